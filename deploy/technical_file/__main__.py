@@ -82,7 +82,12 @@ def arguments(given: list[str]) -> argparse.Namespace:
     parser.add_argument("--dist", type=Path)
     parser.add_argument("--tests", type=Path)
     parser.add_argument("--sbom", type=Path)
-    return parser.parse_args(given)
+    asked = parser.parse_args(given)
+    if asked.dist and not asked.dist.is_dir():
+        parser.error(f"--dist {asked.dist}: no folder; name the one with what is released")
+    if asked.tests and not asked.tests.is_file():
+        parser.error(f"--tests {asked.tests}: no file; name what pytest wrote with --junitxml")
+    return asked
 
 
 def main(given: list[str]) -> int:

@@ -164,3 +164,11 @@ def test_the_rig_is_of_the_highest_class_and_imports_nothing_below() -> None:
     items = tables()["items"]["item"]
     assert traces.item_of("rig/gate.py", items) is first(items, "rig")
     assert {other for one, other in traces.interfaces(items) if one == "rig"} == set()
+
+
+@pytest.mark.parametrize("option", ["--dist", "--tests"])
+def test_what_is_not_there_is_a_mistake_in_the_arguments(option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        technical_file.main([option, "nowhere"])
+    assert caught.value.code == 2
+    assert f"{option} nowhere: no f" in capsys.readouterr().err
