@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 import sys
 import tomllib
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -65,9 +66,32 @@ def render() -> str:
             raise SoupError(f"deploy/soup.toml: {name}: class must be one of {', '.join(CLASSES)}, with a purpose")
     lines = [written["head"], f"## Locked packages ({len(packages)})\n", *_table(locked, packages)]
     lines += ["", f"## Only with an extra ({len(extras)})", "", *_table(more, extras)]
+    lines += ["", "## What they must do, and known anomalies", "", *_anomalies(packages | extras, written["anomalies"])]
     lines += ["", "## Below them", "", "| software | version | class | what for |", "|---|---|---|---|"]
     lines += [f"| {name} | {n['version']} | {n['class']} | {n['for']} |" for name, n in written["below"].items()]
     return "\n".join(lines) + "\n"
+
+
+def _anomalies(told: dict[str, Any], known: dict[str, Any]) -> list[str]:
+    """Each package's faults as a person found them; those of class rig all have an entry.
+
+    Raises SoupError: one has none, an entry is of no package, or leaves a part out.
+    """
+    needed = {name for name, note in told.items() if note["class"] == "rig"}
+    for what, names in (
+        ("not looked at", needed - known.keys()),
+        ("anomalies of no package", known.keys() - told.keys()),
+    ):
+        if names:
+            raise SoupError(f"deploy/soup.toml: {what}: {', '.join(sorted(names))}")
+    lines = ["| package | must | known | here | looked at |", "|---|---|---|---|---|"]
+    for name, note in sorted(known.items(), key=lambda one: (CLASSES.index(told[one[0]]["class"]), one[0])):
+        said = [note["must"], note["known"], note["here"]]
+        if not (all(map(str.strip, said)) and isinstance(note["looked_at"], date)):
+            raise SoupError(f"deploy/soup.toml: anomalies.{name}: needs must, known, here and looked_at, a date")
+        lines.append(f"| {name} | {' | '.join(said)} | {note['looked_at']} |")
+    rest = "; ".join(f"{one}: {sum(n['class'] == one for n in told.values())}" for one in CLASSES)
+    return [*lines, "", f"Packages by class: {rest}. Those without a row were not looked at one by one."]
 
 
 def _table(locked: list[tuple[str, str, str]], told: dict[str, Any]) -> list[str]:

@@ -2,74 +2,29 @@
 
 from __future__ import annotations
 
-import ast
 import importlib.metadata
 import json
 import re
 import subprocess
 import sys
 import tomllib
-from functools import cache
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import pytest
 
 from deploy import soup
+from deploy.technical_file import places, traces
 from stimrig.rig import devices
 from tests.simulator.invariants import INVARIANTS
 
 ROOT = Path(__file__).parents[2]
 HAZARDS = ROOT / "docs" / "safety" / "hazards.toml"
-SEVERITIES = {"critical", "serious", "minor"}
-
-
-@cache
-def names_in(path: Path) -> frozenset[str]:
-    """Names of the tests in a file as pytest would find them, without running it."""
-    names = set()
-    for node in ast.parse(path.read_text("utf-8")).body:
-        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            names.add(node.name)
-        elif isinstance(node, ast.ClassDef) and node.name.startswith("Test"):
-            inside = (n for n in node.body if isinstance(n, ast.FunctionDef | ast.AsyncFunctionDef))
-            names |= {f"{node.name}::{n.name}" for n in inside}
-    return frozenset(name for name in names if name.rpartition("::")[2].startswith("test_"))
 
 
 def faults(hazards: list[dict[str, Any]]) -> list[str]:
     """What does not hold in a list of hazards, a line each."""
-    found = []
-    ids = [hazard.get("id", "?") for hazard in hazards]
-    found += [f"{name}: twice" for name in sorted({name for name in ids if ids.count(name) > 1})]
-    for hazard, name in zip(hazards, ids, strict=True):
-        found += [f"{name}: no {key}" for key in ("title", "harm", "causes") if not hazard.get(key)]
-        if hazard.get("severity") not in SEVERITIES:
-            found.append(f"{name}: severity {hazard.get('severity')!r}")
-        if not hazard.get("control"):
-            found.append(f"{name}: no control")
-        known = {invariant.__name__ for invariant in INVARIANTS}
-        found += [f"{name}: no such invariant: {one}" for one in hazard.get("invariants", []) if one not in known]
-        for control in hazard.get("control", []):
-            found += [f"{name}: {fault}" for fault in control_faults(control)]
-    return found
-
-
-def control_faults(control: dict[str, Any]) -> list[str]:
-    what = control.get("what") or "a control without words"
-    found = [f"{what}: no {key}" for key in ("what", "where", "tests") if not control.get(key)]
-    found += [f"{what}: {place} is not there" for place in control.get("where", []) if not files(place)]
-    for test in control.get("tests", []):
-        path, _, name = test.partition("::")
-        if not (path.startswith("tests/") and (ROOT / path).is_file() and name in names_in(ROOT / path)):
-            found.append(f"{what}: no such test: {test}")
-    return found
-
-
-def files(place: str) -> set[Path]:
-    """A path or a pattern of paths; with a kind of devices in brackets, the drivers of that kind among them."""
-    pattern, _, kind = place.removesuffix(")").partition(" (")
-    return {path for path in ROOT.glob(pattern) if not kind or path.stem in devices.library(cast("Any", kind))}
+    return list(traces.hazard_faults(hazards, {invariant.__name__ for invariant in INVARIANTS}))
 
 
 def hazards() -> list[dict[str, Any]]:
@@ -100,6 +55,8 @@ def test_every_invariant_of_the_simulator_guards_against_a_hazard() -> None:
         (lambda h: h.update(severity="harmless"), "severity"),
         (lambda h: h.update(causes=[]), "no causes"),
         (lambda h: h.update(id="H02"), "twice"),
+        (lambda h: h["control"][0].pop("requirement"), "no requirement"),
+        (lambda h: h.update(control=h["control"][:1]), "one control alone"),
     ],
 )
 def test_what_does_not_hold_is_found(spoil: Any, told: str) -> None:
@@ -110,7 +67,11 @@ def test_what_does_not_hold_is_found(spoil: Any, told: str) -> None:
 
 def test_every_driver_is_named_by_a_control_that_is_tested() -> None:
     named = {
-        path for hazard in hazards() for one in hazard["control"] for place in one["where"] for path in files(place)
+        path
+        for hazard in hazards()
+        for one in hazard["control"]
+        for place in one["where"]
+        for path in places.files(place)
     }
     drivers = {
         ROOT / "rig" / "devices" / f"{name}.py" for kind in get_args(devices.Kind) for name in devices.library(kind)
@@ -155,6 +116,25 @@ for interface in ("socketcan", "socketcand", "slcan"):
     importlib.import_module(f"can.interfaces.{interface}")
 print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
 """
+
+
+@pytest.mark.parametrize(
+    ("spoil", "told"),
+    [
+        (lambda n: n["anomalies"].pop("pyserial"), "not looked at: pyserial"),
+        (lambda n: n["anomalies"].update(leftpad={}), "anomalies of no package: leftpad"),
+        (lambda n: n["anomalies"]["pyserial"].update(known=" "), "anomalies.pyserial: needs must, known"),
+        (lambda n: n["anomalies"]["pyserial"].update(looked_at="soon"), "anomalies.pyserial: needs must, known"),
+    ],
+)
+def test_a_package_of_the_rig_that_nobody_looked_at_is_found(
+    spoil: Any, told: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    notes = soup.notes()
+    spoil(notes)
+    monkeypatch.setattr(soup, "notes", lambda: notes)
+    with pytest.raises(soup.SoupError, match=told):
+        soup.render()
 
 
 def test_what_the_rig_loads_is_classed_as_such() -> None:
