@@ -14,8 +14,8 @@ ROOT = Path(__file__).parents[1]
 FIXED_TOP_LEVEL = {"pyproject.toml", "rig", "identify", "api", "hardware_sim", "tests", "deploy"}
 BESIDE = {
     "README.md", "CONTRIBUTING.md", "Makefile", "stimrig", "docs", "examples", "bench", "requirements", "LICENSE",
-    ".ci", ".containerignore", ".gitattributes", ".gitignore", ".pre-commit-config.yaml", "CHANGELOG.md", "CITATION.cff",
-    "CODE_OF_CONDUCT.md", "SECURITY.md",
+    ".ci", ".containerignore", ".gitattributes", ".gitignore", ".pre-commit-config.yaml", "CHANGELOG.md",
+    "CITATION.cff", "CODE_OF_CONDUCT.md", "SECURITY.md",
 }  # fmt: skip
 
 

@@ -73,7 +73,7 @@ def test_nothing_of_a_person_stays_and_nothing_of_others_goes(tmp_path: Path, sh
         kept = http.get("/v1/participants/P1/model").json()
         recording = http.get(tests["P1"]["recording_url"]).content
         before = [entry["hash"] for entry in http.get("/v1/audit").json()["entries"]]
-    copies.copy_database(tmp_path / "stimrig.db", tmp_path / migrations.BEFORE / "stimrig-0016.db")  # as an upgrade does
+    copies.copy_database(tmp_path / "stimrig.db", tmp_path / migrations.BEFORE / "stimrig-0016.db")
     assert {"stimrig.db", "stimrig-0016.db"} <= set(holding(tmp_path, CODE))
     asked = ["retention", "erase", CODE, "--reason", "asked by letter 12", "--data", str(tmp_path)]
     assert main.run(asked) == 2, "a model is in use: that is told first"
