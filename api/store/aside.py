@@ -54,14 +54,14 @@ class Shelf:
         for row in self.connection.execute(sa.select(held)).mappings().all():
             self.keep(held, row, dict(row), why, {})
 
-    def replace(self, table: str, row: Mapping[str, Any], new: Mapping[str, Any], why: str) -> None:
+    def replace(self, table: str, row: Mapping[Any, Any], new: Mapping[str, Any], why: str) -> None:
         """Give a row other values while the older version has it; if it leaves them so, the old ones come back."""
         held = reflected(self.connection, table)
         self.keep(held, row, {name: row[name] for name in new}, why, new)
         self.connection.execute(held.update().where(*_at(held, _key(held, row))).values(**new))
 
     def keep(
-        self, held: sa.Table, row: Mapping[str, Any], content: Mapping[str, Any], why: str, guard: Mapping[str, Any]
+        self, held: sa.Table, row: Mapping[Any, Any], content: Mapping[str, Any], why: str, guard: Mapping[str, Any]
     ) -> None:
         """Write it down."""
         texts = {"row_key": _text(_key(held, row)), "content": _text(content), "unless_changed": _text(guard)}
@@ -86,6 +86,15 @@ def bring_back(connection: Connection, revision: str) -> list[str]:
     return [f"{count} × {why} It stays aside: what it belongs to was changed since." for why, count in stays.items()]
 
 
+def forget(connection: Connection, names: Iterable[str]) -> None:
+    """Delete what is aside and names one of these: a participant's code, the ids of what was theirs."""
+    if sa.inspect(connection).has_table(SET_ASIDE.name):
+        wanted = [f'"{name}"' for name in names]
+        for row in connection.execute(sa.select(SET_ASIDE)).mappings().all():
+            if any(name in row["row_key"] or name in row["content"] for name in wanted):
+                connection.execute(SET_ASIDE.delete().where(SET_ASIDE.c.id == row["id"]))
+
+
 def told(connection: Connection) -> list[str]:
     """A line for each kind of thing that is aside."""
     counted = (
@@ -99,7 +108,7 @@ def reflected(connection: Connection, table: str) -> sa.Table:
     return sa.Table(table, sa.MetaData(), autoload_with=connection, resolve_fks=False)
 
 
-def _put(connection: Connection, held: sa.Table, row: Mapping[str, Any]) -> bool:
+def _put(connection: Connection, held: sa.Table, row: Mapping[Any, Any]) -> bool:
     key, content, guard = (_value(row[name]) for name in ("row_key", "content", "unless_changed"))
     now = connection.execute(sa.select(held).where(*_at(held, key))).mappings().first()
     if now is None:
@@ -117,7 +126,7 @@ def _with_null(content: Mapping[str, Any]) -> dict[str, Any]:
     return {name: sa.null() if value is None else value for name, value in content.items()}
 
 
-def _key(held: sa.Table, row: Mapping[str, Any]) -> dict[str, Any]:
+def _key(held: sa.Table, row: Mapping[Any, Any]) -> dict[str, Any]:
     return {column.name: row[column.name] for column in held.primary_key}
 
 
