@@ -50,7 +50,9 @@ def test_a_planted_fault_is_told_with_its_mend(planted: Planted) -> None:
     assert row["cause"] and row["mend"] and row["figure"]
 
 
-@pytest.mark.parametrize(("planted", "seed", "noise_nm"), list(sound_rigs(10))[::3], ids=str)
+@pytest.mark.parametrize(
+    ("planted", "seed", "noise_nm"), list(sound_rigs(10))[::3], ids=lambda one: getattr(one, "name", one)
+)
 def test_a_sound_rig_passes(planted: Planted, seed: int, noise_nm: float) -> None:
     checked = Checked(planted, seed, noise_nm)
     assert (checked.report["verdict"], checked.found) == ("sound", []), checked.told
