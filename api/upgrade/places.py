@@ -15,10 +15,10 @@ from stimrig.api.settings import Settings
 from stimrig.api.store.holds import HeldError, ServiceLock
 
 HOLDER = "stimrig upgrade"
-NEW_RIG_KEYS = ("switch", "stimulator.channels", "load_cell.fault", "watch.unmoved_torque_s")
+NEW_RIG_KEYS = ("switch", "require_check", "stimulator.channels", "load_cell.fault", "watch.unmoved_torque_s")
 """Keys of a rig file that version 0.1 refuses; every other one is read by both."""
-NEW_SETTINGS = ("STIMRIG_HEADS_FILE",)
-"""Settings that version 0.1 passes over; every other one is read by both."""
+NEW_SETTINGS = ("STIMRIG_HEADS_FILE", "STIMRIG_OIDC_", "STIMRIG_OTLP_ENDPOINT", "STIMRIG_RETENTION_")
+"""How the settings begin that version 0.1 passes over; every other one is read by both."""
 
 
 class UpgradeError(Exception):
@@ -31,27 +31,45 @@ def held(settings: Settings, rig_data: Path) -> Iterator[None]:
 
     Raises UpgradeError: one of them runs, or the data are another user's.
     """
-    for folder in {settings.data_dir, rig_data}:
+    for folder in (settings.data_dir, rig_data):
         if not folder.is_dir():
             raise UpgradeError(f"{folder}: no such folder; give the data folder with --data")
-        if (owner := folder.stat().st_uid) != os.geteuid():
-            raise UpgradeError(f"{folder}: it is of user {owner}; run this as that user (sudo -u '#{owner}' stimrig …)")
-    try:
-        lock = ServiceLock(settings)
-    except HeldError as error:
-        raise UpgradeError(str(error)) from error
-    try:
-        lock.tell(HOLDER)
-        with _rig_lock(rig_data):
+        if os.geteuid() not in (0, folder.stat().st_uid):
+            raise UpgradeError(f"{folder}: it is another user's; run this as root: sudo stimrig upgrade …")
+    with _rig_lock(rig_data), _as_owner(settings.data_dir):
+        try:
+            lock = ServiceLock(settings)
+        except HeldError as error:
+            raise UpgradeError(str(error)) from error
+        try:
+            lock.tell(HOLDER)
             yield
+        finally:
+            lock.release()
+
+
+@contextlib.contextmanager
+def _as_owner(folder: Path) -> Iterator[None]:
+    """As root: what is made in the folder is its owner's, whose service goes on with it."""
+    before = os.geteuid(), os.getegid()
+    if before[0] == 0:
+        found = folder.stat()
+        os.setegid(found.st_gid)
+        os.seteuid(found.st_uid)
+    try:
+        yield
     finally:
-        lock.release()
+        if before[0] == 0:
+            os.seteuid(before[0])
+            os.setegid(before[1])
 
 
 @contextlib.contextmanager
 def _rig_lock(folder: Path) -> Iterator[None]:
     """The lock by which one rig has the folder for itself (`stimrig.rig.adapters.files`)."""
     with (folder / "rig.lock").open("a+") as file:
+        if os.geteuid() == 0:  # it may be new
+            os.fchown(file.fileno(), folder.stat().st_uid, folder.stat().st_gid)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
@@ -76,7 +94,7 @@ def notes(rig_data: Path, rig_file: Path | None, back: bool) -> list[str]:
     """What the older version will not read, of what stands outside of the database. Raises UpgradeError."""
     if not back:
         return []
-    told = [f"{name}: version 0.1 passes over this setting." for name in NEW_SETTINGS if name in os.environ]
+    told = [f"{name}: version 0.1 passes over this setting." for name in os.environ if name.startswith(NEW_SETTINGS)]
     if (rig_data / "calibrated.json").exists():
         told.append(
             f"{rig_data / 'calibrated.json'}: a calibration nobody has stored; it stays, version 0.1 passes over it."

@@ -162,14 +162,20 @@ class _Run:
         with Session(self.engine) as session:
             entries = list(session.scalars(sa.select(AuditEntry).order_by(AuditEntry.seq)))
             columns = (Recording.id, Recording.path, Recording.file_sha256)
-            recordings = session.execute(sa.select(*columns).order_by(Recording.id)).all()
+            kept = sa.select(*columns).where(Recording.path != "")  # of the others a rule of retention took the file
+            recordings = session.execute(kept.order_by(Recording.id)).all()
         broken = audit.first_broken(entries)
         doubts = [] if broken is None else [f"audit trail: entry {broken} does not fit; see stimrig audit verify"]
         for number, (name, path, digest) in enumerate(recordings):
             self.tell(0.2 + 0.8 * number / len(recordings), f"recording {number + 1} of {len(recordings)}")
-            if doubt := _doubt(Path(path), digest):
+            if doubt := _doubt(self._place(Path(path)), digest):
                 doubts.append(f"recording {name}: {path} {doubt}; restore it from a backup")
         return doubts
+
+    def _place(self, path: Path) -> Path:
+        """The rig's own place of a file that the service's unit sees in another one (its bind mount)."""
+        there = (self.request.rig_data or path.parent) / "recordings" / path.name
+        return there if there.is_file() and not path.is_file() else path
 
 
 def _doubt(path: Path, digest: str) -> str:

@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import tempfile
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -22,13 +23,26 @@ from stimrig.api.settings import Settings
 from stimrig.api.store import Store, copies, downgrades, migrations
 from stimrig.api.store.holds import HeldError, ServiceLock
 from stimrig.api.store.tables import Approval, Model, Participant
-from stimrig.api.upgrade import Request, UpgradeError, upgrade
+from stimrig.api.upgrade import Request, UpgradeError, places, upgrade
+from stimrig.rig.config import RigConfig
 from tests.harness import upgrades
 from tests.harness.postgres import Cluster
 from tests.harness.upgrades import lost_between, make_old, make_since, rows_of
 
 pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
+OLD_SETTINGS = {
+    f"STIMRIG_{name.upper()}"
+    for name in (
+        "data_dir", "database_url", "host", "port", "admin_token", "rig_socket", "rig_file", "emulated", "rig_name",
+        "workers", "session_hours", "idle_lock_min", "time_zone", "secure_cookies", "tls_proxy", "max_upload_mb",
+        "lsl", "effects_dir", "structure", "centre_url", "centre_key",
+    )
+}  # fmt: skip
+OLD_RIG_KEYS = {
+    "data_dir", "socket", "clock_speed", "require_calibration", "stimulator", "load_cell", "angle_sensor", "limits",
+    "watch",
+}  # fmt: skip
 
 
 @pytest.fixture
@@ -236,7 +250,41 @@ def test_a_service_makes_a_copy_before_it_upgrades_by_itself(data: Path, monkeyp
     assert [path.name for path in (data / migrations.BEFORE).iterdir()] == ["stimrig-0012-1.db"]
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root: folders of two users")
+def test_root_upgrades_the_folders_of_two_users_and_what_is_made_is_theirs() -> None:
+    """As the package lays them out: a rig's folder and a service's, and a recording that only the unit sees in both."""
+    with tempfile.TemporaryDirectory() as place:
+        api, rig = Path(place) / "api", Path(place) / "rig"
+        make_old(api, 2, 3)
+        (rig / "recordings").mkdir(parents=True)
+        Path(place).chmod(0o755)
+        (api / "recordings/x1.h5").rename(rig / "recordings/x1.h5")
+        for folder, user in ((api, 5001), (rig, 5002)):
+            for path in (folder, *folder.rglob("*")):
+                os.chown(path, user, 5000)
+                path.chmod(0o750 if path.is_dir() else 0o640)
+        assert run(api, rig_data=rig)["doubts"] == []
+        assert run(api, rig_data=rig, back=True)["doubts"] == []
+        assert {path.stat().st_uid for path in (api, *api.rglob("*"))} == {5001}
+        assert (rig / "rig.lock").stat().st_uid == 5002 and os.geteuid() == 0
+
+
+def test_a_recording_whose_file_a_rule_took_is_no_doubt(data: Path) -> None:
+    run(data)
+    with closing(sqlite3.connect(data / "stimrig.db")) as database, database:
+        database.execute("UPDATE recordings SET path = '' WHERE id = 'x1'")
+    (data / "recordings/x1.h5").unlink()
+    assert run(data, back=True)["doubts"] == []
+
+
 # ---- the verb
+
+
+def test_the_way_back_names_every_key_and_setting_that_is_new() -> None:
+    """`OLD_…`: those of c6ff60e."""
+    names = {f"STIMRIG_{name.upper()}" for name in Settings.model_fields}
+    assert {name for name in names if not name.startswith(places.NEW_SETTINGS)} == OLD_SETTINGS
+    assert RigConfig.model_fields.keys() - OLD_RIG_KEYS == {key for key in places.NEW_RIG_KEYS if "." not in key}
 
 
 def test_the_verb(data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
