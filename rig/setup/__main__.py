@@ -51,13 +51,14 @@ def _say(ports: list[found.Found], links: list[str]) -> None:
 
 
 def _answers(asked: list[Question], options: argparse.Namespace) -> dict[str, str]:
-    """By option; else the person's; else the default. Raises ConfigError."""
+    """By option; else the person's; else, with --yes, the default. Raises ConfigError."""
     answers: dict[str, str] = {}
-    silent = options.yes or not sys.stdin.isatty()
     for question in asked:
         default = question.default(answers)
         answer: str | None = getattr(options, question.option.replace("-", "_"))
-        if answer is None and not silent:
+        if answer is None and not options.yes:
+            if not sys.stdin.isatty():
+                raise ConfigError(f"--{question.option}: nobody is there to ask; give it, or --yes for all defaults")
             print(f"? {question.words} [{default}]: ", end="", file=sys.stderr, flush=True)
             answer = sys.stdin.readline().strip() or None
         answers[question.option] = default if answer is None else answer

@@ -112,6 +112,14 @@ def test_a_wrong_answer_is_one_line_and_writes_nothing(
     assert list(tmp_path.iterdir()) == []
 
 
+def test_where_nobody_can_be_asked_nothing_is_taken_for_granted(
+    tmp_path: Path, machine: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert verb.main(["-o", str(tmp_path / "rig.toml"), "--stimulator", "p24"]) == 2
+    assert "--port: nobody is there to ask; give it, or --yes" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_nothing_is_overwritten(tmp_path: Path, machine: dict[str, Any], capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "rig.toml"
     path.write_text("mine")
