@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import queue
 import re
+import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -425,14 +427,15 @@ def test_a_slow_provider_keeps_nothing_waiting(
     def says_nothing(request: Any) -> None:
         with service.client() as admin, service.client(token=None, auth=None) as other:
             held = service.context.store.engine.pool.checkedout()
-            seen.append((admin.post("/v1/stop").status_code, other.get("/").status_code, held))
-        time.sleep(0.6)
+            seen.put((admin.post("/v1/stop").status_code, other.get("/").status_code, held))
+        answered.wait(PATIENCE_S)
         request.close_connection = True
 
-    seen: list[Any] = []
+    seen, answered = queue.Queue[Any](), threading.Event()
     double.answers["/token"] = says_nothing
     answer = back(visitor, given)
-    assert answer.status_code == 503 and seen == [(200, 200, 0)]
+    answered.set()
+    assert answer.status_code == 503 and seen.get(timeout=PATIENCE_S) == (200, 200, 0)
 
 
 def test_the_machine_without_a_network_works(tmp_path: Path, short_dir: Path) -> None:
