@@ -37,11 +37,16 @@ def whole_file(
     finally:
         part.unlink(missing_ok=True)
     with contextlib.nullcontext() if must_last else contextlib.suppress(OSError):
-        folder = os.open(path.parent, os.O_RDONLY)
-        try:
-            os.fsync(folder)
-        finally:
-            os.close(folder)
+        to_disk(path.parent)
+
+
+def to_disk(path: Path) -> None:
+    """Bring a file, or a folder's list of files, to the disk. Raises OSError."""
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
 
 
 @contextlib.contextmanager

@@ -8,7 +8,6 @@ erased keeps its number, time, person, action and hash, and loses what it said (
 from __future__ import annotations
 
 import glob
-import os
 import secrets
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -38,6 +37,7 @@ from stimrig.api.store.tables import (
     Token,
     Tracked,
 )
+from stimrig.api.whole_file import to_disk
 
 DAY_S = 86_400.0
 BY_RULE = "retention"
@@ -272,11 +272,7 @@ def _remove(path: Path) -> None:
     try:
         path.unlink(missing_ok=True)
         if path.parent.is_dir():
-            folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-            try:
-                os.fsync(folder)
-            finally:
-                os.close(folder)
+            to_disk(path.parent)
     except OSError as error:
         detail = f"{path}: {error.strerror}. Run it as a user who may remove it; what was begun is gone on with then."
         raise ApiError(503, "file-stays", "A file could not be removed", detail) from error

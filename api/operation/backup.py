@@ -20,10 +20,10 @@ from stimrig.api.operation.copying import (
     read_only,
     refuse_no_room,
     row_counts,
-    sync,
     write,
 )
-from stimrig.api.whole_file import sha256_of
+from stimrig.api.store.copies import copy_database
+from stimrig.api.whole_file import sha256_of, to_disk
 
 
 def create(rig_data: Path, api_data: Path, to: Path, tell: Callable[[float, str], None] | None = None) -> Path:
@@ -46,7 +46,7 @@ def create(rig_data: Path, api_data: Path, to: Path, tell: Callable[[float, str]
     partial.mkdir(mode=0o700)
     (partial / "api").mkdir()
     meter.add(source, "copies")
-    _copy_database(source, partial / DATABASE)
+    copy_database(source, partial / DATABASE)
     for path, name_inside in _kept(rig_data, api_data):
         meter.add(path, "copies")
         copy(path, partial / name_inside)
@@ -56,7 +56,7 @@ def create(rig_data: Path, api_data: Path, to: Path, tell: Callable[[float, str]
     check(partial, meter)
     done = to / name
     partial.rename(done)
-    sync(to)
+    to_disk(to)
     return done
 
 
@@ -107,13 +107,6 @@ def recordings_named(database: Path) -> list[tuple[str, str]]:
         if answer != "ok":
             raise BackupError(f"{database}: {answer}")
         return opened.execute("SELECT path, file_sha256 FROM recordings WHERE path != ''").fetchall()
-
-
-def _copy_database(source: Path, target: Path) -> None:
-    """SQLite's own backup: one consistent state, also while the service writes."""
-    with closing(read_only(source)) as old, closing(sqlite3.connect(target)) as new:
-        old.backup(new)
-        new.execute("PRAGMA journal_mode=DELETE")
 
 
 def _kept(rig_data: Path, api_data: Path) -> Iterator[tuple[Path, Path]]:

@@ -110,10 +110,3 @@ def write(path: Path, data: bytes) -> None:
         file.flush()
         os.fsync(file.fileno())
     path.chmod(0o640)
-
-
-def sync(folder: Path) -> None:
-    """Bring a folder's list of files to the disk."""
-    fd = os.open(folder, os.O_RDONLY)
-    os.fsync(fd)
-    os.close(fd)

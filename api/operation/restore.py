@@ -12,9 +12,9 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from stimrig.api.operation.backup import check
-from stimrig.api.operation.copying import NO_METER, BackupError, Meter, copy, manifest, sync, write
+from stimrig.api.operation.copying import NO_METER, BackupError, Meter, copy, manifest, write
 from stimrig.api.operation.state import STATE
-from stimrig.api.whole_file import sha256_of
+from stimrig.api.whole_file import sha256_of, to_disk
 
 
 def restore(backup: Path, rig_data: Path, api_data: Path, force: bool, meter: Meter = NO_METER) -> list[str]:
@@ -79,7 +79,7 @@ def _replace(target: Path, fresh: Path) -> Iterator[str]:
     elif target.exists():
         shutil.rmtree(target)
     fresh.rename(target)
-    sync(target.parent)
+    to_disk(target.parent)
     yield f"{target}: restored"
 
 

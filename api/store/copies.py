@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 from contextlib import closing
 from pathlib import Path
 
 from stimrig.api import owner_only
-from stimrig.api.whole_file import sha256_of
+from stimrig.api.whole_file import sha256_of, to_disk
 
 
 class CopyError(OSError):
@@ -34,9 +33,9 @@ def copy_database(source: Path, to: Path) -> str:
             answer = new.execute("PRAGMA quick_check").fetchone()[0]
         if answer != "ok":
             raise CopyError(f"{source}: damaged ({answer}); restore it from a backup")
-        _to_disk(part)
+        to_disk(part)
         part.replace(to)
-        _to_disk(to.parent)
+        to_disk(to.parent)
     except (OSError, sqlite3.Error) as error:
         if isinstance(error, CopyError):
             raise
@@ -53,11 +52,3 @@ def free_name(folder: Path, stem: str) -> Path:
     while (place := folder / f"{stem}-{number}.db").exists():
         number += 1
     return place
-
-
-def _to_disk(path: Path) -> None:
-    opened = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(opened)
-    finally:
-        os.close(opened)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import getpass
-import time
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +12,7 @@ import typer
 from stimrig.api.cli.commands.audit import DataDir, open_store, settings_of
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import Json, say, say_json
+from stimrig.api.clock import utc_label
 
 if TYPE_CHECKING:
     from stimrig.api.models.erasure import Eraser, Kept
@@ -89,7 +89,7 @@ def _applied(settings: Settings, eraser: Eraser, dry_run: bool) -> dict[str, Any
         "held": list(hold), "unfinished": unfinished,
         "participants": [_document(one) for one in sorted(gone, key=lambda one: one.last_utc)],
         "recordings": [{"id": row.id, "created_utc": row.created_utc, "file_sha256": row.file_sha256} for row in rows],
-        "logs": [{"file": path.name, "changed_utc": _utc(at_s)} for path, at_s in old],
+        "logs": [{"file": path.name, "changed_utc": utc_label(at_s)} for path, at_s in old],
     }  # fmt: skip
 
 
@@ -161,7 +161,3 @@ def _old_logs(folder: Path, days: float | None, now_s: float) -> list[tuple[Path
 
 def _words(days: float) -> str:
     return f"older than {days:g} days"
-
-
-def _utc(unix_s: float) -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(unix_s))
