@@ -190,6 +190,8 @@ def erase(
     if not reason.strip() or code in reason:
         raise InputError("--reason: say why, in words that stay in the audit trail and do not name the participant.")
     settings = _settings(context, data, database)
+    if settings.database_url is None and not (settings.data_dir / "centre.db").exists():
+        raise InputError(f"{settings.data_dir / 'centre.db'}: there is no database. Give the data folder with --data.")
     settings = settings.model_copy(update={"files": files}) if files else settings
     with closing(open_store(settings)) as store:
         try:

@@ -24,6 +24,7 @@ RigData = Annotated[
 DryRun = Annotated[bool, typer.Option("--dry-run", help="say what would be deleted; delete nothing")]
 REMAINS = (
     "backups, until they are deleted by their age: restore none of them without erasing again",
+    "folders that `stimrig backup restore --force` has set aside: ….before-… beside the data folders",
     "a centre, if there is one: `stimrig centre erase` there",
     "what was exported, downloaded or printed: files outside of the data folder are not known here",
     "the audit trail's numbers, times, persons, actions and hashes, without what the entries said",

@@ -200,7 +200,7 @@ def _signals(file: NwbFile, path: str, name: str) -> Iterator[Signal]:
 
 
 def _uneven(time_s: np.ndarray) -> bool:
-    """Whether times are those of events, not of samples: less than 39 a second cannot be a torque anyway."""
+    """Whether times are those of events, not of samples: of one step in a hundred, the length is off by half."""
     steps = np.diff(time_s)
     return bool(steps.size and np.mean(np.abs(steps - np.median(steps)) > 0.5 * np.median(steps)) > 0.01)
 

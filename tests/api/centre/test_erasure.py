@@ -70,6 +70,14 @@ def test_cut_off_it_goes_on(
     assert (done.of, done.files) == ("(erased)", []) and done.done_utc
 
 
+def test_a_folder_that_is_none_is_not_taken_for_a_centre_without_the_participant(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    wrong = tmp_path / "wrong"
+    assert main.run(["centre", "erase", CODE, "--reason", "asked", "--data", str(wrong)]) == 2
+    assert "there is no database" in capsys.readouterr().err and not wrong.exists()
+
+
 def test_a_reason_names_nobody(tmp_path: Path, centre: Centre, capsys: pytest.CaptureFixture[str]) -> None:
     for reason in ("", f"{CODE} asked"):
         assert main.run(["centre", "erase", CODE, "--reason", reason, "--data", str(centre.data)]) == 2
