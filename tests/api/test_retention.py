@@ -114,7 +114,7 @@ def test_it_says_what_it_would_do_and_what_it_did(rig: Rig, capsys: pytest.Captu
         "analyses": 0, "tracked": 0, "approvals": 2, "notes": 0, "models": 2, "recordings": 2, "searches": 0,
         "tests": 2, "tokens": 0, "participants": 1,
     }  # fmt: skip
-    assert found["files"] == 2 and len(found["remains"]) == 4 and unmet("retention", found) == []
+    assert found["files"] == 2 and len(found["remains"]) == 5 and unmet("retention", found) == []
     (done,) = rig.store.all(Erasure)
     assert (done.id, done.of, done.files) == (found["erasure"], "(erased)", []) and done.done_utc
     assert main.run([*verb, "asked"]) == 2 and "There is no participant" in capsys.readouterr().err
@@ -164,6 +164,15 @@ def test_the_rigs_own_files_go_too(rig: Rig, tmp_path: Path) -> None:
     (own / "recordings" / "R2.h5").write_bytes(b"x")
     assert len(eraser(rig, own).erase("P1", "asked", "Ada")[1].files) == 4
     assert [path.name for path in own.rglob("*") if path.is_file()] == ["20260101T000000Z_T11.h5"]
+
+
+def test_a_dry_run_before_the_word_deletes_nothing(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+    ended(rig, "P1")
+    words = ["erase", "P1", "--reason", "asked", "--data", str(rig.folder)]
+    for before in (["--dry-run"], ["--data", str(rig.folder)], ["--rig-data", str(rig.folder)], ["--json"]):
+        assert main.run(["retention", *before, *words]) == 2
+        assert "behind erase" in capsys.readouterr().err
+    assert main.run(["retention", *words, "--dry-run"]) == 0, "it is still there"
 
 
 # ---- the trail

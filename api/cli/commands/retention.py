@@ -35,7 +35,9 @@ REMAINS = (
 def register(app: typer.Typer) -> None:
     """Add the verb and what it can do."""
     verbs = typer.Typer(
-        name="retention", help="What is kept how long, and what is deleted.", invoke_without_command=True
+        name="retention",
+        invoke_without_command=True,
+        help="Delete what is older than the settings STIMRIG_RETENTION_… let it be; without them nothing is.",
     )
     verbs.callback()(apply)
     verbs.command("erase")(erase)
@@ -48,6 +50,8 @@ def apply(
 ) -> None:  # fmt: skip
     """Delete what is older than the settings STIMRIG_RETENTION_… let it be; without them nothing is."""
     if context.invoked_subcommand is not None:
+        if data or rig_data or dry_run or as_json:  # they would be lost, and --dry-run with them
+            raise InputError(f"give the options behind {context.invoked_subcommand}, not before it. Nothing was done.")
         return
     settings = settings_of(data)
     with ExitStack() as stack:
