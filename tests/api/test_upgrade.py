@@ -25,6 +25,7 @@ from stimrig.api.store.holds import HeldError, ServiceLock
 from stimrig.api.store.tables import Approval, Model, Participant
 from stimrig.api.upgrade import Request, UpgradeError, places, upgrade
 from stimrig.rig.config import RigConfig
+from tests.api.test_schemas import unmet
 from tests.harness import upgrades
 from tests.harness.postgres import Cluster
 from tests.harness.upgrades import lost_between, make_old, make_since, rows_of
@@ -294,6 +295,7 @@ def test_the_verb(data: Path, capsys: pytest.CaptureFixture[str], monkeypatch: p
     assert main.run(["upgrade", "--data", str(data), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found.keys() == {"from", "to", "dry_run", "copy", "told", "doubts", "notes"}
+    assert unmet("upgrade", found) == []
     assert main.run(["upgrade", "--data", str(data), "--back", "--rig", str(rig)]) == 0
     said = capsys.readouterr().out
     assert "switch: version 0.1 refuses this key" in said and "stimulator.channels" in said and "HEADS_FILE" in said
