@@ -72,10 +72,9 @@ def _rig(context: Context) -> Iterator[Metric]:
         ("stimrig_rig_torque_age_seconds", "Age of the newest torque; -1: none", known(torque_s)),
         ("stimrig_rig_check_due_timestamp_seconds", "When the rig is to be checked; 0: not known",
          check_due_unix_s(rig.status)),
+        ("stimrig_rig_check_due", "1 where a check of the rig is due",
+         float(bool(rig.status and rig.status.check and rig.status.check.due))),
     ))  # fmt: skip
-    if rig.status is not None and rig.status.check is not None:
-        due = float(bool(rig.status.check.due))
-        yield GaugeMetricFamily("stimrig_rig_check_due", "1 where a check of the rig is due", due)
 
 
 def check_due_unix_s(status: Status | None) -> float:

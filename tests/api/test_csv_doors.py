@@ -48,6 +48,7 @@ DOORS: dict[str, tuple[int, str]] = {
     "bench/goals.py": (1, "a made-up record for a bench: segments of ours"),
     "bench/hidden_on_the_wire.py": (2, "a made-up record for a bench: segments of ours"),
     "bench/pictures.py": (3, "a made-up record for a bench: segments of ours"),
+    "rig/check/person.py": (1, "no table: outputs, as a person types them"),
     "hardware_sim/switch.py": (1, "no table: a relay matrix's answer on the line"),
     "hardware_sim/hidden_records.py": (4, "a made-up record for a bench: segments of ours"),
 }

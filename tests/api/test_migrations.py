@@ -75,8 +75,9 @@ def test_a_database_of_each_older_version_is_upgraded_and_keeps_its_rows(tmp_pat
         store = Store(f"sqlite:///{path}")
         assert differences(store) == []
         assert [row.code for row in store.all(Participant)] == ["P1"]
-        assert [(row.model_id, row.expires_utc) for row in store.all(Approval)] == [("m1", None)]
-        assert [(row.id, row.warnings) for row in store.all(Recording)] == [("upload-1", None)]
+        ended = [("m1", "2026-11-24T00:00:00.000Z")] if name == "12" else []
+        assert [(row.model_id, row.expires_utc) for row in store.all(Approval)] == [*ended, ("m1", None)]
+        assert [row.id for row in store.all(Recording)] == ["r1" if name == "12" else "upload-1"]
         entries = store.all(AuditEntry)
         assert len(entries) == 1 and audit.first_broken(entries) is None
         store.close()

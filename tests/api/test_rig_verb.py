@@ -151,7 +151,7 @@ DUE = CheckStatus(
 
 
 def test_a_check_that_is_due_is_told(service: Service, client: httpx.Client, tmp_path: Path) -> None:
-    assert "check" not in client.get("/v1/rig").json() and "stimrig_rig_check_due" not in client.get("/metrics").text
+    assert "check" not in client.get("/v1/rig").json() and "stimrig_rig_check_due 0.0" in client.get("/metrics").text
     service.rig.check = DUE
     service.rig.become("ready")
     told = soon(lambda: client.get("/v1/rig").json().get("check"))
