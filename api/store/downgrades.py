@@ -59,7 +59,7 @@ def _end_approvals(connection: Connection, now_utc: str) -> list[str]:
 def _0017(op: Operations, shelf: Shelf) -> None:
     held = aside.reflected(shelf.connection, "erasures")
     if shelf.connection.execute(sa.select(held.c.id).where(held.c.done_utc.is_(None)).limit(1)).first():
-        raise migrations.SchemaError("a participant's data are half deleted; run `stimrig retention`, then go back")
+        raise migrations.SchemaError("a deletion is not done; run `stimrig retention --delete`, then go back")
     shelf.rows("identities", "account that a provider signs in: version 0.1 knows passwords and tokens only.")
     shelf.rows("erasures", "deletion of a participant: version 0.1 calls the blanked entries of its trail changed.")
     op.drop_table("identities")

@@ -11,13 +11,12 @@ from typing import get_args
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from stimrig.api.clock import unix_of
 from stimrig.api.operation import state
 from stimrig.api.outbox import status
 from stimrig.api.store.tables import Model, Participant, Test
 from stimrig.api.version import software_version
 from stimrig.api.web.dependencies import Context
-from stimrig.rig.messages import RigState, Status
+from stimrig.rig.messages import RigState
 
 QUANTILES = {"median": "0.5", "p99": "0.99", "max": "1"}
 
@@ -70,17 +69,9 @@ def _rig(context: Context) -> Iterator[Metric]:
         ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
         ("stimrig_rig_age_seconds", "Time since the rig spoke; -1: never", known(rig.age_s)),
         ("stimrig_rig_torque_age_seconds", "Age of the newest torque; -1: none", known(torque_s)),
-        ("stimrig_rig_check_due_timestamp_seconds", "When the rig is to be checked; 0: not known",
-         check_due_unix_s(rig.status)),
         ("stimrig_rig_check_due", "1 where a check of the rig is due",
          float(bool(rig.status and rig.status.check and rig.status.check.due))),
     ))  # fmt: skip
-
-
-def check_due_unix_s(status: Status | None) -> float:
-    """When the rig is to be checked again, by what its state tells of its last check; 0: it tells nothing."""
-    due_utc = status.check.due_at_utc if status is not None and status.check is not None else None
-    return unix_of(due_utc) if due_utc else 0.0
 
 
 def _pulses(context: Context) -> Iterator[Metric]:

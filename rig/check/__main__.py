@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from stimrig.rig.check.person import QUESTIONS, AtTerminal, Hands, Person, Scrip
 from stimrig.rig.check.running import emulated_outputs, file_sha256, run
 from stimrig.rig.check.surroundings import Surroundings
 from stimrig.rig.clock import MonotonicClock
+from stimrig.rig.control.checked import CHECK_FILE
 from stimrig.rig.errors import ConfigError, RigError
 
 CLOSED_WITHIN_S = 45.0
@@ -86,6 +88,16 @@ def _checked(config: configuration.RigConfig, options: argparse.Namespace) -> di
             raise
         finally:
             machine.driver.end()
+            give_to_owner(config.data_dir)
+
+
+def give_to_owner(folder: Path) -> None:
+    """What root has made in a data folder is its owner's, whose rig reads it."""
+    if os.geteuid() == 0 and folder.exists():
+        owner = folder.stat()
+        for path in (folder / CHECK_FILE, folder / "rig.lock", folder / "check", *(folder / "check").rglob("*")):
+            with contextlib.suppress(FileNotFoundError):
+                os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
 
 
 @contextlib.contextmanager

@@ -7,7 +7,6 @@ import re
 import shutil
 import subprocess
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -19,7 +18,6 @@ from stimrig.api.clock import Clock
 from stimrig.api.operation import clock_watch, state
 from stimrig.api.operation.clock_watch import ClockWatch, Synchronised
 from stimrig.api.operation.counted import Counted
-from stimrig.api.web.monitoring import check_due_unix_s
 from tests.api.conftest import Service, run_test
 
 MONITORING = Path(__file__).parents[2] / "deploy" / "monitoring"
@@ -66,7 +64,7 @@ def test_every_figure_that_is_used_is_there_and_tells_nothing_of_anybody(
     assert there["stimrig_stop_confirmation_seconds_count"] == [({}, 1.0)]
     assert [labels["state"] for labels, value in there["stimrig_rig_state"] if value] == ["latched"]
     assert {labels["quantile"] for labels, _ in there["stimrig_pulse_lateness_seconds"]} == {"0.5", "0.99", "1"}
-    assert there["stimrig_rig_check_due_timestamp_seconds"] == [({}, 0.0)]
+    assert there["stimrig_rig_check_due"] == [({}, 0.0)]
     assert there["stimrig_backup_verified_timestamp_seconds"] == [({}, 1793577600.0)]
     assert participant not in text and "typed by" not in text
     labels = {key for samples in there.values() for one, _ in samples for key in one}
@@ -149,12 +147,6 @@ def test_the_kernel_may_be_asked_and_nothing_is_changed_by_it() -> None:
     assert found is None or found.by_service in (True, False)
     if found is not None and found.by_service:
         assert found.error_s is not None and 0 <= found.error_s < 100
-
-
-@pytest.mark.parametrize(("check", "due"), [(None, 0.0), ("2027-01-01T00:00:00.000Z", 1798761600.0)])
-def test_when_the_rig_is_to_be_checked_is_told_where_it_says_so(check: str | None, due: float) -> None:
-    assert check_due_unix_s(None) == 0.0
-    assert check_due_unix_s(SimpleNamespace(check=SimpleNamespace(due_at_utc=check))) == due
 
 
 def test_a_stop_that_was_not_answered_has_no_time() -> None:

@@ -166,12 +166,13 @@ def test_the_rigs_own_files_go_too(rig: Rig, tmp_path: Path) -> None:
     assert [path.name for path in own.rglob("*") if path.is_file()] == ["20260101T000000Z_T11.h5"]
 
 
-def test_a_dry_run_before_the_word_deletes_nothing(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
+def test_options_before_the_word_are_refused(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     ended(rig, "P1")
     words = ["erase", "P1", "--reason", "asked", "--data", str(rig.folder)]
-    for before in (["--dry-run"], ["--data", str(rig.folder)], ["--rig-data", str(rig.folder)], ["--json"]):
+    for before in (["--delete"], ["--data", str(rig.folder)], ["--rig-data", str(rig.folder)], ["--json"]):
         assert main.run(["retention", *before, *words]) == 2
         assert "behind erase" in capsys.readouterr().err
+    assert main.run(["retention", "--dry-run", *words]) == 2 and capsys.readouterr().err
     assert main.run(["retention", *words, "--dry-run"]) == 0, "it is still there"
 
 
@@ -343,15 +344,16 @@ def test_the_verb_does_what_the_settings_say(
     monkeypatch.setenv("STIMRIG_RETENTION_LOGS_DAYS", "30")
     monkeypatch.setattr("stimrig.api.clock.Clock.unix_s", lambda _self: rig.clock.now_s + 50 * 86_400.0)
     monkeypatch.setenv("STIMRIG_RETENTION_RECORDINGS_DAYS", "10")
-    assert main.run([*verb, "--dry-run"]) == 0 and "recordings: 2 would go" in capsys.readouterr().out
+    assert main.run(verb) == 0 and "recordings: 2 would go" in capsys.readouterr().out
     assert log.exists() and len(list((rig.folder / "recordings").glob("*.h5"))) == 2
-    assert main.run([*verb, "--json"]) == 0
+    assert main.run([*verb, "--delete", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert unmet("retention", found) == []
-    assert len(found["recordings"]) == 2 and found["logs"][0]["file"] == "api.log" and not log.exists()
+    assert not found["dry_run"] and len(found["recordings"]) == 2
+    assert found["logs"][0]["file"] == "api.log" and not log.exists()
     assert not list((rig.folder / "recordings").glob("*.h5")) and rig.store.get(Participant, "P1") is not None
     monkeypatch.setenv("STIMRIG_RETENTION_PARTICIPANTS_DAYS", "20")
-    assert main.run([*verb, "--json"]) == 0
+    assert main.run([*verb, "--delete", "--json"]) == 0
     assert [one["code"] for one in json.loads(capsys.readouterr().out)["participants"]] == ["P1"]
     assert rig.store.get(Participant, "P1") is None and audit.first_broken(trail(rig)) is None
     monkeypatch.setenv("STIMRIG_RETENTION_PARTICIPANTS_DAYS", "0")

@@ -232,7 +232,7 @@ def test_the_command_line(machine: Machine, tmp_path: Path) -> None:
     def call(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run([*STIMRIG, *arguments], capture_output=True, text=True)
 
-    folders = ["--rig-data", str(machine.rig), "--api-data", str(machine.api)]
+    folders = ["--rig-data", str(machine.rig), "--data", str(machine.api)]
     made = call("create", *folders, "--to", str(tmp_path / "backups"), "--json")
     assert made.returncode == 0, made.stderr
     kept = json.loads(made.stdout)["backup"]
@@ -241,7 +241,7 @@ def test_the_command_line(machine: Machine, tmp_path: Path) -> None:
     refused = call("restore", *folders, kept)
     assert (refused.returncode, len(refused.stderr.splitlines())) == (1, 1)
     assert call("restore", *folders, "--force", kept).returncode == 0
-    absent = call("create", "--api-data", str(tmp_path / "nowhere"), "--to", str(tmp_path / "b"))
+    absent = call("create", "--data", str(tmp_path / "nowhere"), "--to", str(tmp_path / "b"))
     assert absent.returncode == 2
     assert "no database" in absent.stderr
 

@@ -121,23 +121,23 @@ def test_a_backup_from_before_rows_were_counted_is_verified_and_says_so(kept: Pa
 
 def test_the_result_is_kept_beside_the_database(kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     api = tmp_path / "lib" / "api"
-    assert main.run(["backup", "verify", str(kept), "--api-data", str(api)]) == 0
+    assert main.run(["backup", "verify", str(kept), "--data", str(api)]) == 0
     assert "2 recordings opened, 1 models read" in capsys.readouterr().out
     good = state.read(api)
     assert good.verified_unix_s > 0 and good.verified_of_utc and not good.problem
     change("DELETE FROM models")(kept)
-    assert main.run(["backup", "verify", str(kept), "--api-data", str(api)]) == 1
+    assert main.run(["backup", "verify", str(kept), "--data", str(api)]) == 1
     assert len(capsys.readouterr().err.splitlines()) == 1
     bad = state.read(api)
     assert "models: 0 rows" in bad.problem and bad.verified_utc == good.verified_utc
-    assert main.run(["backup", "verify", str(tmp_path), "--api-data", str(api)]) == 2
+    assert main.run(["backup", "verify", str(tmp_path), "--data", str(api)]) == 2
     assert state.read(api) == bad, "nothing was tried"
     assert main.run(["backup", "verify", str(kept), "--place", str(tmp_path / "nowhere")]) == 1
     assert state.read(tmp_path / "nowhere") == state.Backups()
 
 
 def test_the_verb_makes_and_puts_back(kept: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folders = ["--rig-data", str(tmp_path / "lib/rig"), "--api-data", str(tmp_path / "lib/api")]
+    folders = ["--rig-data", str(tmp_path / "lib/rig"), "--data", str(tmp_path / "lib/api")]
     assert main.run(["backup", "create", *folders, "--to", str(tmp_path / "other"), "--json"]) == 0
     made = json.loads(capsys.readouterr().out)
     assert made["files"] == 3 and Path(made["backup"]).is_dir()

@@ -4,6 +4,7 @@ flows that should not."""
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -345,6 +346,16 @@ def test_it_refuses_while_a_rig_uses_the_data_folder(tmp_path: Path, capsys: pyt
     report = json.loads(capsys.readouterr().out)
     assert report["rig_file"] == file and len(report["rig_file_sha256"]) == 64
     assert [row["fault"] for row in report["steps"] if row["fault"]] == ["port_missing"]
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+def test_what_root_checks_the_rigs_user_reads(tmp_path: Path) -> None:
+    (tmp_path / "check" / "one").mkdir(parents=True)
+    (tmp_path / "check.json").write_text("{}")
+    os.chown(tmp_path, 4711, 4712)
+    verb.give_to_owner(tmp_path)
+    for path in (tmp_path / "check.json", tmp_path / "check" / "one"):
+        assert (path.stat().st_uid, path.stat().st_gid) == (4711, 4712)
 
 
 def test_what_the_system_says(tmp_path: Path) -> None:

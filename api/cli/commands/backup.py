@@ -18,7 +18,7 @@ from stimrig.api.progress_bar import progress_bar
 
 RIG_DATA, API_DATA = Path("/var/lib/stimrig/rig"), Path("/var/lib/stimrig/api")
 RigData = Annotated[Path, typer.Option(help="the rig's data folder; of `stimrig serve` the same for both")]
-ApiData = Annotated[Path, typer.Option(help="the service's data folder, with the database")]
+ApiData = Annotated[Path, typer.Option("--data", help="the service's data folder, with the database")]
 Backup = Annotated[Path, typer.Argument(help="folder that `stimrig backup create` has made", metavar="BACKUP")]
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
 

@@ -22,6 +22,7 @@ RigData = Annotated[
     list[Path] | None, typer.Option("--rig-data", help="the rig's data folder, where the service has one of its own")
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="say what would be deleted; delete nothing")]
+Delete = Annotated[bool, typer.Option("--delete", help="delete it; without this it is only said what would go")]
 REMAINS = (
     "backups, until they are deleted by their age: restore none of them without erasing again",
     "folders that `stimrig backup restore --force` has set aside: ….before-… beside the data folders",
@@ -37,7 +38,7 @@ def register(app: typer.Typer) -> None:
     verbs = typer.Typer(
         name="retention",
         invoke_without_command=True,
-        help="Delete what is older than the settings STIMRIG_RETENTION_… let it be; without them nothing is.",
+        help="Say what is older than the settings STIMRIG_RETENTION_… let it be, and with --delete delete it.",
     )
     verbs.callback()(apply)
     verbs.command("erase")(erase)
@@ -45,12 +46,13 @@ def register(app: typer.Typer) -> None:
 
 
 def apply(
-    context: typer.Context, data: DataDir = None, rig_data: RigData = None, dry_run: DryRun = False,
+    context: typer.Context, data: DataDir = None, rig_data: RigData = None, delete: Delete = False,
     as_json: Json = False,
 ) -> None:  # fmt: skip
-    """Delete what is older than the settings STIMRIG_RETENTION_… let it be; without them nothing is."""
+    """Say what is older than the settings STIMRIG_RETENTION_… let it be, and with --delete delete it."""
+    dry_run = not delete
     if context.invoked_subcommand is not None:
-        if data or rig_data or dry_run or as_json:  # they would be lost, and --dry-run with them
+        if data or rig_data or delete or as_json:  # they would be lost
             raise InputError(f"give the options behind {context.invoked_subcommand}, not before it. Nothing was done.")
         return
     settings = settings_of(data)
@@ -59,7 +61,7 @@ def apply(
     if as_json:
         say_json(found)
         return
-    did = "would go" if dry_run else "deleted"
+    did = "would go (--delete)" if dry_run else "deleted"
     for name, oldest in (("participants", "last_utc"), ("recordings", "created_utc"), ("logs", "changed_utc")):
         rows = found[name]
         since = f", the oldest of {rows[0][oldest]}" if rows else ""
