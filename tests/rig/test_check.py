@@ -132,6 +132,34 @@ def test_after_a_fault_that_was_not_provoked_nothing_is_played() -> None:
     assert {outcomes(checked)[name] for name in ("scope", "stop", "silence", "emergency")} == {"not done"}
 
 
+@pytest.mark.parametrize(
+    ("before", "undone"),
+    [("width and current at the load", ("stop", "silence", "emergency")), ("watchdog", ("emergency",))],
+)
+@pytest.mark.parametrize("kind", ["person", "loose cable"])
+def test_a_train_that_a_fault_has_ended_does_not_count_as_stopped(
+    monkeypatch: pytest.MonkeyPatch, before: str, undone: tuple[str, ...], kind: str
+) -> None:
+    """Somebody is connected, or a cable comes off, once that step is done: the stop that follows ends no train."""
+
+    def fail(rig: Checked) -> None:
+        class Told(list[Any]):
+            def append(self, one: Any) -> None:
+                super().append(one)
+                if kind != "person" and one[0] == before:
+                    rig.devices.faults.on("electrode_error", {})
+
+        told, log = Told(), rig.devices.electrodes.log
+        monkeypatch.setattr(Checked, "told", property(lambda _: told, lambda *_: None), raising=False)
+        new = lambda: kind == "person" and any(title == before for title, _ in told)  # noqa: E731
+        pull = lambda nm, time_s: nm + (5.0 if new() and time_s - log[-1].time_s < 0.1 else 0.0)  # noqa: E731
+        rig.devices.load_cell.torque_hooks.append(pull)
+
+    checked = Checked(Planted("later", world=fail))
+    assert {outcomes(checked)[name] for name in undone} == {"not done"}, checked.told
+    assert checked.report["verdict"] == "incomplete"
+
+
 def test_a_weight_that_stays_on_the_lever_lets_no_pulse_flow() -> None:
     checked = Checked(Planted("weight left"), answers={"weight_off": ""})
     assert checked.devices.electrodes.log == []
