@@ -51,7 +51,7 @@ class Kept:
     counts: dict[str, int]
     files: list[str]
     in_use: str  # why a controller may still use it; empty: it does not
-    last_utc: str  # when it was last tested, or made
+    last_utc: str  # when it was last tested or recorded, or made
 
 
 class Eraser:
@@ -75,8 +75,10 @@ class Eraser:
         counts = {}
         for table, condition in _rows_of(session, code):
             counts[table.__tablename__] = session.scalar(select(func.count()).select_from(table).where(condition)) or 0
-        last = session.scalar(select(func.max(Test.requested_utc)).where(Test.participant == code))
-        return Kept(code, counts, self._files(session, code), self._in_use(session, code), last or row.created_utc)
+        tested = session.scalar(select(func.max(Test.requested_utc)).where(Test.participant == code))
+        recorded = session.scalar(select(func.max(Recording.created_utc)).where(Recording.participant == code))
+        last = max(filter(None, (row.created_utc, tested, recorded)))  # an upload is no test, and counts as one
+        return Kept(code, counts, self._files(session, code), self._in_use(session, code), last)
 
     def _in_use(self, session: Session, code: str) -> str:
         now = self.clock.utc()

@@ -316,6 +316,18 @@ def test_rules_let_go_what_is_old_and_nothing_else(rig: Rig) -> None:
     assert "old" not in [one.code for one in eraser(rig).old_participants(30)], "its model is in use"
 
 
+def test_whose_recording_was_uploaded_of_late_is_not_old(rig: Rig) -> None:
+    """An upload makes no test: the rule for participants must see it all the same."""
+    ended(rig, "P1", 1)
+    rig.clock.sleep(40 * 86_400.0)
+    assert [one.code for one in eraser(rig).old_participants(30)] == ["P1"]
+    upload = {"test_id": None, "origin": "upload", "path": "", "file_sha256": "0" * 64}
+    rig.add(Recording(id="upload-1", participant="P1", created_utc=rig.clock.utc(), **upload))
+    assert eraser(rig).old_participants(30) == []
+    rig.clock.sleep(31 * 86_400.0)
+    assert [one.code for one in eraser(rig).old_participants(30)] == ["P1"]
+
+
 def test_the_verb_does_what_the_settings_say(
     rig: Rig, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
