@@ -197,6 +197,18 @@ def test_only_what_an_entry_vouches_for_may_be_blank(rig: Rig) -> None:
     assert "P1" not in str([entry.as_dict() for entry in trail(rig)])
 
 
+@pytest.mark.parametrize("code", ["tests", "kept", "reason", "a"])
+def test_a_code_that_is_a_word_of_the_trail_or_in_a_persons_name(rig: Rig, code: str) -> None:
+    """Neither what an earlier erasure vouches for breaks, nor does the trail forget who did what."""
+    ended(rig, "P1", 1)
+    ended(rig, code, 1)
+    eraser(rig).erase("P1", "asked", "Ada")
+    eraser(rig).erase(code, "asked", "Ada")
+    assert audit.first_broken(trail(rig)) is None
+    assert [entry.action for entry in trail(rig) if entry.subject != audit.ERASED][-2:] == [audit.ERASE] * 2
+    assert {entry.who for entry in trail(rig) if entry.action == "approve"} == {"Ada"}
+
+
 def test_the_centre_is_told_the_rest_anew_and_nothing_of_who_was_erased(rig: Rig) -> None:
     ended(rig, "P1")
     ended(rig, "P2")
