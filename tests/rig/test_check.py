@@ -4,6 +4,8 @@ flows that should not."""
 from __future__ import annotations
 
 import json
+import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -359,6 +361,29 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert verb.main(words) == 2
         out, err = capsys.readouterr()
         assert out == "" and len(err.strip().splitlines()) == 1 and err.startswith("check: "), err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_whatever_ends_it_stops_the_stimulator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], number: signal.Signals
+) -> None:
+    """A train is running: the rig is stopped and closed before the process ends."""
+    closed: list[bool] = []
+
+    async def train(bench: Any, *_: Any) -> dict[str, Any]:
+        os.kill(os.getpid(), number)
+        await bench.tasks.sleep(30)
+        return {}
+
+    async def close(_self: Rig) -> None:
+        closed.append(True)
+
+    monkeypatch.setattr(verb, "run", train)
+    monkeypatch.setattr(Rig, "close", close)
+    handler = signal.getsignal(number)
+    assert verb.main(["--config", str(rig_file(tmp_path)), "--answer", "by=me"]) == 130
+    assert closed and "was stopped" in capsys.readouterr().err
+    assert signal.getsignal(number) == handler
 
 
 def test_it_refuses_while_a_rig_uses_the_data_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
