@@ -139,7 +139,7 @@ class Settings(ServerSettings):
         default=None, description="file, best on another machine's disk, to which the audit trail's head goes hourly"
     )
     retention_participants_days: Annotated[float, Field(ge=1)] | None = Field(
-        default=None, description="days after the last test, then all of a participant goes; default: kept"
+        default=None, description="days after the last test or recording, then all of a participant goes; default: kept"
     )
     retention_recordings_days: Annotated[float, Field(ge=1)] | None = Field(
         default=None, description="days after which a recording's file goes, and its row stays; default: kept"

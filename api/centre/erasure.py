@@ -88,7 +88,8 @@ def _items(session: Session, code: str) -> list[CentreItem]:
         kinds = ("test", "tracked") if kind == "test" else (kind,)
         for item in session.scalars(select(CentreItem).where(CentreItem.kind.in_(kinds), CentreItem.key.in_(keys))):
             found[item.rig_id, item.chain, item.seq] = item
-    said = CentreItem.body.contains(f'"participant":"{code}"', autoescape=True)
-    for item in session.scalars(select(CentreItem).where(said)):
-        found[item.rig_id, item.chain, item.seq] = item
+    said = f'"participant":"{code}"'
+    for item in session.scalars(select(CentreItem).where(CentreItem.body.contains(said, autoescape=True))):
+        if said in (item.body or ""):  # SQLite's LIKE takes P1 and p1 for the same
+            found[item.rig_id, item.chain, item.seq] = item
     return list(found.values())

@@ -51,7 +51,7 @@ class Kept:
     counts: dict[str, int]
     files: list[str]
     in_use: str  # why a controller may still use it; empty: it does not
-    last_utc: str  # when it was last tested, or made
+    last_utc: str  # when it was last tested or recorded, or made
 
 
 class Eraser:
@@ -75,8 +75,10 @@ class Eraser:
         counts = {}
         for table, condition in _rows_of(session, code):
             counts[table.__tablename__] = session.scalar(select(func.count()).select_from(table).where(condition)) or 0
-        last = session.scalar(select(func.max(Test.requested_utc)).where(Test.participant == code))
-        return Kept(code, counts, self._files(session, code), self._in_use(session, code), last or row.created_utc)
+        tested = session.scalar(select(func.max(Test.requested_utc)).where(Test.participant == code))
+        recorded = session.scalar(select(func.max(Recording.created_utc)).where(Recording.participant == code))
+        last = max(filter(None, (row.created_utc, tested, recorded)))  # an upload is no test, and counts as one
+        return Kept(code, counts, self._files(session, code), self._in_use(session, code), last)
 
     def _in_use(self, session: Session, code: str) -> str:
         now = self.clock.utc()
@@ -144,10 +146,14 @@ class Eraser:
         entries = session.scalars(select(AuditEntry).order_by(AuditEntry.seq)).all()
         newest = seen.last(session)
         of = newest.seq + 1 if newest else 1
-        blanked = [entry for entry in entries if entry.subject in names or _mentions(entry.detail, names)]
+        blanked = [
+            entry for entry in entries
+            if entry.action != audit.ERASE  # it names nobody, and vouches for what was blanked before
+            and (entry.subject in names or _mentions(entry.detail, names))
+        ]  # fmt: skip
         for entry in blanked:
             entry.subject, entry.detail = audit.ERASED, {"erased": of}
-            if any(name in entry.who for name in names):  # what a test does by itself goes by its id
+            if names & {entry.who, *entry.who.split(" ")}:  # what a test does by itself goes by its id
                 entry.who = audit.ERASED
         session.flush()
         told = {"reason": reason, "rows": counts, "entries": len(blanked), "kept": audit.left_of(blanked)}

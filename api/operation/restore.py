@@ -104,14 +104,17 @@ def check_copy(backup: Path, rig: Path, api: Path, meter: Meter = NO_METER) -> i
 
 
 def _own_like(fresh: Path, target: Path) -> None:
-    """The owner and mode that the data folder had: as root only, else they stay the caller's."""
+    """The owner and mode that the data folder had: as root only, else they stay the caller's.
+
+    The folder itself last: who owns it could put a link to a file of root's in the place of one in it.
+    """
     if not target.exists():
         return
     owner = target.stat()
-    fresh.chmod(owner.st_mode & 0o7777)
     if os.geteuid() == 0:
-        for path in (fresh, *fresh.rglob("*")):
-            os.chown(path, owner.st_uid, owner.st_gid)
+        for path in (*sorted(fresh.rglob("*"), reverse=True), fresh):
+            os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
+    fresh.chmod(owner.st_mode & 0o7777)
 
 
 def _locked(path: Path) -> bool:

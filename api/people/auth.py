@@ -184,13 +184,19 @@ class Auth:
         )  # fmt: skip
 
     def fallen(self, token: Token) -> bool:
-        """Whether who made this key has been removed, or the token that made it has been revoked or has expired."""
+        """Whether who made this key could not make it now: has been removed, or lacks a scope since.
+
+        Or the token that made it has been revoked or has expired.
+        """
         if token.made_by is None:
             return False
         maker: Token | None = self.store.get(Token, token.made_by)
-        return maker is None or maker.revoked or (
+        if maker is None or maker.revoked or (
             maker.expires_utc is not None and not maker.expires_utc > self.clock.utc()
-        )  # fmt: skip
+        ):  # fmt: skip
+            return True
+        needed = {Scope.APPROVE_MODEL, *token.scopes}  # a provider's group may have taken one
+        return Scope.ADMINISTER not in maker.scopes and not needed <= set(maker.scopes)
 
     def sign_in(self, token_text: str, address: str) -> str:
         """Open a page session for a token's holder; its cookie. Raises as `bearer` does; 403 for a controller's key."""

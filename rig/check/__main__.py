@@ -11,6 +11,7 @@ import contextlib
 import json
 import logging
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -32,12 +33,15 @@ from stimrig.rig.errors import ConfigError, RigError
 CLOSED_WITHIN_S = 45.0
 """Real seconds for the stop, its evidence and the sealing of a train that was interrupted."""
 INTERRUPTED = 130
+ENDS = (signal.SIGTERM, signal.SIGHUP)
+"""What ends a process besides Ctrl-C: the system, and a terminal that is closed."""
 MARKS = {"passed": "ok", "failed": "FAULT", "not done": "--"}
 
 
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.CRITICAL)
+    before = {one: signal.signal(one, signal.default_int_handler) for one in ENDS}  # each stops the stimulator first
     try:
         for name, number in (("--dummy-load-ohm", options.dummy_load_ohm), ("--days", options.days)):
             if not (0 < number < 1e6):
@@ -53,6 +57,9 @@ def main(arguments: list[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("check: interrupted; the stimulator was stopped", file=sys.stderr)
         return INTERRUPTED
+    finally:
+        for one, handler in before.items():
+            signal.signal(one, handler)
     print(json.dumps(report, ensure_ascii=False))
     return 0 if report["verdict"] == "sound" else 1
 

@@ -199,13 +199,14 @@ class Bench:
         except RigError as error:
             self.halted = f"the rig could not be re-armed: {error}"
 
-    async def until_pulses(self, count: int, longest_s: float = 5.0) -> None:
-        """Until the running train has sent so many, or has ended."""
+    async def until_pulses(self, count: int, longest_s: float = 5.0) -> bool:
+        """Until the running train has sent so many, or has ended: whether it has, and still goes on."""
         player, end_s = self.rig.player, self.clock.now_s() + longest_s * self.clock.speed
         while player.run is not None and not player.run.halt.signal.is_set() and self.clock.now_s() < end_s:
             if player.run.t0_s is not None and player.run.sent >= count:
-                return
+                return True
             await self.tasks.sleep(0.02)
+        return False
 
     def _plan(self, on_s: float, channel: str) -> TestPlan:
         most_nm = EMULATED_TORQUE_NM if self.emulated else MOST_TORQUE_NM + abs(self.offset_nm)

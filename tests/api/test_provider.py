@@ -139,6 +139,33 @@ def test_what_a_group_gave_it_takes(service: Service, double: Double, visitor: h
         assert refused.status_code == 403 and status(elsewhere) == 401
 
 
+@pytest.mark.parametrize("groups", [["stim-readers"], []])
+def test_a_controllers_key_falls_with_the_group_of_who_made_it(
+    service: Service, double: Double, visitor: httpx.Client, groups: list[str]
+) -> None:
+    double.groups, double.sub, double.claims = ["stim-clinicians"], f"maker-{groups}", {"name": "Made It"}
+    assert signs_in(visitor, double).status_code == 200
+    csrf = re.search(r'name="csrf" value="([^"]+)"', visitor.get("/").text)
+    head = {"X-CSRF-Token": csrf[1] if csrf else "", "Accept": "application/json"}
+    code = f"K{len(groups)}"
+    with service.client() as admin:
+        admin.post("/v1/rearm")
+        admin.post("/v1/participants", json={"code": code})
+        test = run_test(admin, code)
+        assert admin.post(f"{test['model_url']}/approve", json={"reason": "good"}).status_code == 200
+        head["If-Match"] = admin.get(f"/v1/participants/{code}").headers["etag"]
+    plan = {"name": "ilc", "current_ma": 8, "max_pulse_width_us": 200, "max_duration_s": 60, "trials": 3}
+    assert signs_in(visitor, double, again="1").status_code == 200
+    made = visitor.post(f"/v1/participants/{code}/keys", json=plan, headers=head)
+    assert made.status_code == 201, made.text
+    with service.client(token=made.json()["key"]) as controller:
+        assert controller.get(f"/v1/participants/{code}/model").status_code == 200
+        double.groups = groups
+        assert signs_in(visitor, double).status_code == (200 if groups else 403)
+        assert controller.get(f"/v1/participants/{code}/model").status_code == 401
+        assert controller.post("/v1/stop").status_code == 200, "a stop is for everybody who had a key"
+
+
 def test_who_has_no_group_hears_so_and_an_administrator_links(
     service: Service, double: Double, visitor: httpx.Client
 ) -> None:

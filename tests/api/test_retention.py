@@ -207,6 +207,18 @@ def test_only_what_an_entry_vouches_for_may_be_blank(rig: Rig) -> None:
     assert "P1" not in str([entry.as_dict() for entry in trail(rig)])
 
 
+@pytest.mark.parametrize("code", ["tests", "kept", "reason", "a"])
+def test_a_code_that_is_a_word_of_the_trail_or_in_a_persons_name(rig: Rig, code: str) -> None:
+    """Neither what an earlier erasure vouches for breaks, nor does the trail forget who did what."""
+    ended(rig, "P1", 1)
+    ended(rig, code, 1)
+    eraser(rig).erase("P1", "asked", "Ada")
+    eraser(rig).erase(code, "asked", "Ada")
+    assert audit.first_broken(trail(rig)) is None
+    assert [entry.action for entry in trail(rig) if entry.subject != audit.ERASED][-2:] == [audit.ERASE] * 2
+    assert {entry.who for entry in trail(rig) if entry.action == "approve"} == {"Ada"}
+
+
 def test_the_centre_is_told_the_rest_anew_and_nothing_of_who_was_erased(rig: Rig) -> None:
     ended(rig, "P1")
     ended(rig, "P2")
@@ -324,6 +336,18 @@ def test_rules_let_go_what_is_old_and_nothing_else(rig: Rig) -> None:
     assert eraser(rig).remove_files([], "rule", "retention") is None
     rig.session("old")
     assert "old" not in [one.code for one in eraser(rig).old_participants(30)], "its model is in use"
+
+
+def test_whose_recording_was_uploaded_of_late_is_not_old(rig: Rig) -> None:
+    """An upload makes no test: the rule for participants must see it all the same."""
+    ended(rig, "P1", 1)
+    rig.clock.sleep(40 * 86_400.0)
+    assert [one.code for one in eraser(rig).old_participants(30)] == ["P1"]
+    upload = {"test_id": None, "origin": "upload", "path": "", "file_sha256": "0" * 64}
+    rig.add(Recording(id="upload-1", participant="P1", created_utc=rig.clock.utc(), **upload))
+    assert eraser(rig).old_participants(30) == []
+    rig.clock.sleep(31 * 86_400.0)
+    assert [one.code for one in eraser(rig).old_participants(30)] == ["P1"]
 
 
 def test_the_verb_does_what_the_settings_say(

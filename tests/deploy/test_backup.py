@@ -75,6 +75,25 @@ def restored(machine: Machine, kept: Path, root: Path) -> Machine:
     return found
 
 
+def test_root_gives_the_folder_away_last_and_follows_no_link(
+    machine: Machine, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else the service's user could make root give it any file, by a link in a folder that it already owns."""
+    kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
+    given: list[Path] = []
+
+    def chown(path: Path, _user: int, _group: int, follow_symlinks: bool = True) -> None:
+        assert not follow_symlinks and not path.is_symlink()
+        assert not {one for one in given if one in path.parents}, "a folder was given away before what is in it"
+        given.append(path)
+
+    monkeypatch.setattr(os, "geteuid", lambda: 0)
+    monkeypatch.setattr(os, "chown", chown)
+    restore(kept, machine.rig, machine.api, force=True)
+    roots = {machine.rig.with_name("rig.restoring"), machine.api.with_name("api.restoring")}
+    assert roots <= set(given) and len(given) > 10
+
+
 def test_there_and_back(machine: Machine, tmp_path: Path) -> None:
     kept = backup.create(machine.rig, machine.api, tmp_path / "backups")
     assert backup.check(kept) == {"files": 5, "recordings": 3, "named_in_database": 3}

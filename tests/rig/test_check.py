@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from pathlib import Path
 from typing import Any
 
@@ -131,6 +132,34 @@ def test_after_a_fault_that_was_not_provoked_nothing_is_played() -> None:
     checked = Checked(Planted("load off", faults={"electrode_error": {}}))
     assert len(checked.devices.electrodes.log) == 1
     assert {outcomes(checked)[name] for name in ("scope", "stop", "silence", "emergency")} == {"not done"}
+
+
+@pytest.mark.parametrize(
+    ("before", "undone"),
+    [("width and current at the load", ("stop", "silence", "emergency")), ("watchdog", ("emergency",))],
+)
+@pytest.mark.parametrize("kind", ["person", "loose cable"])
+def test_a_train_that_a_fault_has_ended_does_not_count_as_stopped(
+    monkeypatch: pytest.MonkeyPatch, before: str, undone: tuple[str, ...], kind: str
+) -> None:
+    """Somebody is connected, or a cable comes off, once that step is done: the stop that follows ends no train."""
+
+    def fail(rig: Checked) -> None:
+        class Told(list[Any]):
+            def append(self, one: Any) -> None:
+                super().append(one)
+                if kind != "person" and one[0] == before:
+                    rig.devices.faults.on("electrode_error", {})
+
+        told, log = Told(), rig.devices.electrodes.log
+        monkeypatch.setattr(Checked, "told", property(lambda _: told, lambda *_: None), raising=False)
+        new = lambda: kind == "person" and any(title == before for title, _ in told)  # noqa: E731
+        pull = lambda nm, time_s: nm + (5.0 if new() and time_s - log[-1].time_s < 0.1 else 0.0)  # noqa: E731
+        rig.devices.load_cell.torque_hooks.append(pull)
+
+    checked = Checked(Planted("later", world=fail))
+    assert {outcomes(checked)[name] for name in undone} == {"not done"}, checked.told
+    assert checked.report["verdict"] == "incomplete"
 
 
 def test_a_weight_that_stays_on_the_lever_lets_no_pulse_flow() -> None:
@@ -332,6 +361,29 @@ def test_bad_input_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str
         assert verb.main(words) == 2
         out, err = capsys.readouterr()
         assert out == "" and len(err.strip().splitlines()) == 1 and err.startswith("check: "), err
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_whatever_ends_it_stops_the_stimulator(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], number: signal.Signals
+) -> None:
+    """A train is running: the rig is stopped and closed before the process ends."""
+    closed: list[bool] = []
+
+    async def train(bench: Any, *_: Any) -> dict[str, Any]:
+        os.kill(os.getpid(), number)
+        await bench.tasks.sleep(30)
+        return {}
+
+    async def close(_self: Rig) -> None:
+        closed.append(True)
+
+    monkeypatch.setattr(verb, "run", train)
+    monkeypatch.setattr(Rig, "close", close)
+    handler = signal.getsignal(number)
+    assert verb.main(["--config", str(rig_file(tmp_path)), "--answer", "by=me"]) == 130
+    assert closed and "was stopped" in capsys.readouterr().err
+    assert signal.getsignal(number) == handler
 
 
 def test_it_refuses_while_a_rig_uses_the_data_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

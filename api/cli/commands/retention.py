@@ -82,7 +82,7 @@ def _applied(settings: Settings, eraser: Eraser, dry_run: bool) -> dict[str, Any
     gone = eraser.old_participants(rules["participants"], hold) if rules["participants"] else []
     if not dry_run:
         for one in sorted(gone, key=lambda one: one.last_utc):
-            eraser.erase(one.code, f"rule: {people} after the last test", "retention")
+            eraser.erase(one.code, f"rule: {people} after the last test or recording", "retention")
     codes = {one.code for one in gone}
     rows = eraser.old_recordings(rules["recordings"], hold) if rules["recordings"] else []
     rows = [row for row in rows if row.participant not in codes]

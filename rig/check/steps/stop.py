@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig.rig.acquire.evidence import NO_SIGNAL
-from stimrig.rig.check.bench import Bench
+from stimrig.rig.check.bench import Bench, NotDone
 from stimrig.rig.check.finding import Fault, Finding, failed, passed
 from stimrig.rig.messages import StopEvidence
 
@@ -31,20 +31,23 @@ async def look(bench: Bench) -> Finding:
     told = dict[str, Any]()
 
     async def press() -> None:
-        await bench.until_pulses(20)
+        told["playing"] = await bench.until_pulses(20)
         told["asked_s"] = bench.clock.now_s()
         told["evidence"] = await bench.rig.stop("stop of the check", bench.by)
 
     train = await bench.play(TRAIN_S, during=press)
+    stopped = told["playing"] and train.finished.outcome == "stopped"  # else by a fault: there was nothing to stop
     evidence: StopEvidence = told["evidence"]
     last_s = max((one.written_s for one in train.pulses if one.written_s == one.written_s), default=told["asked_s"])
     after_ms = 1e3 * (last_s - told["asked_s"]) / bench.clock.speed
     extra = train.heard.edges - train.sent if bench.cell.get("sync") else 0
     figure = f"{evidence.detail}; last pulse {after_ms:+.0f} ms after the stop"
     bound = f"confirmed, no pulse later than {MOST_MS:g} ms"
-    await bench.go_on(train, provoked=evidence.confirmed)
+    await bench.go_on(train, provoked=evidence.confirmed and stopped)
     if not evidence.confirmed:
         return failed("torque_unseen" if NO_SIGNAL in evidence.detail else "stop_unconfirmed", figure, bound)
+    if not stopped:
+        raise NotDone(bench.halted or "no pulses flowed that could be stopped")
     if not (after_ms <= MOST_MS and extra <= 1):
         bench.halted = "pulses flow after the stop"
         return failed("stop_late", f"{figure}, {max(0, extra)} more edges than pulses", bound)

@@ -51,6 +51,22 @@ def test_it_lets_go_of_one_and_keeps_the_others(centre: Centre, rig: httpx.Clien
     assert main.run(asked(centre)) == 2
 
 
+def test_a_code_that_differs_by_its_case_is_another_person(
+    centre: Centre, rig: httpx.Client, http: httpx.Client
+) -> None:
+    """SQLite's LIKE takes both for the same."""
+    told, other = Teller(), CODE.lower()
+    told.session(CODE)
+    told.session(other)
+    told.push(rig)
+    before, kept = http.get(f"/v1/participants/{other}/sessions").json(), files(centre)
+    assert main.run(asked(centre)) == 0
+    assert http.get(f"/v1/participants/{other}/sessions").json() == before
+    assert len(files(centre)) == len(kept) - 2
+    bodies = [item.body or "" for item in centre.context.store.all(CentreItem)]
+    assert any(f'"participant":"{other}"' in body for body in bodies) and CODE not in "".join(bodies)
+
+
 def test_cut_off_it_goes_on(
     centre: Centre, rig: httpx.Client, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
