@@ -149,7 +149,7 @@ class Eraser:
         blanked = [
             entry for entry in entries
             if entry.action != audit.ERASE  # it names nobody, and vouches for what was blanked before
-            and (entry.subject in names or _mentions(entry.detail, names))
+            and (entry.subject in names - {"page", "rig"} or _mentions(entry.detail, names))
         ]  # fmt: skip
         for entry in blanked:
             entry.subject, entry.detail = audit.ERASED, {"erased": of}

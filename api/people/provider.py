@@ -103,14 +103,19 @@ class Provider:
         address = about["authorization_endpoint"]
         return f"{address}{'&' if '?' in address else '?'}{urlencode(asked)}", self._sealed(flow)
 
+    def began(self, cookie: str) -> bool:
+        """Whether the cookie is of a sign-in that was begun here."""
+        text, _, mark = cookie.rpartition(".")
+        return hmac.compare_digest(mark.encode(), self._mac("cookie", text).encode())
+
     def flow_of(self, cookie: str, given: Mapping[str, str]) -> Flow:
         """The sign-in that this answer ends; it is used up with that.
 
         Raises NotAcceptedError: it was begun elsewhere or too long ago, or is over.
         """
-        text, _, mark = cookie.rpartition(".")
-        if not hmac.compare_digest(mark.encode(), self._mac("cookie", text).encode()):
+        if not self.began(cookie):
             raise NotAcceptedError("the browser did not begin it")
+        text = cookie.rpartition(".")[0]
         flow = Flow(**json.loads(base64.urlsafe_b64decode(text)))
         if not hmac.compare_digest(given.get("state", "").encode(), self._part(flow, "state").encode()):
             raise NotAcceptedError("another state")

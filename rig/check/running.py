@@ -15,6 +15,7 @@ from stimrig.rig.check.finding import Finding, not_done
 from stimrig.rig.clock import utc_text
 from stimrig.rig.config import RigConfig
 from stimrig.rig.control.checked import CHECK_FILE, fingerprint
+from stimrig.rig.control.memory import LatchFile
 from stimrig.rig.errors import ConfigError, RigError
 
 FORMAT, FORMAT_VERSION = "stimrig-rig-check", 1
@@ -28,8 +29,11 @@ async def run(
     """Do every step, close the rig, and keep the report in the data folder.
 
     `days`: after so many the check is due again. `about`: what else the report says, of the rig file. `tell`: called
-    after each step. Raises ConfigError: nobody says who checks.
+    after each step. Raises ConfigError: nobody says who checks; the rig waits for a person since it died in a test.
     """
+    remembered, _ = await LatchFile(bench.given.data_dir, bench.ears.as_machine()).read()
+    if remembered == "running":
+        raise ConfigError(f"{bench.given.data_dir}: the rig died in a test; start it, look, re-arm it, then check it")
     try:
         bench.by = await bench.answer("by")
     except NotDone:

@@ -51,7 +51,7 @@ class Checked:
             datetime.fromisoformat(self._found.due_at_utc or "")
         except FileNotFoundError:
             self._found = None
-        except (OSError, ValueError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
             self._found = None
             log.warning("%s: not readable (%s); check the rig again", self._path, " ".join(str(error).split()))
 

@@ -108,6 +108,13 @@ def test_no_pulse_without_a_persons_word_on_the_load() -> None:
         assert {outcomes(checked)[name] for name in ("pulses", "stop", "silence", "emergency")} == {"not done"}
 
 
+@pytest.mark.parametrize("left", [b'{"state": "running", "reason": "in a test"}', b"["])
+def test_a_rig_that_died_in_a_test_is_not_checked(left: bytes) -> None:
+    """Its latch waits for a person; a check would play beside it, in a folder of its own."""
+    with pytest.raises(ConfigError, match="re-arm it, then check"):
+        Checked(Planted("died", world=lambda one: one.disk.replace(FOLDER / "latch.json", left)))
+
+
 def test_limits_of_the_rig_file_hold() -> None:
     checked = Checked(Planted("tight", rig_file={"limits.current_ma": 6.0, "limits.pulse_width_us": 50.0}))
     pulses = checked.devices.electrodes.log
@@ -304,6 +311,7 @@ SOUND = {
         ({**SOUND, "rig": "another"}, "has changed"),
         (None, "never"),
         ("not JSON", "never"),
+        ("[" * 100_000, "never"),
         ("{}", "never"),
         ({**SOUND, "due_at_utc": "tomorrow"}, "never"),
     ],

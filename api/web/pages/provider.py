@@ -68,14 +68,17 @@ async def callback(request: Request, context: Ctx) -> Response:
     """What the provider's page has led back here with. Whatever it was, the flow's cookie is used up."""
     provider, address = the_provider(context), request.client.host if request.client else ""
     given = {name: text for name, text in request.query_params.items() if len(text) <= 4000}
+    held = request.cookies.get(flow_cookie(context), "")
     try:
-        context.guesses.callback(place_of(address))
-        flow = provider.flow_of(request.cookies.get(flow_cookie(context), ""), given)
+        if provider.began(held):  # else any page can have made a browser ask: nothing is counted or written down
+            context.guesses.callback(place_of(address))
+        flow = provider.flow_of(held, given)
         answer = await _finished(request, context, flow, await provider.finish(flow, given))
         context.guesses.callback_was_right(place_of(address))
     except NotAcceptedError as error:
         log.warning("a sign-in through %s was refused: %s", provider.issuer, error)
-        await _note(context, address, str(error))
+        if provider.began(held):
+            await _note(context, address, str(error))
         answer = await sign_in_page(request, context, "/", ApiError(401, "not-accepted", "Not signed in", NOT_ACCEPTED))
     except ApiError as error:
         if error.status != 429:
