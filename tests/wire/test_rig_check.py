@@ -51,11 +51,15 @@ def test_a_fault_of_a_wire_is_told(make_bench: Callable[..., Bench]) -> None:
     assert bench.fault(cmd="pulses")["pulses"] == []
 
 
-def test_ctrl_c_stops_the_stimulator(make_bench: Callable[..., Bench]) -> None:
+@pytest.mark.parametrize(
+    ("module", "end"), [(["stimrig.rig.check"], signal.SIGINT), (["stimrig", "rig", "check"], signal.SIGKILL)]
+)
+def test_ctrl_c_stops_the_stimulator(make_bench: Callable[..., Bench], module: list[str], end: int) -> None:
+    """And so does the end of the command that started the check."""
     bench = make_bench("--noise-seed", "7")
     command = [
         "-m",
-        "stimrig.rig.check",
+        *module,
         "--emulator-json",
         json.dumps(bench.emulator.ready),
         "--data",
@@ -72,9 +76,9 @@ def test_ctrl_c_stops_the_stimulator(make_bench: Callable[..., Bench]) -> None:
     while len(bench.fault(cmd="pulses")["pulses"]) < 5:
         assert process.poll() is None and time.monotonic() < end_s, process.communicate()
         time.sleep(0.02)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=60)
-    assert (process.returncode, out) == (130, ""), err
+    process.send_signal(end)
+    out, err = process.communicate(timeout=60)  # until the check itself has ended, too
+    assert (process.returncode, out) == (130 if end == signal.SIGINT else -end, ""), err
     assert err.strip().splitlines()[-1] == "check: interrupted; the stimulator was stopped"
     state = bench.state()
     assert state["mode"] == "none", "it was told to stop, not only left alone"

@@ -6,14 +6,17 @@ Both are processes of the rig's own package, which this one starts: questions an
 from __future__ import annotations
 
 import json
+import os
 import signal
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from stimrig.api.cli.child import die_with_parent
 from stimrig.api.cli.errors import INTERRUPTED, InputError, LaunchError
 from stimrig.api.cli.terminal import Json, say, say_json, write
 
@@ -78,14 +81,19 @@ def told(report: dict[str, Any]) -> list[str]:
 
 
 def _child(module: str, name: str, words: list[str], capture: bool) -> str:
-    """Start a process of the rig; what it prints. Ctrl-C is that one's: it stops the stimulator before it ends.
+    """Start a process of the rig; what it prints. It stops the stimulator before it ends.
+
+    Ctrl-C is that one's. Where this one is killed it is told to end, and never plays on alone.
 
     Raises LaunchError, Exit.
     """
     command = [sys.executable, "-m", module, *words]
     before = signal.signal(signal.SIGINT, lambda *_: None)
     try:
-        ended = subprocess.run(command, stdout=subprocess.PIPE if capture else None, text=True)
+        ended = subprocess.run(
+            command, stdout=subprocess.PIPE if capture else None, text=True,
+            preexec_fn=partial(die_with_parent, os.getpid(), signal.pthread_sigmask(signal.SIG_BLOCK, ())),
+        )  # fmt: skip
     finally:
         signal.signal(signal.SIGINT, before)
     if ended.returncode in (2, INTERRUPTED):
