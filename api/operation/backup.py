@@ -36,7 +36,7 @@ def create(rig_data: Path, api_data: Path, to: Path, tell: Callable[[float, str]
     """
     source = api_data / "stimrig.db"
     if not source.is_file():
-        raise BackupError(f"{source}: no database; give the service's data folder with --api-data", 2)
+        raise BackupError(f"{source}: no database; give the service's data folder with --data", 2)
     need = source.stat().st_size + sum(path.stat().st_size for path, _ in _kept(rig_data, api_data))
     meter = Meter(tell, 3 * need) if tell else NO_METER
     to.mkdir(parents=True, exist_ok=True)

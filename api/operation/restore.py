@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import NamedTuple
 
 from stimrig.api.operation.backup import check
 from stimrig.api.operation.copying import NO_METER, BackupError, Meter, copy, manifest, write
@@ -17,8 +18,15 @@ from stimrig.api.operation.state import STATE
 from stimrig.api.whole_file import sha256_of, to_disk
 
 
-def restore(backup: Path, rig_data: Path, api_data: Path, force: bool, meter: Meter = NO_METER) -> list[str]:
-    """Put a backup back; what happened, in words. The rig comes up latched: a person looks first.
+class Restored(NamedTuple):
+    """What a restore did: in words, and how many files have the SHA-256 of the manifest."""
+
+    words: list[str]
+    files_same: int
+
+
+def restore(backup: Path, rig_data: Path, api_data: Path, force: bool, meter: Meter = NO_METER) -> Restored:
+    """Put a backup back. The rig comes up latched: a person looks first.
 
     Raises BackupError: the backup does not hold, a process uses the data, or there are data and no `force`. Nothing was
     touched.
@@ -39,8 +47,8 @@ def restore(backup: Path, rig_data: Path, api_data: Path, force: bool, meter: Me
     _stage(backup / "rig", fresh[rig_data], ("journals", "recordings"), meter)
     _stage(backup / "api", fresh[api_data], ("recordings/rig",) if api_data != rig_data else (), meter)
     _latch(fresh[rig_data] / "latch.json", f"the data were restored from {backup.name}")
-    check_copy(backup, fresh[rig_data], fresh[api_data], meter)
-    return [words for target in targets for words in _replace(target, fresh[target])]
+    same = _compare(backup, fresh[rig_data], fresh[api_data], meter)
+    return Restored([words for target in targets for words in _replace(target, fresh[target])], same)
 
 
 def _stage(source: Path, fresh: Path, folders: tuple[str, ...], meter: Meter) -> None:
@@ -83,7 +91,7 @@ def _replace(target: Path, fresh: Path) -> Iterator[str]:
     yield f"{target}: restored"
 
 
-def check_copy(backup: Path, rig: Path, api: Path, meter: Meter = NO_METER) -> int:
+def _compare(backup: Path, rig: Path, api: Path, meter: Meter) -> int:
     """How many restored files have the hash of the manifest. Raises BackupError: one has another, or is not there.
 
     A journal whose recording is in the backup, too, is not restored; the latch is told anew.

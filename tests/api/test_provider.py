@@ -530,7 +530,8 @@ def real() -> Iterator[str]:
     """`oidc-provider-mock`: authlib's server, whose code is not ours."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        mock = pytest.importorskip("oidc_provider_mock")
+        import oidc_provider_mock as mock
+
         person = mock.User(sub="ada@clinic", claims={"name": "Ada", "groups": ["stim-readers"]})
         with mock.run_server_in_thread(user_claims=[person]) as server:
             yield f"http://localhost:{server.server_port}"

@@ -211,7 +211,7 @@ def test_what_is_there_is_not_overwritten(machine: Machine, tmp_path: Path) -> N
         restore(kept, machine.rig, machine.api, force=False)
     assert machine.contents() == before
     assert not (machine.rig / "rig.lock").exists()  # it would belong to the one who restores, and keep the rig out
-    words = restore(kept, machine.rig, machine.api, force=True)
+    words = restore(kept, machine.rig, machine.api, force=True).words
     assert not later.exists()
     [aside] = machine.rig.parent.glob("rig.before-*")
     assert (aside / "recordings" / later.name).read_bytes() == b"made after the backup"

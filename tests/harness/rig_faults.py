@@ -68,7 +68,7 @@ PLANTED = [
 """Those of the issue, and more."""
 
 
-def sound_rigs(count: int) -> Iterator[tuple[Planted, int, float]]:
+def sound_rigs(count: int, first_seed: int = 100) -> Iterator[tuple[Planted, int, float]]:
     """So many rigs without a fault, with a seed and the noise of the cell: device kinds × settings × patients."""
     kinds = itertools.cycle(itertools.product(("p24", "rehastim2"), ("plain", "canopen", "counts", "packed", "angle")))
     patients = itertools.cycle(("paper", "calcium", "paper"))
@@ -86,4 +86,4 @@ def sound_rigs(count: int) -> Iterator[tuple[Planted, int, float]]:
             f"{stimulator}, {cell}, {patient}", settings=settings, arm="held" if cell == "angle" else None,
             channels=(1, 2) if number % 5 == 0 and cell != "angle" else (),
         )  # fmt: skip
-        yield rig, 100 + number, (0.02, 0.05, 0.1, 0.15)[number % 4]
+        yield rig, first_seed + number, (0.02, 0.05, 0.1, 0.15)[number % 4]

@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import typer
 
 from stimrig.api.cli.errors import CommandError
+from stimrig.api.cli.terminal import Json, say, say_json
 from stimrig.api.clock import Clock
 from stimrig.api.operation import state
 from stimrig.api.operation.copying import BackupError, manifest, size_of
@@ -20,7 +21,6 @@ RIG_DATA, API_DATA = Path("/var/lib/stimrig/rig"), Path("/var/lib/stimrig/api")
 RigData = Annotated[Path, typer.Option(help="the rig's data folder; of `stimrig serve` the same for both")]
 ApiData = Annotated[Path, typer.Option("--data", help="the service's data folder, with the database")]
 Backup = Annotated[Path, typer.Argument(help="folder that `stimrig backup create` has made", metavar="BACKUP")]
-Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
 
 
 def register(app: typer.Typer) -> None:
@@ -100,14 +100,12 @@ def restore(
     from stimrig.api.operation.copying import Meter
 
     with one_line(), progress_bar() as tell:
-        words = back.restore(backup, rig_data, api_data, force, Meter(tell, 3 * size_of(backup)))
+        words = back.restore(backup, rig_data, api_data, force, Meter(tell, 3 * size_of(backup))).words
     tell_found({"restored": words}, "\n".join(words), as_json)
 
 
 def tell_found(found: dict[str, Any], words: str, as_json: bool) -> None:
     """One object, or lines for people."""
-    from stimrig.api.cli.terminal import say, say_json
-
     say_json(found) if as_json else say(words)
 
 

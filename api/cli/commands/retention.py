@@ -80,8 +80,9 @@ def _applied(settings: Settings, eraser: Eraser, dry_run: bool) -> dict[str, Any
     if not dry_run:
         eraser.finish()
     gone = eraser.old_participants(rules["participants"], hold) if rules["participants"] else []
+    gone.sort(key=lambda one: one.last_utc)
     if not dry_run:
-        for one in sorted(gone, key=lambda one: one.last_utc):
+        for one in gone:
             eraser.erase(one.code, f"rule: {people} after the last test or recording", "retention")
     codes = {one.code for one in gone}
     rows = eraser.old_recordings(rules["recordings"], hold) if rules["recordings"] else []
@@ -94,7 +95,7 @@ def _applied(settings: Settings, eraser: Eraser, dry_run: bool) -> dict[str, Any
     return {
         "dry_run": dry_run, "rules": {"participants": people, "recordings": files, "logs": logs},
         "held": list(hold), "unfinished": unfinished,
-        "participants": [_document(one) for one in sorted(gone, key=lambda one: one.last_utc)],
+        "participants": [_document(one) for one in gone],
         "recordings": [{"id": row.id, "created_utc": row.created_utc, "file_sha256": row.file_sha256} for row in rows],
         "logs": [{"file": path.name, "changed_utc": utc_label(at_s)} for path, at_s in old],
     }  # fmt: skip
