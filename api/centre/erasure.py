@@ -10,7 +10,7 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.centre.bucket import Bucket
 from stimrig.api.clock import Clock
-from stimrig.api.errors import require_found
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.store import Store, audit
 from stimrig.api.store.centre_tables import (
     CentreDecision,
@@ -20,6 +20,7 @@ from stimrig.api.store.centre_tables import (
     CentreModel,
     CentreParticipant,
     CentreRecording,
+    CentreRig,
     CentreSession,
     CentreTest,
     CentreWanted,
@@ -32,14 +33,19 @@ OF_PERSON = (
 KEYED = {"recording": CentreRecording.recording_id, "model": CentreModel.id, "test": CentreTest.id}
 
 
-def erase(store: Store, bucket: Bucket, clock: Clock, code: str, reason: str, by: str) -> dict[str, Any]:
+def erase(
+    store: Store, bucket: Bucket, clock: Clock, code: str, reason: str, by: str, all_rigs: bool = False
+) -> dict[str, Any]:
     """Take it away; how many rows and files went. Cut off, the same command goes on with the files.
 
-    Raises NotFoundError: no such participant, and nothing that was begun. BucketError: a file cannot be removed.
+    Raises NotFoundError: no such participant, and nothing that was begun. ApiError: 409 several rigs told of the code,
+    and it was not said that all are meant. BucketError: a file cannot be removed.
     """
     with store.write() as session:
         there = session.scalars(select(CentreParticipant).where(CentreParticipant.code == code)).first()
         if there is not None:
+            if not all_rigs:
+                _refuse_several(session, code)
             _rows(session, code, reason, by, clock.utc())
         begun = list(session.scalars(select(Erasure).where(Erasure.of == code, Erasure.done_utc.is_(None))))
     require_found(begun or None, "participant", code, "GET /v1/participants lists them.")
@@ -51,6 +57,15 @@ def erase(store: Store, bucket: Bucket, clock: Clock, code: str, reason: str, by
             if done is not None:  # the code goes with the last file
                 done.files, done.of, done.done_utc = [], audit.ERASED, clock.utc()
     return {"erasure": begun[-1].id, "files": sum(len(row.files) for row in begun)}
+
+
+def _refuse_several(session: Session, code: str) -> None:
+    """A code is one person at a centre; two clinics that gave it to two people must not lose the other one."""
+    told = {item.rig_id for item in _items(session, code)}
+    if len(told) > 1:
+        names = session.scalars(select(CentreRig.name).where(CentreRig.id.in_(told)).order_by(CentreRig.name)).all()
+        detail = f"{code}: told by {', '.join(names)}. If that is one person, give --all-rigs; else erase at the rigs."
+        raise ApiError(409, "several-rigs", "Several rigs told of it", detail)
 
 
 def _rows(session: Session, code: str, reason: str, by: str, now_utc: str) -> None:

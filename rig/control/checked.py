@@ -6,6 +6,7 @@ import hashlib
 import json
 import logging
 from datetime import datetime
+from pathlib import Path
 
 from stimrig.rig.config import RigConfig
 from stimrig.rig.errors import CheckNeededError
@@ -21,8 +22,12 @@ log = logging.getLogger("rig.checked")
 
 
 def fingerprint(config: RigConfig) -> str:
-    """SHA-256 of what a rig is made of: devices, limits and watch."""
+    """SHA-256 of what a rig is made of: devices, what describes their frames, limits and watch."""
     content = {name: value for name, value in config.public().items() if name not in OF_THE_PLACE}
+    for name, device in content.items():  # the content of a DBC file, wherever it lies
+        path = Path(str(device.get("dbc", ""))) if isinstance(device, dict) else Path()
+        if path.suffix == ".dbc" and path.is_file():
+            content[name] = {**device, "dbc": hashlib.sha256(path.read_bytes()).hexdigest()}
     return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()
 
 

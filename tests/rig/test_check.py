@@ -343,6 +343,18 @@ def test_place_and_socket_are_not_part_of_the_rig(sound: Checked) -> None:
     assert fingerprint(sound.config.model_copy(update={"limits": limits})) != fingerprint(sound.config)
 
 
+def test_another_description_of_the_frames_is_another_rig(sound: Checked, tmp_path: Path) -> None:
+    """A scale in the DBC file counts as much as one in the rig file."""
+    described = tmp_path / "cell.dbc"
+
+    def seen(text: str) -> str:
+        described.write_text(text)
+        settings = sound.config.load_cell.model_copy(update={"dbc": str(described)})
+        return fingerprint(sound.config.model_copy(update={"load_cell": settings}))
+
+    assert seen("(0.01,0)") == seen("(0.01,0)") != seen("(0.001,0)")
+
+
 # ---- the process
 
 

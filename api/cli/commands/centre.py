@@ -180,6 +180,7 @@ def erase(
     data: DataOption = None,
     database: DatabaseOption = None,
     files: FilesOption = None,
+    all_rigs: Annotated[bool, typer.Option("--all-rigs", help="also where several rigs told of the code")] = False,
 ) -> None:
     """Delete what all rigs have told of a participant, with the files; erase at the rigs first."""
     from stimrig.api.centre import erasure
@@ -195,7 +196,7 @@ def erase(
     settings = settings.model_copy(update={"files": files}) if files else settings
     with closing(open_store(settings)) as store:
         try:
-            found = erasure.erase(store, ready_bucket(settings), Clock(), code, reason.strip()[:500], WHO)
+            found = erasure.erase(store, ready_bucket(settings), Clock(), code, reason.strip()[:500], WHO, all_rigs)
         except BucketError as error:
             raise CommandError(f"{error}; give the same command once more: it goes on with the files") from error
     say(f"{code}: deleted with {found['files']} files, as erasure {found['erasure']}; backups still have it")

@@ -51,6 +51,23 @@ def test_it_lets_go_of_one_and_keeps_the_others(centre: Centre, rig: httpx.Clien
     assert main.run(asked(centre)) == 2
 
 
+def test_a_code_of_two_rigs_is_erased_only_where_both_are_meant(
+    centre: Centre, rig: httpx.Client, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Two clinics may have given it to two people."""
+    first, second = Teller(), Teller()
+    first.session(CODE)
+    first.push(rig)
+    second.session(CODE, "2026-03-09")
+    with centre.client(centre.key("Hospital B")) as other:
+        second.push(other)
+    kept = files(centre)
+    assert main.run(asked(centre)) == 2
+    told = capsys.readouterr().err
+    assert "Hospital B" in told and "--all-rigs" in told and files(centre) == kept
+    assert main.run([*asked(centre), "--all-rigs"]) == 0 and files(centre) == set()
+
+
 def test_a_code_that_differs_by_its_case_is_another_person(
     centre: Centre, rig: httpx.Client, http: httpx.Client
 ) -> None:
