@@ -73,9 +73,10 @@ class Identities:
         """What a group gave, it takes: its person's open sessions, too."""
         scopes = [str(scope) for scope in ROLES[role]] if role else []
         if sorted(token.scopes) != sorted(scopes):
+            taken = {"token": token.hash[:16]} if set(token.scopes) - set(scopes) else {}  # as of one that is revoked
             token.scopes = scopes
             self.people.auth.end_sessions(session, token.hash)
-            audit.write(session, self.clock.utc(), "provider", ROLE, name, scopes=scopes)
+            audit.write(session, self.clock.utc(), "provider", ROLE, name, scopes=scopes, **taken)
 
     def link(self, name: str, subject: str, by: str) -> None:
         """From now on this subject is this person, and nobody else. Raises ApiError: 404; 409 changed since."""

@@ -101,9 +101,10 @@ def account(name: str) -> About:
 
 
 def revoked(*token_hashes: str | None) -> About:
-    """The end of a token's right, or of that of who made it."""
+    """The end of a token's right or of a part of it, or of that of who made it."""
     ids = [token_hash[:16] for token_hash in token_hashes if token_hash]
-    return and_(AuditEntry.action == "revoke token", AuditEntry.detail["token"].as_string().in_(ids))
+    ends = AuditEntry.action.in_(("revoke token", "change role"))
+    return and_(ends, AuditEntry.detail["token"].as_string().in_(ids))
 
 
 def accounts() -> About:

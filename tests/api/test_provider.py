@@ -21,8 +21,9 @@ from stimrig.api.settings import Settings
 from stimrig.api.store.tables import AuditEntry
 from tests.api import hostile_provider
 from tests.api.centre.conftest import run_centre
-from tests.api.conftest import HTML, NO_TLS, PATIENCE_S, STUB, Service, run_service, run_test
+from tests.api.conftest import HTML, NO_TLS, PATIENCE_S, STUB, Service, run_service, run_test, soon
 from tests.api.hostile_provider import CLIENT, EC, ED, SECRET, STRANGER, Double, encoded
+from tests.api.test_overtaken import TRIAL
 from tests.api.test_people import PASSWORD, standing_still
 
 PUBLIC = "https://rig.example.org"
@@ -161,9 +162,15 @@ def test_a_controllers_key_falls_with_the_group_of_who_made_it(
     assert made.status_code == 201, made.text
     with service.client(token=made.json()["key"]) as controller:
         assert controller.get(f"/v1/participants/{code}/model").status_code == 200
+        speed, service.rig.speed = service.rig.speed, 0.1
+        plays = controller.post("/v1/tests", json={"participant": code, **TRIAL})
+        assert plays.status_code == 202
         double.groups = groups
         assert signs_in(visitor, double).status_code == (200 if groups else 403)
         assert controller.get(f"/v1/participants/{code}/model").status_code == 401
+        # what plays by that right ends, as where a key is revoked
+        soon(lambda: [one for one in service.rig.withdrawn if one.test_id == plays.json()["id"]])
+        service.rig.speed = speed
         assert controller.post("/v1/stop").status_code == 200, "a stop is for everybody who had a key"
 
 
