@@ -8,7 +8,7 @@ cp "$package" "$root/var/tmp/stimrig.deb"
 cp /etc/resolv.conf "$root/etc/"
 mountpoint -q "$root/proc" || mount -t proc proc "$root/proc"
 mountpoint -q "$root/dev" || mount --rbind /dev "$root/dev"
-inside() { chroot "$root" sh -euc "export DEBIAN_FRONTEND=noninteractive; $*"; }
+inside() { env -i PATH=/usr/sbin:/usr/bin:/sbin:/bin DEBIAN_FRONTEND=noninteractive chroot "$root" sh -euc "$*"; } # nothing of this machine's
 seconds() { local began; began=$(date +%s); "${@:2}" >/dev/null; echo "[try] $1: $(($(date +%s) - began)) s"; }
 
 inside 'apt-get update -qq'
