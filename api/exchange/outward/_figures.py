@@ -55,7 +55,7 @@ def devices(record: WholeRecord) -> dict[str, str]:
     """Stimulator, load cell and software by what the recording says of them."""
     try:
         rig = json.loads(record.about.get("configuration") or "{}")["rig"]
-        named = {kind: str(rig[kind]["driver"]) for kind in ("stimulator", "load_cell")}
+        named = {kind: str(rig[kind]["device"]) for kind in ("stimulator", "load_cell")}
     except (ValueError, KeyError, TypeError, RecursionError):
         named = {}
     made_by = str(record.about.get("recorded_by") or record.about.get("software") or NOT_TOLD)

@@ -49,7 +49,7 @@ class Release:
         else:
             named = {"name": [{"value": name, "type": "user-friendly-name"}], "type": [{"text": name}]}
         return {**named, ("version" if name == "software" else "note"): [
-            {"value": version} if name == "software" else {"text": f"driver: {version}"}]}  # fmt: skip
+            {"value": version} if name == "software" else {"text": f"device: {version}"}]}  # fmt: skip
 
 
 RELEASES = (Release("r4"), Release("r5"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,7 @@ from tests.harness.cohort_records import Session, write
 FORMATS = ("parquet", "bids", "nwb", "fhir", "redcap", "mat")
 ODD = "=P2ü"
 """A participant's code as nobody should give it."""
+DEVICES = {"stimulator": {"device": "p24"}, "load_cell": {"device": "can_load_cell"}}
 
 
 @pytest.fixture(scope="session")
@@ -23,9 +25,11 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     even = write(folder / "even.h5", Session("P-1", "2026-01-05", seed=1))
     with h5py.File(even, "r+") as file:
         file["segments/name"][-1] = "validate"
+        file.attrs["configuration"] = json.dumps({"rig": DEVICES})  # as the rig writes it
     odd = write(folder / "odd.h5", Session(ODD, "2026-01-12", seed=2))
     random = np.random.default_rng(3)
     with h5py.File(odd, "r+") as file:
+        file.attrs["configuration"] = json.dumps({"rig": DEVICES})
         size = file["torque/time_s"].shape[0]
         kept = np.r_[0:700, 703:size]
         for name in list(file["torque"]):

@@ -100,6 +100,7 @@ def test_fhirs_models_take_each_bundle(release: str, out: Path, data: Path) -> N
         assert kinds == ["Patient", "Device", "Device", "Device", "Observation", "DiagnosticReport"]
         person = entries[0]["resource"]
         assert person.keys() == {"resourceType", "identifier"}, "a participant is a code"
+        assert [one["resource"]["note"][0]["text"] for one in entries[1:3]] == ["device: p24", "device: can_load_cell"]
         urls = {one["fullUrl"] for one in entries}
         referred = set(re.findall(r'"reference": "([^"]*)"', path.read_text()))
         assert referred and referred <= urls
