@@ -49,6 +49,13 @@ def import_(
     say_json(found) if as_json else say(*report(found))
 
 
+NOT_MAPPED = {
+    "time_s": "Each format says its times; in a Parquet file name the column time_s, or give its unit in its metadata.",
+    "segment": "Give --segments.",
+}
+"""Columns of tables that are no signals of other tools' files."""
+
+
 def answers(columns: Mapping[str, str] | None, segments: str, numbers: Mapping[str, Any]) -> dict[str, str]:
     """What was given, by option."""
     found = {name.replace("_", "-"): str(value) for name, value in numbers.items() if value is not None}
@@ -60,6 +67,9 @@ def taken(path: Path, given: Mapping[str, str], somebody: bool = False) -> tuple
     from stimrig.api.exchange.inward import read_foreign
     from stimrig.api.exchange.inward.taking import Taking
 
+    for target, fix in NOT_MAPPED.items():
+        if target in given:
+            raise BadRequest("an import does not take it", place=f"--map {target}", fix=fix)
     foreign = read_foreign(path)
     taking = Taking(path, foreign, given, _asked if somebody else _refused)
     record = taking.record()

@@ -75,6 +75,9 @@ FIELDS = (
     Field("sha256", "SHA-256 of the file"),
 )  # fmt: skip
 
+UNVERIFIED = 1
+"""Of a form in REDCap: nobody has looked at the figures yet."""
+
 
 def write(record: WholeRecord, who: Who, _put: Put) -> dict[str, Any]:
     """The record's row; its figures are fitted now."""
@@ -106,7 +109,7 @@ def finish(state: State, put: Put) -> None:
     for participant, _, row in state.rows():
         values = row["fields"]
         number = state.number(participant, values["recording_id"])
-        found.append((participant, FORM, number, *(values[name] for name in others), 2))
+        found.append((participant, FORM, number, *(values[name] for name in others), UNVERIFIED))
     _table(put, "import.csv", [header, *sorted(found, key=lambda row: (row[0], row[2]))])
 
 

@@ -41,7 +41,7 @@ async def look(bench: Bench) -> Finding:
     last_s = max((one.written_s for one in train.pulses if one.written_s == one.written_s), default=told["asked_s"])
     after_ms = 1e3 * (last_s - told["asked_s"]) / bench.clock.speed
     extra = train.heard.edges - train.sent if bench.cell.get("sync") else 0
-    figure = f"{evidence.detail}; last pulse {after_ms:+.0f} ms after the stop"
+    figure = f"{evidence.detail}; last pulse {abs(after_ms):.0f} ms {'after' if after_ms > 0 else 'before'} the stop"
     bound = f"confirmed, no pulse later than {MOST_MS:g} ms"
     await bench.go_on(train, provoked=evidence.confirmed and stopped)
     if not evidence.confirmed:

@@ -148,6 +148,8 @@ def test_what_is_not_known_is_asked_for_one_by_one(foreign: Path, tmp_path: Path
         assert said.count("\n") == 1 and named in said and choice in said, said
         assert not (tmp_path / "out.csv").exists()
         given += answer
+    for target in ("time_s=Zeit:s", "segment=part"):  # it would be passed over
+        assert main.run([*given, "--map", target]) == 2 and "does not take it" in capsys.readouterr().err
     assert main.run([*given, "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert unmet("import", told) == []
