@@ -116,9 +116,15 @@ def give_to_owner(folder: Path) -> None:
     """What root has made in a data folder is its owner's, whose rig reads it."""
     if os.geteuid() == 0 and folder.exists():
         owner = folder.stat()
-        for path in (folder / CHECK_FILE, folder / "rig.lock", folder / "check", *(folder / "check").rglob("*")):
+        for place in (folder / CHECK_FILE, folder / "rig.lock", folder / "check"):
             with contextlib.suppress(FileNotFoundError):
-                os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
+                os.chown(place, owner.st_uid, owner.st_gid, follow_symlinks=False)
+        if (folder / "check").is_symlink():  # its owner could name any folder of root's
+            return
+        for _, folders, files, here in os.fwalk(folder / "check", follow_symlinks=False):
+            for name in (*folders, *files):
+                with contextlib.suppress(FileNotFoundError):
+                    os.chown(name, owner.st_uid, owner.st_gid, dir_fd=here, follow_symlinks=False)
 
 
 @contextlib.contextmanager

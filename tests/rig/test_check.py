@@ -461,6 +461,20 @@ def test_what_root_checks_the_rigs_user_reads(tmp_path: Path) -> None:
         assert (path.stat().st_uid, path.stat().st_gid) == (4711, 4712)
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+@pytest.mark.parametrize("place", ["check", "check/one"])
+def test_root_gives_nothing_away_through_a_link(tmp_path: Path, place: str) -> None:
+    """The rig's user, who owns the folder, has put a link to a folder of root's into it."""
+    data, other = tmp_path / "data", tmp_path / "other"
+    (data / place).parent.mkdir(parents=True)
+    (other / "inside").mkdir(parents=True)
+    (other / "inside" / "shadow").touch()
+    (data / place).symlink_to(other)
+    os.chown(data, 4711, 4712)
+    verb.give_to_owner(data)
+    assert {path.stat().st_uid for path in (other, *other.rglob("*"))} == {os.geteuid()}
+
+
 def test_what_the_system_says(tmp_path: Path) -> None:
     see = Surroundings()
     file = tmp_path / "port"
