@@ -15,6 +15,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import wait
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +34,17 @@ from stimrig.rig.errors import ConfigError, RigError
 CLOSED_WITHIN_S = 45.0
 """Real seconds for the stop, its evidence and the sealing of a train that was interrupted."""
 INTERRUPTED = 130
-ENDS = (signal.SIGTERM, signal.SIGHUP)
-"""What ends a process besides Ctrl-C: the system, and a terminal that is closed."""
+ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What ends a process: Ctrl-C, the system, and a terminal that is closed, which is told by two of them at once."""
+EAR_S = 0.1
+"""A signal that another thread of this process has taken is heard after so long."""
 MARKS = {"passed": "ok", "failed": "FAULT", "not done": "--"}
 
 
 def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     logging.basicConfig(level=logging.CRITICAL)
-    before = {one: signal.signal(one, signal.default_int_handler) for one in ENDS}  # each stops the stimulator first
+    before = {one: signal.signal(one, _end) for one in ENDS}  # each stops the stimulator first
     try:
         for name, number in (("--dummy-load-ohm", options.dummy_load_ohm), ("--days", options.days)):
             if not (0 < number < 1e6):
@@ -62,6 +65,13 @@ def main(arguments: list[str] | None = None) -> int:
             signal.signal(one, handler)
     print(json.dumps(report, ensure_ascii=False))
     return 0 if report["verdict"] == "sound" else 1
+
+
+def _end(*_: object) -> None:
+    """The first signal ends the check; none that follows it cuts the stop short."""
+    for one in ENDS:
+        signal.signal(one, lambda *_: None)
+    raise KeyboardInterrupt
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -89,9 +99,13 @@ def _checked(config: configuration.RigConfig, options: argparse.Namespace) -> di
         )  # fmt: skip
         ask = machine.driver.ask
         try:
-            return ask(lambda: run(bench, options.days, about, _tell)).result()
+            asked = ask(lambda: run(bench, options.days, about, _tell))
+            while not wait([asked], EAR_S).done:
+                pass
+            return asked.result()
         except KeyboardInterrupt:
-            ask(bench.rig.close).result(CLOSED_WITHIN_S)
+            if not wait([ask(bench.rig.close)], CLOSED_WITHIN_S).done:
+                raise RigError("interrupted, and no sign that the stimulator has stopped: switch it off") from None
             raise
         finally:
             machine.driver.end()
@@ -102,9 +116,15 @@ def give_to_owner(folder: Path) -> None:
     """What root has made in a data folder is its owner's, whose rig reads it."""
     if os.geteuid() == 0 and folder.exists():
         owner = folder.stat()
-        for path in (folder / CHECK_FILE, folder / "rig.lock", folder / "check", *(folder / "check").rglob("*")):
+        for place in (folder / CHECK_FILE, folder / "rig.lock", folder / "check"):
             with contextlib.suppress(FileNotFoundError):
-                os.chown(path, owner.st_uid, owner.st_gid, follow_symlinks=False)
+                os.chown(place, owner.st_uid, owner.st_gid, follow_symlinks=False)
+        if (folder / "check").is_symlink():  # its owner could name any folder of root's
+            return
+        for _, folders, files, here in os.fwalk(folder / "check", follow_symlinks=False):
+            for name in (*folders, *files):
+                with contextlib.suppress(FileNotFoundError):
+                    os.chown(name, owner.st_uid, owner.st_gid, dir_fd=here, follow_symlinks=False)
 
 
 @contextlib.contextmanager

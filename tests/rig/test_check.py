@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -406,6 +407,48 @@ def test_whatever_ends_it_stops_the_stimulator(
     assert signal.getsignal(number) == handler
 
 
+def test_signals_at_once_neither_get_lost_nor_cut_the_stop_short(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A closed terminal: SIGHUP and SIGTERM at once, of which the kernel may give both to a thread that plays."""
+    told: list[str] = []
+
+    async def train(bench: Any, *_: Any) -> dict[str, Any]:
+        for number in (signal.SIGHUP, signal.SIGTERM):
+            signal.pthread_kill(threading.get_ident(), number)
+        await bench.tasks.sleep(5)
+        told.append("played on")
+        return {}
+
+    async def close(self: Rig) -> None:
+        os.kill(os.getpid(), signal.SIGINT)
+        await self._tasks.sleep(0.5)
+        told.append("stopped")
+
+    monkeypatch.setattr(verb, "run", train)
+    monkeypatch.setattr(Rig, "close", close)
+    assert verb.main(["--config", str(rig_file(tmp_path)), "--answer", "by=me"]) == 130
+    assert told == ["stopped"] and "was stopped" in capsys.readouterr().err
+
+
+def test_a_stop_that_does_not_end_is_not_told_as_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    async def train(bench: Any, *_: Any) -> dict[str, Any]:
+        os.kill(os.getpid(), signal.SIGTERM)
+        await bench.tasks.sleep(5)
+        return {}
+
+    async def close(self: Rig) -> None:
+        await self._tasks.sleep(30)
+
+    monkeypatch.setattr(verb, "run", train)
+    monkeypatch.setattr(verb, "CLOSED_WITHIN_S", 0.2)
+    monkeypatch.setattr(Rig, "close", close)
+    assert verb.main(["--config", str(rig_file(tmp_path)), "--answer", "by=me"]) == 2
+    assert "switch it off" in capsys.readouterr().err
+
+
 def test_it_refuses_while_a_rig_uses_the_data_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = str(rig_file(tmp_path))
     (tmp_path / "data").mkdir()
@@ -428,6 +471,20 @@ def test_what_root_checks_the_rigs_user_reads(tmp_path: Path) -> None:
     verb.give_to_owner(tmp_path)
     for path in (tmp_path / "check.json", tmp_path / "check" / "one"):
         assert (path.stat().st_uid, path.stat().st_gid) == (4711, 4712)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root gives files away")
+@pytest.mark.parametrize("place", ["check", "check/one"])
+def test_root_gives_nothing_away_through_a_link(tmp_path: Path, place: str) -> None:
+    """The rig's user, who owns the folder, has put a link to a folder of root's into it."""
+    data, other = tmp_path / "data", tmp_path / "other"
+    (data / place).parent.mkdir(parents=True)
+    (other / "inside").mkdir(parents=True)
+    (other / "inside" / "shadow").touch()
+    (data / place).symlink_to(other)
+    os.chown(data, 4711, 4712)
+    verb.give_to_owner(data)
+    assert {path.stat().st_uid for path in (other, *other.rglob("*"))} == {os.geteuid()}
 
 
 def test_what_the_system_says(tmp_path: Path) -> None:
