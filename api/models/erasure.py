@@ -112,10 +112,18 @@ class Eraser:
         return {str(path) for path in folder.glob("*")} if database and not self.store.several else set()
 
     def _elsewhere(self, path: str) -> Iterator[str]:
-        """The rig's own place of a file that the service sees in another one (a bind mount of its unit)."""
+        """Other places of a file: the rig's own (the service sees a bind mount), or where it was restored to."""
         for folder in self.folders:
-            if (place := folder / "recordings" / Path(path).name).is_file():
-                yield str(place)
+            yield from map(str, (folder / "recordings").rglob(glob.escape(Path(path).name)))
+
+    def _refuse_outside(self, files: Iterable[str]) -> None:
+        """Raises ApiError: 409 one is not below the data folders. The database alone removes nothing else."""
+        known = [folder.resolve() for folder in self.folders]
+        for path in map(Path, files):
+            there = path.parent.resolve()
+            if path.exists() and not any(there == one or one in there.parents for one in known):
+                detail = f"{path}: it is in none of the data folders. Give its own with --rig-data, or move it there."
+                raise ApiError(409, "outside", "A file is somewhere else", detail)
 
     def erase(self, code: str, reason: str, by: str, though_in_use: bool = False) -> tuple[str, Kept]:
         """Take a participant away; the erasure's number, and what was there.
@@ -194,6 +202,7 @@ class Eraser:
     # ---- the intent, and its end
 
     def _intend(self, session: Session, of: str, reason: str, by: str, files: list[str]) -> str:
+        self._refuse_outside(files)
         row = Erasure(id=secrets.token_hex(6), of=of, reason=reason, asked_by=by, asked_utc=self.clock.utc())
         row.files = files
         session.add(row)
@@ -206,6 +215,7 @@ class Eraser:
     def finish(self) -> None:
         """Remove the files of what was begun. Raises ApiError: 503 one cannot be removed; the next run goes on."""
         for row in self.waiting():
+            self._refuse_outside(row.files)
             for path in row.files:
                 _remove(Path(path))
             with self.store.write() as session:

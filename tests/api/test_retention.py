@@ -166,6 +166,34 @@ def test_the_rigs_own_files_go_too(rig: Rig, tmp_path: Path) -> None:
     assert [path.name for path in own.rglob("*") if path.is_file()] == ["20260101T000000Z_T11.h5"]
 
 
+def test_a_file_outside_of_the_data_folders_stays(rig: Rig, tmp_path_factory: pytest.TempPathFactory) -> None:
+    """The service writes the database; whoever erases may be root."""
+    ended(rig, "P1", 1)
+    other = tmp_path_factory.mktemp("elsewhere") / "shadow"
+    other.write_text("of another program")
+    (rig.folder / "link").symlink_to(other.parent)
+    for path in (
+        other,
+        rig.folder / "link" / "shadow",
+        Path(f"{rig.folder}/../{os.path.relpath(other, rig.folder.parent)}"),
+    ):
+        with rig.store.write() as session:
+            session.execute(update(Recording).values(path=str(path)))
+        with pytest.raises(ApiError, match="none of the data folders"):
+            eraser(rig).erase("P1", "asked", "Ada")
+        assert other.exists() and rig.store.get(Participant, "P1") is not None, "nothing is half"
+
+
+def test_files_that_were_restored_to_another_folder_go_too(rig: Rig, tmp_path: Path) -> None:
+    ended(rig, "P1", 1)
+    (kept,) = (rig.folder / "recordings").rglob("*.h5")
+    moved = tmp_path / "restored" / "recordings" / "deep" / kept.name
+    moved.parent.mkdir(parents=True)
+    kept.rename(moved)
+    eraser(rig, tmp_path / "restored").erase("P1", "asked", "Ada")
+    assert not moved.exists()
+
+
 def test_options_before_the_word_are_refused(rig: Rig, capsys: pytest.CaptureFixture[str]) -> None:
     ended(rig, "P1")
     words = ["erase", "P1", "--reason", "asked", "--data", str(rig.folder)]
@@ -388,7 +416,7 @@ def test_a_recording_that_a_rule_took_says_so(tmp_path: Path, short_dir: Path) -
     with serving(tmp_path, short_dir, STUB) as (service, http):
         http.post("/v1/participants", json={"code": "P1"})
         test = plays(http, "P1")
-        Eraser(service.context.store, service.context.clock, []).remove_files(
+        Eraser(service.context.store, service.context.clock, [tmp_path]).remove_files(
             service.context.store.all(Recording), "rule", "retention"
         )
         gone = http.get(test["recording_url"])
