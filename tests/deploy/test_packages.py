@@ -263,6 +263,18 @@ def test_an_upgrade_waits_for_a_test_and_starts_what_it_has_stopped(machine: Fak
     assert latch.read_text().startswith('{"state": "latched"'), "the rig stays stopped until a person re-arms it"
 
 
+@pytest.mark.parametrize("aborted", ["abort-upgrade", "abort-remove"])
+def test_what_could_not_be_done_leaves_the_services_running(machine: FakeRoot, aborted: str) -> None:
+    machine.stub("systemctl", 'case "$*" in *centre*|*outbox*) exit 3 ;; esac')
+    assert machine.run("prerm", "upgrade", "1.1").returncode == 0
+    machine.stub("systemctl", 'case "$*" in *is-active*) exit 3 ;; esac')
+    assert machine.run("prerm", "failed-upgrade", "1.0.0").returncode == 0, (
+        "asked once more, when nothing runs any more"
+    )
+    assert machine.run("postinst", aborted, "1.1").returncode == 0
+    assert "deb-systemd-invoke start stimrig-api.service stimrig-rig.service" in machine.told.read_text()
+
+
 def test_a_first_installation_starts_nothing(machine: FakeRoot) -> None:
     assert machine.run("preinst", "install").returncode == 0
     assert machine.run("postinst", "configure").returncode == 0

@@ -24,6 +24,7 @@ NAME = "NWB"
 MOST_LINKS = 8
 ROOMS = ("/acquisition", "/stimulus/presentation", "/processing", "/analysis")
 DEEPEST = 4
+MOST_NUMBERS = 8 * LARGEST_ROWS
 SMALL = {1e-6: {"s": "us", "N": "", "Nm": ""}, 1e-3: {"s": "ms", "Nm": "mNm", "N": "mN", "rad": "mrad"}}
 """A unit and its conversion that are a unit of their own: the numbers stay as they were written."""
 OWN = {
@@ -138,7 +139,7 @@ def read(path: Path, content: bytes) -> Foreign:
     file = NwbFile(content, str(path))
     if not str(file.attribute("/", "nwb_version", "")).startswith("2"):
         raise BadRecord("no NWB file of version 2", place=str(path), fix="Convert it with pynwb first.")
-    signals = tuple(signal for room in ROOMS for signal in _series(file, room))
+    signals = tuple(_bounded(file))
     spans = tuple(_spans(file))
     own = _own(file, signals, spans)
     identity = str(file.scalar("/identifier") or "")
@@ -163,6 +164,17 @@ def _own(file: NwbFile, signals: tuple[Signal, ...], spans: tuple[Spans, ...]) -
         option: f"{name}:{units[name]}" if units.get(name) else name for option, name in OWN.items() if name in there
     }
     return {**own, "pulse-rate-hz": repr(rate_hz)} if {"torque_nm", "pulse_width_us"} <= own.keys() else {}
+
+
+def _bounded(file: NwbFile) -> Iterator[Signal]:
+    """All signals, counted as they are read. Raises BadRecord: together they are more than any record has."""
+    count = numbers = 0
+    for room in ROOMS:
+        for signal in _series(file, room):
+            count, numbers = count + 1, numbers + signal.values.size
+            if count > MOST_SIGNALS or numbers > MOST_NUMBERS:
+                raise file.bad(f"more than {MOST_SIGNALS} signals or {MOST_NUMBERS} numbers")
+            yield signal
 
 
 def _series(file: NwbFile, room: str, depth: int = 0) -> Iterator[Signal]:
@@ -194,6 +206,8 @@ def _signals(file: NwbFile, path: str, name: str) -> Iterator[Signal]:
     else:
         raise BadRecord("neither timestamps nor a rate", place=f"{file.name}, {path}", fix="Give the whole file.")
     columns = values.shape[1]
+    if columns > MOST_SIGNALS:
+        raise file.bad(f"{columns} columns, at most {MOST_SIGNALS} are read", data)
     for index in range(columns):
         called = name if columns == 1 else f"{name}/{index + 1}"
         yield Signal(called, time_s, values[:, index], small or unit, events)

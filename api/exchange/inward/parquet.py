@@ -33,7 +33,8 @@ def read(path: Path, content: bytes) -> Foreign:
     file = pq.ParquetFile(io.BytesIO(content))
     schema, rows = file.schema_arrow, file.metadata.num_rows
     groups = (file.metadata.row_group(k).total_byte_size for k in range(file.metadata.num_row_groups))
-    if not 0 < rows <= LARGEST_ROWS or sum(groups) > UNPACKED_BYTES:
+    numbers = 8 * rows * sum(_is_number(column.type) for column in schema)  # in memory: repeated ones are packed small
+    if not 0 < rows <= LARGEST_ROWS or max(sum(groups), numbers) > UNPACKED_BYTES:
         message = f"{rows} rows, or more unpacked than a record has"
         raise BadRecord(message, place=str(path), fix=f"At most {LARGEST_ROWS} rows are read.")
     own = set(OWN) <= set(schema.names)

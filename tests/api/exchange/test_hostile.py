@@ -17,6 +17,8 @@ import pytest
 
 from stimrig.api.cli import main
 from stimrig.api.exchange.inward import bids as bids_in
+from stimrig.api.exchange.inward import nwb as nwb_in
+from stimrig.api.exchange.inward import parquet as parquet_in
 from tests.harness import foreign_files
 from tests.harness.foreign_files import Stream, chunk
 
@@ -201,6 +203,20 @@ def test_each_is_refused_in_one_line(
     assert code == 2 and len(lines) == 1, said
     assert "unexpected" not in said and len(lines[0]) < 600 and lines[0].endswith((".", ")")), said
     assert SECRET not in said and not (tmp_path / "out.csv").exists()
+
+
+def test_what_is_packed_small_is_bounded_by_what_it_is_in_memory(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Constant columns take next to nothing in a file; many series, each of them small enough, add up."""
+    table, many = tmp_path / "x.parquet", hdf5(lambda _: None)(tmp_path)
+    same = {f"c{k}": np.zeros(20_000) for k in range(40)}
+    pq.write_table(pa.table({"time_s": np.arange(20_000) / 100, "torque": np.zeros(20_000), **same}), table)
+    monkeypatch.setattr(parquet_in, "UNPACKED_BYTES", 10 * table.stat().st_size)
+    monkeypatch.setattr(nwb_in, "MOST_NUMBERS", N)
+    for path in (table, many):
+        assert main.run(["import", str(path), "-o", str(tmp_path / "out.csv"), *ANSWERS]) == 2
+        assert capsys.readouterr().err.count("\n") == 1
 
 
 @pytest.mark.parametrize(
