@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: docs demo centre test frozen check fast lint types changed-types serve bench postgresql late pauses soak campaigns mutation words lock clean help packages setup setup-test setup-centre simulate technical-file sbom audit
+.PHONY: docs demo centre test frozen check lint types serve bench soak campaigns mutation words lock clean help packages setup setup-test setup-centre simulate technical-file sbom audit
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -19,24 +19,19 @@ serve: setup ## service and page on 127.0.0.1:8000 (emulated rig unless RIG=file
 centre: setup-centre ## a centre with two emulated rigs that push to it: PostgreSQL, page on 127.0.0.1:8100
 	@$(BIN)/stimrig centre --demo
 
-test: setup-test lint types ## every check and every test; with PYTEST_ARGS those tests alone
-	@$(BIN)/python -m $(if $(PYTEST_ARGS),pytest $(PYTEST_ARGS),tests)
+test: setup-test lint types ## style, layers, types and every test but the campaigns
+	@$(BIN)/python -m pytest -n 4 --dist loadfile -m "not wire"
+	@$(BIN)/python -m pytest -n 2 --dist loadfile -m wire
 
-check: setup-test ## what one runs at each save: style, layers, types of what changed and the fast tests
-	@$(MAKE) --no-print-directory -j3 --output-sync=line lint changed-types fast
-
-fast: setup-test
-	@echo "== fast tests"; $(BIN)/python -m tests fast
+check: setup-test lint ## run at each save: style, layers and the fast tests
+	@$(BIN)/python -m pytest -n 2 --dist loadfile -m "not slow and not wire and not browser"
 
 lint: setup-test ## style and layers
-	@echo "== ruff"; $(BIN)/ruff check . ; $(BIN)/ruff format --check .
-	@echo "== import-linter"; $(BIN)/lint-imports --no-cache
+	@$(BIN)/ruff check . ; $(BIN)/ruff format --check .
+	@$(BIN)/lint-imports --no-cache
 
 types: setup-test ## types
-	@echo "== types"; $(BIN)/basedpyright --level error
-
-changed-types: setup-test
-	@echo "== types of what changed"; $(BIN)/python -m tests.runner.changed_types
+	@$(BIN)/basedpyright --level error
 
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
@@ -48,17 +43,8 @@ docs: setup-test ## the site of the documentation, in build/site; its notebooks 
 soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.md)
 	@$(BIN)/python -m bench.soak --minutes 60
 
-campaigns: setup-test ## the tests that are too long for `make test`: whole grids
-	@$(BIN)/python -m pytest --campaigns -m campaign tests
-
-postgresql: setup-test ## every test of the service on PostgreSQL instead of SQLite
-	@$(BIN)/python -m pytest -n 2 --dist worksteal --postgresql -m "service and not browser and not wire" tests/api
-
-late: setup-test ## the page's tests with answers that come late and in pieces; SEED=2 for other delays
-	@$(BIN)/python -m pytest -n 4 --dist worksteal --late-answers $(or $(SEED),1) -m browser tests/api
-
-pauses: setup-test ## every test while its processes are stopped and continued at random; SEED=2 for other times, PYTEST_ARGS
-	@$(BIN)/python -m tests.harness.pauses $(if $(SEED),--seed $(SEED)) -- $(BIN)/python -m $(if $(PYTEST_ARGS),pytest $(PYTEST_ARGS),tests)
+campaigns: setup-test ## tests that take long or need an idle machine
+	@$(BIN)/python -m pytest -m campaign
 
 frozen: setup-test ## what users hold, compared with golden files (tests/frozen/README.md); ONLY=PATTERN
 	@$(BIN)/python -m tests.frozen check --only '$(ONLY)'

@@ -4,8 +4,7 @@
 
 Muscles and cases are those of `bench.tracking`; every session is on a rig of its own, from a rested muscle. The
 controller is `examples/ilc_controller.py`. Rows that FILE holds already are not played again, so a long run can be
-done in parts. Writes docs/results/tracking.md; `--offline` adds what `bench.tracking --json` wrote. `--disturbed SHARE`
-lets rig and service stand still for so much of the time (`bench.pausing`), and writes no page.
+done in parts. Writes docs/results/tracking.md; `--offline` adds what `bench.tracking --json` wrote.
 """
 
 from __future__ import annotations
@@ -21,7 +20,6 @@ import numpy as np
 
 from bench.common import RESULTS, TOKEN, keep_lines, lines_of, parser, table, written_by
 from bench.ilc import Patient
-from bench.pausing import Disturber, Taken
 from bench.tracking import (
     APPROVAL_S,
     CASES,
@@ -47,8 +45,6 @@ from stimrig.identify.records.recording import read_recording
 PERSON = "TRACK"
 LIMITS = {"gain_percent": 60.0, "threshold_percent": 60.0, "time_scale_percent": 60.0}
 """So far the muscle may be followed; the usual limits would ask for a new test after half of the fatigue."""
-
-UNDISTURBED = Taken("idle")
 
 
 class KeepingClient(Client):
@@ -103,17 +99,11 @@ def patient_file(seed: int, case: str, path: Path) -> Path:
     return path
 
 
-def one(
-    seed: int, case: str, who: str, folder: Path, keep: Path | None = None, taken: Taken = UNDISTURBED
-) -> dict[str, Any]:
+def one(seed: int, case: str, who: str, folder: Path, keep: Path | None = None) -> dict[str, Any]:
     """One session; its trials' recordings and the approved model go to `keep`."""
     file = patient_file(seed, case, folder / "patient.toml")
     emulator = ["--patient", str(file), "--noise-seed", str(seed), "--rate-hz", "400"]
-    with (
-        Services(Settings(data_dir=folder / "data", port=0), emulator, TOKEN) as services,
-        Disturber(services, seed, taken) as disturber,
-    ):
-        disturber.begin()
+    with Services(Settings(data_dir=folder / "data", port=0), emulator, TOKEN) as services:
         service = Session(KeepingClient(services.url, TOKEN), keep)
         client = service.client
         client.make_participant(PERSON, {"current_ma": 20.0, "max_pulse_width_us": LARGEST_US, "max_torque_nm": 30.0})
@@ -144,7 +134,6 @@ def one(
         "delays_s": [trial["delay_s"] for trial in followed if trial["delay_s"] is not None],
         "moves": moves(service.served),
         "outcomes": [served.get("outcome") for served in service.served],
-        "pauses_s": [pause.ended_s - pause.began_s for pause in disturber.stood],
     }
 
 
@@ -241,9 +230,7 @@ def main() -> None:
     made.add_argument("--json", type=Path, help="rows, one a line; those in it are not played again")
     made.add_argument("--keep", type=Path, help="a folder for each session's recordings")
     made.add_argument("--offline", type=Path, help="rows of bench.tracking")
-    made.add_argument("--disturbed", type=float, help="share of the time in which rig and service stand still")
     options = made.parse_args()
-    taken = Taken("host", options.disturbed) if options.disturbed else UNDISTURBED
     rows = lines_of(options.json)
     done = {(row["seed"], row["case"], row["who"]) for row in rows}
     wanted = [(s, c, w) for s in options.seeds for c in options.cases for w in options.who if (s, c, w) not in done]
@@ -252,14 +239,13 @@ def main() -> None:
         with tempfile.TemporaryDirectory(prefix="tracking-") as folder:
             try:
                 keep = options.keep and options.keep / f"{seed}-{case}-{who}".replace(" ", "-")
-                rows.append(one(seed, case, who, Path(folder), keep, taken))
+                rows.append(one(seed, case, who, Path(folder), keep))
             except (Exception, SystemExit) as error:  # the machine stood still: told, and played again another time
                 print(f"{seed}, {case}, {who}: {error!r}", file=sys.stderr, flush=True)
                 continue
         keep_lines(options.json, rows)
     words = page(rows, lines_of(options.offline))
-    if not options.disturbed:
-        (RESULTS / "tracking.md").write_text(words, "utf-8")
+    (RESULTS / "tracking.md").write_text(words, "utf-8")
     print(words)
 
 

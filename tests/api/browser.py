@@ -25,17 +25,11 @@ TABLET, ZOOMED = (820, 1180), (640, 430)
 
 NAME, PASSWORD = "Ada", "correct horse battery"
 
-ASKS_OFTEN = False
-"""With `--late-answers`: what a page asks every few seconds falls into all that a test does, as on a slow machine."""
-SOONER = "const whole = setInterval; window.setInterval = (call, every_ms) => whole(call, Math.min(every_ms, 50));"
-
 
 def watched(browser: Any, **options: Any) -> Any:
     """A tab that takes down every request, error and console message."""
     # a color on its way to another one is neither of the two
     context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, reduced_motion="reduce", **options)
-    if ASKS_OFTEN:
-        context.add_init_script(SOONER)
     page = context.new_page()
     page.requests, page.errors = [], []
     page.on("request", lambda request: page.requests.append(request.url))

@@ -35,7 +35,6 @@ from stimrig.api.web.app import create_app
 from stimrig.api.web.server import configuration
 from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
-from tests.harness.late_answers import LateAnswers
 from tests.harness.looks_first import LooksFirst
 from tests.harness.postgres import Cluster, running
 
@@ -53,9 +52,10 @@ STUB, REAL = thread_process.STUB, thread_process.REAL
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Whatever asks for a running service, by whichever fixture, is marked `service`."""
+    """Mark as `slow` what starts a service: thousands of them take minutes."""
     for item in items:
         if {"short_dir", "service"} & set(getattr(item, "fixturenames", ())):
+            item.add_marker("slow")
             item.add_marker("service")
 
 
@@ -161,17 +161,6 @@ def no_database_on_the_event_loop() -> Iterator[None]:
         yield
 
 
-@pytest.fixture(scope="session", autouse=True)
-def answers_come_late(request: pytest.FixtureRequest) -> Iterator[None]:
-    """With `--late-answers SEED`: to browsers, from every service; and their pages ask often."""
-    seed: int | None = request.config.getoption("--late-answers")
-    with pytest.MonkeyPatch.context() as patch:
-        if seed is not None:
-            patch.setattr(Server, "behind", staticmethod(partial(LateAnswers, seed=seed)))
-            patch.setattr("tests.api.browser.ASKS_OFTEN", True)
-        yield
-
-
 class SetClock(Clock):
     """Both clocks stand where a test sets them."""
 
@@ -272,12 +261,9 @@ class PromptServer(uvicorn.Server):
 class Server:
     """uvicorn in a thread."""
 
-    behind: Callable[[Any], Any] = staticmethod(lambda app: app)
-    """What stands between it and the application."""
-
     def __init__(self, app: Any, **more: Any) -> None:
         self.server = PromptServer(
-            configuration(self.behind(app), port=0, log_level="warning", ws_ping_interval=None, lifespan="on", **more)
+            configuration(app, port=0, log_level="warning", ws_ping_interval=None, lifespan="on", **more)
         )
 
     def __enter__(self) -> str:

@@ -18,6 +18,8 @@ from stimrig.identify.experiments import adaptive
 from stimrig.identify.experiments.adaptive import Decision
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
 
+pytestmark = pytest.mark.slow
+
 HOW: dict[str, Any] = {
     "target": {"curve_percent": 4.0, "step_percent": 4.0},
     "playable_s": 44.0,
@@ -130,7 +132,6 @@ def test_a_slow_cell_keeps_its_samples() -> None:
     assert verbs.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "dropped"), [(74, 0.0), (73, 0.05)])
 def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
     """Also where a busy machine drops pulses: the muscle did not feel them, which is no misfit of the structure."""
@@ -212,7 +213,6 @@ def bank() -> list[tuple[str, str]]:
     return [*((name, model_of(seed)) for name, seed in named), ("another person 3", "{}"), ("another one", "no JSON")]
 
 
-@pytest.mark.slow
 def test_a_test_with_a_bank_decides_and_tells_whom_the_muscle_is_like(bank: list[tuple[str, str]]) -> None:
     widths = [*verbs.outlook(quiet, **HOW, max_torque_nm=30.0, bank=bank)["opening_us"], *[0.0] * 16]
     assert len(widths) == 80 + 16, "a glance"
@@ -230,7 +230,6 @@ def first_advice(widths: list[float], bank: list[tuple[str, str]]) -> dict[str, 
     return verbs.advise(quiet, **news, **laid, torque_time_nm_s=1.0, measured_s=2.3)
 
 
-@pytest.mark.slow
 def test_what_can_be_reached_is_played_with_the_bank(bank: list[tuple[str, str]]) -> None:
     """By the person's own last model, where there is one; an empty bank is a test as ever."""
     how = {**HOW, "max_torque_nm": 30.0, "models": [bank[0][1]]}

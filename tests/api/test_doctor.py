@@ -19,6 +19,8 @@ from stimrig.api.logs import JsonLines
 from stimrig.api.settings import Settings
 from tests.api.conftest import Service, run_test
 
+pytestmark = pytest.mark.slow
+
 RIG = """data_dir = "{folder}"
 socket = "{folder}/rig.sock"
 [stimulator]

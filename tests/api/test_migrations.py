@@ -22,7 +22,7 @@ from stimrig.api.store import Store, audit, migrations
 from stimrig.api.store.tables import Approval, AuditEntry, Participant, Recording, Table, User
 from tests.api.conftest import STUB, play_test, run_service, serving
 
-pytestmark = pytest.mark.sqlite
+pytestmark = [pytest.mark.sqlite, pytest.mark.slow]
 ROOT = Path(__file__).parents[2]
 OLD = Path(__file__).parent / "databases"
 ADDED_SINCE = [
@@ -160,7 +160,6 @@ def test_an_older_stimrig_refuses_a_database_of_today(tmp_path: Path) -> None:
         assert database.execute("SELECT MAX(version) FROM schema_version").fetchone()[0] > 4
 
 
-@pytest.mark.slow
 def test_the_service_says_so_in_one_line_and_ends(tmp_path: Path) -> None:
     path = tmp_path / "stimrig.db"
     Store(f"sqlite:///{path}").close()

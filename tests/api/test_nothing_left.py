@@ -20,9 +20,9 @@ import pytest
 
 from tests.api.conftest import TOKEN
 from tests.harness.looks_first import LooksFirst
-from tests.harness.pauses import stat
+from tests.harness.processes import stat
 
-pytestmark = [pytest.mark.wire, pytest.mark.realtime, pytest.mark.slow]
+pytestmark = [pytest.mark.wire, pytest.mark.slow]
 LIMIT_S = 90.0
 """A machine that is busy or pauses takes long; only what is never true fails."""
 SIDE_BY_SIDE = 3

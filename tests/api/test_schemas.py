@@ -26,6 +26,8 @@ from stimrig.identify.simulation.joint_surface import joint_tables
 from tests.api.conftest import REAL, TOKEN, run_service
 from tests.harness import few_effects
 
+pytestmark = pytest.mark.slow
+
 ALL = {name: schemas.load(name) for name in schemas.NAMES}
 REGISTRY = jsonschema_rs.Registry([(schema["$id"], schema) for schema in ALL.values()])
 

@@ -25,6 +25,8 @@ from tests.api.fake_rig import PATIENT, write_recording
 from tests.api.test_tracked import play, say
 from tests.harness.sessions import Planned, record
 
+pytestmark = pytest.mark.slow
+
 RATE_HZ = 400
 WIDE = Limits(60.0, 60.0, 60.0).bounds(80.0)
 WIDTHS = np.concatenate([

@@ -21,6 +21,8 @@ from stimrig.identify.conclusion import conclude, why_ended
 from tests.api.conftest import Service, csrf, run_test, signed_in, soon, wait_done
 from tests.harness import few_effects
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def model(client: httpx.Client, participant: str) -> str:

@@ -21,6 +21,8 @@ from stimrig.api.workers.process import environment
 from tests.api.fake_rig import default_widths, muscle
 from tests.api.stub_worker import COMMAND
 
+pytestmark = pytest.mark.slow
+
 
 def with_pool(work: Any, workers: int = 1, command: tuple[str, ...] = COMMAND) -> Any:
     async def run() -> Any:

@@ -23,6 +23,8 @@ from tests.harness.changing import Changing
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
+pytestmark = pytest.mark.slow
+
 PATH = Path(__file__).parents[2] / "examples" / "ilc_controller.py"
 
 

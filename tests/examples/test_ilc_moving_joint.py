@@ -21,6 +21,8 @@ import pytest
 from stimrig import Client
 from tests.examples.test_ilc_controller import MODEL, UNLIKE_THE_MODEL, felt, model_of, patient_of
 
+pytestmark = pytest.mark.slow
+
 PATH = Path(__file__).parents[2] / "examples" / "ilc_moving_joint.py"
 SIZE, RATE_HZ = 400, 40.0
 TRIALS = 4

@@ -7,6 +7,8 @@ import pytest
 
 from stimrig.hardware_sim.arm_records import KINDS, arm_patient, changed, held_angles_rad, record
 
+pytestmark = pytest.mark.slow
+
 KIND_NAMES = tuple(KINDS)
 COLUMNS = {"time_s", "pulse_width_us", "torque_nm", "angle_rad", "velocity_rad_s", "segment"}
 

@@ -12,6 +12,8 @@ from stimrig.hardware_sim.errors import PatientError
 from stimrig.hardware_sim.offline import simulate
 from stimrig.hardware_sim.patients.changing import ChangingMuscle, Parameters
 
+pytestmark = pytest.mark.slow
+
 PULSES_PER_S = 40
 DEFAULT = Parameters()
 THIRD_US = DEFAULT.threshold_us + DEFAULT.spread_us * float(weibull_min.ppf(1 / 3, DEFAULT.shape))

@@ -11,6 +11,8 @@ import pytest
 
 from stimrig.hardware_sim.hidden_records import draw_noise, generate, main, write_csv
 
+pytestmark = pytest.mark.slow
+
 
 def read_csv(path: Path) -> dict[str, list[str]]:
     with path.open(newline="") as file:

@@ -260,6 +260,27 @@ def children_of(pid: int) -> list[int]:
     return [int(child) for child in path.read_text().split()] if path.exists() else []
 
 
+def stat(pid: int) -> tuple[str, int] | None:
+    """Return a process's state and its parent; None: there is no such process."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
+    except OSError:
+        return None
+    return fields[0], int(fields[1])
+
+
+def below(root: int) -> list[int]:
+    """List the ids of all processes below one."""
+    children: dict[int, list[int]] = {}
+    for path in Path("/proc").iterdir():
+        if path.name.isdigit() and (found := stat(int(path.name))):
+            children.setdefault(found[1], []).append(int(path.name))
+    tree = [root]
+    for pid in tree:
+        tree.extend(children.get(pid, []))
+    return sorted(tree[1:])
+
+
 def kill_hard(process: Process) -> None:
     """SIGKILL, as the kernel's out-of-memory killer would."""
     os.kill(process.popen.pid, signal.SIGKILL)

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from stimrig import identify
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Diagnosis, Improvement
 from tests.harness import few_effects
-from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 
 
-@made_once
+@cache
 def diagnosed(hidden: str, seed: int, ar1: float = 0.0) -> Diagnosis:
     """Of a muscle with something hidden in it, or nothing."""
     return identify.diagnose(hidden_muscles.record(hidden, seed=seed, ar1=ar1))
@@ -21,7 +22,7 @@ def fatigued() -> Record:
     return hidden_muscles.record("fatigue", seed=15, rate_hz=100)
 
 
-@made_once
+@cache
 def improved_with_a_delay() -> Improvement:
     """Its fatigue is found; a delay that it hasn't is asked for."""
     with few_effects.only("electromechanical_delay", "fatigue", "potentiation", "recruitment_hysteresis"):

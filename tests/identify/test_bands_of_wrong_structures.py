@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -10,7 +12,6 @@ from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.estimation.uncertainty import _below_played, _beyond, prediction_band
 from stimrig.identify.model import Model
-from tests.harness.made_once import made_once
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 from tests.identify import hidden_muscles
@@ -19,7 +20,7 @@ SEEDS = range(28, 38)
 MISSING = ("asymmetric_relaxation", "fatigue", "output_saturation")
 
 
-@made_once
+@cache
 def models_of(hidden: str) -> list[Model]:
     """The plain structure, fitted to records of one muscle; read back from MODEL.json."""
     records = [hidden_muscles.record(hidden, seed=seed) for seed in SEEDS]

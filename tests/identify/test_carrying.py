@@ -18,8 +18,9 @@ from stimrig.identify.conclusion import conclude
 from stimrig.identify.records.record import Record
 from tests.harness import few_effects
 from tests.harness.carried_sessions import SESSIONS, as_record, fine_session, muscle, session
-from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
+
+pytestmark = pytest.mark.slow
 
 
 def again(hidden: str) -> Record:
@@ -124,7 +125,7 @@ def said(record: Record, *effects: tuple[str, str]) -> Answer:
     return found.offered, set(found.still_needed), set(found.no_longer_needed), set(found.undecided)
 
 
-@made_once
+@cache
 def unchanged() -> Answer:
     return said(second_session(), WEAK, STRONG)
 
@@ -145,7 +146,6 @@ def test_nor_does_it_how_torque_and_time_are_counted(change: Callable[[Record], 
     assert said(change(second_session()), WEAK, STRONG) == unchanged()
 
 
-@pytest.mark.slow
 def test_a_third_effect_is_named_beside_the_structure_and_one_that_is_not_named_is_said_to_be_open() -> None:
     record = session(muscle(5006), 5006, "third", SESSIONS["third"])
     found = identify.carry(record, holding(("fatigue", "fitness"), ("asymmetric_relaxation", "slow_lag")))

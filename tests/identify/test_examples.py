@@ -12,6 +12,8 @@ import pytest
 
 from tests.harness.patients import Patient
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 SHARED = ROOT.parent / "shared" / "data" / "biceps"
 
@@ -23,7 +25,6 @@ def run(folder: Path, *options: str) -> str:
     return done.stdout
 
 
-@pytest.mark.slow
 def test_biceps_example_on_a_simulated_muscle(tmp_path):
     """Trains of a muscle of T 0.08 s: its constants come back from pulse times and force alone."""
     rng = np.random.default_rng(0)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pytest
 
@@ -12,14 +14,13 @@ from stimrig.identify.estimation.uncertainty import prediction_band
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
 from stimrig.identify.simulation.predict import problem_of, unforeseen
-from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 
 EFFECTS = ("mains_hum", "baseline_drift", "voluntary_effort", "tremor")
 HUM_NM = 0.3
 
 
-@made_once
+@cache
 def of_one_record(effect: str) -> tuple[identify.Record, Model, Model]:
     """A record with the effect, its plain model, and the one with the effect; read back from MODEL.json."""
     record = hidden_muscles.record("" if effect == "mains_hum" else effect, seed=6)

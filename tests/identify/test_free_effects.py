@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -33,7 +33,6 @@ from stimrig.identify.simulation.predict import problem_of
 from stimrig.identify.simulation.problem import Chosen
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
-from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 
 STEP_S, SIZE = 0.025, 400
@@ -135,7 +134,7 @@ def test_held_out_rows_may_object_to_any_link_of_a_chain(monkeypatch: pytest.Mon
     assert [chain.added for chain in found] == [("A",)]
 
 
-@made_once
+@cache
 def found() -> tuple[Diagnosis, Improvement]:
     """Of a muscle of Ding's calcium and bridges."""
     with few_effects.only(*TRIED):
@@ -306,7 +305,7 @@ def test_two_slow_states_are_refused_where_one_would_be_ignored():
         identify.fit(hidden_muscles.record(seed=3, rate_hz=100), effects=["free_zero", "free_strength"])
 
 
-@made_once
+@cache
 def speedy() -> Model:
     return identify.fit(hidden_muscles.record(seed=3, rate_hz=100), effects=["free_speed:quick_first"])
 

@@ -18,8 +18,9 @@ from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Pulses
 from tests.harness import few_effects
-from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
+
+pytestmark = pytest.mark.slow
 
 HIDDEN = ("", "fatigue", "asymmetric_relaxation", "electromechanical_delay", "output_saturation", "threshold_drift")
 SEED, RATE_HZ = 11, 100
@@ -83,12 +84,12 @@ def record_of(hidden: str) -> Record:
     return hidden_muscles.record(hidden, seed=SEED, rate_hz=RATE_HZ)
 
 
-@made_once
+@cache
 def fitted(hidden: str, *effects: str) -> Model:
     return fit(record_of(hidden), effects=effects)
 
 
-@made_once
+@cache
 def answer(hidden: str) -> tuple[str, str, float]:
     return said(record_of(hidden))
 
@@ -154,7 +155,6 @@ def test_fit_hardly_depends_on_which_samples_show_the_muscle(hidden, relation):
     assert all(found[name] <= allowed[name] for name in found), found
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("relation", ["begun in the PRBS", "a gap of 0.5 s", "every second sample"])
 @pytest.mark.parametrize("hidden", HIDDEN[1:])
 def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
@@ -179,7 +179,6 @@ def whole_grid(cases: list[tuple[str, ...]], always: set[tuple[str, ...]]) -> li
 EACH = [(hidden,) for hidden in HIDDEN]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("hidden", whole_grid(EACH, {("",), ("fatigue",), ("output_saturation",)}))
 def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
     """All at once: turned, ten times as large, 50 N·m lower, 1e4 s later."""
@@ -188,7 +187,6 @@ def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
     assert other == (*answer(hidden)[:2], pytest.approx(answer(hidden)[2], abs=1e-3))
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("hidden", whole_grid(EACH, {("threshold_drift",)}))
 def test_diagnosis_does_not_depend_on_it_the_other_way_either(hidden):
     """A tenth, 50 N·m higher; then counted in 5 mN·m."""
@@ -210,28 +208,23 @@ EACH_RELATION_ONCE = {
 RELATIONS = [(hidden, relation) for hidden in HIDDEN for relation in SAMPLING if relation != "in 5 mN·m"]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(("hidden", "relation"), whole_grid(RELATIONS, EACH_RELATION_ONCE))
 def test_diagnosis_stays_whichever_samples_show_the_muscle(hidden, relation):
     assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("hidden", whole_grid([("",), ("fatigue",), ("threshold_drift",)], {("fatigue",)}))
 def test_without_the_prbs_where_its_pulses_are_known(hidden):
     assert said(without(PRBS, pulses=True)(record_of(hidden)))[:2] == answer(hidden)[:2]
 
 
-@pytest.mark.slow
 def test_without_the_ramp_where_its_pulses_are_known():
     assert said(without(RAMP, pulses=True)(record_of("")))[:2] == answer("")[:2]
 
 
-@pytest.mark.slow
 def test_without_the_prbs_where_nobody_knows_its_pulses():
     assert said(without(PRBS, pulses=False)(record_of("")))[:2] == answer("")[:2]
 
 
-@pytest.mark.slow
 def test_without_the_ramp_where_nobody_knows_its_pulses():
     assert said(without(RAMP, pulses=False)(record_of("")))[:2] == answer("")[:2]

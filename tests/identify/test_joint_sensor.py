@@ -24,7 +24,6 @@ from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.predict import predict
 from stimrig.identify.simulation.pulses import Motion
 from tests.harness.carried_sessions import as_record
-from tests.harness.made_once import made_once
 
 ARM = 5
 NOISY, STEPPED, LATE = AngleSensor(noise_deg=0.3), AngleSensor(step_deg=0.35), AngleSensor(delay_s=0.02)
@@ -170,17 +169,17 @@ def recorded_by(sensor: AngleSensor) -> Record:
     return join([as_record(one) for one in made], [0.0, 120.0, 240.0])
 
 
-@made_once
+@cache
 def clean() -> Model:
     return identify.fit(recorded_by(ENCODER), effects=MOVING_JOINT)
 
 
-@made_once
+@cache
 def late() -> Model:
     return identify.fit(recorded_by(LATE), effects=MOVING_JOINT)
 
 
-@made_once
+@cache
 def noisy() -> Model:
     return identify.fit(recorded_by(NOISY), effects=MOVING_JOINT)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from stimrig.identify.estimation.quality import range_warnings
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis, SplineBasis
-from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
 
 KEYS = {
@@ -24,7 +24,7 @@ KEYS = {
 }  # fmt: skip
 
 
-@made_once
+@cache
 def fitted(rate_hz: int) -> tuple[Record, identify.Model]:
     patient = Patient(delay_s=0.0137, time_constant_s=0.3)
     record, _ = make_record(patient, np.random.default_rng(1), rate_hz=rate_hz, noise_nm=0.03)

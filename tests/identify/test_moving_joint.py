@@ -29,7 +29,8 @@ from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.pulses import Motion, above_rest
 from tests.harness.carried_sessions import as_record
-from tests.harness.made_once import made_once
+
+pytestmark = pytest.mark.slow
 
 ARM = 12
 """Tissue that relaxes, a Hill muscle, moment arm and fibre length: one of the development arms."""
@@ -48,7 +49,7 @@ def joined(made: Any, order: Any = None) -> Record:
     return join([as_record(made[place]) for place in places], [begins[place] for place in places])
 
 
-@made_once
+@cache
 def model() -> Model:
     return identify.fit(joined(recorded_tests()), effects=MOVING_JOINT)
 

@@ -21,8 +21,9 @@ from stimrig.identify.methods.maximum_likelihood import start
 from stimrig.identify.records.record import Record
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
-from tests.harness.made_once import made_once
 from tests.identify.test_moving_joint import joined
+
+pytestmark = pytest.mark.slow
 
 ARM = 56
 """A curve that bends in several places, of which the isometric test alone tells little: one of the development arms."""
@@ -40,12 +41,12 @@ def whole() -> Record:
     return joined([*made, record(arm(), "moving", ARM, duration_s=30.0)])
 
 
-@made_once
+@cache
 def first() -> Fitted:
     return fitted_with(whole(), MOVING_JOINT)
 
 
-@made_once
+@cache
 def renewed() -> Fitted:
     return renewed_curve(first())
 

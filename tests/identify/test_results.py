@@ -6,6 +6,7 @@ import dataclasses
 import json
 import re
 from collections.abc import Iterator
+from functools import cache
 from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
@@ -19,7 +20,6 @@ from stimrig.identify.methods import methods
 from stimrig.identify.model_schema import SCHEMA
 from stimrig.identify.summary import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
 from tests.harness import few_effects
-from tests.harness.made_once import made_once
 from tests.identify import hidden_muscles
 from tests.identify.dear import fatigued, improved_with_a_delay
 
@@ -45,7 +45,7 @@ def record():
     return fatigued()
 
 
-@made_once
+@cache
 def made() -> dict[str, Any]:
     model = identify.fit(fatigued())
     with few_effects.only("fatigue", "potentiation", "recruitment_hysteresis"):

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from typing import Any
 
 import numpy as np
 import pytest
 
 from tests.harness.answers import IMPROVED, answers, answers_elsewhere, records
-from tests.harness.made_once import made_once
+
+pytestmark = pytest.mark.slow
 
 NUDGE = 1.0 + 1e-9
 MOST = 0.01
@@ -18,7 +20,7 @@ MOST = 0.01
 Answers = dict[str, dict[str, Any]]
 
 
-@made_once
+@cache
 def answered(where: str) -> Answers:
     if where == "another processor":
         return answers_elsewhere()

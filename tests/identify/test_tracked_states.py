@@ -26,6 +26,8 @@ from stimrig.identify.tracking.follow import rested, set_states, slow_forms
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
+pytestmark = pytest.mark.slow
+
 SEED = 54200
 PER, RATE_HZ, CURRENT_MA = 10, 400.0, 20.0
 FORMS = [(effect.id, form.name) for effect in effects().values() for form in effect.forms if form.state is not None]

@@ -30,6 +30,8 @@ from tests.harness.changing import Changing, reach_widths
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
+pytestmark = pytest.mark.slow
+
 PATIENT = Patient.with_rise(45.0, 120.0, gain=8.0, time_constant_s=0.25, damping=0.9)
 WIDTHS = reach_widths(PATIENT)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import cache
 
 import numpy as np
 import pytest
@@ -14,14 +15,15 @@ from stimrig.identify.estimation.projection import ar1_or_white, best_ar1
 from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p, correlation_slopes
 from stimrig.identify.estimation.uncertainty import prediction_band, whole_factor
 from stimrig.identify.noise import NoiseLevel
-from tests.harness.made_once import made_once
 from tests.harness.patients import Patient, make_record
+
+pytestmark = pytest.mark.slow
 
 RECORDS = 60
 """Enough to see a band that is off by a tenth; `python -m bench goals` counts 300."""
 
 
-@made_once
+@cache
 def fitted_trials():
     found = []
     for seed in range(RECORDS):
@@ -39,7 +41,6 @@ def trials():
     return fitted_trials()
 
 
-@pytest.mark.slow
 def test_bands_cover_the_truth(trials):
     inside = {"curve": [], "whole": [], "step": [], "prediction": []}
     for patient, record, clean, model in trials:
@@ -76,7 +77,6 @@ def test_false_alarms_are_rare(trials):
         assert 0.35 < np.mean(p) < 0.65, name
 
 
-@pytest.mark.slow
 def test_false_alarms_are_rare_with_an_effect_that_is_not_there(trials):
     """Its parameters stand at a bound or are next to undetermined, and the search stops near the top."""
     models = [identify.fit(record, effects=["fatigue"]) for _, record, *_ in trials[:30]]

@@ -18,6 +18,8 @@ from stimrig.rig.signals import PulseStatus
 from tests.rig.fakes import FIXED, PULSES_HZ, VirtualRig, adaptive, extend, hold, refusals, rest, slow_work, widths_sent
 from tests.rig.test_damaged import blocks_of
 
+pytestmark = pytest.mark.slow
+
 
 def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(tmp_path: Path):
     rig = adaptive(tmp_path)
@@ -204,7 +206,6 @@ def test_a_disk_that_takes_no_segment_ends_it_as_a_fault(tmp_path: Path):
     assert len(rig.run.score.laid) == 20
 
 
-@pytest.mark.slow
 def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path: Path):
     rig = adaptive(tmp_path)
     rig.at(0.2, lambda: extend(rig, 20, [hold("added", max_pulse_width_us=150.0)]))
@@ -398,7 +399,6 @@ def mad_segment(rng: np.random.Generator) -> SegmentPlan:
     return SegmentPlan(name=f"s{rng.integers(100)}", sequence=sequence, settings=settings)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(3))
 def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path: Path, seed: int):
     """Right and wrong extensions at random times, some ends among them; judged by arithmetic of its own."""

@@ -23,6 +23,8 @@ from tests.rig.fakes import VirtualRig
 from tests.rig.test_angle_run import swinging
 from tests.rig.test_damaged import blocks_of
 
+pytestmark = pytest.mark.slow
+
 CELL_HZ, SENSOR_HZ = 1600.0, 200.0
 PPM = 150.0
 """By which the sensor's clock is fast."""

@@ -19,6 +19,8 @@ from stimrig.rig.messages import AdaptivePlan, AnglePlan
 from stimrig.rig.signals import Pulse, PulseStatus
 from tests.rig.fakes import VirtualRig, extend, hold, refusals, rest
 
+pytestmark = pytest.mark.slow
+
 RANGE = (math.radians(20), math.radians(120))
 REST = [rest(5.0)]
 HELD = AnglePlan(range_rad=RANGE, target_rad=math.radians(60))

@@ -32,6 +32,8 @@ from tests.simulator.disk import SimulatedDisk
 from tests.simulator.virtual_time import VirtualMachine
 from tests.simulator.world import World
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[2]
 SECTOR = 4096
 FELT = (0, 4, 5)
@@ -81,7 +83,6 @@ def blocks_of(data: bytes, *kinds: Kind) -> list[int]:
     return found
 
 
-@pytest.mark.slow
 def test_one_flipped_bit_anywhere_loses_no_pulse(tmp_path: Path, played: tuple[bytes, int, float]):
     data, pulses, charge_uc = played
     rng = np.random.default_rng(9)

@@ -19,6 +19,8 @@ from stimrig.rig.signals import SAMPLE
 from tests.rig.fakes import VirtualRig, journal_at
 from tests.rig.test_channels import two
 
+pytestmark = pytest.mark.slow
+
 RATE_HZ, PULSE_HZ, T0_S = 1600.0, 40.0, 100.0
 PLAN = {"test_id": "t", "participant": "P17", "kind": "sequence", "pulse_rate_hz": PULSE_HZ, "adaptive": None}
 

@@ -14,6 +14,8 @@ from stimrig.rig.control.sealing import warnings
 from stimrig.rig.signals import SAMPLE
 from tests.rig.fakes import VirtualRig, hold, rest
 
+pytestmark = pytest.mark.slow
+
 
 def rig_with_noise(folder: Path, on_s: float, repeats: int = 1, ceiling_nm: float = 5.0) -> VirtualRig:
     """Torque rises to 6 N·m in each hold, above the ceiling."""

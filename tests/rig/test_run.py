@@ -34,6 +34,8 @@ from tests.simulator.virtual_time import VirtualMachine
 from tests.simulator.wires import SimulatedPort, Wires
 from tests.simulator.world import World
 
+pytestmark = pytest.mark.slow
+
 
 def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
     rig = VirtualRig(tmp_path)
@@ -251,7 +253,6 @@ FAULTS: dict[str, tuple[Callable[[VirtualRig], object], str, float]] = {
 """What happens, what is told, and within how many seconds nothing is sent or fed to the device's watchdog any more."""
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_every_fault_stops_the_test(tmp_path: Path, name: str):
     inject, words, within_s = FAULTS[name]
@@ -443,7 +444,6 @@ def test_torque_that_falls_long_after_the_time_for_it_confirms_no_stop():
     assert not confirmed
 
 
-@pytest.mark.slow
 def test_a_reader_that_fell_behind_confirms_no_stop_by_torque_from_before_the_first_pulse(tmp_path: Path):
     """The run is stopped because samples arrive at half the rate; their torque is still that of the rest."""
     ramp = SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 4.0})

@@ -29,6 +29,8 @@ from tests.api.conftest import PATIENCE_S, TOKEN, Service
 from tests.api.test_worker import made_up_csv
 from tests.harness import few_effects
 
+pytestmark = pytest.mark.slow
+
 NAMES = {
     "read", "fit", "predict", "compare", "diagnose", "improve", "next_experiment", "effects", "plot", "Model", "Record",
     "Client", "emulate", "explain", "export", "import_recording", "invert", "join", "recover", "save", "schema",
@@ -54,7 +56,6 @@ def test_importing_it_loads_no_library() -> None:
     assert not HEAVY & set(loaded)
 
 
-@pytest.mark.slow
 def test_it_works_in_a_folder_with_packages_of_our_folders_names(tmp_path: Path) -> None:
     """Whatever a project of one's own calls its packages: all of ours are parts of `stimrig`."""
     for name in ("api", "rig", "identify", "hardware_sim", "tests"):
@@ -324,7 +325,6 @@ def test_who_ran_a_test_and_what_is_not_under_way(client: Client) -> None:
 TEXT = (Path(__file__).parents[2] / "docs" / "python.md").read_text("utf-8")
 
 
-@pytest.mark.slow
 def test_every_block_runs_in_order(tmp_path: Path, service: Service) -> None:
     blocks = re.findall(r"^```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
     assert len(blocks) >= 9

@@ -87,7 +87,6 @@ def preview_again_and_again(bench: Bench, ended: threading.Event, codes: list[st
         ended.wait(0.0 if reply["ok"] else 0.2)
 
 
-@pytest.mark.realtime
 def test_a_stop_is_heard_under_forty_previews_and_1200_half_open_connections(make_bench: Callable[..., Bench]):
     bench = make_bench("--noise-seed", "7", speed=1.0)
     client = bench.start_rig()

@@ -81,7 +81,6 @@ def test_the_rig_ends_with_its_parent_where_asked(bench: Bench, tmp_path: Path):
         time.sleep(0.05)
 
 
-@pytest.mark.realtime
 def test_a_port_that_is_not_there_is_told_until_it_is(make_bench: Callable[..., Bench], tmp_path: Path):
     bench = make_bench("--noise-seed", "7", speed=1.0)  # a rig file runs at the speed of the world
     link = tmp_path / "no-such-port"

@@ -19,7 +19,7 @@ from tests.harness.lsl_recorder import Streams, compare, on_this_machine
 from tests.harness.processes import ROOT, Bench, RigClient, short_plan
 
 pytest.importorskip("pylsl", reason="LSL is not installed: pip install stimrig[lsl]", exc_type=Exception)
-pytestmark = [pytest.mark.wire, pytest.mark.realtime, pytest.mark.slow]
+pytestmark = [pytest.mark.wire, pytest.mark.slow]
 
 
 LONG = [{"name": "ramp", "sequence": "ramp", "settings": {"up_s": 6.0, "down_s": 6.0}}]

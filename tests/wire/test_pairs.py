@@ -13,7 +13,6 @@ from tests.harness.processes import Bench, kill_hard, short_plan
 pytestmark = pytest.mark.wire
 
 
-@pytest.mark.realtime
 def test_a_pair_behaves(make_bench: Callable[..., Bench]):
     # at the speed of the world: a backlog of text frames is read hardly faster than twice that
     check_all(make_bench(*options("rehastim2", "canopen", "slcan"), speed=1.0))

@@ -23,7 +23,9 @@ from stimrig.api.cohort.select import FIELDS
 from stimrig.rig.messages import LABEL_TITLES
 from tests.api.test_schemas import unmet
 from tests.harness.cohort_records import cohort
-from tests.harness.pauses import below, stat
+from tests.harness.processes import below, stat
+
+pytestmark = pytest.mark.slow
 
 PATIENCE_S = 240.0
 SESSIONS = 30
@@ -84,7 +86,6 @@ def test_wrong_options_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.slow
 def test_data_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     missing = str(tmp_path / "nowhere")
     assert missing in refused(capsys, "fit", missing, "-o", str(tmp_path / "r.parquet"))
@@ -93,7 +94,6 @@ def test_data_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str], 
     assert "no such file" in refused(capsys, "figures", missing, "-o", str(tmp_path / "f.html"))
 
 
-@pytest.mark.slow
 def test_a_scheduler_that_is_not_there_is_one_line(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -103,7 +103,6 @@ def test_a_scheduler_that_is_not_there_is_one_line(
         assert address in words and "no scheduler answers" in words
 
 
-@pytest.mark.slow
 def test_a_scheduler_without_workers_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from distributed import LocalCluster
 
@@ -160,7 +159,6 @@ def alive(pid: int) -> bool:
     return (stat(pid) or "Z")[0] != "Z"
 
 
-@pytest.mark.slow
 def test_killed_and_with_a_worker_killed_it_is_whole_in_the_end(folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "r.parquet"
     parts = tmp_path / "r.parquet.parts"
@@ -195,7 +193,6 @@ def test_killed_and_with_a_worker_killed_it_is_whole_in_the_end(folder: Path, tm
     assert not parts.exists()
 
 
-@pytest.mark.slow
 def test_the_dashboard_is_told_and_people_are_given_words(
     capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
 ) -> None:
@@ -238,7 +235,6 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
             process.wait()
 
 
-@pytest.mark.slow
 def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
     folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
 ) -> None:

@@ -16,6 +16,8 @@ from stimrig.api.cohort.results import Results
 from stimrig.api.cohort.statistics import read_statistics, repeatability, wilson
 from stimrig.api.cohort.tasks import CohortError, Task
 
+pytestmark = pytest.mark.slow
+
 
 def session(who: int, week: int, tired: bool = False, **more: Any) -> dict[str, Any]:
     chance = 0.9 if tired else 0.3

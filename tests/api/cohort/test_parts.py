@@ -20,6 +20,8 @@ from stimrig.api.cohort.sources import Entry
 from stimrig.api.cohort.table import FORMAT, FORMAT_VERSION, SCHEMA, options_of, table_of
 from stimrig.api.cohort.tasks import CohortError, Task
 
+pytestmark = pytest.mark.slow
+
 TASK = Task("fit", software="1.0")
 
 

@@ -18,6 +18,8 @@ from stimrig.api.cohort.sources import Bucket, Centre, Entry, Folder, Source, So
 from stimrig.api.cohort.tasks import CohortError
 from tests.harness.http_double import answering
 
+pytestmark = pytest.mark.slow
+
 MOST = 1000
 
 
@@ -131,7 +133,6 @@ def bucket(s3: Any) -> Any:
     return s3
 
 
-@pytest.mark.slow
 def test_a_bucket_lists_and_opens_its_objects(bucket: Any) -> None:
     source = pickle.loads(pickle.dumps(Bucket("s3://records")))  # as it comes to a worker
     found = listed(source)
@@ -143,7 +144,6 @@ def test_a_bucket_lists_and_opens_its_objects(bucket: Any) -> None:
     assert [entry.name for entry in listed(Bucket("s3://records/P1/a.h5"))] == ["a.h5"]
 
 
-@pytest.mark.slow
 def test_an_object_that_changes_has_another_stamp(bucket: Any) -> None:
     before = listed(Bucket("s3://records/P1/b.csv"))[0]
     bucket.pipe("records/P1/b.csv", b"cc")
@@ -154,7 +154,6 @@ def test_an_object_that_changes_has_another_stamp(bucket: Any) -> None:
     bucket.pipe("records/P1/b.csv", b"bb")
 
 
-@pytest.mark.slow
 def test_a_bucket_that_is_not_there_is_refused_in_one_line(bucket: Any) -> None:
     assert "s3://nowhere" in refused("s3://nowhere")
     assert "s3://records/P9" in refused("s3://records/P9")
