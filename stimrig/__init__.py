@@ -14,7 +14,7 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from stimrig import deprecations, errors
+from stimrig import errors
 from stimrig.identify.summary import register_plotter
 
 if TYPE_CHECKING:
@@ -59,8 +59,6 @@ def __getattr__(name: str) -> Any:
         return import_module("stimrig.cohort")
     if name not in _PLACES:
         raise AttributeError(f"module 'stimrig' has no attribute {name!r}")
-    if (deprecated := deprecations.of_python(name)) is not None:
-        deprecations.warn(deprecated)
     module, attribute = _PLACES[name]
     return getattr(import_module(module), attribute)
 

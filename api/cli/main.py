@@ -22,7 +22,6 @@ from typing import Annotated
 import typer
 from typer.exceptions import TyperException
 
-from stimrig import deprecations
 from stimrig.api.cli import commands
 from stimrig.api.cli.errors import INTERRUPTED, PAGE, CommandError, leave
 from stimrig.api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
@@ -128,8 +127,6 @@ def run(arguments: list[str] | None = None) -> int:
     _keep_compiled()
     given = arguments if arguments is not None else sys.argv[1:]
     verb = next((word for word in given if word[:1] != "-"), "")
-    for line in deprecations.of_command(given):
-        print(f"stimrig: {line}", file=sys.stderr)
     try:
         code = (build(verb) if verb in VERBS else _overview())(arguments, standalone_mode=False)
         sys.stdout.flush()

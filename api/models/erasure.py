@@ -20,7 +20,7 @@ from sqlalchemy.orm import Session
 from stimrig.api.clock import Clock, utc_label
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.outbox import chain
-from stimrig.api.store import Store, aside, audit, migrations, seen
+from stimrig.api.store import Store, audit, migrations, seen
 from stimrig.api.store.tables import (
     OPEN_STATES,
     Analysis,
@@ -140,7 +140,6 @@ class Eraser:
             names = _names(session, code)
             for table, condition in _rows_of(session, code):
                 session.execute(delete(table).where(condition))
-            aside.forget(session.connection(), names)
             self._blank(session, names, number, reason, by, kept.counts)
             _tell_anew(session, self.clock.utc())
         self.finish()

@@ -37,7 +37,7 @@ class Store:
             parsed = make_url(url)
             shown = parsed.render_as_string(hide_password=True)
             self.engine = open_engine(parsed)
-            migrations.bring_up(self.engine)
+            migrations.migrate(self.engine)
         except migrations.SchemaError as error:
             raise ApiError(503, "database", "The database has another version", str(error)) from error
         except (ArgumentError, SQLAlchemyError, ImportError, OSError) as error:

@@ -256,18 +256,14 @@ def _holder(file: IO[str]) -> str:
 SECRET_BYTES = 32
 
 
-def shared_secret(store: Store, name: str, before: Path | None = None) -> bytes:
+def shared_secret(store: Store, name: str) -> bytes:
     """A secret that all services share, so that a page of one is good at another: read, or drawn once.
 
-    `name`: what it is for; `before`: the file in which an older version kept it: pages that are open stay good over the
-    upgrade.
+    `name`: what it is for.
     """
     with store.write() as session:
         row = session.get(Secret, name)
         if row is None:
-            kept = before.read_bytes() if before is not None and before.is_file() else b""
-            row = Secret(name=name, value=kept if len(kept) == SECRET_BYTES else secrets.token_bytes(SECRET_BYTES))
+            row = Secret(name=name, value=secrets.token_bytes(SECRET_BYTES))
             session.add(row)
-        if before is not None:
-            before.unlink(missing_ok=True)
     return row.value

@@ -20,7 +20,6 @@ from stimrig.api.store.holds import ServiceLock
 from stimrig.api.version import software_version
 from stimrig.api.web import openapi, pages, problems, routes
 from stimrig.api.web.dependencies import build
-from stimrig.api.web.deprecated import Deprecated
 from stimrig.api.web.middleware import BodyLimit, Headers, LookAgain, StrictBody
 from stimrig.api.web.traced import Traced
 from stimrig.api.workers.pool import WORKER
@@ -41,7 +40,7 @@ class Service(FastAPI):
 
     def build_middleware_stack(self) -> ASGIApp:
         """Starlette's, within the headers and the language."""
-        return Headers(Deprecated(super().build_middleware_stack()))
+        return Headers(super().build_middleware_stack())
 
 
 def create_app(

@@ -135,7 +135,7 @@ class Context(Parts):
         )  # fmt: skip
         self.trend, self.jobs = Trend(store, clock, pool), Jobs(pool)
         self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
-        stop_key = shared_secret(store, "stop-right", settings.data_dir / "stop-right.key")
+        stop_key = shared_secret(store, "stop-right")
         self.stop_rights = StopRights(stop_key, clock)
 
     def regular(self) -> list[tuple[float, Callable[[], object]]]:

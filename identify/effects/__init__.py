@@ -48,8 +48,7 @@ def _from_packages() -> Iterator[tuple[str, Effect]]:
     for point in entry_points(group=GROUP):
         place = f"entry point {point.name} = {point.value}"
         try:
-            with own_file.old_names():
-                effect = point.load()
+            effect = point.load()
         except Exception as error:
             raise BadEffect(own_file.in_one_line(error), place=place, fix=own_file.FIX) from error
         yield place, own_file.checked(effect, place)

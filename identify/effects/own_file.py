@@ -4,17 +4,13 @@ from __future__ import annotations
 
 import importlib.util
 import re
-import sys
 import traceback
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from stimrig import deprecations
 from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 from stimrig.identify.effects.base import JOINT_COLUMNS, STAGES, Effect, Form, Parameter, Scene
@@ -29,8 +25,6 @@ ID = r"[a-z][a-z0-9_]{0,63}"
 HEAD = "from stimrig.effects import Effect, Form, Parameter"
 ROWS = 80
 """Pulse intervals on which a form is tried."""
-OLD_NAMES = ("identify", "identify.effects", "identify.effects.base")
-"""From which files of earlier versions import what is in `stimrig.effects` now."""
 
 
 class BadEffect(IdentifyError):
@@ -44,44 +38,12 @@ def effect_of(path: Path) -> Effect:
         raise BadEffect("not a Python file", place=str(path), fix=FIX)
     module = importlib.util.module_from_spec(spec)
     try:
-        with old_names():
-            spec.loader.exec_module(module)
+        spec.loader.exec_module(module)
     except (Exception, SystemExit) as error:
         raise BadEffect(in_one_line(error), place=_place(path, error), fix=FIX) from error
     if not hasattr(module, "EFFECT"):
         raise BadEffect("no EFFECT in it", place=str(path), fix="End the file with EFFECT = Effect(...).")
     return checked(module.EFFECT, str(path), path)
-
-
-@contextmanager
-def old_names() -> Iterator[None]:
-    """Within it, `OLD_NAMES` can be imported, unless they are somebody else's."""
-    spec, own = importlib.util.find_spec("identify"), sys.modules["stimrig.identify"].__file__
-    free = spec is None or (spec.origin and own and Path(spec.origin).samefile(own))  # in a checkout it is our folder
-    old = {name: _Told(sys.modules[f"stimrig.{name}"]) for name in OLD_NAMES if free and name not in sys.modules}
-    sys.modules.update(old)
-    try:
-        yield
-    finally:
-        for name in old:
-            del sys.modules[name]
-
-
-class _Told(ModuleType):
-    """A module under its old name: whoever takes something from it is told the new one."""
-
-    def __init__(self, module: ModuleType) -> None:
-        super().__init__(module.__name__.removeprefix("stimrig."))
-        self.__dict__.update(
-            {name: getattr(module, name) for name in ("__path__", "__spec__") if hasattr(module, name)}
-        )
-        self.__dict__["_module"] = module
-
-    def __getattr__(self, name: str) -> Any:
-        found = getattr(self.__dict__["_module"], name)
-        if not name.startswith("__"):
-            deprecations.warn(deprecations.OWN_EFFECTS)
-        return found
 
 
 def in_one_line(error: BaseException) -> str:

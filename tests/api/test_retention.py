@@ -6,21 +6,19 @@ import json
 import multiprocessing
 import os
 import signal
-import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
-import sqlalchemy.schema
 from sqlalchemy import update
 
 from stimrig.api.cli import main
 from stimrig.api.errors import ApiError
 from stimrig.api.models import erasure
 from stimrig.api.models.erasure import Eraser
-from stimrig.api.store import Store, aside, audit, copies, migrations
+from stimrig.api.store import Store, audit, copies, migrations
 from stimrig.api.store.tables import Approval, AuditEntry, Erasure, OutboxItem, Participant, Recording, Test, Token
 from tests.api.conftest import STUB, serving
 from tests.api.conftest import run_test as plays
@@ -75,13 +73,8 @@ def test_nothing_of_a_person_stays_and_nothing_of_others_goes(tmp_path: Path, sh
         kept = http.get("/v1/participants/P1/model").json()
         recording = http.get(tests["P1"]["recording_url"]).content
         before = [entry["hash"] for entry in http.get("/v1/audit").json()["entries"]]
-    copies.copy_database(tmp_path / "stimrig.db", tmp_path / migrations.BEFORE / "stimrig-0016.db")
-    assert {"stimrig.db", "stimrig-0016.db"} <= set(holding(tmp_path, CODE))
-    with closing(sqlite3.connect(tmp_path / "stimrig.db")) as database:  # what a way back left, and could not come back
-        database.execute(sqlalchemy.schema.CreateTable(aside.SET_ASIDE).compile().string)
-        row = ("0015", "participants", json.dumps({"code": CODE}), "{}", "{}", "channels")
-        database.execute("INSERT INTO set_aside VALUES (NULL, ?, ?, ?, ?, ?, ?)", row)
-        database.commit()
+    copies.copy_database(tmp_path / "stimrig.db", tmp_path / migrations.BEFORE / "stimrig-0001.db")
+    assert {"stimrig.db", "stimrig-0001.db"} <= set(holding(tmp_path, CODE))
     asked = ["retention", "erase", CODE, "--reason", "asked by letter 12", "--data", str(tmp_path)]
     assert main.run(asked) == 2, "a model is in use: that is told first"
     assert main.run([*asked, "--though-in-use", "--json"]) == 0

@@ -7,7 +7,6 @@ import re
 import socket
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 from urllib.parse import urlsplit
@@ -19,7 +18,7 @@ from sqlalchemy.exc import OperationalError
 from stimrig.api.clock import Clock
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.stops import RIGHT_S, StopRights
-from stimrig.api.store import Store, holds
+from stimrig.api.store import holds
 from tests.api.conftest import HTML, TOKEN, Service, SetClock, soon
 from tests.api.conftest import csrf as csrf_of
 from tests.api.test_people import standing_still
@@ -214,18 +213,8 @@ def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
 
 def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Service) -> None:
     context = service.context
-    right, gone = context.stop_rights.give("Ada", None), service.data / "stop-right.key"
-    assert StopRights(holds.shared_secret(context.store, "stop-right", gone), Clock()).holder(right) == "Ada"
-
-
-def test_the_upgrade_keeps_them_too(tmp_path: Path) -> None:
-    """An older version kept their key in a file."""
-    path, store = tmp_path / "stop-right.key", Store(f"sqlite:///{tmp_path}/stimrig.db")
-    path.write_bytes(bytes(range(32)))
-    for _ in range(2):
-        assert holds.shared_secret(store, "stop-right", path) == bytes(range(32)) and not path.exists()
-    assert len(set(holds.shared_secret(store, "another", path))) > 1
-    store.close()
+    right = context.stop_rights.give("Ada", None)
+    assert StopRights(holds.shared_secret(context.store, "stop-right"), Clock()).holder(right) == "Ada"
 
 
 def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Service, client: httpx.Client) -> None:

@@ -1,5 +1,4 @@
-"""`python -m tests.frozen make`: write what users hold; `check`: compare this tree with it; `public`: the list of
-what is public. See README.md here."""
+"""`python -m tests.frozen make`: write what users hold; `check`: compare this tree with it. See README.md here."""
 
 from __future__ import annotations
 
@@ -9,20 +8,17 @@ import sys
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 
-from tests.frozen import public
 from tests.frozen.parts import PARTS, compare, keep
 
 
 def main(arguments: list[str] | None = None) -> int:
     """The exit code: 1 if anything differs or cannot be made."""
     parser = argparse.ArgumentParser(prog="python -m tests.frozen", description=__doc__)
-    parser.add_argument("what", choices=["make", "check", "public"])
+    parser.add_argument("what", choices=["make", "check"])
     parser.add_argument("--only", default="", metavar="PATTERN", help="parts whose name fits")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--most", type=int, default=12, help="lines for a part")
     asked = parser.parse_args(arguments)
-    if asked.what == "public":
-        return public.main()
     parts = [part for part in PARTS if re.search(asked.only, part)]
     if not parts:
         parser.error(f"no part fits {asked.only!r}")

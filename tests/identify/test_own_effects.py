@@ -206,15 +206,6 @@ def test_an_effect_that_is_not_found_names_the_way_to_its_file() -> None:
 # ---- names ----
 
 
-def test_a_file_of_an_earlier_version_is_loaded(tmp_path, monkeypatch) -> None:
-    old = GOOD.replace("from stimrig.effects import", "from identify.effects.base import")
-    assert old != GOOD
-    (tmp_path / "mine.py").write_text(old)
-    monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
-    assert "sensor_gain_swing" in effects.registry()
-    assert "identify" not in sys.modules
-
-
 def test_the_library_can_be_called_where_its_names_were_imported() -> None:
     from stimrig.effects import Effect
 

@@ -19,7 +19,6 @@ COMMAND_ONLY = {
     "centre": "it runs a server of its own",
     "demo": "`emulate`, `Client.run_test` and `Client.approve` one after the other",
     "doctor": "it says what this machine lacks for stimulation",
-    "upgrade": "it changes the data of a service that is stopped",
     "rig": "it asks a person who stands at the rig",
     "retention": "it deletes, alone with the data folder; it is asked for by a person, or by a timer",
     "serve": "it runs until it is ended, and may own a rig; `Client` talks to it",

@@ -1,0 +1,1 @@
+"""Alembic scripts of the database; `stimrig.api.store.migrations` runs them."""
