@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: docs demo centre test frozen check lint types serve bench soak campaigns mutation words lock clean help packages setup setup-test setup-centre simulate technical-file sbom audit
+.PHONY: docs demo centre test frozen check lint types serve bench soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -74,20 +74,8 @@ $(VENV)/.centre: requirements/centre.txt pyproject.toml deploy/setup.sh
 $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench
 
-packages: setup-test ## wheel, sdist, Debian package and container, built into dist/ and tried (docs/install.md)
-	@bash deploy/packages.sh
-
 words: setup ## renew the catalogues of the pages' languages; LANGUAGE=fr begins one (docs/languages.md)
 	@$(BIN)/python -m stimrig.api.language.extract $(LANGUAGE)
-
-technical-file: setup-test ## docs/safety with its tables, as one page to print; DIST=dist TESTS=tests.xml fill the release record
-	@$(BIN)/python -m deploy.technical_file $(if $(DIST),--dist $(DIST)) $(if $(TESTS),--tests $(TESTS))
-
-sbom: setup-test ## build/sbom.json: the bill of materials (CycloneDX) of the locks
-	@$(BIN)/python -m deploy.technical_file --sbom build/sbom.json
-
-audit: setup-test ## known vulnerabilities of the locks; a package that was not asked about is a failure (needs a network)
-	@$(BIN)/python -m deploy.technical_file.audit
 
 lock: ## resolve the locked lists anew (needs uv; for maintainers)
 	@bash deploy/lock.sh

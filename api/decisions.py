@@ -1,7 +1,7 @@
 """Which requests decide something, and which document's version each of them must have been made on.
 
 Clients send the `ETag` of that document back as `If-Match` (RFC 9110, section 13.1.1; RFC 6585, section 3); a page's
-form has it in a field. What each decision rests on, and where that is checked, is in docs/safety/decisions.toml.
+form has it in a field. What each decision rests on, and where that is checked, is in tests/api/decisions.toml.
 """
 
 from __future__ import annotations

@@ -20,9 +20,6 @@ os.environ |= {"PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "PYDEVD_DIS
 import generators  # noqa: E402
 import numpydoc.xref  # noqa: E402
 
-from deploy.technical_file import __main__ as technical_file  # noqa: E402
-from deploy.technical_file import places  # noqa: E402
-from deploy.technical_file import release as release_record  # noqa: E402
 from stimrig.api.version import software_version  # noqa: E402
 
 project = "stimrig"
@@ -84,8 +81,6 @@ def prepare(app: Any, docname: str, source: list[str]) -> None:
         return f"[{found[1]}]({found[2]}/README.md)" if inside else found[1]
 
     made = re.sub(r"<!-- made: ([a-z_]+) -->", lambda found: getattr(generators, found[1])(), source[0])
-    if docname.startswith("docs/safety/"):
-        made = technical_file.filled(made, places.read(), release_record.record(None, None))
     source[0] = LINK.sub(of_folder, made)
 
 

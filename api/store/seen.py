@@ -70,7 +70,7 @@ def read(text: str, *marks: str) -> Seen | None:
 
 
 shown: ContextVar[Seen | None] = ContextVar("shown", default=None)
-"""What who asks was shown, as the request says; None: its action needs none (docs/safety/decisions.toml)."""
+"""What who asks was shown, as the request says; None: its action needs none (tests/api/decisions.toml)."""
 today: ContextVar[Callable[[], str] | None] = ContextVar("today", default=None)
 """Tells the day of now while somebody decides."""
 looked: ContextVar[Seen | None] = ContextVar("looked", default=None)

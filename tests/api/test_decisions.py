@@ -1,4 +1,4 @@
-"""A decision counts only for what the person saw: every door of docs/safety/decisions.toml, and known attacks."""
+"""A decision counts only for what the person saw: every door of tests/api/decisions.toml, and known attacks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.api.fake_arm import still
 from tests.api.test_profiles import mark_all
 
 ROOT = Path(__file__).parents[2]
-TABLE = tomllib.loads((ROOT / "docs" / "safety" / "decisions.toml").read_text("utf-8"))
+TABLE = tomllib.loads(Path(__file__).with_name("decisions.toml").read_text("utf-8"))
 LIMITS = {"current_ma": 21.0, "max_pulse_width_us": 250.0, "max_torque_nm": 20.0}
 KEY = {"name": "ilc", "current_ma": "8", "max_pulse_width_us": "200", "max_duration_s": "60", "trials": "3"}
 
@@ -46,16 +46,14 @@ def test_every_route_and_button_that_changes_something_is_in_the_table_once() ->
     }
     named = doors("decision") + doors("free")
     assert sorted(named) == sorted(set(named))
-    said = (
-        "Say in docs/safety/decisions.toml what must have been seen for it, or why nothing (CONTRIBUTING.md, a route)"
-    )
+    said = "Say in tests/api/decisions.toml what must have been seen for it, or why nothing (CONTRIBUTING.md, a route)"
     assert set(named) == there, said
 
 
 def test_what_the_table_calls_decisions_says_its_version_at_the_door() -> None:
     ours = {f"{one.method} {one.path}" for one in DECISIONS if one.path}
     ours |= {f"POST {one.form}" for one in DECISIONS if one.form}
-    said = "api/decisions.py and docs/safety/decisions.toml name the same decisions; CASES here says how each is tried"
+    said = "api/decisions.py and tests/api/decisions.toml name the same decisions; CASES here says how each is tried"
     assert set(doors("decision")) == ours and {last_word(door) for door in ours} <= set(CASES), said
     for row in TABLE["decision"]:
         assert all((ROOT / place).is_file() for place in row["where"]), row

@@ -11,7 +11,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from deploy.technical_file import checks, places
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.launcher import Services
 from stimrig.api.client.rest import Client
@@ -151,4 +150,3 @@ def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Pa
         document = http.get(f"/v1/tests/{test_id}").json()
         assert document["state"] == "stopped" and "shutting down" in document["reason"]
         assert http.get(document["recording_url"]).content.startswith(b"\x89HDF")
-    assert checks.unmapped(tmp_path, places.read()["data-map"]) == []  # rig and service in one folder

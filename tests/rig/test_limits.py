@@ -103,6 +103,21 @@ def test_the_hard_limits_are_those_that_were_agreed_on():
     }
 
 
+def test_the_strongest_admitted_pulses_stay_below_the_stimulators_standard():
+    """IEC 60601-2-10, 201.12.4 into 500 Ω, and its attention level of current density on electrodes of 10 cm²."""
+    load_ohm, area_cm2 = 500.0, 10.0
+    pulses = [Pulse(width, current) for width in range(10, 501, 10) for current in range(2, 101, 2)]
+    admitted = [verdict for pulse in pulses if isinstance(verdict := admit(pulse, HARD_LIMITS), Admitted)]
+    rate, charge = HARD_LIMITS["pulse_rate_hz"].hi, HARD_LIMITS["charge_per_second_uc"].hi
+    energy_mj = max(2 * load_ohm * (p.current_ma * 1e-3) ** 2 * p.pulse_width_us * 1e-3 for p in admitted)
+    rms_ma = max(
+        p.current_ma * math.sqrt(2 * p.pulse_width_us * 1e-6 * min(rate, charge / p.charge_uc)) for p in admitted
+    )
+    assert len(admitted) > 100 and energy_mj < 300
+    assert rms_ma < 50 and rms_ma / area_cm2 < 2
+    assert rate < 400
+
+
 def test_a_limit_cannot_be_changed_in_place():
     for thing, name in (
         (HARD_LIMITS["current_ma"], "hi"),

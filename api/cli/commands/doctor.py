@@ -160,7 +160,7 @@ def check_data(settings: Settings) -> Iterator[Finding]:
     folder = settings.data_dir.absolute()
     nearest = next(place for place in (folder, *folder.parents) if place.exists())
     if not os.access(nearest, os.W_OK | os.X_OK):
-        fix = f"chown it to this user, or set STIMRIG_DATA_DIR; the Debian package makes {folder} as it should be"
+        fix = f"chown it to this user, or set STIMRIG_DATA_DIR; deploy/install.sh makes {folder} as it should be"
         yield Finding("data folder", "fails", f"{nearest} may not be written by this user", fix)
         return
     if folder.exists() and folder.stat().st_mode & stat.S_IROTH:
