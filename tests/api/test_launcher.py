@@ -1,11 +1,10 @@
-"""The whole house as processes: emulator, rig, service; sped up where the clock allows it."""
+"""The whole house as processes: emulator, rig, service."""
 
 from __future__ import annotations
 
 import socket
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import httpx
@@ -20,7 +19,6 @@ from tests.api.test_operation_wire import all_as_documented
 from tests.harness.looks_first import LooksFirst
 
 pytestmark = pytest.mark.wire
-FAST = ["--speed", "4"]
 
 
 def settings(tmp_path: Path, **more: object) -> Settings:
@@ -31,16 +29,20 @@ def client(services: Services) -> httpx.Client:
     return httpx.Client(base_url=services.url, auth=LooksFirst(TOKEN), timeout=60)
 
 
+def playing(http: httpx.Client) -> bool:
+    """Whether the test has played for more than a second."""
+    return http.get("/v1/rig").json()["elapsed_s"] > 1.0
+
+
 @pytest.mark.timeout(900)  # an identification gives way to every other process: beside them it takes minutes
 def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
-    with Services(settings(tmp_path), FAST, TOKEN) as services, Client(services.url, TOKEN) as rest:
+    with Services(settings(tmp_path), [], TOKEN) as services, Client(services.url, TOKEN) as rest:
         http = rest.http
         assert http.get("/rig/now").json()["emulated"] is True
         document = rest.run_test(rest.make_participant("P1")["code"])
         assert document["summary"]["lost_samples"] == 0
         fit = document["fit"]
-        # A busy machine's stalls count four times at this speed; the figure at the speed of the world is the demo's.
-        assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 75
+        assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 90
         curves = http.get(f"{document['model_url']}/curves").json()
         assert {part["name"] for part in curves["segments"]} >= {"rest", "prbs", "ramp", "validate"}
         preview = http.post("/v1/preview", json={"participant": "P1"}).json()
@@ -62,14 +64,14 @@ def test_only_the_emulator_makes_an_emulated_rig(tmp_path: Path) -> None:
 
 
 def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path) -> None:
-    with Services(settings(tmp_path), ["--speed", "2"], TOKEN) as services, client(services) as http:
+    with Services(settings(tmp_path), [], TOKEN) as services, client(services) as http:
         http.post("/v1/participants", json={"code": "P1"})
         test_id = http.post("/v1/tests", json={"participant": "P1"}).json()["id"]
-        time.sleep(2)
+        soon(lambda: playing(http))
         assert services.rig.process is not None
         services.rig.process.kill()
         services.rig.process.wait()
-        soon(lambda: not http.get("/v1/rig").json()["connected"], 5.0)
+        soon(lambda: not http.get("/v1/rig").json()["connected"])
         assert any("rig had ended" in event for event in services.watch())
         document = wait_done(http, test_id, 60)
         assert document["state"] == "fault"
@@ -80,12 +82,13 @@ def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path)
         assert http.post("/v1/rearm").json()["state"] == "ready"
 
 
+@pytest.mark.campaign
 @pytest.mark.timeout(900)  # an identification gives way to every other process: beside them it takes minutes
 def test_killed_service_comes_back_at_the_same_place_with_everything(tmp_path: Path) -> None:
-    with Services(settings(tmp_path), FAST, TOKEN) as services, client(services) as http:
+    with Services(settings(tmp_path), [], TOKEN) as services, client(services) as http:
         http.post("/v1/participants", json={"code": "P1"})
         test_id = http.post("/v1/tests", json={"participant": "P1"}).json()["id"]
-        time.sleep(1.5)
+        soon(lambda: playing(http))
         assert services.api.process is not None
         services.api.process.kill()
         services.api.process.wait()
@@ -145,7 +148,7 @@ def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Pa
     with Services(settings(tmp_path), [], TOKEN) as services, client(services) as http:
         http.post("/v1/participants", json={"code": "P1"})
         test_id = http.post("/v1/tests", json={"participant": "P1"}).json()["id"]
-        time.sleep(3)
+        soon(lambda: playing(http))
     with Services(settings(tmp_path), [], TOKEN) as services, client(services) as http:
         document = http.get(f"/v1/tests/{test_id}").json()
         assert document["state"] == "stopped" and "shutting down" in document["reason"]

@@ -1,4 +1,4 @@
-"""Fixtures: the emulated rig as processes, sped up unless a test says otherwise."""
+"""The emulated rig as processes, at the speed of the world: then a pause of the machine is as long to the devices."""
 
 from __future__ import annotations
 
@@ -9,15 +9,13 @@ import pytest
 
 from tests.harness.processes import Bench, RigClient, made_ready
 
-SPEED = 2.0
-
 
 @pytest.fixture
 def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
     """Start an emulator with options; it and its rig end with the test."""
     benches: list[Bench] = []
 
-    def make(*options: str, speed: float = SPEED) -> Bench:
+    def make(*options: str, speed: float = 1.0) -> Bench:
         bench = Bench(tmp_path / f"bench{len(benches)}", *options, speed=speed)
         benches.append(bench)
         return bench
@@ -30,7 +28,7 @@ def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
 @pytest.fixture(scope="module")
 def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
     """One emulator and one rig for a whole file."""
-    bench = Bench(tmp_path_factory.mktemp("shared"), "--noise-seed", "7", speed=SPEED)
+    bench = Bench(tmp_path_factory.mktemp("shared"), "--noise-seed", "7")
     yield bench, bench.start_rig()
     bench.close()
 
@@ -43,5 +41,5 @@ def shared(pair: tuple[Bench, RigClient]) -> tuple[Bench, RigClient]:
 
 @pytest.fixture
 def bench(make_bench: Callable[..., Bench]) -> Bench:
-    """An emulator of the paper's patient at the tests' usual speed."""
+    """An emulator of the paper's patient."""
     return make_bench("--noise-seed", "7")

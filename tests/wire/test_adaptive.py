@@ -88,6 +88,7 @@ def test_a_test_stops_itself_and_is_identified(whole: Whole) -> None:
     assert document["fit"]["fit_percent"] > 90.0
 
 
+@pytest.mark.campaign
 def test_a_worker_that_is_killed_ends_in_the_fixed_plan(whole: Whole, tmp_path: Path) -> None:
     test_id = whole.start(target={"curve_percent": 0.2, "step_percent": 0.2}, anyway=True)
     whole.until(test_id, lambda document: bool(document["adaptive"]["decisions"]))

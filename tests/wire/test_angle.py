@@ -41,7 +41,7 @@ def played(bench: Bench, client: RigClient, test_id: str, **fields: Any) -> dict
     ("options", "methods"),
     [
         (("--angle-clock-ppm", f"{PPM:g}", "--angle-jitter-us", "200"), {"order", "stamps"}),
-        (("--angle", "in-cell"), {"cell"}),
+        pytest.param(("--angle", "in-cell"), {"cell"}, marks=pytest.mark.campaign),
     ],
     ids=["socketcand", "in the cell"],
 )
@@ -79,7 +79,7 @@ def test_angles_are_recorded_and_stand_within_a_millisecond_of_the_torque(
 @pytest.fixture(scope="module")
 def angled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
     """An arm with its sensor, and a rig, for the rest of this file."""
-    bench = Bench(tmp_path_factory.mktemp("angled"), "--arm", "held", "--noise-seed", "7", *MOUNTED, speed=2.0)
+    bench = Bench(tmp_path_factory.mktemp("angled"), "--arm", "held", "--noise-seed", "7", *MOUNTED)
     yield bench, bench.start_rig()
     bench.close()
 

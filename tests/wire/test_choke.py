@@ -87,8 +87,9 @@ def preview_again_and_again(bench: Bench, ended: threading.Event, codes: list[st
         ended.wait(0.0 if reply["ok"] else 0.2)
 
 
+@pytest.mark.campaign  # what it does to the machine can end the test before the stop does
 def test_a_stop_is_heard_under_forty_previews_and_1200_half_open_connections(make_bench: Callable[..., Bench]):
-    bench = make_bench("--noise-seed", "7", speed=1.0)
+    bench = make_bench("--noise-seed", "7")
     client = bench.start_rig()
     ended, codes = threading.Event(), []
     assert client.start(default_plan("choke", segments=HOLD))["ok"]
@@ -96,8 +97,7 @@ def test_a_stop_is_heard_under_forty_previews_and_1200_half_open_connections(mak
     if rank_is_granted():
         ranks = ranks_of(bench)
         assert ranks.count(os.SCHED_FIFO) == 1  # who sends its pulses
-        assert ranks.count(os.SCHED_OTHER) == 1  # paced time's own thread
-        assert set(ranks) == {os.SCHED_RR, os.SCHED_FIFO, os.SCHED_OTHER}
+        assert set(ranks) == {os.SCHED_RR, os.SCHED_FIFO}
     askers = [threading.Thread(target=preview_again_and_again, args=(bench, ended, codes)) for _ in range(40)]
     with half_open(bench.socket, 600), half_open(stop_socket(bench.socket), 600):
         for asker in askers:

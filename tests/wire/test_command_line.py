@@ -82,7 +82,7 @@ def test_the_rig_ends_with_its_parent_where_asked(bench: Bench, tmp_path: Path):
 
 
 def test_a_port_that_is_not_there_is_told_until_it_is(make_bench: Callable[..., Bench], tmp_path: Path):
-    bench = make_bench("--noise-seed", "7", speed=1.0)  # a rig file runs at the speed of the world
+    bench = make_bench("--noise-seed", "7")
     link = tmp_path / "no-such-port"
     can = bench.emulator.ready["can"]
     path = tmp_path / "rig.toml"

@@ -13,7 +13,7 @@ import pytest
 from stimrig.identify.records import read
 from tests.harness.processes import Bench, RigClient, default_plan
 
-pytestmark = pytest.mark.wire
+pytestmark = [pytest.mark.wire, pytest.mark.campaign]  # an extension must not be late; tests/rig/test_extending.py
 
 KEY = "a key that nobody knows"
 FIXED = [

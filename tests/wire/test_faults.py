@@ -17,12 +17,13 @@ from tests.harness.processes import Bench, RigClient, default_plan, kill_hard, s
 
 pytestmark = pytest.mark.wire
 
+RATE_HZ = 40.0
 FAULTS = {"electrode_error": "electrode error", "cell_silent": "stale", "stimulator_unplugged": "stimulator"}
 
 
 STEPS = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.4}},
-    {"name": "steps", "sequence": "steps", "settings": {"on_s": 5.0, "off_s": 0.0}},
+    {"name": "steps", "sequence": "steps", "settings": {"on_s": 30.0, "off_s": 0.0}},
 ]
 
 
@@ -34,11 +35,21 @@ def start(bench: Bench, test_id: str = "t", client: RigClient | None = None) -> 
     reply = client.start(default_plan(test_id, segments=STEPS))
     assert reply["ok"], reply
     client.wait_state("running")
-    end = time.monotonic() + 10
+    end = time.monotonic() + 60
     while bench.state()["pulses_received"] < before + 30:
         assert time.monotonic() < end, client.status()
         time.sleep(0.02)
     return client
+
+
+def later(bench: Bench) -> dict[str, Any]:
+    """What the emulator says half a second of its own time later."""
+    began_s = bench.state()["time_s"]
+    end = time.monotonic() + 60
+    while (state := bench.state())["time_s"] < began_s + 0.5:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return state
 
 
 def check_kept(event: dict[str, Any], outcome: str) -> None:
@@ -59,23 +70,22 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     start(bench, fault, client)
     injected = bench.fault(cmd="fault", name=fault, on=True)
     assert injected["ok"], injected
-    event = client.wait_finished(fault, timeout_s=20)
+    counted = bench.state()["pulses_received"]
+    event = client.wait_finished(fault, timeout_s=60)
     check_kept(event, "fault")
     assert FAULTS[fault] in event["reason"]
-    felt = bench.felt()
-    # with slack for a shared machine; without acknowledgements one pulse is on its way at most
-    late_s = max(p["monotonic_s"] - injected["monotonic_s"] for p in felt)
+    # pulses are counted, not seconds: a computer that stands still sends none
     watch_s = EMULATOR_WATCH["stale_torque_s"] if fault == "cell_silent" else 0.0
-    assert late_s < watch_s + 0.25, late_s
+    assert bench.state()["pulses_received"] - counted <= RATE_HZ * (watch_s + 0.25)
     status = client.wait_state("latched")
     # what the reader of a silent or unplugged device finds after the end comes behind
-    later = status["reason"].removeprefix(event["reason"])
-    assert later != status["reason"]
-    assert not later or fault in ("stimulator_unplugged", "cell_silent"), status["reason"]
+    rest = status["reason"].removeprefix(event["reason"])
+    assert rest != status["reason"]
+    assert not rest or fault in ("stimulator_unplugged", "cell_silent"), status["reason"]
     refused = client.ask("start", plan=short_plan("refused"))
     assert refused["problem"]["code"] == "latched"
     bench.fault(cmd="fault", name=fault, on=False)
-    time.sleep(0.1)
+    later(bench)
     rearmed = client.rearm("nurse")
     assert rearmed["ok"], rearmed
     assert rearmed["body"]["state"] == "ready"
@@ -89,17 +99,16 @@ def test_a_load_cell_that_fails_before_the_start_is_told_before_the_first_pulse(
     client.ask("subscribe")
     before = bench.state()["pulses_received"]
     assert bench.fault(cmd="fault", name=fault, on=True)["ok"]
-    time.sleep(0.15)
     test_id = f"{fault}-before"
     reply = client.start(default_plan(test_id, segments=STEPS))
     if reply["ok"]:
-        assert client.wait_finished(test_id, timeout_s=20)["outcome"] == "fault"
+        assert client.wait_finished(test_id, timeout_s=60)["outcome"] == "fault"
     # also where the rest between two tests left the rig the time to find it silent
     reason = client.status()["reason"] if reply["ok"] else reply["problem"]["detail"]
     assert "load cell" in reason and "look at its plug and supply, and at the CAN adapter" in reason, reply
     assert bench.state()["pulses_received"] == before
     bench.fault(cmd="fault", name=fault, on=False)
-    time.sleep(0.1)
+    later(bench)
     assert client.rearm("nurse")["body"]["state"] == "ready"
 
 
@@ -124,8 +133,7 @@ def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient])
     event = client.wait_finished("t")
     check_kept(event, "stopped")
     assert "participant asks (by nurse)" in event["reason"]
-    time.sleep(0.2)
-    assert bench.state()["pulses_received"] == count
+    assert later(bench)["pulses_received"] == count
     assert client.wait_state("latched")["reason"] == "participant asks (by nurse)"
     assert client.rearm("nurse")["body"]["state"] == "ready"
 
@@ -134,9 +142,8 @@ def test_a_signal_stops_stimulation_first_and_seals(bench: Bench):
     start(bench)
     assert bench.rig is not None
     assert bench.rig.stop(signal.SIGTERM) == 0
-    before = bench.state()
-    time.sleep(0.1)
-    assert bench.state()["pulses_received"] == before["pulses_received"]
+    count = bench.state()["pulses_received"]
+    assert later(bench)["pulses_received"] == count
     sealed = list((bench.data / "recordings").glob("*.h5"))
     assert len(sealed) == 1
     with h5py.File(sealed[0]) as file:
@@ -150,10 +157,10 @@ def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(bench: Bench):
     start(bench, "killed")
     assert bench.rig is not None
     kill_hard(bench.rig)
-    time.sleep(0.05)
-    count = bench.state()["pulses_received"]
-    time.sleep(0.3)
-    assert bench.state()["pulses_received"] == count  # silence is no stimulation
+    killed_s = bench.state()["time_s"]
+    count = later(bench)["pulses_received"]
+    # silence is no stimulation; one command may have been on its way
+    assert sum(pulse["time_s"] > killed_s for pulse in bench.felt()) <= 1
     client = bench.start_rig()
     status = client.status()
     assert status["state"] == "uncertain"

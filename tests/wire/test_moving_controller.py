@@ -22,7 +22,7 @@ from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
 from tests.harness.processes import control
 
-pytestmark = [pytest.mark.wire, pytest.mark.slow]
+pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 ROOT = Path(__file__).parents[2]
 TOKEN = "administrator-token-of-a-moving-joint"

@@ -10,17 +10,17 @@ import pytest
 from tests.harness.device_pairs import HOLD, check_all, options
 from tests.harness.processes import Bench, kill_hard, short_plan
 
-pytestmark = pytest.mark.wire
+pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 
 
 def test_a_pair_behaves(make_bench: Callable[..., Bench]):
     # at the speed of the world: a backlog of text frames is read hardly faster than twice that
-    check_all(make_bench(*options("rehastim2", "canopen", "slcan"), speed=1.0))
+    check_all(make_bench(*options("rehastim2", "canopen", "slcan")))
 
 
 def test_a_rehastim2_is_kept_alive_through_a_rest_and_lets_go_of_a_dead_host(make_bench: Callable[..., Bench]):
     """Its watchdog strikes 1200 ms after the last command: the bound of its silence, here with single pulses."""
-    bench = make_bench("--stimulator", "rehastim2", speed=2.0)
+    bench = make_bench("--stimulator", "rehastim2")
     client = bench.start_rig()
     client.ask("subscribe")
     rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 3.0}}

@@ -17,7 +17,7 @@ from stimrig.rig.signals import PulseStatus
 from tests.harness.processes import Bench, control
 from tests.wire.test_faults import start
 
-pytestmark = pytest.mark.wire
+pytestmark = [pytest.mark.wire, pytest.mark.campaign]  # tests/rig/test_pauses.py does it in virtual time
 
 STOOD_S = 0.15
 """With what a shared machine may stand still by itself less than a second in all."""
@@ -25,7 +25,7 @@ STOOD_S = 0.15
 
 @pytest.mark.parametrize("transport", ["socketcand", "slcan"])
 def test_a_rig_that_stands_still_goes_on_and_loses_no_sample(make_bench: Callable[..., Bench], transport: str):
-    bench = make_bench("--noise-seed", "7", "--load-cell", transport, speed=1.0)
+    bench = make_bench("--noise-seed", "7", "--load-cell", transport)
     client = start(bench)
     assert bench.rig is not None
     for _ in range(3):
@@ -52,7 +52,7 @@ def test_a_rig_that_stands_still_goes_on_and_loses_no_sample(make_bench: Callabl
 
 
 def test_one_that_stands_still_for_longer_ends_its_test_and_nothing_follows(make_bench: Callable[..., Bench]):
-    bench = make_bench("--noise-seed", "7", speed=1.0)
+    bench = make_bench("--noise-seed", "7")
     client = start(bench)
     assert bench.rig is not None
     bench.rig.popen.send_signal(signal.SIGSTOP)

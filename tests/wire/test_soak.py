@@ -16,6 +16,7 @@ SEGMENTS = [
 
 
 @pytest.mark.wire
+@pytest.mark.campaign
 def test_no_sample_is_lost_while_fits_run_beside():
     found = soak(0.5, every_minutes=0.25, patient=True, segments=SEGMENTS)
     assert found["lost_samples"] == 0

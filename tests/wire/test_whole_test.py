@@ -69,16 +69,17 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
             assert file[name].attrs["description"]
 
 
-def test_a_test_over_slcan(make_bench: Callable[..., Bench]):
-    """At the world's speed: text frames cost the emulator more, and a late ack costs the next pulse."""
-    bench = make_bench("--load-cell", "slcan", "--noise-seed", "5", speed=1.0)
-    event = play(bench, short_plan("slcan"))
+@pytest.mark.parametrize("transport", ["socketcand", pytest.param("slcan", marks=pytest.mark.campaign)])
+def test_what_is_sealed_is_what_was_felt(make_bench: Callable[..., Bench], transport: str):
+    bench = make_bench("--load-cell", transport, "--noise-seed", "5")
+    event = play(bench, short_plan("t"))
     check_recording(bench, event)
 
 
+@pytest.mark.campaign  # it compares times of the computer; tests/rig/test_receivers.py aligns in virtual time
 def test_aligned_times_are_those_of_the_muscle(make_bench: Callable[..., Bench]):
     """The emulator knows when each pulse was felt; the recording's sync edges must lie there."""
-    bench = make_bench("--clock-ppm", "-200", "--clock-jitter-us", "100", speed=1.0)
+    bench = make_bench("--clock-ppm", "-200", "--clock-jitter-us", "100")
     event = play(bench, short_plan("align"))
     felt_s = np.array([p["monotonic_s"] for p in bench.felt()])
     with h5py.File(event["recording_path"]) as file:
