@@ -47,8 +47,7 @@ DECISIONS = (
     Decision("POST", "/v1/rig/angle/pose", "/v1/rig/angle", "/rig/angle/pose"),
     *(Decision("POST", f"/v1/searches/{{search_id}}/{word}", "/v1/searches/{search_id}",
                f"{OF_PERSON}/electrodes/{{search_id}}/{word}") for word in ("stimuli", "choice")),
-    *(Decision("PUT", f"/v1/users/{{name}}/{word}", "/v1/users", f"/administration/users/{{name}}/{word}")
-      for word in ("password", "provider")),
+    Decision("PUT", "/v1/users/{name}/password", "/v1/users", "/administration/users/{name}/password"),
 )  # fmt: skip
 _PATHS = [
     (method, re.compile(re.sub(r"\{(\w+)\}", r"(?P<\1>[^/]+)", path)), decision)

@@ -15,7 +15,7 @@ from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from stimrig.api.errors import SettingsError
 
-SECRET = ("_KEY", "_TOKEN", "_SECRET")
+SECRET = ("_KEY", "_TOKEN")
 """How the names of settings end whose values are not shown."""
 
 
@@ -37,19 +37,6 @@ class ServerSettings(BaseSettings):
     time_zone: str | None = Field(default=None, description="as Europe/Berlin; default: the machine's")
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
     tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
-    oidc_issuer: str | None = Field(default=None, description="provider that signs people in; see docs/sign-in.md")
-    oidc_public_url: str | None = Field(
-        default=None, validate_default=True, description="this service as browsers know it, as https://rig.example.org"
-    )
-    oidc_client_id: str | None = Field(default=None, validate_default=True, description="as the provider knows it")
-    oidc_client_secret: SecretStr | None = Field(default=None, description="default: PKCE alone")
-    oidc_client_secret_file: Path | None = Field(default=None, description="file with the secret, instead of it")
-    oidc_name: str | None = Field(default=None, description="what the button calls the provider; default: its host")
-    oidc_scope: str = Field(default="openid profile", description="scopes that are asked for")
-    oidc_claim: str = Field(default="groups", description="claim of the id_token that lists a person's groups")
-    oidc_roles: Annotated[dict[str, str], NoDecode] = Field(
-        default={}, description="group=role, comma-separated; the first one that a person has counts; default: nobody"
-    )
 
     def __init__(self, **given: Any) -> None:
         try:
@@ -64,44 +51,6 @@ class ServerSettings(BaseSettings):
         if given and given not in available_timezones():
             raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
         return given or None
-
-    @field_validator("oidc_issuer")
-    @classmethod
-    def _issuer(cls, given: str | None) -> str | None:
-        """An address that may say who signs in; as it is given: an issuer is compared to the letter."""
-        return safe_address(given) if given else None
-
-    @field_validator("oidc_public_url", "oidc_client_id")
-    @classmethod
-    def _with_the_issuer(cls, given: str | None, info: ValidationInfo) -> str | None:
-        """What a provider cannot be asked without."""
-        if info.data.get("oidc_issuer") is None:
-            return given
-        if not given:
-            raise ValueError("the issuer (…OIDC_ISSUER) is set, and this is not; docs/sign-in.md names what is needed")
-        return safe_address(given) if info.field_name == "oidc_public_url" else given
-
-    @field_validator("oidc_roles", mode="before")
-    @classmethod
-    def _pairs(cls, given: object) -> object:
-        """Text as it stands in the environment: group=role, group=role."""
-        if not isinstance(given, str):
-            return given
-        parts = [part.strip().rpartition("=") for part in given.split(",") if part.strip()]
-        if odd := next((part for part in parts if not part[0].strip() or not part[2].strip()), None):
-            raise ValueError(f"{''.join(odd)} is no pair; give group=role, separated by commas")
-        return {group.strip(): role.strip() for group, _, role in parts}
-
-    def oidc_secret(self) -> str:
-        """The client's secret; empty where there is none. Raises SettingsError: its file cannot be read."""
-        if self.oidc_client_secret_file is None:
-            return self.oidc_client_secret.get_secret_value() if self.oidc_client_secret else ""
-        try:
-            return self.oidc_client_secret_file.read_text("utf-8").strip()
-        except (OSError, UnicodeDecodeError) as error:
-            raise SettingsError(
-                f"the file of the client's secret: {error}; give one that this user may read"
-            ) from error
 
     @property
     def exports_dir(self) -> Path:
@@ -230,22 +179,6 @@ def refusal(error: ValidationError, prefix: str) -> str:
     says = first["msg"].removeprefix("Value error, ")
     shown = re.sub(r"//[^/]*@", "//…@", repr(first["input"]))
     return f"{name}: {says}" if name.endswith(SECRET) else f"{name}: {says}, not {shown}"
-
-
-def safe_address(given: str, beside: str = "https:") -> str:
-    """An address to which secrets may go: over TLS, or on this machine; `beside` one of this machine only.
-
-    Raises ValueError: it is none.
-    """
-    parts, own = urlsplit(given), urlsplit(beside)
-    odd = "@" in parts.netloc or parts.fragment or re.search(r"[\s\\\\]", given) or not given.isprintable()
-    if parts.scheme not in ("http", "https") or not parts.hostname or odd:
-        raise ValueError("it is no address; give one like https://login.example.org")
-    here = loopback(parts.hostname) and (not own.hostname or loopback(own.hostname))
-    if parts.scheme == "http" and not here:
-        raise ValueError("people do not sign in in the clear; give an address that begins with https://")
-    _ = parts.port  # raises where it is none
-    return given
 
 
 def loopback(host: str) -> bool:

@@ -25,11 +25,11 @@ RIG_SIDE = "/v1/rig/"
 PIECE_S = 300.0
 ROUTERS = (routes.operation, routes.v1, rig_routes.router, pages.router)
 SHARED = (
-    "/sign-in", "/sign-in/provider", "/sign-in/callback", "/sign-out", "/locked", "/unlock", "/lock", "/rig/acted",
+    "/sign-in", "/sign-out", "/locked", "/unlock", "/lock", "/rig/acted",
     "/language", "/colours", "/static/{name}", "/docs", "/administration", "/administration/users",
-    "/administration/users/{name}/password", "/administration/users/{name}/provider",
+    "/administration/users/{name}/password",
     "/administration/users/{name}/remove", "/administration/keys", "/administration/tokens/{token_id}/revoke",
-    "/administration/audit.jsonl", "/v1/users", "/v1/users/{name}/password", "/v1/users/{name}/provider",
+    "/administration/audit.jsonl", "/v1/users", "/v1/users/{name}/password",
     "/v1/users/{name}", "/v1/sessions", "/v1/sessions/lock", "/v1/sessions/unlock", "/v1/sessions/current",
     "/v1/tokens", "/v1/tokens/{token_id}", "/v1/audit",
 )  # fmt: skip

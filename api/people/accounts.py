@@ -23,7 +23,7 @@ from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.audit import digest
-from stimrig.api.store.tables import Confirmation, Identity, KnownPlace, PageSession, Token, User
+from stimrig.api.store.tables import Confirmation, KnownPlace, Token, User
 
 CONFIRMED_S = 120.0
 """How long a password given once more is good for one approval."""
@@ -47,16 +47,12 @@ class People:
             taken = user_named(session, name)
             if taken is not None:
                 raise ApiError(409, "exists", "The name is taken", f"User {taken.name!r} exists. Take another name.")
-            return self.put(session, name, scopes, hashed, by)
-
-    def put(self, session: Session, name: str, scopes: list[Scope], hashed: str, by: str) -> User:
-        """The rows of a new person, in a transaction in which the name is free."""
-        token = self.auth.token_of_person(session, name, scopes)
-        row = User(name=name, folded_name=folded_name(name), password_hash=hashed, token_hash=token.hash)
-        row.created_utc = row.changed_utc = now = self.clock.utc()
-        session.add(row)
-        session.flush()
-        audit.write(session, now, by, "add user", name, scopes=token.scopes)
+            token = self.auth.token_of_person(session, name, scopes)
+            row = User(name=name, folded_name=folded_name(name), password_hash=hashed, token_hash=token.hash)
+            row.created_utc = row.changed_utc = now = self.clock.utc()
+            session.add(row)
+            session.flush()
+            audit.write(session, now, by, "add user", name, scopes=token.scopes)
         return row
 
     async def sign_in(self, name: str, password: str, address: str) -> str:
@@ -141,20 +137,6 @@ class People:
             raise unauthorized("The page stays locked. Enter it again.", "wrong-password", title)
         await asyncio.to_thread(self.auth.idle.unlock, held.hash, principal.name)
 
-    def signed_in_again(self, session_hash: str, token_hash: str, name: str) -> None:
-        """The person of a page session has just signed in at the provider once more: as good as the password.
-
-        Raises ApiError: 403 it was somebody else, or the session has ended.
-        """
-        row: PageSession | None = self.store.get(PageSession, session_hash)
-        if row is None or row.token_hash != token_hash or row.expires_unix_s <= self.clock.unix_s():
-            detail = "Another person signed in than the one whose page it is. Nothing was confirmed or unlocked."
-            raise ApiError(403, "another-person", "Another person", detail)
-        if self.auth.idle.locked(row):
-            self.auth.idle.unlock(session_hash, name)
-        else:
-            self._confirm(session_hash)
-
     def _confirm(self, session_hash: str) -> None:
         with self.store.write() as session:
             session.merge(Confirmation(session_hash=session_hash, at_unix_s=self.clock.unix_s()))
@@ -222,13 +204,12 @@ class People:
 
     def documents(self) -> list[dict[str, Any]]:
         """All users, without their hashes."""
-        found, subjects = [], {row.name: row.subject for row in self.store.all(Identity)}
+        found = []
         for row in self.store.all(User, order=User.name):
             token = self.store.get(Token, row.token_hash)
             found.append(
-                {"name": row.name, "scopes": token.scopes, "removed": token.revoked, "created_utc": row.created_utc,
-                 "subject": subjects.get(row.name)}
-            )  # fmt: skip
+                {"name": row.name, "scopes": token.scopes, "removed": token.revoked, "created_utc": row.created_utc}
+            )
         return found
 
     def close(self) -> None:

@@ -195,7 +195,7 @@ class Auth:
             maker.expires_utc is not None and not maker.expires_utc > self.clock.utc()
         ):  # fmt: skip
             return True
-        needed = {Scope.APPROVE_MODEL, *token.scopes}  # a provider's group may have taken one
+        needed = {Scope.APPROVE_MODEL, *token.scopes}
         return Scope.ADMINISTER not in maker.scopes and not needed <= set(maker.scopes)
 
     def sign_in(self, token_text: str, address: str) -> str:
@@ -205,7 +205,7 @@ class Auth:
             raise outside(who.participant)
         return self.open_session(digest(token_text), who.name)
 
-    def open_session(self, token_hash: str, name: str, **detail: str) -> str:
+    def open_session(self, token_hash: str, name: str) -> str:
         """Open a page session for the holder of a token; its cookie."""
         cookie, now = secrets.token_urlsafe(32), self.clock.unix_s()
         with self.store.write() as session:
@@ -218,7 +218,7 @@ class Auth:
                     expires_unix_s=now + self.session_s,
                 )
             )
-            audit.write(session, self.clock.utc(), name, "sign in", "page", **detail)
+            audit.write(session, self.clock.utc(), name, "sign in", "page")
         return cookie
 
     def token_of_person(self, session: Session, name: str, scopes: list[Scope]) -> Token:

@@ -96,7 +96,7 @@ class Guesses:
 
     def __init__(self, clock: Clock) -> None:
         self._own, self._sessions, self._tokens = Pace(clock), Pace(clock), Pace(clock)
-        self._pairs, self._places, self._callbacks = Pace(clock), Pace(clock), Pace(clock)
+        self._pairs, self._places = Pace(clock), Pace(clock)
         self._names = Pace(clock, FREE_FOR_A_NAME)
         self._proven: OrderedDict[tuple[str, str], None] = OrderedDict()
         self._lock = threading.Lock()
@@ -129,15 +129,6 @@ class Guesses:
     def unknown_token(self, place: str) -> None:
         """Count a token that is none. Raises ApiError: 429 with `Retry-After`."""
         self._admit((self._tokens, place))
-
-    def callback(self, place: str) -> None:
-        """Admit what a browser brings back from a provider, and count it. Raises ApiError: 429 with `Retry-After`."""
-        self._admit((self._callbacks, place))
-
-    def callback_was_right(self, place: str) -> None:
-        """The wrong ones before it still count."""
-        with self._lock:
-            self._callbacks.give_back(place)
 
     def chosen_token(self, token_hash: str, place: str) -> None:
         """A token that a person chose may be guessed: where guesses are held back, it opens only if it did before."""

@@ -25,7 +25,7 @@ About = ColumnElement[bool]
 """Which entries of the trail a decision rests on."""
 SETTINGS = ("create participant", "set profile", "set muscle", "archive", "unarchive", "finish calibration")
 DECISIONS = ("approve", "reject")
-ACCOUNTS = ("add user", "change password", "revoke token", "link sign-in", "change role")
+ACCOUNTS = ("add user", "change password", "revoke token")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
 RIGHTS = (*DECISIONS, "revoke token", "set muscle", "archive")
 """Entries with which a right ends that a controller plays by."""
@@ -101,9 +101,9 @@ def account(name: str) -> About:
 
 
 def revoked(*token_hashes: str | None) -> About:
-    """The end of a token's right or of a part of it, or of that of who made it."""
+    """The end of a token's right, or of that of who made it."""
     ids = [token_hash[:16] for token_hash in token_hashes if token_hash]
-    ends = AuditEntry.action.in_(("revoke token", "change role"))
+    ends = AuditEntry.action == "revoke token"
     return and_(ends, AuditEntry.detail["token"].as_string().in_(ids))
 
 

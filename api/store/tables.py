@@ -249,19 +249,6 @@ class User(Table):
     changed_utc: Mapped[str] = mapped_column(String)
 
 
-class Identity(Table):
-    """Whom a provider calls by this subject; nobody is found by a name or an address."""
-
-    __tablename__ = "identities"
-    issuer: Mapped[str] = mapped_column(String, primary_key=True)
-    subject: Mapped[str] = mapped_column(String, primary_key=True)
-    name: Mapped[str] = mapped_column(ForeignKey("users.name"), index=True)
-    by_group: Mapped[bool] = mapped_column(Boolean)
-    """Whether a group of the provider's made the account: then its groups say the role at each sign-in."""
-    linked_by: Mapped[str] = mapped_column(String)
-    linked_utc: Mapped[str] = mapped_column(String)
-
-
 class KnownPlace(Table):
     """Where a person has signed in from: guesses from elsewhere do not hold them back there."""
 

@@ -28,9 +28,7 @@ from stimrig.api.outbox.feed import Feed
 from stimrig.api.outbox.receipts import note_hourly
 from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock, Principal, Scope
-from stimrig.api.people.identities import Identities
 from stimrig.api.people.pace import Guesses
-from stimrig.api.people.provider import Provider
 from stimrig.api.sessions.lifecycle import Follower
 from stimrig.api.sessions.notes import Notes
 from stimrig.api.sessions.questions import Questions
@@ -71,10 +69,6 @@ class Parts:
             settings.admin_token.get_secret_value() if settings.admin_token else None
         )
         self.people = People(store, clock, self.auth, guesses)
-        self.provider = self.identities = None
-        if settings.oidc_issuer is not None:
-            self.provider = Provider(settings, clock, shared_secret(store, "provider"))
-            self.identities = Identities(self.people, clock, settings.oidc_issuer, settings.oidc_roles)
         self.versions = Versions(store, clock)
         self._tasks: list[asyncio.Task[None]] = []
 

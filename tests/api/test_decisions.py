@@ -217,11 +217,10 @@ CASES = {
         lambda world: world.colleague.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}),
         {"angle_rad": 1.5}, {"angle_deg": "80"}, sensor, "/rig/angle"),
     "password": ACCOUNT,
-    "provider": Case(ACCOUNT.change, {"subject": "one"}, {"subject": "another"}, user, "/administration"),
     "stimuli": Case(less_torque, {}, {"elements": "1"}, searching, "/participants/{code}/electrodes"),
     "choice": Case(less_torque, {"elements": [1]}, {"elements": "1"}, searching, "/participants/{code}/electrodes"),
 }  # fmt: skip
-shared = shared_service(oidc_issuer="http://127.0.0.1:9", oidc_public_url="http://127.0.0.1:9", oidc_client_id="rig")
+shared = shared_service()
 
 
 @pytest.fixture

@@ -28,8 +28,6 @@ GET    /rig/now                                            anybody        200
 GET    /stopped/x                                          anybody        404
 GET    /sign-in                                            anybody        200
 POST   /sign-in                                            anybody        401
-GET    /sign-in/provider                                   anybody        404
-GET    /sign-in/callback                                   anybody        404
 POST   /language                                           anybody        4xx
 POST   /colours                                            anybody        4xx
 POST   /v1/sessions                                        anybody        401
@@ -175,13 +173,11 @@ GET    /v1/audit                                           administer     200
 POST   /v1/users                                           administer     422
 GET    /v1/users                                           administer     200
 PUT    /v1/users/x/password                                administer     428
-PUT    /v1/users/x/provider                                administer     428
 DELETE /v1/users/x                                         administer     404
 POST   /v1/controller-keys                                 administer     422
 GET    /administration                                     administer     200
 POST   /administration/users                               administer     422
 POST   /administration/users/x/password                    administer     428
-POST   /administration/users/x/provider                    administer     428
 POST   /administration/users/x/remove                      administer     404
 POST   /administration/keys                                administer     422
 POST   /administration/tokens/x/revoke                     administer     404

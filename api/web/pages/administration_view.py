@@ -82,14 +82,6 @@ async def set_password(context: Ctx, who: Administrator, name: str, password: Te
     return await people.renew_password(context, who, name, body.password, back())
 
 
-@router.post("/users/{name}/provider")
-async def link_provider(context: Ctx, who: Administrator, name: str, subject: Text = "") -> Response:
-    """Who of the provider's this person is; empty: nobody."""
-    body = typed.checked(people.SubjectIn, subject=subject.strip() or None)
-    await asyncio.to_thread(people.link_provider, context, who, name, body)
-    return back()
-
-
 @router.post("/users/{name}/remove")
 async def remove(context: Ctx, who: Administrator, name: str) -> Response:
     """Nobody signs in under this name any more."""

@@ -77,8 +77,6 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     bar = {**face.bar(request, looking, principal), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
     shown["signed"] = signed(principal)
-    provider = request.app.state.context.provider
-    shown["provider"] = provider and provider.name
     kept = request.cookies.get(COLOURS, "")
     shown["colours"] = kept if kept in MEDIA else "system"
     html = face.environment.get_template(template).render(request=request, **shown, **values)

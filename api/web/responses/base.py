@@ -100,7 +100,6 @@ class Problem(Document):
     have_bytes: int | None = Field(None, description="409 `other-offset`: what a centre has of the file; go on there")
     seq: int | None = Field(None, description="409 `out-of-order`: the last item that a centre has; go on after it")
     hash: str | None = Field(None, description="409 `out-of-order`: its hash")
-    subject: str | None = Field(None, description="403 `no-role`: what the provider calls the person by")
     evidence: StopEvidence | None = Field(None, description="503 `stop-not-confirmed`: what is known of the stop")
 
 

@@ -25,7 +25,6 @@ class ListedUser(UserOut):
     """A person in the list of all."""
 
     removed: bool = Field(description="signs in no more")
-    subject: str | None = Field(None, description="what the provider that signs them in calls them by")
 
 
 class SessionOut(Document):

@@ -65,12 +65,6 @@ class PasswordIn(_Body):
     password: Password
 
 
-class SubjectIn(_Body):
-    """What a provider calls a person by (`sub`); null: nobody."""
-
-    subject: Annotated[str, StringConstraints(min_length=1, max_length=255, pattern=r"^[ -~]+$")] | None
-
-
 class ConfirmIn(_Body):
     """The password, once more."""
 
@@ -110,17 +104,6 @@ async def renew_password(context: Context, who: Principal, name: str, password: 
     if cookie is not None:
         set_cookie(context, answer, cookie)
     return answer
-
-
-@router.put("/users/{name}/provider", status_code=204)
-def link_provider(context: Ctx, who: Administrator, name: str, body: SubjectIn) -> None:
-    """Whom the provider calls by this subject signs in as this person; `null`: nobody does. The sessions end."""
-    if context.identities is None:
-        raise ApiError(409, "no-provider", "No provider is configured", "Set STIMRIG_OIDC_ISSUER first.")
-    if body.subject is None:
-        context.identities.unlink(name, who.name)
-    else:
-        context.identities.link(name, body.subject, who.name)
 
 
 @router.delete("/users/{name}", status_code=204)

@@ -27,8 +27,8 @@ SHARED = """
 /lock /rig/acted /v1/sessions/lock /v1/sessions/unlock /v1/sessions/current /v1/users /v1/users/x/password
 /v1/users/x /v1/tokens /v1/tokens/x /v1/audit /administration /administration/users
 /administration/users/x/password /administration/users/x/remove /administration/keys
-/administration/tokens/x/revoke /administration/audit.jsonl /sign-in/provider /sign-in/callback
-/v1/users/x/provider /administration/users/x/provider
+/administration/tokens/x/revoke /administration/audit.jsonl
+
 """
 """What a centre answers as a rig's service does: who may, stands in tests/api/test_scopes.py."""
 TABLE = """
