@@ -1,4 +1,4 @@
-"""`python -m bench [NAME …] [OPTIONS]`: goals, table1, drawings, rivals, diagnosis; all of them without a name.
+"""`python -m bench [NAME …] [OPTIONS]`: table1, rivals, diagnosis; all of them without a name.
 
 Options are those of `rivals` or `diagnosis`.
 """
@@ -14,7 +14,7 @@ for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
 os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-NAMES = ("goals", "table1", "drawings", "rivals", "diagnosis")
+NAMES = ("table1", "rivals", "diagnosis")
 OPTIONS = {"diagnosis": [], "rivals": ["--write"]}
 
 

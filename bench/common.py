@@ -102,26 +102,6 @@ def services(*emulator: str) -> Iterator[Any]:
             yield running, client
 
 
-def http_client(url: str, timeout_s: float = 180) -> Any:
-    """The administrator's, of HTTP alone."""
-    import httpx
-
-    from stimrig.api.client.connection import SendsVersions
-
-    return httpx.Client(base_url=url, auth=SendsVersions({"Authorization": f"Bearer {TOKEN}"}), timeout=timeout_s)
-
-
-def sign_in(page: Any, url: str, password: str) -> None:
-    """As the clinician Ada, who is made for it."""
-    with http_client(url) as http:
-        http.post("/v1/users", json={"name": "Ada", "password": password}).raise_for_status()
-    page.goto(f"{url}/sign-in")
-    page.get_by_label("Name", exact=True).fill("Ada")
-    page.get_by_label("Password").fill(password)
-    page.get_by_role("button", name="Sign in", exact=True).click()
-    page.wait_for_url(f"{url}/")
-
-
 @contextmanager
 def emulated_rig(*emulator: str, busy: int = 0, speed: float = 1.0) -> Iterator[tuple[Any, Any]]:
     """An emulator with a rig on it, and its client; so many busy processes beside."""

@@ -1,10 +1,11 @@
-"""Following a muscle that changes from trial to trial: ours and peers, on simulated sessions without waiting.
+"""Following a muscle that changes from trial to trial, on simulated sessions without waiting.
 
-    python -m bench.tracking [--seeds 94000:94020] [--cases fatigue …] [--who tracking …] [--json FILE]
+    python -m bench.tracking [--seeds 94000:94020] [--cases fatigue …] [--json FILE]
 
 For each muscle, drawn by its seed, and each case of `CASES`: the paper's test, a model fitted on it, a minute of rest,
-then ten trials of `examples/ilc_controller.py` with 15 s of rest between them, each time from the same state of the
-muscle and with the same noise. Told is the error of a trial, rms of reference minus torque, % of the reference's rms.
+then ten trials of `examples/ilc_controller.py` with 15 s of rest between them, with tracking and without, each time
+from the same state of the muscle and with the same noise. Printed is the error of a trial, rms of reference minus
+torque, % of the reference's rms.
 """
 
 from __future__ import annotations
@@ -21,13 +22,13 @@ import numpy as np
 
 from bench.adaptive import paper_test
 from bench.common import keep_lines, parser, table
-from bench.tracking_rivals import FOLLOWERS, OURS, UNTRACKED, Follower
 from examples import ilc_controller as ilc
 from stimrig import identify
 from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.offline import simulate
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
+from stimrig.identify.tracking import QUANTITIES, follow, model_for_next
 
 RATE_HZ, NOISE_NM, CURRENT_MA, LARGEST_US = 400.0, 0.05, 20.0, 300.0
 TRIALS, REST_S, APPROVAL_S = 10, 15.0, 60.0
@@ -35,6 +36,7 @@ PER = round(RATE_HZ / ilc.PULSE_RATE_HZ)
 FIRST_TRIAL = 2
 """The pre-session test is a muscle's first contraction."""
 NOTHING = "nothing changes"
+TRACKED, UNTRACKED = "tracking", "no tracking"
 DISTURBED_TRIAL = 5
 PEAK_SHARE = 0.4
 """The reference's peak, of the largest torque: a muscle that has lost 40 % of it can still reach it."""
@@ -95,10 +97,10 @@ class Person:
 
 
 class Simulated:
-    """What `ilc.learn` asks of the service."""
+    """What `ilc.learn` asks of the service; it follows `model` from trial to trial."""
 
-    def __init__(self, person: Person, follower: Follower | None) -> None:
-        self.person, self.follower = person, follower
+    def __init__(self, person: Person, model: Model) -> None:
+        self.person, self.model, self.state = person, model, None
         self.record: Record | None = None
         self.served: list[dict[str, Any]] = []
         self.seconds: list[float] = []
@@ -116,39 +118,37 @@ class Simulated:
         return torque[before : before + widths_us.size].mean(axis=1) - baseline_nm, widths_us
 
     def fetch_followed(self) -> dict[str, Any]:
-        """What the follower makes of the trial just played."""
-        assert self.follower is not None and self.record is not None
+        """The model after the trial just played, as the service makes it from the recording."""
+        assert self.record is not None
         began = time.perf_counter()
-        document = self.follower.learn(self.record)
+        step = follow(self.model, self.state, self.record)
+        self.state = step.coming
+        served = step.to_dict() | {"moved": list(QUANTITIES)}
+        document = model_for_next(self.model, step).to_dict() | {"tracking": served}
         self.seconds.append(time.perf_counter() - began)
-        self.served.append(document.get("tracking", {}))
+        self.served.append(served)
         return document
 
 
-def one(seed: int, case: str, who: list[str], trials: int = TRIALS) -> list[dict[str, Any]]:
-    """Each follower's session with this muscle."""
+def one(seed: int, case: str) -> list[dict[str, Any]]:
+    """The sessions with and without tracking with this muscle."""
     person = Person(seed, case)
     test = person.play(*paper_test(LARGEST_US, held_out=True))
     person.now_s += APPROVAL_S
     model = identify.fit(test)
     document = model.to_dict()
     reference = ilc.Reference.reach(PEAK_SHARE * float(document["recruitment"]["inverse"]["torque_nm"][-1]))
-    return [{"seed": seed, "case": case} | session(copy.deepcopy(person), model, test, reference, name, trials)
-            for name in who]  # fmt: skip
+    return [{"seed": seed, "case": case} | session(copy.deepcopy(person), model, reference, tracked)
+            for tracked in (True, False)]  # fmt: skip
 
 
-def session(
-    person: Person, model: Model, test: Record, reference: ilc.Reference, name: str, trials: int
-) -> dict[str, Any]:
-    """Ten trials with one follower."""
-    make = FOLLOWERS[name]
-    service: Any = Simulated(person, make(model, test) if make else None)
+def session(person: Person, model: Model, reference: ilc.Reference, tracked: bool) -> dict[str, Any]:
+    """Ten trials."""
+    service: Any = Simulated(person, model)
     with contextlib.redirect_stderr(io.StringIO()):
-        done = ilc.learn(
-            service, model.to_dict(), reference, "norm-optimal", trials, tracked=service.follower is not None
-        )
+        done = ilc.learn(service, model.to_dict(), reference, "norm-optimal", TRIALS, tracked=tracked)
     return {
-        "who": name,
+        "who": TRACKED if tracked else UNTRACKED,
         "errors": [trial.error_percent for trial in done],
         "gains": service.gains,
         "seconds": service.seconds,
@@ -175,7 +175,7 @@ def moves(served: list[dict[str, Any]]) -> list[list[float]]:
 
 
 def tables(rows: list[dict[str, Any]]) -> list[str]:
-    """Errors of the tenth trial, and their ratio to that of the same muscle and follower when nothing changes."""
+    """Errors of the tenth trial, and their ratio to that of the same muscle when nothing changes."""
     names = list(dict.fromkeys(row["who"] for row in rows))
     last = {(row["seed"], row["case"], row["who"]): float(row["errors"][-1]) for row in rows}
     muscles = {name: len({key[0] for key in last if key[2] == name}) for name in names}
@@ -212,7 +212,7 @@ def moved_lines(rows: list[dict[str, Any]]) -> list[str]:
     """How often a trial moved what is served by more than its band."""
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
-        found = [row["moves"] for row in rows if row["case"] == case and row["who"] == OURS and row["moves"]]
+        found = [row["moves"] for row in rows if row["case"] == case and row["who"] == TRACKED and row["moves"]]
         if found:
             moved = np.concatenate(found)
             beyond = np.mean(np.any(moved > 1.0, axis=1))
@@ -227,12 +227,11 @@ def main() -> None:
     """Print the tables."""
     made = parser(__doc__, "94000:94020")
     made.add_argument("--cases", nargs="*", default=list(CASES))
-    made.add_argument("--who", nargs="*", default=list(FOLLOWERS), help=f"e.g. '{UNTRACKED}'")
     options = made.parse_args()
     rows: list[dict[str, Any]] = []
     for seed in options.seeds:
         for case in options.cases:
-            rows += one(seed, case, options.who)
+            rows += one(seed, case)
         print(f"seed {seed}", file=sys.stderr, flush=True)
         keep_lines(options.json, rows)
     print(*tables(rows), "", *seconds_of(rows), "", *moved_lines(rows), sep="\n")

@@ -17,10 +17,10 @@ def test_each_fault_has_one_place_and_is_imported_there(tmp_path: Path) -> None:
     faults = read_faults()
     assert len(faults) > 30
     for fault in faults:
-        there = places(fault, old=False)
+        there = places(fault)
         kept = {at: (tmp_path / at).read_text("utf-8") for at, _, _ in there}
         for at, find, put in there:
-            plant(tmp_path, at, find, put, old=False)
+            plant(tmp_path, at, find, put)
         for at, text in kept.items():
             assert (tmp_path / "stimrig" / at).read_text("utf-8") != text, fault["name"]
             (tmp_path / at).write_text(text, "utf-8")

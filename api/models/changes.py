@@ -2,7 +2,7 @@
 
 The standard deviations of both models say what the noise of the two records does. On emulated muscles that had not
 changed they are right for most figures and too small for some (a curve's bend between two knots, an effect that no
-model holds). So a floor is added to them: `python -m bench.trend`, docs/results/trend.md.
+model holds). So a floor is added to them; docs/results/trend.md says how it was measured.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from pathlib import Path
 PACKAGE = Path(__file__).absolute().parents[2]
 """`stimrig`; in a checkout its packages are links to the folders beside it."""
 MEMORY_BYTES = 2 * 2**30
-"""Three times what the largest record takes (`bench/hostile_files.py` prints what was taken)."""
+"""Three times what the largest record takes."""
 FILE_BYTES = 512 * 2**20
 OPEN_FILES = 256
 SYSTEM = (

@@ -187,7 +187,7 @@ def test_a_recording_in_a_folder_not_known_yet_is_read_by_a_fresh_worker(tmp_pat
 
 
 def test_hostile_files_through_a_worker() -> None:
-    """A few of each kind that libhdf5 or the memory could die of; `python -m bench.hostile_files` tries all."""
+    """A few of each kind that libhdf5 or the memory could die of."""
     picked = (
         "gzip bomb",
         "virtual over raw storage",

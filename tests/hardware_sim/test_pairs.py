@@ -93,7 +93,7 @@ PAIRS = [
     ("rehastim2", "canopen", "socketcand"),
     ("p24", "with_angle", "socketcand"),
 ]
-"""Each device and each transport, in several; `python -m bench.rig_pairs` plays all pairs."""
+"""Each device and each transport, in several; a campaign of `tests/wire/test_pairs.py` plays all pairs."""
 
 
 @pytest.mark.parametrize(("stimulator", "cell", "transport"), PAIRS)

@@ -1,4 +1,4 @@
-"""What every pair of devices must do, whatever its protocol: one suite for tests (some pairs) and bench (all)."""
+"""What every pair of devices must do, whatever its protocol: one suite for one pair and for all of them."""
 
 from __future__ import annotations
 

@@ -20,7 +20,7 @@ def copy_tree(source: Path, tree: Path) -> None:
     shutil.copytree(source, tree, symlinks=True, ignore=shutil.ignore_patterns(*LEFT_BEHIND))
 
 
-def plant(tree: Path, at: str, find: str, put: str, old: bool) -> None:
+def plant(tree: Path, at: str, find: str, put: str) -> None:
     """Change one place of a tree. Raises ValueError if it is not there, or not once."""
     path = tree / at
     lines = path.read_text("utf-8").splitlines()
@@ -35,7 +35,7 @@ def plant(tree: Path, at: str, find: str, put: str, old: bool) -> None:
     first, last = starts[0], starts[0] + len(wanted) - 1
     indent = lines[first][: len(lines[first]) - len(lines[first].lstrip())]
     tail = _bare(lines[last]).removeprefix(wanted[-1])
-    words = (put.replace("await ", "") if old else put).splitlines()
+    words = put.splitlines()
     words[-1] += tail if words[-1].endswith("(") else ""
     lines[first : last + 1] = [indent + line for line in words]
     path.write_text("\n".join(lines) + "\n", "utf-8")
@@ -45,10 +45,8 @@ def _bare(line: str) -> str:
     return line.strip().replace("await ", "")
 
 
-def places(fault: dict[str, Any], old: bool) -> list[tuple[str, str, str]]:
+def places(fault: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Where a fault is planted: file, what stands there, what is put there."""
-    if old and "old" in fault:
-        return [tuple(place) for place in fault["old"]]
     here = [(fault["at"], fault["find"], fault["put"])]
     here += [(fault["at"], find, put) for find, put in fault.get("also", [])]
     return here + [tuple(place) for place in fault.get("more", [])]

@@ -191,7 +191,7 @@ def test_an_effect_that_is_asked_for_is_fitted_to_its_end() -> None:
     """From a delay of 20 ms, of which the record has 3, a search was given up: the fit fell by 5 points."""
     rng = np.random.default_rng(720149)
     patient = Patient.draw(rng)
-    rng.choice(5), rng.choice(3)  # as `python -m bench goals` draws rate and noise, in whose records it was seen
+    rng.choice(5), rng.choice(3)  # rate and noise, as they were drawn where this was seen
     baseline_nm = float(rng.uniform(-1, 1))
     record, _ = make_record(patient, rng, noise_nm=0.1, baseline_nm=baseline_nm, pulses=paper.protocol())
     plain = identify.fit(record)

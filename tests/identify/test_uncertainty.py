@@ -20,7 +20,7 @@ from tests.harness.patients import Patient, make_record
 pytestmark = pytest.mark.slow
 
 RECORDS = 60
-"""Enough to see a band that is off by a tenth; `python -m bench goals` counts 300."""
+"""Enough to see a band that is off by a tenth."""
 
 
 @cache

@@ -1,21 +1,41 @@
-"""The same behaviour on every kind of device: one pair here, all of them in `python -m bench.rig_pairs`."""
+"""The same behaviour on every kind of device: one pair in each run, all of them in a campaign."""
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable
 
 import pytest
 
-from tests.harness.device_pairs import HOLD, check_all, options
+from tests.harness.device_pairs import CELLS, HOLD, STIMULATORS, TRANSPORTS, check_all, options
 from tests.harness.processes import Bench, kill_hard, short_plan
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
+
+MOST = {
+    "align_ms": 1.0,
+    "ack_ms": 10.0,
+    "stop_ms": 100.0,
+    "fault_ms": 250.0,
+    "silence_ms": 30.0,
+    "dropped_percent": 10.0,
+}
+"""Bounds of the figures of a pair, on a machine that does nothing else."""
 
 
 def test_a_pair_behaves(make_bench: Callable[..., Bench]):
     # at the speed of the world: a backlog of text frames is read hardly faster than twice that
     check_all(make_bench(*options("rehastim2", "canopen", "slcan")))
+
+
+@pytest.mark.realtime
+@pytest.mark.campaign
+@pytest.mark.parametrize("pair", list(itertools.product(STIMULATORS, CELLS, TRANSPORTS)), ids=" ".join)
+def test_every_pair_behaves(make_bench: Callable[..., Bench], pair: tuple[str, str, str]):
+    figures = check_all(make_bench(*options(*pair), speed=1.0))
+    over = {name: figures[name] for name, most in MOST.items() if not figures[name] <= most}
+    assert not over
 
 
 def test_a_rehastim2_is_kept_alive_through_a_rest_and_lets_go_of_a_dead_host(make_bench: Callable[..., Bench]):

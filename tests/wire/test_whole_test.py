@@ -41,7 +41,7 @@ def check_recording(bench: Bench, event: dict[str, Any]) -> None:
         sent = file["pulses/sent_pulse_width_us"][:]
         acknowledged = status == 0
         assert np.array_equal(status == 1, planned < 10)
-        # a busy machine drops late ones, tells how many, and does nothing else; `bench.rig_pairs` judges how many
+        # a busy machine drops late ones, tells how many, and does nothing else
         assert set(status) <= {PulseStatus.ACKNOWLEDGED, PulseStatus.REST, PulseStatus.DROPPED}
         assert np.sum(status == PulseStatus.DROPPED) == event["summary"]["dropped_pulses"]
         assert np.sum(acknowledged) >= 20
