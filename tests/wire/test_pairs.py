@@ -29,7 +29,6 @@ def test_a_pair_behaves(make_bench: Callable[..., Bench]):
     check_all(make_bench(*options("rehastim2", "canopen", "slcan")))
 
 
-@pytest.mark.realtime
 @pytest.mark.campaign
 @pytest.mark.parametrize("pair", list(itertools.product(STIMULATORS, CELLS, TRANSPORTS)), ids=" ".join)
 def test_every_pair_behaves(make_bench: Callable[..., Bench], pair: tuple[str, str, str]):
