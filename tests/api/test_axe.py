@@ -125,7 +125,7 @@ def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
         examined(stranger, "a new key")
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
+@pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.campaign)])
 def test_a_test_and_its_ends(browser: Any, service: Service, scheme: str) -> None:
     service.rig.speed = 0.7
     for page in open_tab(browser, service, color_scheme=scheme):
@@ -187,27 +187,6 @@ def test_trials_of_a_controller(tab: Any, service: Service, client: httpx.Client
     wait_done(client, trial["id"])
     assert client.get("/v1/participants/X7/model?tracked=true").json()["tracking"]["ask"]
     visit(tab, service, "/participants/X7", tab.get_by_text("All trials as a table").click)
-
-
-def test_in_the_dark(browser: Any, service: Service, client: httpx.Client) -> None:
-    """The main pages and their notices, where the system is dark; a test's states are above."""
-    done = play_test(client, "X5")
-    model = f"/models/{done['model_id']}"
-
-    def opened() -> None:
-        page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-        chart(page, "comparison")
-
-    for page in open_tab(browser, service, color_scheme="dark"):
-        for path, ready in (("/", None), ("/participants/X5", None), (model, opened), (f"/tests/{done['id']}", None)):
-            visit(page, service, path, ready)
-        assert page.evaluate("getComputedStyle(document.body).backgroundColor") == "rgb(17, 22, 27)"
-        page.goto(service.url + "/participants/X5/calibration")
-        page.get_by_role("button", name="Begin the calibration").click()
-        page.get_by_role("button", name="Discard").wait_for()
-        examined(page, "calibration")
-        page.get_by_role("button", name="Discard").click()
-        page.wait_for_url("**/participants/X5")
 
 
 def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:

@@ -77,41 +77,6 @@ def test_switching_colours_recolours_what_is_drawn_and_keeps_the_page(tab: Any, 
     assert tab.locator(".bar").get_by_role("button", name="Dark").get_attribute("aria-pressed") == "true"
 
 
-RANGE = "() => document.querySelector('[data-figure=comparison] .plot').layout.xaxis.range.map((s) => +s.toFixed(3))"
-
-
-def test_other_colours_keep_the_view(tab: Any, service: Service, model: str) -> None:
-    tab.set_viewport_size(LAPTOP)
-    drawn(tab, service, model)
-    chart = tab.locator("[data-figure=comparison]")
-    chart.scroll_into_view_if_needed()
-    plane, whole = chart.locator(".nsewdrag").first, tab.evaluate(RANGE)
-    box = plane.bounding_box()
-    tab.mouse.move(box["x"] + 100, box["y"] + 20)
-    tab.mouse.down()
-    tab.mouse.move(box["x"] + 300, box["y"] + 25, steps=5)
-    tab.mouse.up()
-    near = tab.evaluate(RANGE)
-    assert near != whole
-    for view in (near, whole):
-        for words in ("Light", "Dark"):
-            tab.locator(".bar").get_by_role("button", name=words).click()
-            assert tab.evaluate(RANGE) == view
-        chart.locator(".modebar-btn[data-title='Show all again']").click()
-        assert tab.evaluate(RANGE) == whole
-
-
-def test_as_the_system_follows_the_system_at_once(browser: Any, service: Service, model: str) -> None:
-    for page in open_tab(browser, service, color_scheme="dark"):
-        drawn(page, service, model)
-        dark = page.evaluate(LINE)
-        page.emulate_media(color_scheme="light")
-        page.wait_for_function(f"() => ({LINE})() !== '{dark}'")
-        assert page.evaluate(LINE) == page.evaluate(NAMED, "model")
-        page.emulate_media(color_scheme="dark")
-        page.wait_for_function(f"() => ({LINE})() === '{dark}'")
-
-
 def test_without_scripts_the_switch_is_a_form(browser: Any, service: Service) -> None:
     for page in open_tab(browser, service, signed_in=False, java_script_enabled=False):
         page.goto(service.url + "/sign-in")
@@ -256,20 +221,6 @@ def test_stills_follow_the_colours_and_fit_their_boxes(tab: Any, service: Servic
         assert tab.evaluate(line) == tab.evaluate(NAMED, "measured")
     tab.set_viewport_size({"width": 390, "height": 844})
     tab.wait_for_function(f"() => ({wide})() < 390")
-
-
-def test_a_chart_that_does_not_come_can_be_asked_for_again(tab: Any, service: Service, model: str) -> None:
-    tab.goto(f"{service.url}/models/{model}?diagnose=0")
-    tab.route("**/figures/step.html*", lambda route: route.abort())
-    tab.locator("#curves > summary").click()
-    tab.locator("[data-figure=step]").scroll_into_view_if_needed()
-    again = tab.get_by_role("button", name="The chart could not be loaded.")
-    again.wait_for()
-    tab.unroute("**/figures/step.html*")
-    again.click()
-    chart(tab, "step")
-    assert again.count() == 0
-    tab.errors.clear()  # the browser's own words on the request that was broken off
 
 
 def test_without_scripts_stills_are_pictures(browser: Any, service: Service, model: str) -> None:

@@ -129,7 +129,7 @@ def test_rig_file_that_does_not_hold_is_one_line(
     path.write_text(RIG_FILE.format(device=device, port="/dev/ttyUSB77", signal=signal_name))
     for verb in verbs:
         command = [sys.executable, "-m", "stimrig", verb, "--rig", str(path), "--data", str(tmp_path)]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        done = subprocess.run(command, capture_output=True, text=True, timeout=300)
         assert done.returncode == 2, done
         assert done.stderr.count("\n") == 1 and "Traceback" not in done.stderr
         assert all(word in done.stderr for word in named)

@@ -96,7 +96,7 @@ def test_the_tightest_torque_limit_is_the_one_shown() -> None:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize(("key", "focus"), [("Escape", "#tone"), (" ", ""), (" ", "#stop"), (" ", "#tone")])
+@pytest.mark.parametrize(("key", "focus"), [("Escape", "#tone"), (" ", "")])
 def test_esc_and_space_stop_once_wherever_the_focus_is(running: Any, service: Service, key: str, focus: str) -> None:
     if focus:
         running.locator(focus).focus()
@@ -118,20 +118,6 @@ def test_a_space_in_a_note_is_a_space_and_esc_stops_there_too(running: Any, serv
     assert running.locator("#remark").input_value() == "arm moved " and service.rig.state == "running"
     running.keyboard.press("Escape")
     running.get_by_text("The rig confirms that stimulation is off.").wait_for()
-
-
-@pytest.mark.browser
-def test_the_tone_is_off_until_it_is_wished_and_kept(running: Any) -> None:
-    assert not running.locator("#tone").is_checked()
-    running.locator("#tone").click()
-    running.reload()
-    expected(running.locator("#mute")).to_be_visible()
-    assert running.locator("#tone").is_checked()
-    running.mouse.click(5, 400)
-    running.locator("#mute").wait_for(state="hidden")
-    running.locator("#tone").click()
-    running.reload()
-    assert not running.locator("#tone").is_checked()
 
 
 @pytest.mark.browser

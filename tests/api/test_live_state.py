@@ -86,13 +86,6 @@ def test_back_to_a_page_that_was_loaded_before_the_start_shows_what_flows(tab: A
     says(tab, "Stimulating")
 
 
-def test_a_page_that_the_browser_had_kept_is_loaded_anew(tab: Any, service: Service) -> None:
-    says(tab, "ready")
-    with tab.expect_navigation():
-        tab.evaluate("dispatchEvent(new PageTransitionEvent('pageshow', {persisted: true}))")
-    says(tab, "ready")
-
-
 def without_answers(tab: Any, service: Service) -> None:
     """A page that has shown the rig's state, on a clock of its own, and hears no more of it."""
     tab.clock.install()
@@ -219,50 +212,6 @@ def test_the_page_that_refuses_a_re_arm_is_read_first(tab: Any, service: Service
     soon(lambda: service.rig.state == "ready")
 
 
-def test_a_third_stop_on_the_page_that_refuses_is_read_first_too(tab: Any, service: Service) -> None:
-    button = tab.locator("#rig-notice [name=latch] ~ button")
-    for stop in ("one", "two"):
-        if stop == "two":
-            tab.route("**/rig/*", lambda route: route.abort())
-        service.rig_thread.become("latched", stop)
-        soon(lambda: service.context.rig.status.latch == service.rig.latch)
-        if stop == "one":
-            button.wait_for()
-    button.click()
-    tab.get_by_text("This was changed since you saw it").wait_for()
-    tab.wait_for_load_state("load")  # its scripts have begun
-    expected(button).to_be_enabled()
-    tab.unroute("**/rig/*")
-    for stop, moves in (("three", False), ("four", True)):
-        button.focus()
-        service.rig_thread.become("latched", stop)
-        expected(tab.locator("#rig-notice [name=latch]")).to_have_value(service.rig.latch)
-        if moves:
-            tab.locator("#stop").focus()
-        expected(button).to_be_enabled()
-        expected(tab.locator("#stop") if moves else button).to_be_focused()
-    service.rig_thread.become("ready")
-
-
-def test_the_page_that_refuses_a_re_arm_is_read_first_also_without_its_style(tab: Any, service: Service) -> None:
-    tab.add_init_script(
-        "{ const wait = setTimeout; window.setTimeout = (call, ms) => wait(call, ms > 999 ? 1e8 : ms); }"
-    )
-    tab.goto(service.url + "/participants/E1")
-    service.rig_thread.become("latched", "one")
-    tab.get_by_role("button", name="I have checked: re-arm").wait_for()
-    tab.route("**/rig/*", lambda route: route.abort())
-    tab.route("**/page.css*", lambda route: route.abort())
-    service.rig_thread.become("latched", "two")
-    soon(lambda: service.context.rig.status.latch == service.rig.latch)
-    tab.get_by_role("button", name="I have checked: re-arm").click()
-    tab.get_by_text("This was changed since you saw it").wait_for()
-    tab.wait_for_load_state("load")
-    for number in (0, 1):
-        expected(tab.locator("form:has([name=latch]) button").nth(number)).to_be_disabled()
-    service.rig_thread.become("ready")
-
-
 def test_without_scripts_the_state_carries_its_time(browser: Any, service: Service) -> None:
     for page in open_tab(browser, service, java_script_enabled=False):
         assert re.search(r"No stimulation\s+ready\s+at \d\d:\d\d:\d\d", page.locator("#rig-state").inner_text())
@@ -276,10 +225,3 @@ def test_who_is_not_signed_in_learns_the_state_and_no_participant(service: Servi
         assert "E1" not in seen.text and seen.headers["cache-control"] == "no-store"
         assert http.get("/rig/now").json()["test"]["participant"] == "E1"
     bring_to_rest(service)
-
-
-def test_browsers_of_before_2022_ask_for_the_state_too(tab: Any, service: Service) -> None:
-    tab.add_init_script("delete AbortSignal.timeout")
-    with tab.expect_response("**/rig/now") as answer:
-        tab.goto(f"{service.url}/")
-    assert answer.value.ok

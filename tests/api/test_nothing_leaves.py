@@ -99,6 +99,7 @@ def saved_here(page: Any, figures: int) -> None:
     assert all(Path(found.path()).read_bytes().startswith(PNG) for found in page.downloads)
 
 
+@pytest.mark.campaign
 def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service) -> None:
     with service.client() as http:
         model = play_test(http, "N1")["model_id"]

@@ -144,6 +144,7 @@ class Started:
         return left
 
 
+@pytest.mark.campaign
 def test_nothing_is_left_whenever_it_is_told_to_end(tmp_path: Path) -> None:
     began_s = time.monotonic()
     served = Started(tmp_path, "measured")

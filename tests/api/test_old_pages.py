@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-from stimrig.api.web.pages import static
 from tests.api.browser import PASSWORD, expected, open_tab, participant, start
 from tests.api.conftest import Service, play_test, shared_service, soon
 from tests.api.test_axe import examined
@@ -97,33 +95,6 @@ def test_a_stop_gets_through_where_only_the_state_is_not_heard_of(tab: Any, serv
     service.rig.speed = 30.0
 
 
-def test_a_stop_without_an_answer_says_so_in_time_and_can_be_pressed_again(paced: Any, service: Service) -> None:
-    paced.goto(service.url + "/participants/O2")
-    heard_of(paced)
-    held: list[Any] = []
-    paced.route("**/v1/stop", lambda route: held.append(route))  # and no answer ever
-    paced.route("**/rig/now", lambda route: route.abort())
-    paced.clock.fast_forward(3_000)
-    expected(doubt(paced)).to_contain_text("has not answered")
-    stop = paced.get_by_role("button", name="Stop stimulation")
-    for press in (1, 2):
-        stop.click()
-        expected(doubt(paced)).to_contain_text("Stop is being sent")
-        while len(held) < press:
-            paced.wait_for_timeout(20)
-        if press == 2:  # who presses on does not wait longer
-            paced.clock.fast_forward(4_000)
-            stop.click()
-            paced.clock.fast_forward(2_000)
-            assert "No answer to stop came" in doubt(paced).inner_text()  # now: the page's clock goes on by itself
-        else:
-            paced.clock.fast_forward(6_000)
-        expected(doubt(paced)).to_contain_text("No answer to stop came. Use the emergency switch on the stimulator.")
-    paced.unroute("**/v1/stop")
-    stop.click()
-    paced.get_by_text("The rig confirms that stimulation is off.").wait_for()
-
-
 def test_after_an_hour_of_sleep_the_page_says_how_old_it_is(paced: Any, service: Service, ids: dict[str, str]) -> None:
     paced.goto(f"{service.url}/models/{ids['model']}")
     heard_of(paced)
@@ -153,22 +124,6 @@ def test_a_test_that_went_on_or_ended_while_the_laptop_slept(paced: Any, service
     paced.wait_for_url("**/models/*")
 
 
-def test_one_script_knows_that_a_form_was_sent_and_the_live_page_asks_it(tab: Any, service: Service) -> None:
-    scripts = {path.name: path.read_text("utf-8") for path in Path(static.__file__).parent.glob("static/*.js")}
-    assert [name for name, text in scripts.items() if "defaultPrevented" in text] == ["wait.js"]
-    service.rig.speed = 0.5
-    participant(tab, service, "O7")
-    start(tab)
-    tab.locator("#age", has_text="ms").wait_for()
-    assert tab.evaluate("answering()") is False
-    tab.evaluate("pressed = performance.now()")
-    service.rig.speed = 30.0
-    soon(lambda: tab.evaluate("state.test.done"))
-    assert "/tests/" in tab.url, "the answer to what was pressed comes first"
-    tab.evaluate("pressed = -ANSWER_MS")  # it never came
-    tab.wait_for_url("**/models/*")
-
-
 def test_a_session_that_ended_is_told_with_the_way_back(tab: Any, service: Service) -> None:
     tab.goto(service.url + "/participants/O2?x=1")
     heard_of(tab)
@@ -184,48 +139,3 @@ def test_a_session_that_ended_is_told_with_the_way_back(tab: Any, service: Servi
     tab.get_by_role("button", name="Sign in", exact=True).click()
     tab.wait_for_url("**/participants/O2?x=1")
     other.close()
-
-
-def test_what_is_next_is_told_where_nothing_but_a_decision_changed(tab: Any, service: Service) -> None:
-    with service.client() as http:
-        model = play_test(http, "O4")["model_id"]
-        tab.goto(service.url + "/participants/O4")
-        tab.get_by_text("The model is ready.").wait_for()
-        heard_of(tab)
-        http.post(f"/v1/models/{model}/approve")
-    tab.get_by_text("Today's model is approved until").wait_for()
-
-
-PRESS_AT_NEWS = """(place) => {
-  window.fetch = async () => new Response('{"key": "news"}');
-  document.querySelector(place).click();
-  document.dispatchEvent(new CustomEvent("rig", { detail: { state: "news", test: null } })); }"""
-
-
-@pytest.mark.parametrize(("place", "leads"), [(".next button", "/participants/O6/calibration"), (".bar a", "/")])
-def test_what_somebody_has_pressed_comes_although_the_page_has_news(
-    tab: Any, service: Service, place: str, leads: str
-) -> None:
-    """To load it anew then would take the answer away."""
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "O6"})
-    tab.goto(service.url + "/participants/O6")
-    heard_of(tab)
-    tab.evaluate(PRESS_AT_NEWS, place)
-    tab.wait_for_url(service.url + leads)
-
-
-def test_a_note_that_was_not_written_stays_in_its_field(tab: Any, service: Service) -> None:
-    service.rig.speed = 0.5
-    participant(tab, service, "O5")
-    start(tab)
-    tab.locator("#age", has_text="ms").wait_for()
-    tab.get_by_label("Note (may be left empty)").fill("left hand")
-    tab.context.set_offline(True)
-    tab.get_by_role("button", name="Spasm").click()
-    expected(tab.locator("#notes-written")).to_contain_text("Not written")
-    assert tab.get_by_label("Note (may be left empty)").input_value() == "left hand"
-    tab.context.set_offline(False)
-    tab.get_by_role("button", name="Spasm").click()
-    expected(tab.locator("#notes-written li")).to_contain_text("left hand")
-    service.rig.speed = 30.0

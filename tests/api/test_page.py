@@ -129,27 +129,6 @@ def test_data_grow_stale_within_a_second_when_the_rig_dies(tab: Any, service: Se
     tab.get_by_text("rig's process ended").first.wait_for(timeout=30_000)
 
 
-def test_keyboard_alone_reaches_stop_and_start(tab: Any, service: Service) -> None:
-    participant(tab, service, f"K{time.time_ns() % 10**9}")
-    reached: list[str] = []
-    for _ in range(18):
-        tab.keyboard.press("Tab")
-        reached.append(tab.evaluate("document.activeElement.textContent.trim()"))
-    assert reached[:2] == ["Skip to content", "Stop stimulation"]
-    assert "Start the pre-session test" in reached
-
-
-def test_two_browsers_see_the_same_test(browser: Any, tab: Any, service: Service) -> None:
-    service.rig.speed = 0.5  # it runs until the second one has seen it
-    participant(tab, service, f"T{time.time_ns() % 10**9}")
-    start(tab)
-    for second in open_tab(browser, service):
-        second.get_by_role("link", name="test running").click()
-        second.locator("#segment", has_text=re.compile("Random pulses|Ramp|Rest|Check")).wait_for()
-        assert painted_soon(second, "torque-chart") > 1500
-    service.rig.speed = 60.0
-
-
 def test_limits_for_today_are_set_by_a_key(tab: Any, service: Service) -> None:
     participant(tab, service, f"L{time.time_ns() % 10**9}")
     tab.get_by_label("Current of every pulse").fill("17,5")
@@ -310,54 +289,3 @@ def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, ser
     blank.get_by_role("button", name="Sign out").click()
     sign_in(blank, service, name)
     assert blank.get_by_role("link", name="Administration").count() == 0
-
-
-def test_the_whole_way_by_keyboard_alone(blank: Any, service: Service, client: httpx.Client) -> None:
-    """Sign in, make a participant, start, stop, re-arm: only keys."""
-    client.post("/v1/users", json={"name": NAME, "password": PASSWORD})
-    service.rig.speed = 1.5
-    blank.goto(service.url)
-    keys = blank.keyboard
-    blank.locator("#name:focus").wait_for()  # it has the focus by itself
-    keys.type(NAME)
-    keys.press("Tab")
-    keys.type(PASSWORD)
-    keys.press("Enter")
-    blank.get_by_role("heading", name="Participants").wait_for()
-    tab_to(blank, "code")
-    keys.type(f"B{time.time_ns() % 10**9}")
-    keys.press("Enter")
-    blank.get_by_role("button", name="Start the pre-session test").wait_for()
-    tab_to(blank, "Start the pre-session test")
-    keys.press("Enter")
-    blank.get_by_role("heading", name="Start the pre-session test of").wait_for()
-    tab_to(blank, "Start now: 20 mA, 300 µs")
-    keys.press("Enter")
-    blank.wait_for_url("**/tests/T*")
-    tab_to(blank, "stop")
-    keys.press("Space")
-    blank.get_by_text("The rig confirms that stimulation is off.").wait_for()
-    tab_to(blank, "To the participants")
-    keys.press("Enter")
-    blank.get_by_role("button", name="I have checked: re-arm").wait_for()
-    blank.get_by_text("stays stopped").wait_for()
-    tab_to(blank, "I have checked: re-arm")
-    keys.press("Enter")
-    blank.get_by_role("heading", name="Participants").wait_for()
-    gone(blank.get_by_text("stays stopped"))
-    service.rig.speed = 8.0
-
-
-def tab_to(page: Any, name: str) -> None:
-    """Press Tab until what has this id or text has the focus; each stop on the way is seen."""
-    page.wait_for_load_state()
-    for _ in range(page.locator("a, button, input, select, textarea, summary").count()):  # once round the page
-        page.keyboard.press("Tab")
-        at = page.evaluate(
-            """() => { const e = document.activeElement, s = getComputedStyle(e);
-              return {id: e.id, text: e.textContent.trim(), ring: s.outlineStyle !== 'none'}; }"""
-        )
-        assert at["ring"], at
-        if name in (at["id"], at["text"]):
-            return
-    raise AssertionError(f"{name} cannot be reached by Tab")

@@ -141,7 +141,7 @@ def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient])
 def test_a_signal_stops_stimulation_first_and_seals(bench: Bench):
     start(bench)
     assert bench.rig is not None
-    assert bench.rig.stop(signal.SIGTERM) == 0
+    assert bench.rig.stop(signal.SIGTERM, timeout_s=120.0) == 0
     count = bench.state()["pulses_received"]
     assert later(bench)["pulses_received"] == count
     sealed = list((bench.data / "recordings").glob("*.h5"))

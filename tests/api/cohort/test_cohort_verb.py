@@ -159,6 +159,7 @@ def alive(pid: int) -> bool:
     return (stat(pid) or "Z")[0] != "Z"
 
 
+@pytest.mark.campaign
 def test_killed_and_with_a_worker_killed_it_is_whole_in_the_end(folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "r.parquet"
     parts = tmp_path / "r.parquet.parts"
@@ -235,6 +236,7 @@ def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
             process.wait()
 
 
+@pytest.mark.campaign
 def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
     folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
 ) -> None:

@@ -33,7 +33,6 @@ pytestmark = pytest.mark.slow
 
 BOUNDS = computing.Bounds(300.0, 10**9, 500)
 LANES = 2
-OF_THE_RUN = ("computed_utc", "took_s", "processor_s", "worker_memory_mb")
 
 
 @pytest.fixture(scope="module")
@@ -172,18 +171,6 @@ def test_a_long_list_is_never_held_at_once(client: Client, tmp_path: Path, monke
     assert tally.error == 300 and {row["error_kind"] for row in read(tmp_path / "r.parquet")} == {"unreadable"}
     assert max(done.parcels.most, *ahead) <= AHEAD * LANES * LARGEST_PARCEL
     assert max(ahead) > AHEAD * LANES, "records that come back at once travel together"
-
-
-def test_a_records_row_is_the_same_whatever_travelled_beside_it(
-    client: Client, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    found = []
-    for most in (1, LARGEST_PARCEL):
-        monkeypatch.setattr(run, "LARGEST_PARCEL", most)
-        go(client, sources_of([str(folder)]), tmp_path / f"{most}.parquet")
-        rows = sorted(read(tmp_path / f"{most}.parquet"), key=lambda row: row["address"])
-        found.append([{name: value for name, value in row.items() if name not in OF_THE_RUN} for row in rows])
-    assert found[0] == found[1] and len(found[0]) == 22
 
 
 def test_long_records_travel_alone(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

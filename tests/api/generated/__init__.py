@@ -1,1 +1,0 @@
-"""Clients that generators make of our OpenAPI document, on a controller's whole day."""
