@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: docs demo centre test frozen check lint types serve bench soak campaigns mutation words lock clean help setup setup-test setup-centre simulate
+.PHONY: docs demo test frozen check lint types serve bench soak campaigns mutation words lock clean help setup setup-test simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -15,9 +15,6 @@ demo: setup ## one whole pre-session test on the emulated rig, with its report
 
 serve: setup ## service and page on 127.0.0.1:8000 (emulated rig unless RIG=file is given)
 	@$(BIN)/stimrig serve $(if $(RIG),--rig $(RIG))
-
-centre: setup-centre ## a centre with two emulated rigs that push to it: PostgreSQL, page on 127.0.0.1:8100
-	@$(BIN)/stimrig centre --demo
 
 test: setup-test lint types ## style, layers, types and every test but the campaigns
 	@$(BIN)/python -m pytest -n 4 --dist loadfile -m "not wire"
@@ -58,8 +55,6 @@ mutation: setup-test ## which changes of the rig's safety code no test sees (doc
 
 setup: $(VENV)/.run ## the virtual environment from the hash-locked list
 
-setup-centre: $(VENV)/.centre ## what `make centre` needs, Debian's PostgreSQL included
-
 setup-test: $(VENV)/.test ## what tests need, a browser included
 
 $(VENV)/.run: requirements/run.txt pyproject.toml deploy/setup.sh
@@ -67,9 +62,6 @@ $(VENV)/.run: requirements/run.txt pyproject.toml deploy/setup.sh
 
 $(VENV)/.test: requirements/test.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh test
-
-$(VENV)/.centre: requirements/centre.txt pyproject.toml deploy/setup.sh
-	@bash deploy/setup.sh centre
 
 $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench

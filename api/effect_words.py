@@ -21,7 +21,7 @@ UNITS = (
 def library() -> dict[str, dict[str, Any]]:
     """What the library's effects say of themselves in `EFFECT = Effect(…)`, by id; no forms.
 
-    The files are read and not loaded: the web process does without their physics, and the centre has no worker to ask.
+    The files are read and not loaded: the web process does without their physics.
     """
     return _read("stimrig.identify.effects", "EFFECT")
 

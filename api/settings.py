@@ -7,27 +7,27 @@ import re
 import socket
 from pathlib import Path
 from typing import Annotated, Any
-from urllib.parse import urlsplit
 from zoneinfo import available_timezones
 
-from pydantic import Field, SecretStr, ValidationError, ValidationInfo, field_validator
+from pydantic import Field, SecretStr, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from stimrig.api.errors import SettingsError
 
+PREFIX = "STIMRIG_"
 SECRET = ("_KEY", "_TOKEN")
 """How the names of settings end whose values are not shown."""
 
 
-class ServerSettings(BaseSettings):
-    """Settings of whatever listens: a rig's service, a centre.
-
-    Every field has an environment variable, its name behind a prefix.
+class Settings(BaseSettings):
+    """Settings of the service. Every field has an environment variable: ``data_dir`` is ``STIMRIG_DATA_DIR``.
 
     Raises SettingsError: a value does not hold; the message names its environment variable.
     """
 
-    data_dir: Path
+    model_config = SettingsConfigDict(env_prefix=PREFIX, extra="ignore")
+
+    data_dir: Path = Field(default=Path("var"), description="database, recordings, journals and logs")
     host: str = Field(default="127.0.0.1", description="address to listen on")
     admin_token: SecretStr | None = Field(default=None, description="first administrator's token; default: drawn")
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
@@ -37,33 +37,6 @@ class ServerSettings(BaseSettings):
     time_zone: str | None = Field(default=None, description="as Europe/Berlin; default: the machine's")
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
     tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
-
-    def __init__(self, **given: Any) -> None:
-        try:
-            super().__init__(**given)
-        except ValidationError as error:
-            raise SettingsError(refusal(error, self.model_config.get("env_prefix", ""))) from error
-
-    @field_validator("time_zone")
-    @classmethod
-    def _known_zone(cls, given: str | None) -> str | None:
-        """A zone that this machine knows."""
-        if given and given not in available_timezones():
-            raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
-        return given or None
-
-    @property
-    def exports_dir(self) -> Path:
-        """Where a file lies while it is handed out; emptied at each start."""
-        return self.data_dir / "exports"
-
-
-class Settings(ServerSettings):
-    """Settings of the service: ``data_dir`` is ``STIMRIG_DATA_DIR``."""
-
-    model_config = SettingsConfigDict(env_prefix="STIMRIG_", extra="ignore")
-
-    data_dir: Path = Field(default=Path("var"), description="database, recordings, journals and logs")
     database_url: str | None = Field(
         default=None, description="URL of a SQLite or PostgreSQL database; default: SQLite in the data folder"
     )
@@ -84,9 +57,6 @@ class Settings(ServerSettings):
     otlp_endpoint: str | None = Field(
         default=None, description="OpenTelemetry collector that gets traces, as http://127.0.0.1:4318; default: nowhere"
     )
-    heads_file: Path | None = Field(
-        default=None, description="file, best on another machine's disk, to which the audit trail's head goes hourly"
-    )
     retention_participants_days: Annotated[float, Field(ge=1)] | None = Field(
         default=None, description="days after the last test or recording, then all of a participant goes; default: kept"
     )
@@ -99,10 +69,20 @@ class Settings(ServerSettings):
     retention_hold: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="participants of whom nothing is deleted, by whatever rule; comma-separated"
     )
-    centre_url: str | None = Field(default=None, description="where the centre answers; default: there is none")
-    centre_key: SecretStr | None = Field(
-        default=None, validate_default=True, description="this rig's key, as the centre has made it"
-    )
+
+    def __init__(self, **given: Any) -> None:
+        try:
+            super().__init__(**given)
+        except ValidationError as error:
+            raise SettingsError(refusal(error)) from error
+
+    @field_validator("time_zone")
+    @classmethod
+    def _known_zone(cls, given: str | None) -> str | None:
+        """A zone that this machine knows."""
+        if given and given not in available_timezones():
+            raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
+        return given or None
 
     @field_validator("structure", mode="before")
     @classmethod
@@ -123,34 +103,6 @@ class Settings(ServerSettings):
         """A comma-separated text, as it stands in the environment."""
         return tuple(part.strip() for part in given.split(",") if part.strip()) if isinstance(given, str) else given
 
-    @field_validator("centre_url")
-    @classmethod
-    def _safe_address(cls, given: str | None) -> str | None:
-        """An address that a key may be sent to."""
-        if not given:
-            return None
-        parts = urlsplit(given)
-        odd = "@" in parts.netloc or parts.query or parts.fragment or re.search(r"\s", given)
-        if parts.scheme not in ("http", "https") or not parts.hostname or odd:
-            raise ValueError("it is no address of a centre; give one like https://centre.example.org")
-        if parts.scheme == "http" and not loopback(parts.hostname):
-            raise ValueError("a key is not sent in the clear; give an address that begins with https://")
-        _ = parts.port  # raises where it is none
-        return given.rstrip("/")
-
-    @field_validator("centre_key")
-    @classmethod
-    def _key_for_the_centre(cls, given: SecretStr | None, info: ValidationInfo) -> SecretStr | None:
-        """A key where there is a centre; one that a header can hold."""
-        key = given.get_secret_value() if given else ""
-        if info.data.get("centre_url") and not key:
-            raise ValueError("STIMRIG_CENTRE_URL names a centre; give the key that it has made for this rig")
-        if key and info.data.get("centre_url") is None and "centre_url" in info.data:
-            raise ValueError("a key for a centre, and no centre; set STIMRIG_CENTRE_URL, too")
-        if not re.fullmatch(r"[!-~]*", key):
-            raise ValueError("a key holds letters, digits and signs only, no spaces; copy it once more")
-        return given if key else None
-
     @property
     def database(self) -> str:
         """The database's SQLAlchemy URL."""
@@ -160,6 +112,11 @@ class Settings(ServerSettings):
     def rig(self) -> str:
         """What the services of one rig call it."""
         return self.rig_name or f"{socket.gethostname()}:{self.data_dir.absolute()}"
+
+    @property
+    def exports_dir(self) -> Path:
+        """Where a file lies while it is handed out; emptied at each start."""
+        return self.data_dir / "exports"
 
     @property
     def recordings_dir(self) -> Path:
@@ -172,10 +129,10 @@ class Settings(ServerSettings):
         return self.data_dir / "logs"
 
 
-def refusal(error: ValidationError, prefix: str) -> str:
+def refusal(error: ValidationError) -> str:
     """Which setting does not hold, in one line, by the name of its environment variable."""
     first = error.errors()[0]
-    name = prefix + "_".join(str(part) for part in first["loc"]).upper()
+    name = PREFIX + "_".join(str(part) for part in first["loc"]).upper()
     says = first["msg"].removeprefix("Value error, ")
     shown = re.sub(r"//[^/]*@", "//…@", repr(first["input"]))
     return f"{name}: {says}" if name.endswith(SECRET) else f"{name}: {says}, not {shown}"

@@ -16,6 +16,5 @@ pins=$(mktemp); trap 'rm -f "$pins"' EXIT
 grep -E '^[a-z0-9_-]+==' requirements/run.txt | sed 's/ \\$//' > "$pins"
 constraint=(-c "$pins") # tests run with the very versions that users run
 compile test build test
-compile centre build page centre cohort files lsl telemetry
 constraint=() # the peers ask for an older scipy: the bench has an environment of its own
 compile bench build page bench

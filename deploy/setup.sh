@@ -1,5 +1,5 @@
 #!/usr/bin/env bash
-# Set up .venv from a hash-locked list: deploy/setup.sh run|test|centre|bench
+# Set up .venv from a hash-locked list: deploy/setup.sh run|test|bench
 # Debian packages are installed only where they are missing, and only as root.
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -62,10 +62,10 @@ if [ "$what" = test ] && ! command -v $shell >/dev/null 2>&1; then
     debian $shell
   fi
 fi
-if [ "$what" != run ] && [ "$what" != bench ] && ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then
+if [ "$what" = test ] && ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then
   debian postgresql
 fi
 touch "$venv/.$what"
-# The lists of tests and of a centre hold the run list.
-if [ "$what" = test ] || [ "$what" = centre ]; then touch "$venv/.run"; fi
+# The list of tests holds the run list.
+if [ "$what" = test ]; then touch "$venv/.run"; fi
 say "ready"

@@ -26,7 +26,7 @@ def fit(data: Sequence[str | Path], output: str | Path, **options: Any) -> Repor
     Parameters
     ----------
     data : sequence of path
-        Files, folders, buckets, centres.
+        Files, folders, buckets.
     output : path
         Parquet file to write; one that was cut off goes on.
     **options
@@ -45,7 +45,7 @@ def diagnose(data: Sequence[str | Path], output: str | Path, **options: Any) -> 
     Parameters
     ----------
     data : sequence of path
-        Files, folders, buckets, centres.
+        Files, folders, buckets.
     output : path
         Parquet file to write; one that was cut off goes on.
     **options
@@ -64,7 +64,7 @@ def improve(data: Sequence[str | Path], output: str | Path, **options: Any) -> R
     Parameters
     ----------
     data : sequence of path
-        Files, folders, buckets, centres.
+        Files, folders, buckets.
     output : path
         Parquet file to write; one that was cut off goes on.
     **options

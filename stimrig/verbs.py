@@ -112,7 +112,6 @@ def export(
     no_dates: bool = False,
     shift_days: int = 0,
     map: Sequence[str] = (),
-    token: str = "",
     format: str = "",
     output: str | Path | None = None,
 ) -> Report:
@@ -121,7 +120,7 @@ def export(
     Parameters
     ----------
     data : sequence of path
-        Files, folders, buckets, centres.
+        Files, folders, buckets.
     parquet : path, optional
         Folder for Parquet files.
     bids : path, optional
@@ -134,8 +133,6 @@ def export(
         Move all days by so many.
     map : sequence of str
         As of `read`.
-    token : str
-        For a centre.
     format : str
         One of `stimrig export --format`, in place of `parquet` or `bids`.
     output : path, optional
@@ -150,7 +147,7 @@ def export(
 
     given = {"parquet": parquet, "bids": bids, "output": output}
     folders = {name: Path(path) for name, path in given.items() if path is not None}
-    options = {"format": format, "select": select, "no_dates": no_dates, "shift_days": shift_days, "token": token}
+    options = {"format": format, "select": select, "no_dates": no_dates, "shift_days": shift_days}
     told = exported([str(place) for place in data], **folders, **options, columns=list(map))  # pyright: ignore
     return Report("export", told)
 

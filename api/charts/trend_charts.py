@@ -67,7 +67,7 @@ def sessions_told(sessions: Sequence[dict[str, Any]]) -> list[list[Any]]:
     plane = Plane([{"at_s": unix_of(one["at_utc"]), "value": None} for one in sessions], False) if sessions else None
     return [
         [round(plane.x(unix_of(one["at_utc"])), 1), language.when(one["at_utc"]), tip(one),
-         one.get("href") or f"/models/{one['model_id']}"]
+         f"/models/{one['model_id']}"]
         for one in sessions if plane
     ]  # fmt: skip
 

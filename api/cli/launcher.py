@@ -77,9 +77,6 @@ class Streams:
 SEAL_S = 35.0
 """The rig may still have a test to seal."""
 RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
-OUTBOX_RESTART_S = (1.0, 5.0, 30.0, 300.0)
-STEADY_S = 600.0
-"""What ran for so long is started again at once."""
 
 
 class Ended(KeyboardInterrupt):
@@ -141,7 +138,6 @@ class Services:
             self.emulator = self._child("emulator", ["stimrig.hardware_sim", *arguments])
         self.rig = self._child("rig", ["stimrig.rig"])
         self.api = self._child("api", ["stimrig.api.web.server"])
-        self.outbox = None if settings.centre_url is None else self._child("outbox", ["stimrig.api.outbox"])
         self.admin_token = admin_token
         self.lsl = Streams(self._child("lsl", ["stimrig.rig.lsl_outlets"])) if settings.lsl else None
 
@@ -202,9 +198,6 @@ class Services:
             self.api.environment["STIMRIG_ADMIN_TOKEN"] = self.admin_token
         self.api.start()
         self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
-        if self.outbox is not None:
-            self.outbox.environment = {"STIMRIG_DATA_DIR": data}
-            self.outbox.start_unheard()
         if self.lsl is not None:
             self.lsl.start([] if self.attached else self._source(), data)
 
@@ -232,21 +225,7 @@ class Services:
             raise self.emulator.failure()
         ours = (self.api,) if self.attached else (self.rig, self.api)
         events = [self._restart(child) for child in ours if not child.alive()]
-        return events + self._keep_telling() + (self.lsl.watch() if self.lsl is not None else [])
-
-    def _keep_telling(self) -> list[str]:
-        """Start what tells the centre again where it has ended, at longer and longer intervals; it ends nobody else."""
-        child = self.outbox
-        if child is None or child.alive():
-            return []
-        up_s = time.monotonic() - child.started_s
-        if up_s < OUTBOX_RESTART_S[min(child.restarts, len(OUTBOX_RESTART_S) - 1)]:
-            return []
-        words = child.last_words()
-        child.end()
-        child.restarts = 1 if up_s > STEADY_S else child.restarts + 1
-        child.start_unheard()
-        return [f"outbox had ended ({words or 'without a message'}) and was started again"]
+        return events + (self.lsl.watch() if self.lsl is not None else [])
 
     def _restart(self, child: Child) -> str:
         if time.monotonic() - child.started_s > 60:
@@ -265,8 +244,6 @@ class Services:
         self._endings.deaf = True
         self.rig.end(SEAL_S)
         self.api.end()
-        if self.outbox is not None:
-            self.outbox.end()
         if self.lsl is not None:
             self.lsl.child.end()
         if self.emulator is not None:

@@ -147,37 +147,6 @@ class Connection:
         except (httpx.RequestError, httpx.InvalidURL) as error:
             raise self._unreachable(error) from error
 
-    def content(self, path: str, most_bytes: int) -> bytes:
-        """The content at a path; of a longer one no more than its beginning: a service may be anybody.
-
-        Parameters
-        ----------
-        path : str
-            Path of the service, as "/v1/rig".
-        most_bytes : int
-            So much is kept at most, B.
-
-        Returns
-        -------
-        bytes
-
-        Raises
-        ------
-        Unreachable, Refused
-        """
-        content = bytearray()
-        try:
-            with self.http.stream("GET", path) as answer:
-                if not answer.is_success:
-                    answer.read()
-                for piece in _accepted(answer).iter_bytes():
-                    content += piece
-                    if len(content) > most_bytes:
-                        break
-        except (httpx.RequestError, httpx.InvalidURL) as error:
-            raise self._unreachable(error) from error
-        return bytes(content)
-
     def get(self, path: str, **more: Any) -> Any:
         """The JSON document at a path.
 

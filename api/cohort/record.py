@@ -24,7 +24,7 @@ from stimrig.identify.records.hdf5 import StrictFile
 REPEATED = {name: field.attribute for name, field in FIELDS.items() if field.attribute}
 ABOUT = {**REPEATED, "begun_utc": "created_utc", "recorded_by": "software"}
 """Columns that repeat attributes of a sealed recording, and these."""
-SAID = ("day", "rig", *REPEATED)
+SAID = ("day", *REPEATED)
 LIBRARIES = (
     "stimrig.identify.fitting", "stimrig.identify.diagnosis", "stimrig.identify.diagnosis.improvement",
     "stimrig.identify.records.csv", "stimrig.identify.records.mat", "stimrig.identify.records.recording",

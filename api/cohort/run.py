@@ -18,7 +18,7 @@ from distributed import Client, Future, as_completed
 from distributed.scheduler import KilledWorker
 
 from stimrig.api.cohort.cluster import lanes
-from stimrig.api.cohort.computing import COPY, LEFT_OUT, Bounds, Done, Record, close_all, identity, lost, run_parcel
+from stimrig.api.cohort.computing import COPY, LEFT_OUT, Bounds, Done, Record, close_all, lost, run_parcel
 from stimrig.api.cohort.results import Results
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import Source
@@ -190,13 +190,11 @@ class Run:
     def _open(self) -> Iterator[Record]:
         """Records that are meant, or may be, and that are not done."""
         for source in self.sources:
-            for entry in source.entries(self.selection):
+            for entry in source.entries():
                 if self.selection(entry.known) is False:
                     continue
                 if self.results.done.has_place(entry):
                     self.tally.before += 1
-                elif self.results.done.has_content(entry.sha256):
-                    self._add({**identity(entry), "sha256": entry.sha256, "bytes": entry.bytes, "status": COPY})
                 else:
                     yield source, entry, self.results.done.alike(entry)
 

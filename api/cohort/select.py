@@ -38,8 +38,7 @@ FIELDS: dict[str, Field] = {
     "participant": PARTICIPANT,
     "day": Field("day", "day of the session, UTC"),
     **LABELS,
-    "rig": Field("text", "id of the rig, where a centre knows it"),
-    "name": Field("text", "name of the file, or id at a centre"),
+    "name": Field("text", "name of the file"),
     "origin": Field("text", "the DATA in which it was found"),
     "record_id": Field("text", "id of the recording, where it says one", "", "recording_id"),
     "test_id": Field("text", "id of the test", "", "test_id"),
@@ -69,12 +68,6 @@ DEEPEST = 50
 MIRRORED: dict[type[ast.cmpop], type[ast.cmpop]] = {
     ast.Lt: ast.Gt, ast.LtE: ast.GtE, ast.Gt: ast.Lt, ast.GtE: ast.LtE, ast.Eq: ast.Eq, ast.NotEq: ast.NotEq,
 }  # fmt: skip
-HINTS = {
-    ("participant", ast.Eq): ("participant",), ("rig", ast.Eq): ("rig",), ("day", ast.Eq): ("from", "to"),
-    ("day", ast.GtE): ("from",), ("day", ast.Gt): ("from",), ("day", ast.LtE): ("to",), ("day", ast.Lt): ("to",),
-}  # fmt: skip
-"""What a centre can be asked for itself, of a comparison that holds in any case."""
-
 Test = Callable[[Known], bool | None]
 
 
@@ -87,26 +80,13 @@ class Selection:
 
     def __init__(self, text: str = "") -> None:
         self.text = " ".join(text.split())
-        self.hints: dict[str, str] = {}
         self._test: Test = lambda _known: True
         if self.text:
-            tree = _parsed(self.text)
-            self._test = _test(tree)
-            self._hint(tree)
+            self._test = _test(_parsed(self.text))
 
     def __call__(self, known: Known) -> bool | None:
         """Whether a record is meant; None while fields that decide it are not known yet."""
         return self._test(known)
-
-    def _hint(self, node: ast.expr) -> None:
-        """Collect what holds for every record that is meant."""
-        if isinstance(node, ast.BoolOp) and isinstance(node.op, ast.And):
-            for value in node.values:
-                self._hint(value)
-        elif isinstance(node, ast.Compare):
-            field, kind, value = _sides(node)
-            for name in HINTS.get((field, kind), ()) if isinstance(value, str) else ():
-                self.hints.setdefault(name, value)
 
 
 def _parsed(text: str) -> ast.expr:

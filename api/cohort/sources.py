@@ -1,7 +1,7 @@
 """Where records lie: a source lists them one after the other, and opens one, here or on a worker.
 
-Files and folders, addresses of fsspec, and a centre's REST interface. A source is sent to the workers, so it holds
-addresses and settings, never an open connection. fsspec's keys and servers come from where it looks for them (for S3:
+Files and folders, and addresses of fsspec. A source is sent to the workers, so it holds addresses and settings, never
+an open connection. fsspec's keys and servers come from where it looks for them (for S3:
 the variables and files of AWS, `FSSPEC_S3_*`), here and on the workers; no key is sent.
 """
 
@@ -12,13 +12,8 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
-from urllib.parse import urlsplit
 
-from stimrig.api.client.connection import Connection
-from stimrig.api.client.errors import ServiceError
-from stimrig.api.cohort.select import Selection, as_day
 from stimrig.api.cohort.tasks import CohortError
-from stimrig.api.settings import loopback
 
 SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 """What counts as a record in a folder. A file that is named itself is taken whatever its name."""
@@ -29,12 +24,11 @@ class Entry:
     """One record as a source lists it."""
 
     address: str  # what names it among all, and for people: a path, a URL
-    name: str  # name of the file, or id at a centre
+    name: str  # name of the file
     key: str  # what `open` takes
     bytes: int | None = None  # size, where the listing says it
     stamp: str = ""
     """Changes whenever the content does: time of change, ETag, hash. Empty: not known."""
-    sha256: str = ""  # of the content, where the listing says it
     known: dict[str, Any] = field(default_factory=dict)
     """Fields (`stimrig.api.cohort.select`) that are known without reading the record."""
 
@@ -51,10 +45,10 @@ class Source(Protocol):
 
         Raises CohortError: it is not there, or does not let us in.
         """
-        next(self.entries(Selection()), None)
+        next(self.entries(), None)
 
-    def entries(self, selection: Selection) -> Iterator[Entry]:
-        """Every record, one after the other; those that cannot be meant may be left out.
+    def entries(self) -> Iterator[Entry]:
+        """List every record, one after the other.
 
         Raises CohortError: the place is not there, or does not let us in.
         """
@@ -83,9 +77,8 @@ class Folder:
         if not os.path.lexists(self.path):
             raise CohortError(f"{self.path}: no such file or folder. Give a path, s3://… or https://…")
 
-    def entries(self, selection: Selection) -> Iterator[Entry]:
+    def entries(self) -> Iterator[Entry]:
         """Files as the system lists them, so that none but the present one is held in memory."""
-        del selection  # what a file says of itself is known once it is read
         place = Path(self.path)
         if place.is_file():
             yield self._entry(place)
@@ -137,9 +130,8 @@ class Bucket(Source):
 
     url: str
 
-    def entries(self, selection: Selection) -> Iterator[Entry]:
+    def entries(self) -> Iterator[Entry]:
         """Objects below the address, in the order of their names, one folder in memory at a time."""
-        del selection  # what a file says of itself is known once it is read
         files, path = self._files()
         try:
             if files.isfile(path):
@@ -198,84 +190,17 @@ def _line(error: BaseException, most: int = 200) -> str:
     return " ".join(str(error).split())[:most].rstrip(".") or type(error).__name__
 
 
-MOST_PAGES = 1_000_000
-"""A centre that answers the same page for ever is not believed."""
-
-
-@dataclass(frozen=True)
-class Centre(Source):
-    """A centre by its address and a token that may read."""
-
-    url: str
-    token: str = field(repr=False)
-
-    def entries(self, selection: Selection) -> Iterator[Entry]:
-        """Recordings page by page; what the selection says of participant, rig and day is asked of the centre."""
-        after, seen = "", set[str]()
-        try:
-            with Connection(self.url, self.token) as line:
-                for _ in range(MOST_PAGES):
-                    asked = {**selection.hints, **({"after": after} if after else {})}
-                    page = line.get("/v1/recordings", params=asked)
-                    for document in page["recordings"]:
-                        yield self._entry(document)
-                    after = str(page.get("after") or "")
-                    if not after or after in seen:
-                        return
-                    seen = {after}
-        except ServiceError as error:
-            raise CohortError(f"{self.url}: {_line(error, 300)}") from error
-        except (KeyError, TypeError, ValueError, AttributeError):
-            raise CohortError(f"{self.url}: its answer is no list of recordings. Is it a centre?") from None
-
-    def _entry(self, document: dict[str, Any]) -> Entry:
-        """A recording as the centre lists it: `file` is the SHA-256 of its file, null where the rig has not sent it."""
-        number, name = int(document["id"]), str(document["recording_id"])
-        sha256, size = str(document.get("file") or ""), document.get("file_bytes")
-        known: dict[str, Any] = {"name": name, "origin": self.url, "record_id": name}
-        known |= {key: document[key] for key in ("participant", "rig", "test_id") if isinstance(document.get(key), str)}
-        known["day"] = as_day(str(document.get("created_utc") or ""))
-        known["begun_utc"] = document.get("created_utc")
-        if size is not None:
-            known["bytes"] = size = int(size)
-        address = f"{self.url}/v1/recordings/{number}"
-        return Entry(address, name, str(number), size, sha256, sha256, known)
-
-    def open(self, entry: Entry, most_bytes: int) -> bytes:
-        try:
-            with Connection(self.url, self.token) as line:
-                return line.content(f"/v1/recordings/{entry.key}", most_bytes)
-        except ServiceError as error:
-            raise SourceError(f"cannot be fetched ({_line(error, 300)})") from None
-
-
-def sources_of(addresses: Sequence[str], token: str = "", scheduler: str = "") -> list[Source]:
-    """A source for each address; `scheduler`: where they are sent to, with the token; empty: to this machine only.
-
-    Raises CohortError: an address that cannot be used, a centre without a token, or a token that would travel in the
-    clear.
-    """
+def sources_of(addresses: Sequence[str]) -> list[Source]:
+    """A source for each address. Raises CohortError: there is none, or one cannot be used."""
     if not addresses:
-        raise CohortError("DATA is missing. Give files, folders, s3://… or the https://… of a centre.")
-    sources = [_source(address, token) for address in addresses]
-    if any(isinstance(source, Centre) for source in sources) and scheduler and not scheduler.startswith("tls://"):
-        raise CohortError(
-            f"--scheduler {scheduler}: the token would go on to the workers in the clear, wherever they are. "
-            "Start the scheduler with TLS and give tls://… (docs/cohorts.md)."
-        )
-    return sources
+        raise CohortError("DATA is missing. Give files, folders, or addresses like s3://….")
+    return [_source(address) for address in addresses]
 
 
-def _source(address: str, token: str) -> Source:
+def _source(address: str) -> Source:
     protocol, separator, rest = address.partition("://")
     if not separator:
         return Folder(str(Path(address)))
-    if protocol in ("http", "https"):
-        if not token:
-            raise CohortError(f"{address}: a centre needs a token. Set STIMRIG_TOKEN, or give --token.")
-        if protocol == "http" and not loopback(urlsplit(address).hostname or ""):
-            raise CohortError(f"{address}: the token would be sent in the clear. Give https://…")
-        return Centre(address.rstrip("/"), token)
     if protocol == "file":
         return Folder(rest)
     return Bucket(address)

@@ -57,7 +57,7 @@ COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
     ("stamp", pa.string(), "", "state of the file when it was listed: it changes with the content"),
     *_fields("bytes", "participant", "day"),
     ("begun_utc", INSTANT, "", "when the recording was made"),
-    *_fields(*LABELS, "rig", "test_id", "outcome"),
+    *_fields(*LABELS, "test_id", "outcome"),
     ("recorded_by", pa.string(), "", "software that sealed the recording"),
     *_fields("duration_s", "rate_hz"),
     ("verb", pa.string(), "", "fit, diagnose or improve"),
@@ -114,7 +114,7 @@ def table_of(rows: Sequence[dict[str, Any]], schema: pa.Schema = SCHEMA) -> pa.T
 
 
 def _array(values: list[Any], kind: pa.DataType) -> pa.Array:
-    """A column; a value that does not fit is null: what a file or a centre says must not end a run."""
+    """A column; a value that does not fit is null: what a file says must not end a run."""
     try:
         return pa.array(values, kind)
     except MISFITS:

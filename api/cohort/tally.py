@@ -48,7 +48,7 @@ def counting(tally: Tally, sources: Sequence[Source], selection: Selection) -> I
         total = 0
         try:
             for source in sources:
-                for entry in source.entries(selection):
+                for entry in source.entries():
                     if ended.is_set():
                         return
                     total += selection(entry.known) is not False

@@ -19,7 +19,6 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.clock import Clock, utc_label
 from stimrig.api.errors import ApiError, require_found
-from stimrig.api.outbox import chain
 from stimrig.api.store import Store, audit, migrations, seen
 from stimrig.api.store.tables import (
     OPEN_STATES,
@@ -29,7 +28,6 @@ from stimrig.api.store.tables import (
     Erasure,
     Model,
     Note,
-    OutboxItem,
     Participant,
     Recording,
     Search,
@@ -141,7 +139,6 @@ class Eraser:
             for table, condition in _rows_of(session, code):
                 session.execute(delete(table).where(condition))
             self._blank(session, names, number, reason, by, kept.counts)
-            _tell_anew(session, self.clock.utc())
         self.finish()
         self._compact()
         return number, kept
@@ -272,14 +269,6 @@ def _mentions(detail: Any, names: set[str]) -> bool:
     if isinstance(detail, list):
         return any(_mentions(part, names) for part in detail)
     return isinstance(detail, str) and detail in names
-
-
-def _tell_anew(session: Session, now_utc: str) -> None:
-    """What waits for a centre, or was told to one, holds the participant, too: the chain is begun anew without it."""
-    end = chain.head(session)
-    if end is not None:
-        session.execute(delete(OutboxItem))
-        chain.begin(session, now_utc, end)
 
 
 def _remove(path: Path) -> None:

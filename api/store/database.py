@@ -6,7 +6,7 @@ Who writes has the database alone, whichever process it is in: what a transactio
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -99,10 +99,6 @@ class Store:
         with self.write() as session:
             audit.write(session, clock.utc(), who, action, subject, **detail)
 
-    def listen(self, event_name: str, heard: Callable[..., None]) -> None:
-        """Hear an event of every session that writes, e.g. `before_commit`."""
-        event.listen(self._writing, event_name, heard)
-
     def close(self) -> None:
         """Let the connections go."""
         self.engine.dispose()
@@ -169,7 +165,7 @@ def _postgresql(url: URL) -> Engine:
             connect_args={"connect_timeout": CONNECT_S, "options": options, **KEEPALIVES},
         )  # fmt: skip
     except ImportError as error:
-        raise ImportError("PostgreSQL needs psycopg: pip install 'stimrig[centre]'") from error
+        raise ImportError("PostgreSQL needs psycopg: pip install 'stimrig[postgresql]'") from error
     event.listen(engine, "begin", _begin_postgresql)
     return engine
 

@@ -16,7 +16,7 @@ from alembic.script import ScriptDirectory
 from sqlalchemy import Connection, Engine, inspect
 
 from stimrig.api.store import copies
-from stimrig.api.store.centre_tables import Table
+from stimrig.api.store.tables import Table
 
 REVISIONS = Path(__file__).parent / "revisions"
 BEFORE = "before-upgrade"

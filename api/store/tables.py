@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Index, Integer, LargeBinary, String, Text
+from sqlalchemy import JSON, Boolean, Float, ForeignKey, Integer, LargeBinary, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 OPEN_STATES = ("requested", "running", "sealing", "identifying")
@@ -300,28 +300,4 @@ class AuditEntry(Table):
     subject: Mapped[str] = mapped_column(String, index=True)
     detail: Mapped[dict[str, Any]] = mapped_column(JSON, default=dict)
     previous_hash: Mapped[str] = mapped_column(String)
-    hash: Mapped[str] = mapped_column(String)
-
-
-class OutboxItem(Table):
-    """What a centre is told: an append-only chain, each item holding the hash of the one before (decision 0013)."""
-
-    __tablename__ = "outbox"
-    __table_args__ = (
-        Index("ix_outbox_chain_seq", "chain", "seq", unique=True),
-        Index("ix_outbox_kind_key", "kind", "key"),
-    )
-    id: Mapped[int] = mapped_column(Integer, primary_key=True, autoincrement=True)
-    """In the order they were written, over all chains: the newest one's chain is the one that is pushed."""
-    chain: Mapped[str] = mapped_column(String)
-    seq: Mapped[int] = mapped_column(Integer)
-    kind: Mapped[str] = mapped_column(String)
-    key: Mapped[str] = mapped_column(String)
-    body: Mapped[str] = mapped_column(Text)
-    """The canonical text that `sha256` is of."""
-    sha256: Mapped[str] = mapped_column(String)
-    file: Mapped[str | None] = mapped_column(String, default=None, index=True)
-    file_bytes: Mapped[int | None] = mapped_column(BigInteger, default=None)
-    at_utc: Mapped[str] = mapped_column(String)
-    previous: Mapped[str] = mapped_column(String)
     hash: Mapped[str] = mapped_column(String)

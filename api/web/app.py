@@ -26,17 +26,7 @@ from stimrig.api.workers.pool import WORKER
 
 
 class Service(FastAPI):
-    """The application of some parts, which are opened and closed with it; `more` goes to FastAPI.
-
-    Its headers and language are outermost: an unexpected error's answer has them, too.
-    """
-
-    def __init__(self, context: Any, **more: Any) -> None:
-        super().__init__(
-            version=software_version(), lifespan=_lifespan(context), docs_url=None, redoc_url=None,
-            openapi_url="/openapi.json", **more,
-        )  # fmt: skip
-        self.state.context = context
+    """The application. Its headers and language are outermost: an unexpected error's answer has them, too."""
 
     def build_middleware_stack(self) -> ASGIApp:
         """Starlette's, within the headers and the language."""
@@ -69,12 +59,17 @@ def create_app(
     """
     context = build(settings or Settings(), clock, worker, lock)
     app = Service(
-        context,
         title="stimrig",
         summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",
         description=openapi.DESCRIPTION,
+        version=software_version(),
+        lifespan=_lifespan(context),
+        docs_url=None,
+        redoc_url=None,
+        openapi_url="/openapi.json",
         routes=list(_routes()),
     )
+    app.state.context = context
     app.add_middleware(LookAgain, context=context)
     app.add_middleware(StrictBody)
     app.add_middleware(BodyLimit, context=context)

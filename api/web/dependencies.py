@@ -10,7 +10,7 @@ import shutil
 import time
 from collections.abc import Callable, Coroutine
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Concatenate, ParamSpec, TypeVar
+from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
 
 from fastapi import Depends, Request, Security
 from sqlalchemy.exc import SQLAlchemyError
@@ -24,8 +24,6 @@ from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.models.trend import Trend
 from stimrig.api.operation.clock_watch import LOOK_S, ClockWatch
 from stimrig.api.operation.telemetry import Telemetry
-from stimrig.api.outbox.feed import Feed
-from stimrig.api.outbox.receipts import note_hourly
 from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock, Principal, Scope
 from stimrig.api.people.pace import Guesses
@@ -36,7 +34,7 @@ from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.stops import StopLog, StopRights
 from stimrig.api.sessions.trials import Trials
-from stimrig.api.settings import ServerSettings, Settings
+from stimrig.api.settings import Settings
 from stimrig.api.store import Store, holds, uploads
 from stimrig.api.store.holds import LIMITS_TURN, ServiceLock, shared_secret
 from stimrig.api.store.tables import Model, Recording
@@ -51,55 +49,11 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-class Parts:
-    """What a rig's service and a centre both have: a database, people who sign in, work that nobody asks for.
-
-    `settings`: session hours, idle lock, first administrator; `store`: opened.
-    """
-
-    forgiven: ClassVar[tuple[type[Exception], ...]] = (SQLAlchemyError, OSError)
-    """What may go wrong in regular work: the next time has it all."""
-
-    def __init__(self, settings: ServerSettings, clock: Clock, store: Store) -> None:
-        self.clock, self.store, self.started_s = clock, store, time.monotonic()
-        guesses = self.guesses = Guesses(clock)
-        idle = IdleLock(store, clock, settings.idle_lock_min)
-        self.auth = Auth(store, clock, guesses, idle, settings.session_hours)
-        self.drawn_token = self.auth.first_administrator(
-            settings.admin_token.get_secret_value() if settings.admin_token else None
-        )
-        self.people = People(store, clock, self.auth, guesses)
-        self.versions = Versions(store, clock)
-        self._tasks: list[asyncio.Task[None]] = []
-
-    def regular(self) -> list[tuple[float, Callable[[], object]]]:
-        """What is done again and again, each with its seconds."""
-        return [(FLUSH_S, self.auth.idle.flush)]
-
-    async def open(self) -> None:
-        """Begin with it."""
-        self._tasks = [asyncio.create_task(self._again(every_s, work)) for every_s, work in self.regular()]
-
-    async def _again(self, every_s: float, work: Callable[[], object]) -> None:
-        while True:
-            await asyncio.sleep(every_s)
-            try:
-                await asyncio.to_thread(work)
-            except self.forgiven:
-                log.exception("what is done again and again could not be done")
-
-    async def close(self) -> None:
-        """Let everything go."""
-        for task in self._tasks:
-            task.cancel()
-        with contextlib.suppress(SQLAlchemyError):
-            await asyncio.to_thread(self.auth.idle.flush)
-        self.people.close()
-        self.auth.close()
-        self.store.close()
+FORGIVEN = (SQLAlchemyError, OSError)
+"""Errors of regular work that are logged; the work is done again at the next interval."""
 
 
-class Context(Parts):
+class Context:
     """Everything a route of the service may need.
 
     `worker`: how to start a worker process. `lock`: held; let go at the end.
@@ -110,10 +64,16 @@ class Context(Parts):
         if settings.time_zone:
             set_zone(settings.time_zone)
         store = Store(settings.database)
-        if settings.centre_url is not None:
-            Feed(store, clock)  # hears of all that is written from here on
-        super().__init__(settings, clock, store)
+        self.clock, self.store, self.started_s = clock, store, time.monotonic()
         self.settings, self.lock, self.clock_watch = settings, lock, ClockWatch(clock)
+        guesses = self.guesses = Guesses(clock)
+        idle = IdleLock(store, clock, settings.idle_lock_min)
+        self.auth = Auth(store, clock, guesses, idle, settings.session_hours)
+        self.drawn_token = self.auth.first_administrator(
+            settings.admin_token.get_secret_value() if settings.admin_token else None
+        )
+        self.people = People(store, clock, self.auth, guesses)
+        self.versions = Versions(store, clock)
         self.tracer = Telemetry(settings)
         rig = self.rig = RigClient(settings.rig_socket, clock)
         pool = self.pool = Pool(settings.workers, worker, places(settings, store))
@@ -131,15 +91,10 @@ class Context(Parts):
         self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
         stop_key = shared_secret(store, "stop-right")
         self.stop_rights = StopRights(stop_key, clock)
-
-    def regular(self) -> list[tuple[float, Callable[[], object]]]:
-        """As `Parts`; the audit trail's head is noted hourly, where there is a file for it."""
-        heads_file = self.settings.heads_file
-        heads = [] if heads_file is None else [(FLUSH_S, lambda: note_hourly(self.store, self.clock, heads_file))]
-        return [*super().regular(), *heads, (LOOK_S, self.clock_watch.look)]
+        self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self) -> None:
-        """Connect, warm the workers, take up what a restart left open."""
+        """Connect, warm the workers, take up what a restart left open; begin the regular work."""
         await asyncio.to_thread(uploads.settle, self.settings.recordings_dir, self.store)
         await asyncio.to_thread(self.clock_watch.look)
         self.rig.start()
@@ -149,7 +104,8 @@ class Context(Parts):
                 break
             await asyncio.sleep(0.05)
         await self.runner.resume()
-        await super().open()
+        regular = [(FLUSH_S, self.auth.idle.flush), (LOOK_S, self.clock_watch.look)]
+        self._tasks = [asyncio.create_task(_repeat(every_s, work)) for every_s, work in regular]
 
     async def close(self) -> None:
         """Let everything go."""
@@ -157,8 +113,24 @@ class Context(Parts):
             await part.close()
         self.holds.close()
         await asyncio.to_thread(self.tracer.close)
-        await super().close()
+        for task in self._tasks:
+            task.cancel()
+        with contextlib.suppress(SQLAlchemyError):
+            await asyncio.to_thread(self.auth.idle.flush)
+        self.people.close()
+        self.auth.close()
+        self.store.close()
         self.lock.release()
+
+
+async def _repeat(every_s: float, work: Callable[[], object]) -> None:
+    """Do the work in a thread, at this interval, until it is cancelled."""
+    while True:
+        await asyncio.sleep(every_s)
+        try:
+            await asyncio.to_thread(work)
+        except FORGIVEN:
+            log.exception("regular work failed; it is done again at the next interval")
 
 
 def build(

@@ -162,14 +162,10 @@ class BodyLimit(HttpMiddleware):
         finally:
             self._previews -= 1
 
-    def bounds(self, path: str) -> tuple[int, float]:
-        """Most bytes that a route takes, and for how long it waits for them, s."""
-        if path.rstrip("/").endswith(UPLOAD):
-            return int(self.context.settings.max_upload_mb * 1e6), UPLOAD_S
-        return BODY_BYTES, BODY_S
-
     def _bounded(self, scope: Scope, receive: Receive) -> Receive:
-        limit, patience_s = self.bounds(scope["path"])
+        limit, patience_s = BODY_BYTES, BODY_S
+        if scope["path"].rstrip("/").endswith(UPLOAD):
+            limit, patience_s = int(self.context.settings.max_upload_mb * 1e6), UPLOAD_S
         end_s = asyncio.get_running_loop().time() + patience_s
         taken, whole = 0, False
 

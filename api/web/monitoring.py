@@ -12,7 +12,6 @@ from typing import get_args
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
 from stimrig.api.operation import state
-from stimrig.api.outbox import status
 from stimrig.api.store.tables import Model, Participant, Test
 from stimrig.api.version import software_version
 from stimrig.api.web.dependencies import Context
@@ -30,7 +29,7 @@ class Figures:
 
 def figures(context: Context) -> Iterator[Metric]:
     """The service's figures, one family after the other."""
-    for part in (_tests, _rig, _pulses, _store, _jobs, _operation, _centre):
+    for part in (_tests, _rig, _pulses, _store, _jobs, _operation):
         yield from part(context)
     yield from context.runner.counted.collect()
 
@@ -132,18 +131,3 @@ def _operation(context: Context) -> Iterator[Metric]:
         ("stimrig_clock_jump_seconds", "How far the clock jumped last; 0: it has not", watch.last_jump_s),
     ))  # fmt: skip
     yield CounterMetricFamily("stimrig_clock_jumps_total", "Jumps of the clock by more than 2 s", watch.jumps)
-
-
-def _centre(context: Context) -> Iterator[Metric]:
-    """How telling the centre goes; nothing where there is none."""
-    now_s = context.clock.unix_s()
-    told = status.read(context.settings, now_s)
-    if told is None:
-        return
-    since_s = told.since_contact_s(now_s)
-    yield from gauges((
-        ("stimrig_outbox_items_waiting", "Items that the centre lacks", told.items_waiting),
-        ("stimrig_outbox_files_waiting", "Files that it is known to lack", told.files_waiting),
-        ("stimrig_outbox_files_damaged", "Files that cannot be sent to it", told.damaged_count),
-        ("stimrig_outbox_contact_age_seconds", "Time since it answered; -1: never", known(since_s)),
-    ))  # fmt: skip

@@ -23,7 +23,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from stimrig.api import logs
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.models import carried_structure
-from stimrig.api.settings import ServerSettings, Settings, loopback
+from stimrig.api.settings import Settings, loopback
 from stimrig.api.store.holds import ServiceLock
 from stimrig.api.web.app import create_app
 
@@ -71,17 +71,16 @@ def configuration(app: ASGIApp, **more: Any) -> uvicorn.Config:
     return uvicorn.Config(app, **usual | more)
 
 
-def refuse_open_door(settings: ServerSettings) -> None:
+def refuse_open_door(settings: Settings) -> None:
     """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
 
     Raises OSError: the host is not loopback, and TLS in front has not been vouched for.
     """
     if loopback(settings.host) or (settings.tls_proxy and settings.secure_cookies):
         return
-    prefix = settings.model_config.get("env_prefix", "")
     fix = (
         "listen on 127.0.0.1 and put the TLS proxy of deploy/nginx in front; if one stands in front on another "
-        f"machine, set {prefix}TLS_PROXY=true and {prefix}SECURE_COOKIES=true"
+        "machine, set STIMRIG_TLS_PROXY=true and STIMRIG_SECURE_COOKIES=true"
     )
     raise OSError(f"{settings.host}: refused, it is not this machine's loopback; {fix}")
 

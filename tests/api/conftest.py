@@ -24,10 +24,8 @@ from argon2 import PasswordHasher
 from sqlalchemy import text
 from websockets.sync.client import ClientConnection, connect
 
-from stimrig.api.centre.postgres import programs
 from stimrig.api.cli import main
 from stimrig.api.clock import Clock
-from stimrig.api.errors import SettingsError
 from stimrig.api.people import accounts
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, database
@@ -36,7 +34,7 @@ from stimrig.api.web.server import configuration
 from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness.looks_first import LooksFirst
-from tests.harness.postgres import Cluster, running
+from tests.harness.postgres import Cluster, programs, running
 
 TOKEN = "administrator-token-of-the-tests"
 HTML = {"Accept": "text/html,application/xhtml+xml"}
@@ -106,11 +104,10 @@ def databases_that_need_not_last() -> Iterator[None]:
 @pytest.fixture(scope="session")
 def cluster() -> Iterator[Cluster]:
     """PostgreSQL, of this test process's own."""
-    try:
-        programs()
-    except SettingsError as error:
-        pytest.skip(str(error))
-    with running() as cluster:
+    place = programs()
+    if place is None:
+        pytest.skip("PostgreSQL is not installed: as root, apt-get install postgresql")
+    with running(place) as cluster:
         yield cluster
 
 

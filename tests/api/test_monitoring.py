@@ -52,7 +52,6 @@ def test_every_figure_that_is_used_is_there_and_tells_nothing_of_anybody(
     run_test(client, participant)
     client.post("/v1/stop", json={"reason": "typed by a person"})
     settings = service.context.settings
-    monkeypatch.setattr(settings, "centre_url", "https://centre.example.org")  # then its figures are there, too
     state.note(settings.data_dir, created_utc="2026-11-01T00:00:00Z", verified_utc="2026-11-02T00:00:00Z")
     text = client.get("/metrics", headers={"Authorization": ""}).text
     there = exported(text)

@@ -21,7 +21,6 @@ from stimrig.api.people.auth import Scope
 from stimrig.api.people.pace import Pace
 from stimrig.api.settings import Settings
 from stimrig.api.web.server import configuration, loopback, refuse_open_door
-from tests.api.centre.conftest import run_centre
 from tests.api.conftest import (
     HTML,
     PATIENCE_S,
@@ -366,14 +365,13 @@ def test_approval_ends_with_its_day(client: httpx.Client, service: Service, part
 
 @pytest.fixture
 def urls(tmp_path: Path, short_dir: Path) -> Iterator[list[str]]:
-    """Services of two rigs, and a centre."""
+    """Services of two rigs."""
     for one in run_service(tmp_path / "a", short_dir, STUB):
         for other in run_service(tmp_path / "b", tmp_path, STUB):
-            for centre in run_centre(tmp_path / "centre"):
-                yield [one.url, other.url, centre.url]
+            yield [one.url, other.url]
 
 
-@pytest.mark.sqlite  # three services of one folder, each with a database of its own
+@pytest.mark.sqlite  # two services of one folder, each with a database of its own
 def test_one_browser_stays_signed_in_at_every_service_of_a_host(urls: list[str]) -> None:
     for url in urls:
         answer = httpx.post(
@@ -386,6 +384,6 @@ def test_one_browser_stays_signed_in_at_every_service_of_a_host(urls: list[str])
         for url in urls:
             csrf[url] = browser.post(f"{url}/v1/sessions", json={"name": "Ada", "password": PASSWORD}).json()["csrf"]
         assert len(browser.cookies) == len(urls)
-        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [200, 200, 200]
+        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [200, 200]
         browser.delete(f"{urls[0]}/v1/sessions/current", headers={"X-CSRF-Token": csrf[urls[0]]}).raise_for_status()
-        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [401, 200, 200]
+        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [401, 200]

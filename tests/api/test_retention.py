@@ -19,15 +19,13 @@ from stimrig.api.errors import ApiError
 from stimrig.api.models import erasure
 from stimrig.api.models.erasure import Eraser
 from stimrig.api.store import Store, audit, copies, migrations
-from stimrig.api.store.tables import Approval, AuditEntry, Erasure, OutboxItem, Participant, Recording, Test, Token
+from stimrig.api.store.tables import Approval, AuditEntry, Erasure, Participant, Recording, Test, Token
 from tests.api.conftest import STUB, serving
 from tests.api.conftest import run_test as plays
-from tests.api.outbox.conftest import Rig, assert_told, run
-from tests.api.outbox.conftest import rig as outbox_rig
+from tests.api.rig_data import Rig
+from tests.api.rig_data import rig as rig
 from tests.api.test_schemas import unmet
-from tests.harness.fake_centre import FakeCentre
 
-rig = outbox_rig
 CODE = "XQ7ZZ81"
 
 
@@ -79,7 +77,7 @@ def test_nothing_of_a_person_stays_and_nothing_of_others_goes(tmp_path: Path, sh
     assert main.run(asked) == 2, "a model is in use: that is told first"
     assert main.run([*asked, "--though-in-use", "--json"]) == 0
     assert holding(tmp_path, CODE) == [] and holding(tmp_path, tests[CODE]["id"]) == []
-    assert main.run(["audit", "verify", "--data", str(tmp_path), "--no-centre"]) == 0
+    assert main.run(["audit", "verify", "--data", str(tmp_path)]) == 0
     with serving(tmp_path, short_dir, STUB) as (_, http):
         assert http.get(f"/v1/participants/{CODE}").status_code == 404
         assert http.get("/v1/participants/P1/model").json() == kept
@@ -107,7 +105,7 @@ def test_it_says_what_it_would_do_and_what_it_did(rig: Rig, capsys: pytest.Captu
         "analyses": 0, "tracked": 0, "approvals": 2, "notes": 0, "models": 2, "recordings": 2, "searches": 0,
         "tests": 2, "tokens": 0, "participants": 1,
     }  # fmt: skip
-    assert found["files"] == 2 and len(found["remains"]) == 5 and unmet("retention", found) == []
+    assert found["files"] == 2 and len(found["remains"]) == 4 and unmet("retention", found) == []
     (done,) = rig.store.all(Erasure)
     assert (done.id, done.of, done.files) == (found["erasure"], "(erased)", []) and done.done_utc
     assert main.run([*verb, "asked"]) == 2 and "There is no participant" in capsys.readouterr().err
@@ -238,21 +236,6 @@ def test_a_code_that_is_a_word_of_the_trail_or_in_a_persons_name(rig: Rig, code:
     assert audit.first_broken(trail(rig)) is None
     assert [entry.action for entry in trail(rig) if entry.subject != audit.ERASED][-2:] == [audit.ERASE] * 2
     assert {entry.who for entry in trail(rig) if entry.action == "approve"} == {"Ada"}
-
-
-def test_the_centre_is_told_the_rest_anew_and_nothing_of_who_was_erased(rig: Rig) -> None:
-    ended(rig, "P1")
-    ended(rig, "P2")
-    centre = FakeCentre()
-    run(rig.pusher(centre.handle), 60)
-    assert_told(rig, centre)
-    rig.session("P1")  # which waits
-    eraser(rig).erase("P1", "asked", "Ada", though_in_use=True)
-    assert "P1" not in str([item.body for item in rig.store.all(OutboxItem)])
-    run(rig.pusher(centre.handle), 60)
-    chain = rig.items()[-1].chain
-    assert [item["hash"] for item in centre.chains[chain]] == [item.hash for item in rig.items() if item.chain == chain]
-    assert "P1" not in str(centre.chains[chain]) and ("participant", "P2") in rig.told()
 
 
 # ---- cut off

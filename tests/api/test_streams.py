@@ -121,12 +121,12 @@ def test_killed_beside_the_service_it_comes_back_and_the_service_goes_on(tmp_pat
     ("log", "words"),
     [
         (None, ""), ("", ""), ('{"message": "all went well"}\n', "all went well"),
-        ("outbox: no room\n", "outbox: no room"),
+        ("lsl: no room\n", "lsl: no room"),
         ('{"time": "2026-11-23T08:0', ""), ('{"level": "info"}\n', ""), ("{" * 100_000, ""),
-        ("x" * 3 * LAST_BYTES + "\noutbox: gone\n", "outbox: gone"),
+        ("x" * 3 * LAST_BYTES + "\nlsl: gone\n", "lsl: gone"),
     ],
 )  # fmt: skip
 def test_whatever_its_log_is(tmp_path: Path, log: str | None, words: str) -> None:
     if log is not None:
-        (tmp_path / "outbox.log").write_text(log)
-    assert Child("outbox", [], tmp_path / "outbox.log").last_words() == words
+        (tmp_path / "lsl.log").write_text(log)
+    assert Child("lsl", [], tmp_path / "lsl.log").last_words() == words

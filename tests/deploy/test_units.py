@@ -32,7 +32,7 @@ def unit(name: str) -> dict[str, list[str]]:
 RIG, API = unit("stimrig-rig.service"), unit("stimrig-api.service")
 
 
-@pytest.mark.parametrize("name", [f"stimrig-{name}.service" for name in ("rig", "api", "backup", "outbox", "centre")])
+@pytest.mark.parametrize("name", [f"stimrig-{name}.service" for name in ("rig", "api", "backup")])
 def test_no_service_has_more_rights_than_it_needs(name: str) -> None:
     settings = unit(name)
     assert settings["User"] != ["root"]
@@ -52,15 +52,6 @@ def test_the_service_reaches_no_device_and_none_of_the_rigs_files() -> None:
     assert API["ReadWritePaths"] == ["/var/lib/stimrig/api"]
     assert API["BindReadOnlyPaths"][0].startswith("/var/lib/stimrig/rig/recordings:")
     assert "AF_CAN" not in API["RestrictAddressFamilies"][0]
-
-
-def test_what_talks_to_a_centre_cannot_reach_the_rig() -> None:
-    outbox = unit("stimrig-outbox.service")
-    assert outbox["User"] == API["User"] and outbox["Group"] == API["Group"]
-    assert outbox["InaccessiblePaths"] == [f"-/run/{RIG['RuntimeDirectory'][0]}"]
-    assert "RIG_SOCKET" not in " ".join(outbox["Environment"]) and outbox["PrivateDevices"] == ["yes"]
-    assert outbox["ReadWritePaths"] == API["ReadWritePaths"] and outbox["BindReadOnlyPaths"] == API["BindReadOnlyPaths"]
-    assert outbox["RestartPreventExitStatus"] == ["2"]
 
 
 def test_the_rig_reaches_its_devices_and_no_network() -> None:
@@ -108,7 +99,6 @@ def test_both_speak_of_the_same_socket_and_folders() -> None:
 
 def test_a_token_drawn_at_the_first_start_is_not_in_the_journal() -> None:
     assert API["StandardOutput"] == ["null"]
-    assert unit("stimrig-centre.service")["StandardOutput"] == ["null"]
 
 
 def test_devices_belong_to_the_rigs_user_alone() -> None:

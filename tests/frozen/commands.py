@@ -15,9 +15,8 @@ METHODS = ("two-stage", "ramp-deconvolution", "separable-least-squares", "narx")
 IN_FULL = ("fatigue", "plain", "electromechanical_delay", "sealed", "rig_plain")
 VERBS = (
     "", "fit", "predict", "compare", "diagnose", "improve", "invert", "export", "recover", "audit", "audit verify",
-    "audit heads", "audit export", "effects", "schema", "table1", "test", "doctor", "demo", "serve", "emulate",
-    "cohort", "cohort fit", "cohort diagnose", "cohort improve", "cohort changed", "cohort figures", "centre",
-    "centre add-rig", "centre revoke-rig", "centre check",
+    "audit export", "effects", "schema", "table1", "test", "doctor", "demo", "serve", "emulate",
+    "cohort", "cohort fit", "cohort diagnose", "cohort improve", "cohort changed", "cohort figures",
 )  # fmt: skip
 REFUSED = (
     "fly", "fit", "fit none.csv", "fit plain.csv --effects no_such_effect", "fit plain.csv --effects fatigue:none",
@@ -30,12 +29,12 @@ REFUSED = (
     "diagnose plain.csv --model none.json", "improve plain.csv -o model.txt", "invert model.json plain.csv -o i.csv",
     "invert model.json reference.csv -o i.csv --largest-us 9000", "export cohort", "export cohort --parquet new/p",
     "export cohort --bids b --select day", "recover none.journal", "recover plain.csv", "recover cut.journal",
-    "audit verify", "audit heads", "audit export -o a.jsonl", "audit verify --file plain.csv", "schema nothing",
+    "audit verify", "audit export -o a.jsonl", "audit verify --file plain.csv", "schema nothing",
     "table1 --trials 0", "test --protocol none", "test --rig none.toml", "cohort fit",
     "cohort fit nowhere -o r.parquet",
     "cohort fit cohort -o r.parquet --select day", "cohort fit cohort -o r.parquet --workers 0",
     "cohort changed plain.csv plain.csv", "cohort figures plain.csv -o f.html", "serve --port 99999",
-    "emulate --patient none", "emulate --fault none", "centre add-rig --data none x",
+    "emulate --patient none", "emulate --fault none",
 )  # fmt: skip
 DONE = (
     "--version", "effects", "effects --json", "table1 --trials 2", "table1 --trials 1 --json",

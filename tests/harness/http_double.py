@@ -1,4 +1,4 @@
-"""A server on a real port that answers what a function says: what stands where a service or a centre would."""
+"""A server on a real port that answers what a function says: what stands where a service would."""
 
 from __future__ import annotations
 

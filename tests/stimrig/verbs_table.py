@@ -16,7 +16,6 @@ PAGE = Path(__file__).parents[2] / "docs" / "python.md"
 COMMAND_ONLY = {
     "audit": "it reads the audit trail of a data folder; over HTTP: `client.get(\"/v1/audit\")`",
     "backup": "it looks after an installed machine's data folders",
-    "centre": "it runs a server of its own",
     "demo": "`emulate`, `Client.run_test` and `Client.approve` one after the other",
     "doctor": "it says what this machine lacks for stimulation",
     "rig": "it asks a person who stands at the rig",

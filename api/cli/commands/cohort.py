@@ -29,7 +29,7 @@ NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
 Given = Annotated[
     list[str],
     typer.Argument(
-        help="files, folders, addresses that fsspec knows (s3://…), or a centre (https://…)",
+        help="files, folders, addresses that fsspec knows (s3://…)",
         metavar="DATA…",
         show_default=False,
     ),
@@ -41,7 +41,6 @@ Select = Annotated[
         "(docs/cohorts.md lists the fields)"
     ),
 ]
-Token = Annotated[str, typer.Option(help="of a centre", envvar="STIMRIG_TOKEN", show_envvar=True, show_default=False)]
 Columns = Annotated[
     list[str] | None,
     typer.Option("--map", help="columns of another tool's files, as in `stimrig fit`", show_default=False),
@@ -114,7 +113,6 @@ def run(
     again: Annotated[
         bool, typer.Option("--again", help="do anew what timed out, was killed or could not be read")
     ] = False,
-    token: Token = "",
     columns: Columns = None,
     as_json: Json = False,
 ) -> None:
@@ -128,7 +126,7 @@ def run(
 def computed(
     verb: str, data: Sequence[str], output: Path, *, select: str = "", method: str = METHOD, effects: str = "",
     scheduler: str = "", workers: int = 2, memory: str = "1GB", limit: float = 600.0, renew: int = 500,
-    dashboard: bool = False, wait: float = 60.0, again: bool = False, token: str = "",
+    dashboard: bool = False, wait: float = 60.0, again: bool = False,
     columns: Sequence[str] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One run, and the keys of `--json`. Raises InputError, CommandError."""
@@ -145,7 +143,7 @@ def computed(
     given = (verb, Selection(select).text, method, names(effects), tuple(columns or ()), software_version())
     task = checked(Task(*given))
     place = cluster.Workers(scheduler, workers, cluster.memory_of(memory), dashboard, wait)
-    sources = sources_of(data, token, place.scheduler)
+    sources = sources_of(data)
     bounds = Bounds(limit, place.memory_bytes, renew)
     for source in sources:
         source.check()

@@ -193,8 +193,7 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "ok", "not there yet; the first start makes it")
         return
     from stimrig.api.errors import ApiError
-    from stimrig.api.outbox import receipts
-    from stimrig.api.store import Store
+    from stimrig.api.store import Store, audit
     from stimrig.api.store.tables import AuditEntry
 
     try:
@@ -203,7 +202,7 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "fails", str(error), "restore it from the backup (docs/install.md)")
         return
     entries = store.all(AuditEntry, order=AuditEntry.seq)
-    broken = receipts.check_folder(entries, settings.data_dir).first_broken
+    broken = audit.first_broken(entries)
     store.close()
     if broken is None:
         yield Finding("database", "ok", f"opens; the chain of the audit trail's {len(entries)} entries is complete")
@@ -231,25 +230,6 @@ def check_backup(settings: Settings) -> Iterator[Finding]:
         yield Finding("backup", "care", says, "stimrig backup verify BACKUP restores it for trial")
     else:
         yield Finding("backup", "ok", says)
-
-
-def check_centre(settings: Settings) -> Iterator[Finding]:
-    """Does a centre hear of this rig? Nothing where none is configured."""
-    from stimrig.api.clock import Clock
-    from stimrig.api.outbox import status
-
-    told = status.read(settings, Clock().unix_s())
-    if told is None:
-        return
-    says = f"{told.centre}: {status.WORDS[told.state]}"
-    if told.detail:
-        says += f" ({told.detail})"
-    says += f" {told.items_waiting} items and {told.files_waiting} files wait"
-    says += f"; last contact {told.last_contact_utc or 'never'}"
-    if told.damaged_count:
-        says += f"; {told.damaged_count} files are missing or damaged, the first: {told.damaged[0]}"
-    fix = status.FIXES.get(told.state, "see outbox.log in the folder of the logs")
-    yield Finding("centre", "ok" if told.state in status.GOOD else "care", says, fix)
 
 
 def check_clock(_settings: Settings) -> Iterator[Finding]:

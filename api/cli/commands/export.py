@@ -13,7 +13,6 @@ from stimrig.api.cli.commands.cohort import (
     Columns,
     Given,
     Select,
-    Token,
     need_extra,
     passed_over,
     refuse_undone,
@@ -34,7 +33,6 @@ def export(
     no_dates: Annotated[bool, typer.Option("--no-dates", help="leave out days and times")] = False,
     shift_days: Annotated[int, typer.Option(min=-80000, max=80000, help="move every day by so many days")] = 0,
     columns: Columns = None,
-    token: Token = "",
     as_json: Json = False,
 ) -> None:
     """Hand records on: Parquet, BIDS, NWB, FHIR, REDCap, MATLAB; one cut off goes on with the same command."""
@@ -47,7 +45,7 @@ def export(
 def exported(
     data: Sequence[str], parquet: Path | None = None, bids: Path | None = None, format: str = "",
     output: Path | None = None, select: str = "", no_dates: bool = False, shift_days: int = 0,
-    columns: Sequence[str] | None = None, token: str = "",
+    columns: Sequence[str] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One export, and the keys of `--json`. Raises InputError, CommandError."""
     need_extra()
@@ -60,7 +58,7 @@ def exported(
     from stimrig.api.cohort.sources import sources_of
     from stimrig.api.cohort.tasks import CutOffError
 
-    selection, sources, mapped = Selection(select), sources_of(data, token), columns or []
+    selection, sources, mapped = Selection(select), sources_of(data), columns or []
     for source in sources:
         source.check()
     options = {"format": made.NAME, "hide": no_dates, "shift_days": shift_days, "columns": mapped}

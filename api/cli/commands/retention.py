@@ -26,7 +26,6 @@ Delete = Annotated[bool, typer.Option("--delete", help="delete it; without this 
 REMAINS = (
     "backups, until they are deleted by their age: restore none of them without erasing again",
     "folders that `stimrig backup restore --force` has set aside: ….before-… beside the data folders",
-    "a centre, if there is one: `stimrig centre erase` there",
     "what was exported, downloaded or printed: files outside of the data folder are not known here",
     "the audit trail's numbers, times, persons, actions and hashes, without what the entries said",
 )
@@ -112,7 +111,7 @@ def erase(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Delete all that is kept of a participant: recordings, models, notes, limits, keys, what waits for a centre."""
+    """Delete all that is kept of a participant: recordings, models, notes, limits, keys."""
     settings = settings_of(data)
     if code in settings.retention_hold:
         raise InputError(f"{code}: STIMRIG_RETENTION_HOLD holds it. Take it out there once nothing needs it any more.")

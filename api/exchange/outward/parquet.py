@@ -81,7 +81,6 @@ COLUMNS = {table: [Column(*entry) for entry in entries] for table, entries in {
         ("content_sha256", "text", "", "the recording's own hash over its datasets", "64 digits", "content_sha256"),
         ("format", "text", "", "what the file was", "sealed recording, table", "computed"),
         ("address", "text", "", "where it was read; null where days are hidden", "", "DATA"),
-        ("rig", "text", "", FIELDS["rig"].says, "", "centre"),
         ("test_id", "text", "", FIELDS["test_id"].says, "", "test_id"),
         *((name, "text", "", label.says, "", name) for name, label in LABELS.items()),
         ("begun_utc", "time", "", "when the recording was made (UTC); moved or null where days are hidden", "",

@@ -11,8 +11,8 @@ from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
 from stimrig.api import language
 from stimrig.api.language import lazy
-from stimrig.api.outbox import receipts, status
 from stimrig.api.people.auth import ROLES
+from stimrig.api.store import audit
 from stimrig.api.store.tables import AuditEntry
 from stimrig.api.web.dependencies import Administrator, Context, Ctx
 from stimrig.api.web.pages import typed
@@ -47,16 +47,14 @@ async def show_page(request: Request, context: Context, key: dict[str, Any] | No
             "tokens": [token for token in people.list_tokens(context, None) if token["origin"] == "issued"],  # pyright: ignore[reportArgumentType]
             "entries": entries[: -NEWEST - 1 : -1],
             "count": len(entries),
-            "stands": receipts.check_folder(entries, context.settings.data_dir),
-            "centre": status.read(context.settings, context.clock.unix_s()),
+            "first_broken": audit.first_broken(entries),
         }
 
     found = await asyncio.to_thread(gather)
     structure = context.settings.structure
     return page(
-        request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc(), structure=structure,
-        centre_words=status.WORDS, centre_good=status.GOOD,
-    )  # fmt: skip
+        request, "administration.html", **found, key=key, roles=MAY, now_utc=context.clock.utc(), structure=structure
+    )
 
 
 def role_of(scopes: list[str]) -> str:

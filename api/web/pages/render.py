@@ -5,13 +5,11 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Awaitable, Callable
-from dataclasses import dataclass
 from typing import Any
 from urllib.parse import quote
 
 from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from jinja2 import Environment
 from markupsafe import Markup
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -33,17 +31,6 @@ MEDIA = {"light": "not all", "dark": "screen", "system": "screen and (prefers-co
 """For which media `dark.css` holds. Never for print."""
 environment.globals["colours_media"] = MEDIA
 LOOK_S = 1.0
-
-
-@dataclass(frozen=True)
-class Face:
-    """What the pages of an application look like: its templates, and what each of them has at its top.
-
-    `bar` is asked with the request, who looks at the page, and the same where nothing keeps that from doing more.
-    """
-
-    environment: Environment
-    bar: Callable[[Request, Principal | None, Principal | None], dict[str, Any]]
 
 
 async def done_or_said(done: Awaitable[Any], said: Callable[[ApiError], Awaitable[Response]], leads: str) -> Response:
@@ -71,15 +58,15 @@ BACK = {"models": "Back to the model", "participants": "Back to the participant"
 
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """A page, with the bar that every page has."""
-    face: Face = getattr(request.app.state, "face", RIG)
     looking: Principal | None = getattr(request.state, "who", None)
     principal = None if looking is None or looking.locked else looking
-    bar = {**face.bar(request, looking, principal), "version": request.app.version}
-    shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(request.app.state.context)}
+    context: Context = request.app.state.context
+    bar = {**bar_of(context, principal), "right": stop_right(request, looking), "version": request.app.version}
+    shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
     shown["signed"] = signed(principal)
     kept = request.cookies.get(COLOURS, "")
     shown["colours"] = kept if kept in MEDIA else "system"
-    html = face.environment.get_template(template).render(request=request, **shown, **values)
+    html = environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
 
 
@@ -144,15 +131,6 @@ def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
         "now": rig_now(context, principal),
         "may_rearm": principal is not None and principal.may(Scope.REARM),
     }
-
-
-def rig_bar(request: Request, looking: Principal | None, principal: Principal | None) -> dict[str, Any]:
-    """What every page of a rig's service has at its top, with what its stop button is good for."""
-    return {**bar_of(request.app.state.context, principal), "right": stop_right(request, looking)}
-
-
-RIG = Face(environment, rig_bar)
-"""The pages of a rig's service."""
 
 
 def here(request: Request) -> str:

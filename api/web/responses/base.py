@@ -97,9 +97,6 @@ class Problem(Document):
     )
     of: str | None = Field(None, description="409 `other-participant`: whose recording it is; send it as `of`")
     reach: ReachOut | None = Field(None, description="422 `out-of-reach`: what the adaptive test will probably reach")
-    have_bytes: int | None = Field(None, description="409 `other-offset`: what a centre has of the file; go on there")
-    seq: int | None = Field(None, description="409 `out-of-order`: the last item that a centre has; go on after it")
-    hash: str | None = Field(None, description="409 `out-of-order`: its hash")
     evidence: StopEvidence | None = Field(None, description="503 `stop-not-confirmed`: what is known of the stop")
 
 

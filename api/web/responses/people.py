@@ -84,8 +84,7 @@ class AuditOut(Document):
     """The audit trail."""
 
     whole: bool = Field(description="whether the chain of hashes holds")
-    first_broken: int | None = Field(description="`seq` of the first entry that does not hold, or was changed")
-    missing_since: int | None = Field(description="`seq` of the first entry that a receipt names and that is gone")
+    first_broken: int | None = Field(description="`seq` of the first entry that does not hold")
     entries: list[AuditEntryOut]
 
 

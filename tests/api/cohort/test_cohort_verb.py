@@ -89,7 +89,6 @@ def test_wrong_options_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path
 def test_data_that_is_not_there_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     missing = str(tmp_path / "nowhere")
     assert missing in refused(capsys, "fit", missing, "-o", str(tmp_path / "r.parquet"))
-    assert "STIMRIG_TOKEN" in refused(capsys, "diagnose", "https://centre.example", "-o", str(tmp_path / "r.parquet"))
     assert "no such file" in refused(capsys, "changed", missing, missing)
     assert "no such file" in refused(capsys, "figures", missing, "-o", str(tmp_path / "f.html"))
 

@@ -63,7 +63,7 @@ def test_a_fit_gives_what_the_verb_gives(computing: Computing, good: bytes, tmp_
     (tmp_path / "good.h5").write_bytes(good)
     model = identify.fit(identify.read(tmp_path / "good.h5")).to_dict()
     assert (found["status"], found["participant"], found["day"]) == ("ok", "P001", "2026-01-05")
-    assert found["record_id"] == "R-P001-5" and found["kind"] == "pre-session" and found["rig"] is None
+    assert found["record_id"] == "R-P001-5" and found["kind"] == "pre-session"
     assert found["fit_percent"] == pytest.approx(model["fit"]["fit_percent"])
     assert found["verdict"] == model["quality"]["verdict"]
     values = {entry["name"]: entry for entry in found["parameters"]}
@@ -151,7 +151,6 @@ def test_no_file_of_the_machine_can_be_read(computing: Computing, good: bytes, t
 
 def test_the_environment_of_a_child_holds_no_key(computing: Computing, good: bytes, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "secret-of-the-bucket")
-    monkeypatch.setenv("STIMRIG_TOKEN", "secret-of-the-centre")
     computing.close_process()
     row(computing, good)
     assert b"secret-of" not in Path(f"/proc/{pid(computing)}/environ").read_bytes()
@@ -270,9 +269,7 @@ def parcel(content: bytes, patience_s: float, software: str = "") -> Done:
     )
 
 
-def test_a_wrong_hash_or_size_is_a_row_without_a_look_inside(good: bytes) -> None:
-    found = of_worker(good, Entry("a", "a", "a", sha256="0" * 64))
-    assert found["error_kind"] == "hash differs" and "000000000000" in found["error"]
+def test_a_file_that_is_too_large_is_a_row_without_a_look_inside(good: bytes) -> None:
     found = of_worker(good, Entry("a", "a", "a", bytes=10**12))
     assert found["error_kind"] == "bad record" and "256 MB" in found["error"]
 

@@ -1,53 +1,33 @@
-"""Folders, a bucket (moto's server) and a centre (a double): what they list and open, what is wrong with them."""
+"""Folders and a bucket (moto's server): what they list and open, what is wrong with them."""
 
 from __future__ import annotations
 
-import hashlib
 import os
 import pickle
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
-from urllib.parse import parse_qs
 
-import httpx
 import pytest
 
 from stimrig.api.cohort.select import FIELDS, Selection
-from stimrig.api.cohort.sources import Bucket, Centre, Entry, Folder, Source, SourceError, sources_of
+from stimrig.api.cohort.sources import Bucket, Entry, Folder, Source, SourceError, sources_of
 from stimrig.api.cohort.tasks import CohortError
-from tests.harness.http_double import answering
 
 pytestmark = pytest.mark.slow
 
 MOST = 1000
 
 
-def listed(source: Source, select: str = "") -> list[Entry]:
-    return sorted(source.entries(Selection(select)), key=lambda entry: entry.address)
+def listed(source: Source) -> list[Entry]:
+    return sorted(source.entries(), key=lambda entry: entry.address)
 
 
-def refused(*addresses: str, token: str = "") -> str:
+def refused(*addresses: str) -> str:
     with pytest.raises(CohortError) as caught:
-        for source in sources_of(addresses, token):
+        for source in sources_of(addresses):
             source.check()
     assert "\n" not in str(caught.value)
     return str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "scheduler", ["tcp://10.0.0.1:8786", "node7:8786", "ws://10.0.0.1:8786", "tcp://127.0.0.1:8786", "tls", "[evil"]
-)
-def test_a_centres_token_goes_to_no_worker_in_the_clear(scheduler: str, tmp_path: Path) -> None:
-    with pytest.raises(CohortError, match="in the clear") as caught:
-        sources_of(["https://centre.example.org"], "secret-token", scheduler)
-    assert scheduler in str(caught.value) and "secret-token" not in str(caught.value)
-    assert sources_of([str(tmp_path)], "secret-token", scheduler), "a folder needs none"
-
-
-@pytest.mark.parametrize("scheduler", ["", "tls://10.0.0.1:8786"])
-def test_where_nobody_reads_it_a_token_goes_to_the_workers(scheduler: str) -> None:
-    assert sources_of(["https://centre.example.org"], "secret-token", scheduler)
 
 
 # ---- folders
@@ -114,10 +94,7 @@ def test_a_folder_that_may_not_be_read_is_told_and_ends_nothing(tmp_path: Path, 
 
 def test_addresses_that_cannot_be_used_are_refused(tmp_path: Path) -> None:
     assert "no such file or folder" in refused(str(tmp_path / "nowhere"))
-    assert "STIMRIG_TOKEN" in refused("https://centre.example")
-    assert "in the clear" in refused("http://centre.example", token="t")
     assert "gibberish://" in refused("gibberish://x/y")
-    assert "cannot be reached" in refused("http://127.0.0.1:9", token="t")
     assert "DATA is missing" in refused()
 
 
@@ -159,87 +136,11 @@ def test_a_bucket_that_is_not_there_is_refused_in_one_line(bucket: Any) -> None:
     assert "s3://records/P9" in refused("s3://records/P9")
 
 
-# ---- a centre
-
-
-CONTENTS = (b"one", b"two", b"three", b"four", b"five")
-
-
-class CentreDouble:
-    """`GET /v1/recordings` in pages of two, and `GET /v1/recordings/{id}`, as a centre answers them."""
-
-    def __init__(self) -> None:
-        self.asked: list[dict[str, list[str]]] = []
-        self.url = ""
-
-    def __call__(self, request: httpx.Request) -> httpx.Response:
-        number = request.url.path.rpartition("/")[2]
-        if request.headers.get("Authorization") != "Bearer right":
-            return problem(401, "unauthorized", "Not signed in")
-        if number == "recordings":
-            self.asked.append(parse_qs(request.url.query.decode()))
-            begin = int(request.url.params.get("after", 0))
-            rows = [self.row(number) for number in range(begin, min(begin + 2, 5))]
-            after = str(begin + 2) if begin + 2 < 5 else None
-            return httpx.Response(200, json={"recordings": rows, "after": after})
-        if number.isdecimal() and int(number) < 4:
-            return httpx.Response(200, content=CONTENTS[int(number)])
-        return problem(404, "not-found", "No such recording")
-
-    def row(self, number: int) -> dict[str, Any]:
-        return {
-            "id": number, "rig": "R1", "recording_id": f"rec-{number}", "participant": f"P{number}", "test_id": None,
-            "origin": None, "created_utc": f"2026-01-0{number + 1}T10:00:00.000Z", "url": f"/v1/recordings/{number}",
-            "file": hashlib.sha256(CONTENTS[number]).hexdigest(), "file_bytes": len(CONTENTS[number]),
-        }  # fmt: skip
-
-
-def problem(status: int, code: str, title: str) -> httpx.Response:
-    return httpx.Response(status, json={"type": f"/problems/{code}", "title": title, "status": status})
-
-
-@pytest.fixture
-def centre() -> Iterator[CentreDouble]:
-    made = CentreDouble()
-    with answering(made) as made.url:
-        yield made
-
-
-def test_a_centre_is_read_page_by_page(centre: CentreDouble) -> None:
-    source = Centre(centre.url, "right")
-    found = listed(source)
-    assert [entry.name for entry in found] == [f"rec-{number}" for number in range(5)]
-    assert [asked.get("after") for asked in centre.asked] == [None, ["2"], ["4"]]
-    assert found[1].known == {
-        "name": "rec-1", "origin": centre.url, "record_id": "rec-1", "participant": "P1", "rig": "R1",
-        "day": "2026-01-02", "begun_utc": "2026-01-02T10:00:00.000Z", "bytes": 3,
-    }  # fmt: skip
-    assert found[1].sha256 == hashlib.sha256(b"two").hexdigest()
-    assert source.open(found[1], MOST) == b"two"
-    assert len(source.open(found[2], 3)) >= 4
-    with pytest.raises(SourceError, match="No such recording"):
-        source.open(found[4], MOST)
-
-
-def test_a_centre_is_asked_for_what_the_selection_says(centre: CentreDouble) -> None:
-    listed(Centre(centre.url, "right"), 'participant == "P1" and day >= "2026-01-02" and "x" in name')
-    assert centre.asked[0] == {"participant": ["P1"], "from": ["2026-01-02"]}
-
-
-def test_a_wrong_token_or_what_is_no_centre_is_one_line(centre: CentreDouble) -> None:
-    assert "Not signed in" in refused(centre.url, token="wrong")
-    assert "Is it a centre?" in refused(f"{centre.url}/v1/recordings/1?", token="right")
-
-
-def test_a_token_is_not_shown() -> None:
-    assert "secret" not in repr(Centre("https://centre.example", "secret"))
-
-
 # ---- `--select`: what is meant, what is not known yet, what is refused, and that nothing is ever run
 
 
 RECORD = {
-    "participant": "P001", "day": "2026-03-01", "kind": "pre-session", "rig": None, "name": "a calib.h5",
+    "participant": "P001", "day": "2026-03-01", "kind": "pre-session", "test_id": None, "name": "a calib.h5",
     "duration_s": 22.7, "bytes": 1000,
 }  # fmt: skip
 
@@ -260,8 +161,8 @@ RECORD = {
         ("duration_s > -1.5", True),
         ('"calib" in name', True),
         ('"calib" not in name', False),
-        ("rig == None", True),
-        ('rig == "R1"', False),
+        ("test_id == None", True),
+        ('test_id == "T1"', False),
         ('rig != "R1"', True),
         ('rig > "R1"', False),
         ('"R" in rig', False),
@@ -349,10 +250,3 @@ def test_a_wrong_field_is_named_and_all_fields_are() -> None:
 )
 def test_what_is_no_comparison_of_fields_is_refused_in_one_line(text: str) -> None:
     refused_selection(text)
-
-
-def test_what_holds_in_any_case_is_asked_of_a_centre() -> None:
-    text = 'participant == "P001" and day >= "2026-01-01" and (rig == "R1" or rig == "R2") and "2026-02-01" > day'
-    assert Selection(text).hints == {"participant": "P001", "from": "2026-01-01", "to": "2026-02-01"}
-    assert Selection('participant == "P001" or rig == "R1"').hints == {}
-    assert Selection('not participant == "P001"').hints == {}

@@ -7,7 +7,7 @@ every change of the tables needs a revision of its own.
 
 from alembic import op
 
-from stimrig.api.store.centre_tables import Table
+from stimrig.api.store.tables import Table
 
 revision = "0001"
 down_revision = None
