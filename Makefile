@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
 
-.PHONY: docs demo test frozen check lint types serve bench soak campaigns mutation words lock clean help setup setup-test simulate
+.PHONY: docs demo test frozen check lint types serve bench soak campaigns mutation lock clean help setup setup-test simulate
 
 help:
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -65,9 +65,6 @@ $(VENV)/.test: requirements/test.txt pyproject.toml deploy/setup.sh
 
 $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench
-
-words: setup ## renew the catalogues of the pages' languages; LANGUAGE=fr begins one (docs/languages.md)
-	@$(BIN)/python -m stimrig.api.language.extract $(LANGUAGE)
 
 lock: ## resolve the locked lists anew (needs uv; for maintainers)
 	@bash deploy/lock.sh

@@ -1,4 +1,4 @@
-"""What the library's effects say of themselves to people, in the page's language; ids are for programs."""
+"""What the library's effects say of themselves to people; ids are for programs."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
-
-from stimrig.api import language
 
 UNITS = (
     "_nm_s_per_rad2", "_s_per_rad", "_per_rad2", "_nm_per_s", "_us_per_s", "_nm_per_rad", "_per_rad", "_per_s", "_nm",
@@ -66,24 +64,21 @@ def effect_words(effect: str) -> str:
     giving, _to, taking = ends.partition(">")
     title = fact_of(effect, "name", interplay().get(known, {}).get("name", ""))
     if taking:
-        return f"{language._(title)} ({giving} → {taking})"
-    return language._(title) if title else effect.replace("_", " ").capitalize()
+        return f"{title} ({giving} → {taking})"
+    return title if title else effect.replace("_", " ").capitalize()
 
 
 def within(effect: str) -> str:
     """A title within a sentence: in English it begins with a small letter."""
     words = effect_words(effect)
-    return words[:1].lower() + words[1:] if language.code() == language.DEFAULT else words
+    return words[:1].lower() + words[1:]
 
 
 def effects_words(effects: Iterable[str], without_evidence: Collection[str] = ()) -> str:
     """Titles, one after the other, those added without evidence marked; of an effect's form (`fatigue:fitness`) people
     are told nothing."""
     named = ((effect, within(effect if ">" in effect else effect.partition(":")[0])) for effect in effects)
-    return ", ".join(
-        language._("%(effects)s (without evidence)", effects=words) if effect in without_evidence else words
-        for effect, words in named
-    )
+    return ", ".join(f"{words} (without evidence)" if effect in without_evidence else words for effect, words in named)
 
 
 def without_unit(parameter: str) -> str:
@@ -92,7 +87,7 @@ def without_unit(parameter: str) -> str:
 
 
 def parameter_words(parameter: str) -> str:
-    """A parameter's name without its unit, in the page's language where it stands for its effect."""
+    """A parameter's name without its unit where it stands for its effect."""
     name = without_unit(parameter)
     known = _short_names().get(name)
-    return name.replace("_", " ") if known is None else language._(known)
+    return name.replace("_", " ") if known is None else known

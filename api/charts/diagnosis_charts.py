@@ -7,7 +7,6 @@ from typing import Any
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import INK, MEASURED, MODEL, TOOLBAR_PX, axis, box, line, role
 from stimrig.api.charts.model_charts import segment_marks
-from stimrig.api.language import _, localised, plain
 from stimrig.api.models import explanation
 from stimrig.identify.healing import looks_like_noise
 from stimrig.identify.yardstick import floor_nm
@@ -58,14 +57,14 @@ def residual(
     for place in places:
         shapes.append(box(place["start_s"], place["end_s"], MARK))
         labels.append(number_place(place))
-    words = _("measured − model")
+    words = "measured − model"
     said = fig.hover(words, fig.RESIDUAL + fig.BESIDE, fig.name_segments(time_s, segments))
     return fig.figure(
         [line(time_s, series["residual_nm"], words, INK, 0.9, **said)],
         height=320, shapes=shapes, annotations=labels, showlegend=False,
         margin={"l": 64, "r": TOOLBAR_PX, "t": 30, "b": 48},
-        xaxis=axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **fig.AT_TIME),
-        yaxis=axis(_("Measured − model (N·m)")),
+        xaxis=axis("Time (s)", range=[time_s[0], time_s[-1]], **fig.AT_TIME),
+        yaxis=axis("Measured − model (N·m)"),
     )  # fmt: skip
 
 
@@ -80,28 +79,28 @@ def number_place(place: dict[str, Any]) -> dict[str, Any]:
 
 def signature(time_s: list[float], found: dict[str, list[float]]) -> dict[str, Any]:
     """What is left without an effect, and what adding it explains of that."""
-    seen, expected = (fig.hover(words, fig.RESIDUAL) for words in (_("seen"), _("expected")))
+    seen, expected = (fig.hover(words, fig.RESIDUAL) for words in ("seen", "expected"))
     data = [
-        line(time_s, found["seen_nm"], _("seen: left without it"), MEASURED, 3.2, **seen),
-        line(time_s, found["expected_nm"], _("expected: what it explains"), MODEL, 1.8, **expected),
+        line(time_s, found["seen_nm"], "seen: left without it", MEASURED, 3.2, **seen),
+        line(time_s, found["expected_nm"], "expected: what it explains", MODEL, 1.8, **expected),
     ]
-    x = axis(_("Time (s)"), range=[time_s[0], time_s[-1]], **fig.AT_TIME)
+    x = axis("Time (s)", range=[time_s[0], time_s[-1]], **fig.AT_TIME)
     margin = {"l": 56, "r": TOOLBAR_PX, "t": 30, "b": 42}
-    return fig.figure(data, height=250, xaxis=x, yaxis=axis(_("Torque (N·m)")), margin=margin)
+    return fig.figure(data, height=250, xaxis=x, yaxis=axis("Torque (N·m)"), margin=margin)
 
 
 def picture(found: dict[str, Any]) -> dict[str, Any]:
     """What a free effect does: its curves, each with its band."""
     data = []
     for number, (name, own) in enumerate(found["lines"].items()):
-        colour, words = (MODEL, MEASURED)[number % 2], fig.unlinked(plain(name))
-        data += fig.filled(found["at"], own["lower"], own["upper"], _("95 %% band")) if number == 0 else []
+        colour, words = (MODEL, MEASURED)[number % 2], fig.unlinked(name)
+        data += fig.filled(found["at"], own["lower"], own["upper"], "95 % band") if number == 0 else []
         if number:
             edges = (line(found["at"], own[edge], "", colour, 0.8, showlegend=False, **fig.QUIET) for edge in EDGES)
             data += edges
         data.append(line(found["at"], own["value"], words, colour, 2.2, **fig.hover(words, fig.SHARE)))
     margin = {"l": 64, "r": TOOLBAR_PX, "t": 30, "b": 48}
-    x, y = (axis(fig.unlinked(plain(found[key]))) for key in ("driver", "axis"))
+    x, y = (axis(fig.unlinked(found[key])) for key in ("driver", "axis"))
     return fig.figure(data, height=270, xaxis=x, yaxis=y, margin=margin)
 
 
@@ -111,8 +110,8 @@ def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
     sizes = [13 if row["current"] else 8 for row in rows]
     data = []
     for key, words, colour, symbol in (
-        ("rms_nm", _("fitted pulses"), MEASURED, "circle"),
-        ("held_out_rms_nm", _("held-out pulses"), MODEL, "diamond"),
+        ("rms_nm", "fitted pulses", MEASURED, "circle"),
+        ("held_out_rms_nm", "held-out pulses", MODEL, "diamond"),
     ):
         values, marker = [row[key] for row in rows], {"size": sizes, "symbol": symbol, "color": colour}
         if key == "rms_nm" or any(value is not None for value in values):
@@ -120,18 +119,18 @@ def falling(rows: list[dict[str, Any]]) -> dict[str, Any]:
             data.append(line(names, values, words, colour, 2.2, mode="lines+markers", marker=marker, **said))
     shapes, labels = [], []
     repeats = rows[-1].get("repetition") or {}
-    between = _("scatter at rest") if repeats.get("found_by") == "estimate" else _("between repeats")
-    floors = ((rows[-1].get("noise_sd_nm"), "noise", _("noise"), "left"),
+    between = "scatter at rest" if repeats.get("found_by") == "estimate" else "between repeats"
+    floors = ((rows[-1].get("noise_sd_nm"), "noise", "noise", "left"),
               (floor_nm(repeats), "repetition", between, "right"))  # fmt: skip
     for level_nm, name, words, side in floors:
         if level_nm:
             shapes.append({"type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": level_nm, "y1": level_nm,
                            "line": {"color": FLOOR, "width": 1.6, "dash": "dash"}})  # fmt: skip
             labels.append({"xref": "paper", "x": 0 if side == "left" else 1, "y": level_nm, "showarrow": False,
-                           "text": f"{words} {localised(f'{level_nm:.3f}')} N·m", "yanchor": "bottom",
+                           "text": f"{words} {level_nm:.3f} N·m", "yanchor": "bottom",
                            "xanchor": side, "name": name, "font": {"color": FLOOR}})  # fmt: skip
     x = axis("", type="category", range=[-0.4, len(rows) - 0.6])
     if sum(map(len, names)) > NAMED_LETTERS:  # they would be cut off; the table below names each number
         x |= {"tickvals": names, "ticktext": [f"{number}." for number in range(1, len(rows) + 1)]}
-    y = axis(_("Error (N·m)"), rangemode="tozero")
+    y = axis("Error (N·m)", rangemode="tozero")
     return fig.figure(data, height=320, shapes=shapes, annotations=labels, xaxis=x, yaxis=y)

@@ -8,7 +8,6 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from stimrig.api.charts.figure import role
-from stimrig.api.language import _, localised
 
 STEP, RADIUS, EDGE = 66.0, 24.0, 36.0
 """From element to element, of one whose utility is quite sure, and around all, px."""
@@ -36,8 +35,8 @@ def array_map(found: dict[str, Any], label: str) -> Markup:
 
 def said(one: dict[str, Any]) -> str:
     """What is expected of a choice, in a line."""
-    said = {name: localised(f"{one[name]['mean']:.1f} ± {one[name]['sd']:.1f}") for name in ("utility", "torque_nm")}
-    words = _("utility %(utility)s N·m, torque %(torque_nm)s N·m", **said)
+    said = {name: f"{one[name]['mean']:.1f} ± {one[name]['sd']:.1f}" for name in ("utility", "torque_nm")}
+    words = "utility {utility} N·m, torque {torque_nm} N·m".format(**said)
     return f"{named(one['elements'])}: {words}"
 
 

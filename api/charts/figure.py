@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 from stimrig.api.clinical_words import segment_words
-from stimrig.api.language import _, lazy, localised
 
 SHEET = Path(__file__).parents[1] / "web" / "pages" / "static" / "page.css"
 NAMED = re.compile(r"var\(--([\w-]+)\)")
@@ -71,16 +70,16 @@ CHART_CONFIG: dict[str, Any] = {
 """Look closer, and save a picture on this machine. The plot library's own set of buttons offers to upload the chart,
 with a person's torque in it, to its maker's cloud: buttons are named one by one, and later versions' stay away, too."""
 BUTTONS = {
-    "Download plot as a PNG": lazy("Save as a picture"),
-    "Download plot": lazy("Save as a picture"),
-    "Zoom": lazy("Zoom: draw a box"),
-    "Pan": lazy("Move"),
-    "Reset axes": lazy("Show all again"),
+    "Download plot as a PNG": "Save as a picture",
+    "Download plot": "Save as a picture",
+    "Zoom": "Zoom: draw a box",
+    "Pan": "Move",
+    "Reset axes": "Show all again",
 }
 PAGE_CONFIG: dict[str, Any] = {
     **CHART_CONFIG, "locale": "page", "locales": {"page": {"format": {}, "dictionary": BUTTONS}},
 }  # fmt: skip
-"""On a page: the buttons' words in its language."""
+"""On a page: the buttons' words."""
 
 
 def unlinked(words: str) -> str:
@@ -161,7 +160,7 @@ def band_of(document: dict[str, Any], curve: str) -> dict[str, Any]:
 
 def band(known: dict[str, Any], along: str) -> list[dict[str, Any]]:
     """A curve's band as MODEL.json has it; nothing where it has none."""
-    return filled(known[along], known["whole_lower"], known["whole_upper"], _("95 %% band")) if known else []
+    return filled(known[along], known["whole_lower"], known["whole_upper"], "95 % band") if known else []
 
 
 # ---- under the pointer: quantity, unit, and as many digits as the measurement carries -----------------------------
@@ -196,7 +195,7 @@ def hover_halves(words: str, value: str, halves: Sequence[float]) -> dict[str, A
     """A curve's hover text with the half width of its band at each of its points; without it if there are none."""
     if not halves:
         return hover(words, value)
-    return hover(words, f"{value} ± %{{customdata}}", [localised(f"{half:.2f}") for half in halves])
+    return hover(words, f"{value} ± %{{customdata}}", [f"{half:.2f}" for half in halves])
 
 
 def interpolate(at: float, x: Sequence[float], y: Sequence[float]) -> float:

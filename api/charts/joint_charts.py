@@ -13,7 +13,6 @@ from typing import Any
 
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import axis, filled, line, role
-from stimrig.api.language import _
 
 STILL_RAD_S, FAST_RAD_S = 0.15, 0.7
 """The ways to move, as the coverage of the guided tests divides them (`api.sessions.joint_plan`)."""
@@ -51,8 +50,8 @@ def joint_figures(document: dict[str, Any]) -> dict[str, Any]:
     if not (joint.get("seen_h") and joint.get("seen_g")):
         return {}
     return {
-        "joint_g": _figure(joint, "g", "", fig.FACTOR, _("Share of the torque (1)")),
-        "joint_h": _figure(joint, "h", "_nm", fig.TORQUE, _("Passive torque (N·m)")),
+        "joint_g": _figure(joint, "g", "", fig.FACTOR, "Share of the torque (1)"),
+        "joint_h": _figure(joint, "h", "_nm", fig.TORQUE, "Passive torque (N·m)"),
     }
 
 
@@ -101,8 +100,8 @@ def _figure(joint: dict[str, Any], name: str, unit: str, value: str, title: str)
         lines.append(line(angle_deg, solid, words, way.colour, way.width, **marked))
     if dotted:  # an entry of the legend, without a line
         dots = {"line": {"dash": "dot"}, **fig.QUIET}
-        lines.append(line(angle_deg[:1], [None], _("dotted: not seen"), role("mark"), 1.2, **dots))
-    x = axis(_("Joint angle (°)"), range=[angle_deg[0], angle_deg[-1]], **fig.AT_ANGLE)
+        lines.append(line(angle_deg[:1], [None], "dotted: not seen", role("mark"), 1.2, **dots))
+    x = axis("Joint angle (°)", range=[angle_deg[0], angle_deg[-1]], **fig.AT_ANGLE)
     return fig.figure([*bands, *dotted, *lines], height=430, xaxis=x, yaxis=axis(title))
 
 
@@ -116,7 +115,7 @@ def _bands(
         if end - begin < 2:
             continue
         part = slice(begin, end)
-        pair = filled(angle_deg[part], lower[part], upper[part], _("95 %% band"), role("series-band"))
+        pair = filled(angle_deg[part], lower[part], upper[part], "95 % band", role("series-band"))
         if data or not first:
             pair[1] |= {"name": "", "showlegend": False}
         data += pair
@@ -126,9 +125,5 @@ def _bands(
 def _words(way: Way, velocity_rad_s: float) -> str:
     speed = f"{abs(math.degrees(velocity_rad_s)):.0f}"
     if way.name == "still":
-        return _("not moving")
-    return (
-        _("bending %(speed)s°/s", speed=speed)
-        if way.name == "flexion"
-        else _("straightening %(speed)s°/s", speed=speed)
-    )
+        return "not moving"
+    return f"bending {speed}°/s" if way.name == "flexion" else f"straightening {speed}°/s"

@@ -9,7 +9,6 @@ from typing import Any
 
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import INK, MEASURED, MODEL, STIMULUS, TOOLBAR_PX, axis, band, band_of, box, line, role
-from stimrig.api.language import _, localised
 from stimrig.identify.records.record import HELD_OUT
 
 SHOWN_BEYOND = 1.5
@@ -54,10 +53,10 @@ def measurement(
         hoversubplots="axis",
         legend={"orientation": "h", "x": 0, "y": 1.04, "yanchor": "bottom", "traceorder": "normal"},
         margin={"l": 64, "r": TOOLBAR_PX, "t": 60, "b": 48},
-        xaxis=axis(_("Time (s)"), anchor="y3", range=[time_s[0], time_s[-1]], **fig.AT_TIME),
-        yaxis=axis(_("Torque (N·m)"), domain=[0.52, 1.0]),
-        yaxis2=axis(_("Residual (N·m)"), domain=[0.27, 0.46]),
-        yaxis3=axis(_("Pulse width (µs)"), domain=[0.0, 0.2], rangemode="tozero"),
+        xaxis=axis("Time (s)", anchor="y3", range=[time_s[0], time_s[-1]], **fig.AT_TIME),
+        yaxis=axis("Torque (N·m)", domain=[0.52, 1.0]),
+        yaxis2=axis("Residual (N·m)", domain=[0.27, 0.46]),
+        yaxis3=axis("Pulse width (µs)", domain=[0.0, 0.2], rangemode="tozero"),
     )
 
 
@@ -75,8 +74,8 @@ def overview(large: dict[str, Any]) -> dict[str, Any]:
         "legend": {**layout["legend"], "y": 1.01, "font": {"size": 11}},
         "margin": {"l": 52, "r": TOOLBAR_PX, "t": 6, "b": 34},
         "xaxis": {**layout["xaxis"], "anchor": "y2"},
-        "yaxis": axis(_("Torque (N·m)"), domain=[0.43, 1.0], nticks=5),
-        "yaxis2": axis(_("Residual (N·m)"), domain=[0.0, 0.29], nticks=4),
+        "yaxis": axis("Torque (N·m)", domain=[0.43, 1.0], nticks=5),
+        "yaxis2": axis("Residual (N·m)", domain=[0.0, 0.29], nticks=4),
         "yaxis3": {"visible": False, "domain": [0.0, 0.29], "overlaying": "y2"},
     }
     only_said = [{**line, "line": {**line["line"], "width": 0}} if line.get("yaxis") == "y3" else line
@@ -94,16 +93,16 @@ def measured_lines(curves: dict[str, Any], series: dict[str, Any] | None) -> lis
     ]
     names = fig.name_segments(time_s, curves["segments"])
     data = [
-        line(time_s, torque_nm, _("measured"), MEASURED, 3.2,
-             **fig.hover(_("measured"), fig.TORQUE + fig.BESIDE, names)),
-        line(time_s, predicted_nm, _("model, free run"), MODEL, 1.8, **fig.hover(_("model"), fig.TORQUE)),
-        line(time_s, residual, _("measured − model"), INK, 1.0, yaxis="y2", showlegend=False,
-             **fig.hover(_("measured − model"), fig.RESIDUAL)),
-        line(time_s, curves["pulse_width_us"], _("pulse width"), STIMULUS, 1.2, yaxis="y3", showlegend=False,
-             line={"shape": "hv"}, **fig.hover(_("pulse width"), fig.WIDTH)),
+        line(time_s, torque_nm, "measured", MEASURED, 3.2,
+             **fig.hover("measured", fig.TORQUE + fig.BESIDE, names)),
+        line(time_s, predicted_nm, "model, free run", MODEL, 1.8, **fig.hover("model", fig.TORQUE)),
+        line(time_s, residual, "measured − model", INK, 1.0, yaxis="y2", showlegend=False,
+             **fig.hover("measured − model", fig.RESIDUAL)),
+        line(time_s, curves["pulse_width_us"], "pulse width", STIMULUS, 1.2, yaxis="y3", showlegend=False,
+             line={"shape": "hv"}, **fig.hover("pulse width", fig.WIDTH)),
     ]  # fmt: skip
     if series and series.get("lower_nm"):
-        data[1:1] = fig.filled(series["time_s"], series["lower_nm"], series["upper_nm"], _("95 %% band of the model"))
+        data[1:1] = fig.filled(series["time_s"], series["lower_nm"], series["upper_nm"], "95 % band of the model")
     return data
 
 
@@ -150,26 +149,26 @@ def recorded(found: dict[str, Any], plan_us: list[float], rate_hz: float, how: s
     last_s = max([end_s, *found["time_s"][-1:]])
     stairs: dict[str, Any] = {"yaxis": "y2", "line": {"shape": "hv"}}
     data = [
-        line(found["time_s"], found["torque_nm"], _("torque, measured"), MODEL, 1.8),
-        line(found["pulse_time_s"], found["sent_pulse_width_us"], _("pulse width, sent"), STIMULUS, 1.8, **stairs),
+        line(found["time_s"], found["torque_nm"], "torque, measured", MODEL, 1.8),
+        line(found["pulse_time_s"], found["sent_pulse_width_us"], "pulse width, sent", STIMULUS, 1.8, **stairs),
     ]
     rest = [(k / rate_hz, width_us) for k, width_us in enumerate(plan_us) if k / rate_hz >= end_s - 0.5 / rate_hz]
     shapes, labels = segment_marks(found["segments"])
     if rest:
         last_s = max(last_s, min(rest[-1][0] + 1.0 / rate_hz, SHOWN_BEYOND * end_s + 2.0))
         beyond_s, planned_us = zip(*[at for at in rest if at[0] <= last_s], strict=True)
-        data.append(line(list(beyond_s), list(planned_us), _("planned, not played"), fig.FAINT, 1.2, **stairs))
+        data.append(line(list(beyond_s), list(planned_us), "planned, not played", fig.FAINT, 1.2, **stairs))
         shapes.append({"type": "line", "xref": "x", "yref": "paper", "x0": end_s, "x1": end_s, "y0": 0, "y1": 1,
                        "line": {"color": INK}})  # fmt: skip
-        words = fig.unlinked(_("%(how)s at %(time)s s", how=how, time=localised(f"{end_s:.1f}")))
+        words = fig.unlinked(f"{how} at {end_s:.1f} s")
         labels.append({"xref": "x", "yref": "paper", "x": end_s, "y": 0.42, "text": words})
-    axes = {"yaxis": axis(_("Torque (N·m)"), domain=[0.48, 1.0])}
-    axes["yaxis2"] = axis(_("Pulse width (µs)"), domain=[0.0, 0.36], rangemode="tozero")
+    axes = {"yaxis": axis("Torque (N·m)", domain=[0.48, 1.0])}
+    axes["yaxis2"] = axis("Pulse width (µs)", domain=[0.0, 0.36], rangemode="tozero")
     if found.get("angle_deg"):
-        data.append(line(found["angle_time_s"], found["angle_deg"], _("angle of the joint"), INK, 1.6, yaxis="y3"))
+        data.append(line(found["angle_time_s"], found["angle_deg"], "angle of the joint", INK, 1.6, yaxis="y3"))
         axes["yaxis"]["domain"], axes["yaxis2"]["domain"] = [0.6, 1.0], [0.0, 0.2]
-        axes["yaxis3"] = axis(_("Angle (°)"), domain=[0.3, 0.5])
-    return fig.figure(data, shapes=shapes, annotations=labels, xaxis=axis(_("Time (s)"), range=[0.0, last_s]), **axes)
+        axes["yaxis3"] = axis("Angle (°)", domain=[0.3, 0.5])
+    return fig.figure(data, shapes=shapes, annotations=labels, xaxis=axis("Time (s)", range=[0.0, last_s]), **axes)
 
 
 def inversion(found: dict[str, Any]) -> dict[str, Any]:
@@ -177,16 +176,16 @@ def inversion(found: dict[str, Any]) -> dict[str, Any]:
     time_s = [round(k / found["pulse_rate_hz"], 6) for k in range(len(found["pulse_width_us"]))]
     return fig.figure(
         [
-            line(time_s, found["predicted_torque_nm"], _("predicted"), MODEL, 2.2),
-            line(time_s, found["reference_torque_nm"], _("Reference"), INK, 1.4, line={"dash": "dash"}),
-            line(time_s, found["pulse_width_us"], _("pulse width"), STIMULUS, 1.2, yaxis="y2", showlegend=False,
+            line(time_s, found["predicted_torque_nm"], "predicted", MODEL, 2.2),
+            line(time_s, found["reference_torque_nm"], "Reference", INK, 1.4, line={"dash": "dash"}),
+            line(time_s, found["pulse_width_us"], "pulse width", STIMULUS, 1.2, yaxis="y2", showlegend=False,
                  line={"shape": "hv"}),
         ],
         height=460,
         shapes=[box(one["begin_s"], one["end_s"], role("worst-band")) for one in found["unreachable"]],
-        xaxis=axis(_("Time (s)"), range=[0.0, found["duration_s"]]),
-        yaxis=axis(_("Torque above rest (N·m)"), domain=[0.42, 1.0]),
-        yaxis2=axis(_("Pulse width (µs)"), domain=[0.0, 0.32], rangemode="tozero"),
+        xaxis=axis("Time (s)", range=[0.0, found["duration_s"]]),
+        yaxis=axis("Torque above rest (N·m)", domain=[0.42, 1.0]),
+        yaxis2=axis("Pulse width (µs)", domain=[0.0, 0.32], rangemode="tozero"),
     )  # fmt: skip
 
 
@@ -197,25 +196,25 @@ def recruitment(document: dict[str, Any], curves: dict[str, Any] | None = None) 
     """The recruitment curve with its band; with a recording's curves, what its ramp says on the way up and down."""
     curve, known = document["recruitment"], band_of(document, "recruitment")
     width_us = curve["pulse_width_us"]
-    said = fig.hover_band(_("model"), fig.TORQUE, width_us, known, "pulse_width_us")
-    data = [*band(known, "pulse_width_us"), line(width_us, curve["torque_nm"], _("model"), MODEL, 2.2, **said)]
-    words = {"rising": _("ramp up"), "falling": _("ramp down")}
+    said = fig.hover_band("model", fig.TORQUE, width_us, known, "pulse_width_us")
+    data = [*band(known, "pulse_width_us"), line(width_us, curve["torque_nm"], "model", MODEL, 2.2, **said)]
+    words = {"rising": "ramp up", "falling": "ramp down"}
     for way, points in sorted(ramp_points(document, curves).items(), reverse=True) if curves else []:
         marker = {"symbol": SYMBOLS[way], "size": 9, "color": role("chart"),
                   "line": {"color": role(way), "width": 1.8}}  # fmt: skip
         data.append(line(points["pulse_width_us"], points["torque_nm"], words[way], role(way), mode="markers",
                          marker=marker, **fig.hover(words[way], fig.TORQUE)))  # fmt: skip
-    x, y = axis(_("Pulse width (µs)"), **fig.AT_WIDTH), axis(_("Steady torque (N·m)"))
+    x, y = axis("Pulse width (µs)", **fig.AT_WIDTH), axis("Steady torque (N·m)")
     return fig.figure(data, height=340, xaxis=x, yaxis=y, showlegend=len(data) > 1)
 
 
 def step(document: dict[str, Any], response: dict[str, list[float]]) -> dict[str, Any]:
     """The linear part's step response with its band."""
     known, time_s = band_of(document, "step_response"), response["time_s"]
-    said = fig.hover_band(_("model"), fig.SHARE, time_s, known, "time_s")
-    data = [*band(known, "time_s"), line(time_s, response["response"], _("model"), MODEL, 2.2, **said)]
-    x = axis(_("Time (s)"), range=[0, time_s[-1]], **fig.AT_TIME)
-    y = axis(_("Share of the final torque (1)"))
+    said = fig.hover_band("model", fig.SHARE, time_s, known, "time_s")
+    data = [*band(known, "time_s"), line(time_s, response["response"], "model", MODEL, 2.2, **said)]
+    x = axis("Time (s)", range=[0, time_s[-1]], **fig.AT_TIME)
+    y = axis("Share of the final torque (1)")
     return fig.figure(data, height=340, xaxis=x, yaxis=y, showlegend=bool(known))
 
 
@@ -308,7 +307,7 @@ def compared_recruitment(documents: Sequence[dict[str, Any]], names: Sequence[st
             data += pair
         curve = document["recruitment"]
         data.append(_series(curve["pulse_width_us"], curve["torque_nm"], name, number, fig.TORQUE))
-    x, y = axis(_("Pulse width (µs)"), **fig.AT_WIDTH), axis(_("Steady torque (N·m)"))
+    x, y = axis("Pulse width (µs)", **fig.AT_WIDTH), axis("Steady torque (N·m)")
     return fig.figure(data, height=380, xaxis=x, yaxis=y)
 
 
@@ -319,7 +318,7 @@ def compared_step(curves: Sequence[dict[str, Any] | None], names: Sequence[str])
         for number, (found, name) in enumerate(zip(curves, names, strict=True))
         if found
     ]
-    x, y = axis(_("Time (s)"), **fig.AT_TIME), axis(_("Share of the final torque (1)"))
+    x, y = axis("Time (s)", **fig.AT_TIME), axis("Share of the final torque (1)")
     return fig.figure(data, height=380, xaxis=x, yaxis=y)
 
 

@@ -7,7 +7,6 @@ from typing import Any
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import INK, MEASURED, MODEL, TOOLBAR_PX, axis, filled, hover_band, line, role
 from stimrig.api.charts.model_charts import LARGE, segment_marks
-from stimrig.api.language import _
 from stimrig.api.models.stored_model import muscles_of
 
 DASHES = ("solid", "dash", "dot", "dashdot")
@@ -43,7 +42,7 @@ def recruitment(owners: dict[str, dict[str, Any]]) -> dict[str, Any]:
         data += _band(known, "pulse_width_us", name, number)
         said = hover_band(name, fig.TORQUE, curve["pulse_width_us"], known, "pulse_width_us")
         data.append(line(curve["pulse_width_us"], curve["torque_nm"], name, colour, width, **dash, **said))
-    x, y = axis(_("Pulse width (µs)"), **fig.AT_WIDTH), axis(_("Steady torque (N·m)"))
+    x, y = axis("Pulse width (µs)", **fig.AT_WIDTH), axis("Steady torque (N·m)")
     return fig.figure(data, height=340, xaxis=x, yaxis=y)
 
 
@@ -56,7 +55,7 @@ def step(owners: dict[str, dict[str, Any]], responses: dict[str, dict[str, list[
         said = hover_band(name, fig.SHARE, found["time_s"], known, "time_s")
         data.append(line(found["time_s"], found["response"], name, colour, width, **dash, **said))
         last_s = max(last_s, found["time_s"][-1])
-    x, y = axis(_("Time (s)"), range=[0, last_s], **fig.AT_TIME), axis(_("Share of the final torque (1)"))
+    x, y = axis("Time (s)", range=[0, last_s], **fig.AT_TIME), axis("Share of the final torque (1)")
     return fig.figure(data, height=340, xaxis=x, yaxis=y)
 
 
@@ -64,7 +63,7 @@ def _band(known: dict[str, Any], along: str, name: str, number: int) -> list[dic
     if not known:
         return []
     fill = role(f"muscle-{number}-band" if number <= 2 else "series-band")
-    words = _("95 %% band of %(muscle)s", muscle=name)
+    words = f"95 % band of {name}"
     return filled(known[along], known["whole_lower"], known["whole_upper"], words, fill)
 
 
@@ -75,10 +74,10 @@ def measurement(curves: dict[str, Any], whole: bool = True) -> dict[str, Any]:
     """
     time_s, measured_nm, predicted_nm = curves["time_s"], curves["torque_nm"], curves["predicted_torque_nm"]
     shapes, labels = segment_marks(curves["segments"])
-    said = fig.hover(_("measured"), fig.TORQUE + fig.BESIDE, fig.name_segments(time_s, curves["segments"]))
+    said = fig.hover("measured", fig.TORQUE + fig.BESIDE, fig.name_segments(time_s, curves["segments"]))
     data = [
-        line(time_s, measured_nm, _("measured"), MEASURED, 3.2, **said),
-        line(time_s, predicted_nm, _("model, free run"), MODEL, 1.8, **fig.hover(_("model"), fig.TORQUE)),
+        line(time_s, measured_nm, "measured", MEASURED, 3.2, **said),
+        line(time_s, predicted_nm, "model, free run", MODEL, 1.8, **fig.hover("model", fig.TORQUE)),
     ]
     stairs = {"yaxis": "y4", "showlegend": False}
     for number, (name, own) in enumerate(curves["muscles"].items(), start=1):
@@ -89,21 +88,21 @@ def measurement(curves: dict[str, Any], whole: bool = True) -> dict[str, Any]:
         if whole:
             said = fig.hover(name, fig.WIDTH)
             data.append(line(time_s, own["pulse_width_us"], name, colour, 1.2, line={"shape": "hv"}, **stairs, **said))
-    torque, share = _("Torque (N·m)"), _("Each muscle (N·m)")
+    torque, share = "Torque (N·m)", "Each muscle (N·m)"
     if not whole:
         axes = {"yaxis": axis(torque, domain=[0.48, 1.0], nticks=5), "yaxis2": axis(share, domain=[0, 0.4], nticks=4)}
         below, height, margin = "y2", 300, {"l": 52, "r": TOOLBAR_PX, "t": 6, "b": 34}
     else:
         left = [round(m - p, 5) for m, p in zip(measured_nm, predicted_nm, strict=True)]
-        words = _("measured − model")
+        words = "measured − model"
         said = fig.hover(words, fig.RESIDUAL)
         data.append(line(time_s, left, words, INK, 1.0, yaxis="y3", showlegend=False, **said))
         axes = {
             "yaxis": axis(torque, domain=[0.66, 1.0]), "yaxis2": axis(share, domain=[0.4, 0.6]),
-            "yaxis3": axis(_("Residual (N·m)"), domain=[0.22, 0.36]),
-            "yaxis4": axis(_("Pulse width (µs)"), domain=[0.0, 0.17], rangemode="tozero"),
+            "yaxis3": axis("Residual (N·m)", domain=[0.22, 0.36]),
+            "yaxis4": axis("Pulse width (µs)", domain=[0.0, 0.17], rangemode="tozero"),
         }  # fmt: skip
         below, height, margin = "y4", 800, {"l": 64, "r": TOOLBAR_PX, "t": 60, "b": 48}
-    x = axis(_("Time (s)"), anchor=below, range=[time_s[0], time_s[-1]], **fig.AT_TIME)
+    x = axis("Time (s)", anchor=below, range=[time_s[0], time_s[-1]], **fig.AT_TIME)
     more = {"shapes": shapes, "annotations": labels, "hoversubplots": "axis", "xaxis": x, **axes}
     return fig.figure(data, height=height, margin=margin, **more)

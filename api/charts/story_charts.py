@@ -10,7 +10,6 @@ from stimrig.api.charts.diagnosis_charts import falling, number_place
 from stimrig.api.charts.figure import INK, MEASURED, MODEL, TOOLBAR_PX, axis, box, line, role
 from stimrig.api.charts.model_charts import broken_at_pauses, segment_marks
 from stimrig.api.charts.svg import Figures
-from stimrig.api.language import _, localised
 
 BEFORE = role("series-2")
 AROUND_S = 1.0
@@ -50,24 +49,24 @@ def side_by_side(
     for place in places:
         shapes.append(box(place["start_s"], place["end_s"], role("healed-band" if place["healed"] else "worst-band")))
         labels.append(number_place(place))
-    first = [(before, _("model at first"), BEFORE, "dot", 1.6)] if changed else []
-    data = [line(*_within(curves, "torque_nm", start_s, end_s), _("measured"), MEASURED, 3.2,
-                 **fig.hover(_("measured"), fig.TORQUE))]  # fmt: skip
-    last = _("model at last") if changed else _("model")
+    first = [(before, "model at first", BEFORE, "dot", 1.6)] if changed else []
+    data = [line(*_within(curves, "torque_nm", start_s, end_s), "measured", MEASURED, 3.2,
+                 **fig.hover("measured", fig.TORQUE))]  # fmt: skip
+    last = "model at last" if changed else "model"
     for model, words, colour, dash, width in [*first, (after, last, MODEL, "solid", 1.8)]:
         said = fig.hover(words, fig.TORQUE)
         x, y = _within(model["curves"], "predicted_torque_nm", start_s, end_s)
         data.append(line(x, y, words, colour, width, line={"dash": dash}, **said))
-    for model, words, colour, width in [(before, _("left at first"), BEFORE, 0.9)] * changed + [
-        (after, _("left at last") if changed else _("residual"), INK, 1.0)
+    for model, words, colour, width in [(before, "left at first", BEFORE, 0.9)] * changed + [
+        (after, "left at last" if changed else "residual", INK, 1.0)
     ]:
         x, y = _within(model["comparison"]["series"], "residual_nm", start_s, end_s)
         data.append(line(x, y, words, colour, width, yaxis="y2", showlegend=False, **fig.hover(words, fig.RESIDUAL)))
     return fig.figure(
         data, height=420, shapes=shapes, annotations=labels, hoversubplots="axis",
         margin={"l": 64, "r": TOOLBAR_PX, "t": 40, "b": 48},
-        xaxis=axis(_("Time (s)"), anchor="y2", range=[start_s, end_s], **fig.AT_TIME),
-        yaxis=axis(_("Torque (N·m)"), domain=[0.42, 1.0]), yaxis2=axis(_("Residual (N·m)"), domain=[0.0, 0.34]),
+        xaxis=axis("Time (s)", anchor="y2", range=[start_s, end_s], **fig.AT_TIME),
+        yaxis=axis("Torque (N·m)", domain=[0.42, 1.0]), yaxis2=axis("Residual (N·m)", domain=[0.0, 0.34]),
     )  # fmt: skip
 
 
@@ -80,18 +79,17 @@ def _within(found: dict[str, Any], name: str, start_s: float, end_s: float) -> t
 
 def captions(told: dict[str, Any]) -> dict[str, str]:
     """What stands below each figure, with its numbers."""
-    rows, noise = told["rows"], localised(f"{told['noise_sd_nm']:.3g}")
-    first, last = (localised(f"{row[told['error']]:.3g}") for row in (rows[0], rows[-1]))
+    rows, noise = told["rows"], f"{told['noise_sd_nm']:.3g}"
+    first, last = (f"{row[told['error']]:.3g}" for row in (rows[0], rows[-1]))
     found = {
-        "story-torque": _("Torque measured and predicted in free run from the pulse widths (top), and measured minus "
-                          "predicted (bottom); grey band: 95 %% of the noise of %(noise)s N·m. Error %(first)s N·m.",
-                          noise=noise, first=first),
-        "falling": _("Error of each version; dashed: the noise of a sample, and what differs between repeats of the "
+        "story-torque": ("Torque measured and predicted in free run from the pulse widths (top), and measured minus "
+                          f"predicted (bottom); grey band: 95 % of the noise of {noise} N·m. Error {first} N·m."),
+        "falling": ("Error of each version; dashed: the noise of a sample, and what differs between repeats of the "
                      "same pulses, or where nothing repeats, how the torque scatters at rest."),
     }  # fmt: skip
     if len(rows) > 1:
-        found["story-torque"] += " " + _("Error of the last model %(last)s N·m.", last=last)
+        found["story-torque"] += " " + f"Error of the last model {last} N·m."
     if told["places"]:
         place = told["places"][0]
-        found["story-place"] = _("The worst place close up: %(place)s.", place=place["words"].rstrip("."))
+        found["story-place"] = f"The worst place close up: {place['words'].rstrip('.')}."
     return found

@@ -8,8 +8,6 @@ from typing import Any
 
 from markupsafe import escape
 
-from stimrig.api.language import localised
-
 STROKES = {"dash": "6 4", "dot": "2 3", "dashdot": "7 3 2 3", "longdash": "11 4", "longdashdot": "11 3 2 3"}
 Point = tuple[float, float]
 
@@ -33,7 +31,7 @@ def ticks(low: float, high: float, count: int) -> list[float]:
 
 def plain(value: float) -> str:
     """A tick's number."""
-    return localised(f"{round(value, 9):g}".replace("-", "−"))
+    return f"{round(value, 9):g}".replace("-", "−")
 
 
 def stairs(points: list[Point | None]) -> Iterator[Point | None]:

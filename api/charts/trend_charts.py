@@ -11,10 +11,9 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from stimrig.api import language
+from stimrig.api import local_time
 from stimrig.api.charts.strokes import plain, ticks
 from stimrig.api.clock import unix_of, utc_label
-from stimrig.api.language import _, lazy
 from stimrig.api.models import changes
 from stimrig.api.models.changes import BEYOND, UNBROKEN, Name
 from stimrig.api.models.tracking import Bounds
@@ -66,7 +65,7 @@ def sessions_told(sessions: Sequence[dict[str, Any]]) -> list[list[Any]]:
     """
     plane = Plane([{"at_s": unix_of(one["at_utc"]), "value": None} for one in sessions], False) if sessions else None
     return [
-        [round(plane.x(unix_of(one["at_utc"])), 1), language.when(one["at_utc"]), tip(one),
+        [round(plane.x(unix_of(one["at_utc"])), 1), local_time.when(one["at_utc"]), tip(one),
          f"/models/{one['model_id']}"]
         for one in sessions if plane
     ]  # fmt: skip
@@ -94,7 +93,7 @@ def point(session: dict[str, Any], figure: str, name: Name) -> Point:
 def tip(session: dict[str, Any]) -> str:
     """What is said of a session below its value, line by line."""
     by = session["approved_by"]
-    lines = [_("approved by %(name)s", name=by) if session["approved"] else _("not approved")]
+    lines = [f"approved by {by}" if session["approved"] else "not approved"]
     lines += [f"{note['by']}: {note['text'][:120]}" for note in session["notes"][:4]]
     return "\n".join(lines)
 
@@ -133,7 +132,7 @@ class Plane:
         for value in ticks(self.low, self.high, 4):
             at = self.y(value)
             parts.append(f'<path class="grid" d="M{LEFT:g} {at:.1f}H{WIDE - RIGHT:g}"/>')
-            words = escape(language.localised(plain(value)))
+            words = escape(plain(value))
             parts.append(f'<text class="y" x="{LEFT - 5:g}" y="{at + 4:.1f}">{words}</text>')
         return parts
 
@@ -148,7 +147,7 @@ class Plane:
         parts = []
         for number, at_s in enumerate(marks):
             label = utc_label(at_s)
-            words = language.clock(label)[:5] if short else language.day(label, year=False)
+            words = local_time.clock(label)[:5] if short else local_time.day(label, year=False)
             anchor = "middle" if 0 < number < len(marks) - 1 or len(marks) == 1 else ("start", "end")[number > 0]
             parts.append(
                 f'<text class="x" x="{self.x(at_s):.1f}" y="{TALL - 5:g}" text-anchor="{anchor}">{escape(words)}</text>'
@@ -233,10 +232,10 @@ FOOT = 16.0
 """For the name of the axis below its numbers."""
 MOST_LABELS = 12
 TRIAL_FIGURES: dict[str, tuple[Any, str, float]] = {
-    "gain": (lazy("Gain"), "%", 100.0),
-    "threshold_shift_us": (lazy("Threshold shift"), "µs", 1.0),
-    "time_scale": (lazy("Time scale"), "%", 100.0),
-    "error_percent": (lazy("Error against the reference"), "%", 1.0),
+    "gain": ("Gain", "%", 100.0),
+    "threshold_shift_us": ("Threshold shift", "µs", 1.0),
+    "time_scale": ("Time scale", "%", 100.0),
+    "error_percent": ("Error against the reference", "%", 1.0),
 }
 """Name, unit that is shown, and the factor to it."""
 
@@ -266,7 +265,7 @@ def _trial_point(trial: Mapping[str, Any], name: str) -> Point:
     return {
         "at_s": float(trial["number"]), "value": value, "half": half, "current_ma": None,
         "approved": trial["outcome"] in ("followed", "little"), "noted": bool(trial["ask"]), "words": words,
-        "tip": "\n".join((_("Trial %(number)s", number=trial["number"]), language.clock(trial["at_utc"]), words)),
+        "tip": "\n".join((f"Trial {trial['number']}", local_time.clock(trial["at_utc"]), words)),
     }  # fmt: skip
 
 
@@ -284,7 +283,7 @@ def trial_words(trial: Mapping[str, Any], name: str) -> str:
     if value is None:
         return "–"
     text = f"{value:.1f}" + ("" if half is None else f" ± {half:.1f}")
-    return language.localised(text.replace("-", "−")) + UNBROKEN + TRIAL_FIGURES[name][1]
+    return text.replace("-", "−") + UNBROKEN + TRIAL_FIGURES[name][1]
 
 
 class TrialPlane(Plane):
@@ -317,7 +316,7 @@ class TrialPlane(Plane):
             for one in self.points[::every]
         ]
         middle = (LEFT + WIDE - RIGHT) / 2
-        name = escape(_("Number of the trial"))
+        name = escape("Number of the trial")
         return [*marks, f'<text class="x" x="{middle:g}" y="{TALL + 11:g}" text-anchor="middle">{name}</text>']
 
     def tips(self) -> list[str]:

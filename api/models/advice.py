@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
-from stimrig.api.language import _, lazy, localised, plain
 from stimrig.api.models.stored_model import followed
 
 Act = Literal["approve", "look", "add", "improve", "test", "fit", "wait"]
@@ -48,83 +47,83 @@ class Advice:
 
 GATES: dict[str, Gate] = {
     "stable": Gate(
-        lazy("The dynamics are unstable: in the model the torque grows without end."),
-        lazy("Usable with care: look at the step response first."),
-        lazy("Not usable: test again with the limb held still and relaxed."),
-        lazy("The controller would expect torque that grows without end, and may switch between no and full pulses."),
+        "The dynamics are unstable: in the model the torque grows without end.",
+        "Usable with care: look at the step response first.",
+        "Not usable: test again with the limb held still and relaxed.",
+        "The controller would expect torque that grows without end, and may switch between no and full pulses.",
     ),
     "converged": Gate(
-        lazy("The search for the muscle's speed did not come to its end."),
-        lazy("Usable with care: look at the step response first."),
-        lazy("Not usable: test again with the limb held still and relaxed."),
-        lazy("The speed of the muscle is not certain: the controller may react too early or too late."),
+        "The search for the muscle's speed did not come to its end.",
+        "Usable with care: look at the step response first.",
+        "Not usable: test again with the limb held still and relaxed.",
+        "The speed of the muscle is not certain: the controller may react too early or too late.",
     ),
     "torque": Gate(
-        lazy("The pulses hardly change the torque, or the recruitment curve is far outside what was measured."),
-        lazy("Usable with care: look at the recruitment curve first."),
-        lazy("Not usable: test again with electrodes, current and load cell checked."),
-        lazy("The controller would set too wide pulses: the recruitment curve is not identified."),
+        "The pulses hardly change the torque, or the recruitment curve is far outside what was measured.",
+        "Usable with care: look at the recruitment curve first.",
+        "Not usable: test again with electrodes, current and load cell checked.",
+        "The controller would set too wide pulses: the recruitment curve is not identified.",
     ),
     "monotone": Gate(
-        lazy("The recruitment curve falls at one place."),
-        lazy("Usable with care: look at the recruitment curve first."),
-        lazy("Not usable: test again with electrodes, current and load cell checked."),
-        lazy("The controller's pulse width jumps where the curve falls: two widths belong to one torque there."),
+        "The recruitment curve falls at one place.",
+        "Usable with care: look at the recruitment curve first.",
+        "Not usable: test again with electrodes, current and load cell checked.",
+        "The controller's pulse width jumps where the curve falls: two widths belong to one torque there.",
     ),
     "range": Gate(
-        lazy("Only a few pulse widths were measured; between them the recruitment curve is a guess."),
-        lazy("Usable with care: look at the recruitment curve first; a test with a ramp makes it sure."),
-        lazy("Not usable: test again with a ramp."),
-        lazy("The controller would set pulse widths that were never measured: the plateau is not identified."),
+        "Only a few pulse widths were measured; between them the recruitment curve is a guess.",
+        "Usable with care: look at the recruitment curve first; a test with a ramp makes it sure.",
+        "Not usable: test again with a ramp.",
+        "The controller would set pulse widths that were never measured: the plateau is not identified.",
     ),
     "ceiling": Gate(
-        lazy("The fit is less than the noise would allow."),
-        lazy("Usable with care: look at where the error sits first."),
-        lazy("Not usable: test again with electrodes checked and the limb relaxed: the torque hardly follows."),
-        lazy("The model does not follow the torque: the controller's pulses would be too wide at one time and too "
+        "The fit is less than the noise would allow.",
+        "Usable with care: look at where the error sits first.",
+        "Not usable: test again with electrodes checked and the limb relaxed: the torque hardly follows.",
+        ("The model does not follow the torque: the controller's pulses would be too wide at one time and too "
              "narrow at another."),
     ),
     "held_out": Gate(
-        lazy("The error on held-out pulses is clearly larger than on the others."),
-        lazy("Usable with care: look at the check in the chart first."),
-        lazy("Not usable: test again with the limb held still and relaxed."),
-        lazy("On other pulses the controller would be further off than the fit says."),
+        "The error on held-out pulses is clearly larger than on the others.",
+        "Usable with care: look at the check in the chart first.",
+        "Not usable: test again with the limb held still and relaxed.",
+        "On other pulses the controller would be further off than the fit says.",
     ),
     "gap": Gate(
-        lazy("The fit on held-out pulses is less than the noise would allow."),
-        lazy("Usable with care: look at where the error sits first."),
-        lazy("Not usable: test again with the limb held still and relaxed, or add what is missing."),
-        lazy("The controller works with pulses that the model has not seen: its torque there would be far off."),
+        "The fit on held-out pulses is less than the noise would allow.",
+        "Usable with care: look at where the error sits first.",
+        "Not usable: test again with the limb held still and relaxed, or add what is missing.",
+        "The controller works with pulses that the model has not seen: its torque there would be far off.",
     ),
     "residual": Gate(
-        lazy("What the model leaves over is not only noise."),
-        lazy("Usable with care: look at where the error sits first."),
-        lazy("Not usable: test again with the limb held still and relaxed."),
-        lazy("The error follows a pattern, and the controller repeats it in each trial."),
+        "What the model leaves over is not only noise.",
+        "Usable with care: look at where the error sits first.",
+        "Not usable: test again with the limb held still and relaxed.",
+        "The error follows a pattern, and the controller repeats it in each trial.",
     ),
     "joint": Gate(
-        lazy("The joint moved during the test, and the model does not know of it."),
-        lazy("Usable with care: hold the joint still and test again, or add what depends on the joint."),
-        lazy("Not usable: test again with the limb held still and relaxed."),
-        lazy("At another angle the muscle is stronger or weaker: the controller's pulses would not fit."),
+        "The joint moved during the test, and the model does not know of it.",
+        "Usable with care: hold the joint still and test again, or add what depends on the joint.",
+        "Not usable: test again with the limb held still and relaxed.",
+        "At another angle the muscle is stronger or weaker: the controller's pulses would not fit.",
     ),
     "joint_seen": Gate(
-        lazy("The joint hardly moved in these tests: how the torque depends on it is a guess."),
-        lazy("Usable with care: at the angle of these tests only."),
-        lazy("Not usable: record again while the joint moves."),
-        lazy("At another angle the torque that the controller expects is a guess."),
+        "The joint hardly moved in these tests: how the torque depends on it is a guess.",
+        "Usable with care: at the angle of these tests only.",
+        "Not usable: record again while the joint moves.",
+        "At another angle the torque that the controller expects is a guess.",
     ),
     "evidence": Gate(
-        lazy("It holds an effect that was added without evidence."),
-        lazy("Usable with care: the recording does not ask for an effect in it. Compare it with the version before."),
-        lazy("Not usable: go back to the version before."),
-        lazy("The controller would rely on an effect of which the recording gives no evidence."),
+        "It holds an effect that was added without evidence.",
+        "Usable with care: the recording does not ask for an effect in it. Compare it with the version before.",
+        "Not usable: go back to the version before.",
+        "The controller would rely on an effect of which the recording gives no evidence.",
     ),
     "sensor": Gate(
-        lazy("The load cell shows the same torque again and again: it clips, or it is not connected."),
-        lazy("Usable with care: look at the highest torques in the chart first; the load cell clips."),
-        lazy("Not usable: test again with the load cell checked."),
-        lazy("The controller would set too wide pulses: the plateau is not identified, as the load cell could not "
+        "The load cell shows the same torque again and again: it clips, or it is not connected.",
+        "Usable with care: look at the highest torques in the chart first; the load cell clips.",
+        "Not usable: test again with the load cell checked.",
+        ("The controller would set too wide pulses: the plateau is not identified, as the load cell could not "
              "show it."),
     ),
 }  # fmt: skip
@@ -132,9 +131,9 @@ GATES: dict[str, Gate] = {
 
 
 BESIDE: dict[str, Any] = {
-    "unsure": lazy("Usable: approve it. Whether something is missing, this recording cannot tell."),
-    "unexplained": lazy("Usable: approve it. Some error is left that is not explained."),
-    "missing": lazy("Usable: approve it. An effect is possibly missing."),
+    "unsure": "Usable: approve it. Whether something is missing, this recording cannot tell.",
+    "unexplained": "Usable: approve it. Some error is left that is not explained.",
+    "missing": "Usable: approve it. An effect is possibly missing.",
 }
 """What to do with a usable model whose diagnosis is not that nothing is missing, and names no likely effect."""
 
@@ -159,27 +158,27 @@ def advice(
     `verdict`: identify's; `found`: the checks that failed, the worst first; `missing`: names of effects that the
     diagnosis found likely to be missing.
     """
-    effects = _(" and ").join(_("“%(name)s”", name=plain(name)) for name in missing)
+    effects = " and ".join(f"“{name}”" for name in missing)
     add: Act = "add" if len(missing) == 1 else "improve"
     first = GATES[found[0].gate] if found else None
     if looking and verdict in ("usable", "usable with care"):
-        return Advice("wait", _("Wait: what is missing in the model is still being looked for."))
+        return Advice("wait", "Wait: what is missing in the model is still being looked for.")
     if verdict == "usable":
         if missing:
-            return Advice(add, _("Usable, and better with %(effects)s: add that first.", effects=effects))
-        return Advice("approve", str(BESIDE.get(kind or "", _("Usable: approve it."))))
+            return Advice(add, f"Usable, and better with {effects}: add that first.")
+        return Advice("approve", str(BESIDE.get(kind or "", "Usable: approve it.")))
     if verdict == "usable with care":
         if missing:
-            return Advice(add, _("Usable with care: add %(effects)s first.", effects=effects))
-        look = str(first.look) if first else _("Usable with care: look at where the error sits first.")
+            return Advice(add, f"Usable with care: add {effects} first.")
+        look = str(first.look) if first else "Usable with care: look at where the error sits first."
         forced = bool(found) and found[0].gate == "evidence"
         return Advice("approve" if kind in ("nothing", "unsure") and not forced else "look", look)
     if verdict == "not usable":
         if missing and all(finding.gate in ("gap", "ceiling") for finding in found if finding.severe):
-            return Advice(add, _("Not usable as it is: add %(effects)s, or test again.", effects=effects))
-        again = _("Not usable: test again with electrodes, fixture and load cell checked.")
+            return Advice(add, f"Not usable as it is: add {effects}, or test again.")
+        again = "Not usable: test again with electrodes, fixture and load cell checked."
         return Advice("test", str(first.test) if first else again)
-    return Advice("fit", _("There is no verdict on this model: test again, or fit the recording again."))
+    return Advice("fit", "There is no verdict on this model: test again, or fit the recording again.")
 
 
 def risks(document: dict[str, Any], found: Sequence[Finding]) -> list[str]:
@@ -188,8 +187,8 @@ def risks(document: dict[str, Any], found: Sequence[Finding]) -> list[str]:
     said = list(dict.fromkeys(finding.risk for finding in found))
     if fit is not None:
         error = f"{100.0 - fit:.0f}"
-        said.append(_("On held-out pulses the error is %(percent)s %% of the torque.", percent=error))
-    return said or [_("Nobody knows how far the torque will be from what the controller expects.")]
+        said.append(f"On held-out pulses the error is {error} % of the torque.")
+    return said or ["Nobody knows how far the torque will be from what the controller expects."]
 
 
 def fit_sentence(fit: dict[str, Any]) -> str:
@@ -198,10 +197,10 @@ def fit_sentence(fit: dict[str, Any]) -> str:
     if found.percent is None:
         return ""
     if found.percent <= 0.0:
-        return _("%(where)s the model does not follow the torque at all.", where=found.where)
-    reached = localised(f"{found.percent:.1f}")
-    fit_is = _("%(where)s the fit is %(reached)s %%", where=found.where, reached=reached)
+        return f"{found.where} the model does not follow the torque at all."
+    reached = f"{found.percent:.1f}"
+    fit_is = f"{found.where} the fit is {reached} %"
     if found.ceiling_percent is None:
         return f"{fit_is}."
-    limit = _("the noise allows about %(ceiling)s %%", ceiling=localised(f"{found.ceiling_percent:.1f}"))
+    limit = f"the noise allows about {found.ceiling_percent:.1f} %"
     return f"{fit_is}; {limit}."

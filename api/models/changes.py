@@ -12,9 +12,8 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import Any
 
-from stimrig.api import language
+from stimrig.api import local_time
 from stimrig.api.effect_words import effect_words, effects_words, fact_of, parameter_words
-from stimrig.api.language import _, lazy
 from stimrig.api.models.stored_model import Figure
 
 BEYOND = 2.0
@@ -165,22 +164,22 @@ class Name:
 
 
 NAMES = {
-    "threshold_us": Name(lazy("Threshold"), "µs", digits=1),
-    "plateau_nm": Name(lazy("Plateau"), "N·m", digits=2, in_percent=True),
-    "time_constant_s": Name(lazy("Time constant"), "s", digits=3, in_percent=True),
-    "damping": Name(lazy("Damping"), "1", digits=3, in_percent=True),
-    "delay_s": Name(lazy("Delay"), "ms", 1e3, digits=1),
-    "follows_percent": Name(lazy("Fit"), "%", digits=1),
-    "noise_sd_nm": Name(lazy("Noise of the torque sensor"), "N·m", digits=3),
-    "charge_uc": Name(lazy("Dose of the day"), "mC", 1e-3, digits=2),
-    "current_ma": Name(lazy("Current"), "mA", digits=1),
+    "threshold_us": Name("Threshold", "µs", digits=1),
+    "plateau_nm": Name("Plateau", "N·m", digits=2, in_percent=True),
+    "time_constant_s": Name("Time constant", "s", digits=3, in_percent=True),
+    "damping": Name("Damping", "1", digits=3, in_percent=True),
+    "delay_s": Name("Delay", "ms", 1e3, digits=1),
+    "follows_percent": Name("Fit", "%", digits=1),
+    "noise_sd_nm": Name("Noise of the torque sensor", "N·m", digits=3),
+    "charge_uc": Name("Dose of the day", "mC", 1e-3, digits=2),
+    "current_ma": Name("Current", "mA", digits=1),
 }
 """In the order in which they are shown."""
 UNBROKEN = "\u00a0"
 """Between a number and its unit no line ends."""
 LAST = ("follows_percent", "noise_sd_nm", "charge_uc", "current_ma")
 """Shown after the effects' parameters."""
-KINDS = {"electrodes": lazy("electrodes"), "side": lazy("the side"), "posture": lazy("posture")}
+KINDS = {"electrodes": "electrodes", "side": "the side", "posture": "posture"}
 
 
 def name_of(figure: str, unit: str = "1") -> Name:
@@ -192,12 +191,12 @@ def name_of(figure: str, unit: str = "1") -> Name:
 
 
 def value_words(value: float | None, name: Name, unit: bool = True) -> str:
-    """A value in the unit in which it is shown, as the page's language writes it."""
+    """A value in the unit in which it is shown."""
     if value is None:
         return "–"
     scaled = value * name.factor
     digits = name.digits if name.digits is not None else _digits(scaled)
-    text = language.localised(f"{round(scaled, digits) + 0.0:.{digits}f}".replace("-", "−"))  # + 0.0: no "−0"
+    text = f"{round(scaled, digits) + 0.0:.{digits}f}".replace("-", "−")  # + 0.0: no "−0"
     return f"{text}{UNBROKEN}{name.unit}" if unit and name.unit != "1" else text
 
 
@@ -224,9 +223,9 @@ def _digits(value: float) -> int:
 
 def sentences(before: State, now: State, since_utc: str) -> list[str]:
     """What changed beyond its uncertainty, a sentence each; one that says so where nothing did."""
-    day = language.day(since_utc)
+    day = local_time.day(since_utc)
     moved = [_sentence(one, day) for one in changed(before, now)]
-    return moved or [_("Nothing changed beyond its uncertainty since %(day)s.", day=day)]
+    return moved or [f"Nothing changed beyond its uncertainty since {day}."]
 
 
 def _sentence(one: dict[str, Any], day: str) -> str:
@@ -234,15 +233,15 @@ def _sentence(one: dict[str, Any], day: str) -> str:
     name = name_of(one["figure"], one["unit"])
     if one["before"] * one["now"] < 0:
         amounts = {"before": value_words(one["before"], name), "now": value_words(one["now"], name)}
-        return _("%(figure)s: %(now)s, it was %(before)s on %(day)s.", figure=name.words, day=day, **amounts)
+        return "{figure}: {now}, it was {before} on {day}.".format(figure=name.words, day=day, **amounts)
     if name.in_percent and one["percent"] is not None:
         amount = f"{abs(one['percent']):.{1 if abs(one['percent']) < 9.95 else 0}f}{UNBROKEN}%"
     else:
         amount = value_words(abs(one["difference"]), name)
-    given = {"figure": name.words, "amount": language.localised(amount), "day": day}
+    given = {"figure": name.words, "amount": amount, "day": day}
     if abs(one["now"]) < abs(one["before"]):
-        return _("%(figure)s %(amount)s lower than on %(day)s, more than twice its uncertainty.", **given)
-    return _("%(figure)s %(amount)s higher than on %(day)s, more than twice its uncertainty.", **given)
+        return "{figure} {amount} lower than on {day}, more than twice its uncertainty.".format(**given)
+    return "{figure} {amount} higher than on {day}, more than twice its uncertainty.".format(**given)
 
 
 def doubt_sentences(before: State, now: State) -> list[str]:
@@ -252,16 +251,16 @@ def doubt_sentences(before: State, now: State) -> list[str]:
 
 def _doubt(kind: str, before: Any, now: Any) -> str:
     if kind == "current unknown":
-        return _("The current of a recording is not known: threshold and plateau compare only at the same current.")
+        return "The current of a recording is not known: threshold and plateau compare only at the same current."
     if kind == "current":
         given = {name: value_words(value, NAMES["current_ma"]) for name, value in (("before", before), ("now", now))}
-        return _("The current was %(before)s, now it is %(now)s: threshold and plateau are not compared.", **given)
+        return "The current was {before}, now it is {now}: threshold and plateau are not compared.".format(**given)
     if kind == "effects":
-        given = {name: effects_words(value) or _("none") for name, value in (("before", before), ("now", now))}
+        given = {name: effects_words(value) or "none" for name, value in (("before", before), ("now", now))}
         if given["before"] == given["now"]:
-            return _("The models describe %(now)s in different ways: only large differences are told.", **given)
-        return _("The models' effects differ (%(before)s, then %(now)s): only large differences are told.", **given)
+            return "The models describe {now} in different ways: only large differences are told.".format(**given)
+        return "The models' effects differ ({before}, then {now}): only large differences are told.".format(**given)
     given = {"before": str(before or "–")[:80], "now": str(now or "–")[:80]}
     if kind == "method":
-        return _("The methods differ (%(before)s, then %(now)s): only large differences are told.", **given)
-    return _("The notes on %(kind)s differ: “%(before)s”, then “%(now)s”.", kind=KINDS.get(kind, kind), **given)
+        return "The methods differ ({before}, then {now}): only large differences are told.".format(**given)
+    return "The notes on {kind} differ: “{before}”, then “{now}”.".format(kind=KINDS.get(kind, kind), **given)

@@ -9,18 +9,17 @@ from typing import Any
 from stimrig.api.clinical_words import segment_words
 from stimrig.api.effect_words import effect_words, effects_words, parameter_words, within, without_unit
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _, lazy, localised, plain, translated
 from stimrig.api.structure import worded
 from stimrig.identify.conclusion import asked_for, conclude, in_order, is_likely
 from stimrig.identify.healing import stands_out
 from stimrig.identify.summary import probability, sure
 
 SPLITS: dict[str, Any] = {
-    "segment": lazy("By part of the test"),
-    "level": lazy("By level of pulse width"),
-    "direction": lazy("By direction of pulse width"),
-    "time": lazy("By time since the start"),
-    "frequency": lazy("By frequency"),
+    "segment": "By part of the test",
+    "level": "By level of pulse width",
+    "direction": "By direction of pulse width",
+    "time": "By time since the start",
+    "frequency": "By frequency",
 }
 OWN_SHARE = 0.05
 """By so much the error of a model that is fitted anew may differ."""
@@ -28,10 +27,10 @@ LEAST_SHARE = 0.005
 """Octaves above the last one with a larger share are not shown."""
 
 PARTS = {
-    "f": lazy("f(u), the recruitment curve"),
-    "G": lazy("G, the linear dynamics"),
-    "g": lazy("g(x, ẋ), the active torque over angle and velocity"),
-    "h": lazy("h(x, ẋ), the passive torque over angle and velocity"),
+    "f": "f(u), the recruitment curve",
+    "G": "G, the linear dynamics",
+    "g": "g(x, ẋ), the active torque over angle and velocity",
+    "h": "h(x, ẋ), the passive torque over angle and velocity",
 }
 """Where an effect stands in the paper's Fig. 2."""
 
@@ -55,14 +54,14 @@ def view(diagnosis: dict[str, Any], comparison: dict[str, Any] | None, effects: 
     places = [] if noise else (comparison or {}).get("where") or diagnosis.get("where") or []
     return {
         "kind": said.kind,
-        "title": translated(said.title),
-        "words": translated(said.words) + _mostly_here(places if said.kind == "unexplained" else []),
-        "advice": translated(said.advice),
+        "title": said.title,
+        "words": said.words + _mostly_here(places if said.kind == "unexplained" else []),
+        "advice": said.advice,
         "missing": [card(entry, library, diagnosis.get("base") or {}) for entry in missing],
         "free": [free_card(entry, library) for entry in free],
         "to_add": [entry["effect"] for entry in asked],
         "likely": [name_of(entry["effect"], library) for entry in asked if is_likely(entry)],
-        "structure": effects_words(diagnosis.get("structure") or []) or _("plain"),
+        "structure": effects_words(diagnosis.get("structure") or []) or "plain",
         "places": [place(entry, number) for number, entry in enumerate(places, start=1)],
         "splits": [] if noise else splits(comparison or {}),
         "tests": ((comparison or {}).get("tests") or {}).get("tests") or [],
@@ -105,15 +104,15 @@ def decided(experiment: dict[str, Any] | None, diagnosis: dict[str, Any], effect
         return ""
     library = diagnosis.get("library") or {}
     named = [row for row in diagnosis["missing"] if row["effect"] in rivals]
-    between = {"rivals": _(" and ").join(_in_a_sentence(rival, library) for rival in rivals)}
+    between = {"rivals": " and ".join(_in_a_sentence(rival, library) for rival in rivals)}
     if not named:
-        return _("The further test was to decide between %(rivals)s: with it, none of them is asked for.", **between)
+        return "The further test was to decide between {rivals}: with it, none of them is asked for.".format(**between)
     if any(not set(row.get("confused_with") or []).isdisjoint(rivals) for row in named):
-        return _("The further test was to decide between %(rivals)s: it has not told them apart.", **between)
+        return "The further test was to decide between {rivals}: it has not told them apart.".format(**between)
     if len(named) > 1:
-        return _("The further test was to decide between %(rivals)s: it asks for more than one of them.", **between)
+        return "The further test was to decide between {rivals}: it asks for more than one of them.".format(**between)
     found = _in_a_sentence(named[0]["effect"], library)
-    return _("The further test was to decide between %(rivals)s: it is %(found)s.", **between, found=found)
+    return "The further test was to decide between {rivals}: it is {found}.".format(**between, found=found)
 
 
 def _without(diagnosis: dict[str, Any], held: Collection[str]) -> dict[str, list[dict[str, Any]]]:
@@ -126,7 +125,7 @@ def _without(diagnosis: dict[str, Any], held: Collection[str]) -> dict[str, list
 def _mostly_here(places: Sequence[dict[str, Any]]) -> str:
     if not places:
         return ""
-    return " " + _("It sits mostly here: %(place)s.", place=place(places[0], 1)["words"])
+    return " " + f"It sits mostly here: {place(places[0], 1)['words']}."
 
 
 def name_of(effect: str, library: dict[str, Any]) -> str:
@@ -136,13 +135,13 @@ def name_of(effect: str, library: dict[str, Any]) -> str:
 
 def _in_a_sentence(effect: str, library: dict[str, Any]) -> str:
     known = (library.get(effect) or {}).get("name")
-    return plain(known.lower()) if known else within(effect)
+    return known.lower() if known else within(effect)
 
 
 def card(entry: Mapping[str, Any], library: dict[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     """One effect that is missing. `base`: this model's errors; an effect found beside another begins at other ones."""
     known = library.get(entry["effect"]) or {}
-    rows = ((_("fitted pulses"), ""), (_("held-out pulses"), "held_out_"))
+    rows = (("fitted pulses", ""), ("held-out pulses", "held_out_"))
     errors = [
         (label, before_nm, entry.get(f"{prefix}rms_after_nm"))
         for label, prefix in rows
@@ -197,9 +196,9 @@ def how_sure(chance: float | None) -> str:
     if chance is None:
         return ""
     words = {
-        "very probably": _("very probably missing · %(percent)s", percent=probability(chance)),
-        "probably": _("probably missing · %(percent)s", percent=probability(chance)),
-        "possibly": _("possibly missing · %(percent)s", percent=probability(chance)),
+        "very probably": f"very probably missing · {probability(chance)}",
+        "probably": f"probably missing · {probability(chance)}",
+        "possibly": f"possibly missing · {probability(chance)}",
     }
     return words[sure(chance)]
 
@@ -209,7 +208,7 @@ def _labelled(parameters: dict[str, Any], known: dict[str, Any], own: str | None
     forms = sorted(known.get("forms") or [], key=lambda form: form.get("name") == own)
     about = {one["name"]: one.get("about") or "" for form in forms for one in form["parameters"]}
     return {
-        name: {**value, "label": plain(about.get(name, "")) or parameter_words(name), "symbol": without_unit(name)}
+        name: {**value, "label": about.get(name, "") or parameter_words(name), "symbol": without_unit(name)}
         for name, value in parameters.items()
     }
 
@@ -220,8 +219,8 @@ def place(entry: dict[str, Any], number: int) -> dict[str, Any]:
     span = f"{low:.0f} µs" if high - low < 0.5 else f"{low:.0f}–{high:.0f} µs"
     segment = segment_words(entry["segment"])
     ways = {
-        "rising": _("%(segment)s, pulse width rising, %(span)s", segment=segment, span=span),
-        "falling": _("%(segment)s, pulse width falling, %(span)s", segment=segment, span=span),
+        "rising": f"{segment}, pulse width rising, {span}",
+        "falling": f"{segment}, pulse width falling, {span}",
     }
     words = ways.get(entry.get("direction") or "", f"{segment}, {span}")
     text = entry.get("text") or ""
@@ -230,7 +229,7 @@ def place(entry: dict[str, Any], number: int) -> dict[str, Any]:
         **entry,
         "number": number,
         "text": text,
-        "words": f"{words}: {plain(what)}" if what else words,
+        "words": f"{words}: {what}" if what else words,
         "percent": 100 * entry["share_of_excess"],
     }
 
@@ -240,7 +239,7 @@ def splits(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     by = comparison.get("by") or {}
     found = []
     for kind, title in SPLITS.items():
-        say = segment_words if kind == "segment" else plain
+        say = segment_words if kind == "segment" else str
         rows = [{**row, "words": say(row["label"])} for row in by.get(kind) or []]
         while kind == "frequency" and len(rows) > 1 and rows[-1]["share_of_excess"] < LEAST_SHARE:
             rows.pop()
@@ -269,7 +268,7 @@ def _seconds(settings: dict[str, Any], pulse_rate_hz: float | None) -> str:
         parts.append(f"{len(widths) / pulse_rate_hz:g} s")
     width = settings.get("max_pulse_width_us")
     times = f" × {settings['repeats']}" if settings.get("repeats", 1) != 1 else ""
-    return localised(" + ".join(parts)) + times + (" " + _("to %(width)s µs", width=f"{width:g}") if width else "")
+    return " + ".join(parts) + times + (f" to {width:g} µs" if width else "")
 
 
 def others(diagnosis: dict[str, Any], effects: Sequence[str], library: dict[str, Any]) -> list[dict[str, Any]]:
@@ -306,7 +305,7 @@ def label(row: dict[str, Any]) -> str:
     if row["added_effect"]:
         return f"+ {effects_words(row['added_effect'].split(','), forced)}"
     begun_with = effects_words(row.get("effects") or [], forced)
-    return _("with %(effects)s", effects=begun_with) if begun_with else _("base model")
+    return f"with {begun_with}" if begun_with else "base model"
 
 
 def step_versions(found: dict[str, Any]) -> list[dict[str, Any]]:

@@ -5,15 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from stimrig.api.language import _, lazy, localised
-
 REASONS: dict[str, Any] = {
-    "above-plateau": lazy("too high for the widest pulse"),
-    "below-zero": lazy("on the other side of zero, and a muscle only pulls"),
-    "rises-too-fast": lazy("rises faster than the muscle, or than pulses may widen"),
-    "falls-too-fast": lazy("falls faster than the muscle lets go"),
-    "under-threshold": lazy("too low: near the threshold a pulse gives too little or too much"),
-    "not-followed": lazy("the muscle does something there that the pulses cannot make up for"),
+    "above-plateau": "too high for the widest pulse",
+    "below-zero": "on the other side of zero, and a muscle only pulls",
+    "rises-too-fast": "rises faster than the muscle, or than pulses may widen",
+    "falls-too-fast": "falls faster than the muscle lets go",
+    "under-threshold": "too low: near the threshold a pulse gives too little or too much",
+    "not-followed": "the muscle does something there that the pulses cannot make up for",
 }
 
 COLUMNS = ("pulse_width_us", "reference_torque_nm", "predicted_torque_nm")
@@ -23,7 +21,7 @@ def rows(found: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
     """A row for each stretch: when, how much lacks, why."""
     return [
         {
-            "when": _("%(begin)s to %(end)s s", begin=_number(one["begin_s"]), end=_number(one["end_s"])),
+            "when": f"{_number(one['begin_s'])} to {_number(one['end_s'])} s",
             "lacks": f"{_number(one['shortfall_nm'])} N·m",
             "why": str(REASONS.get(one["reason"], one["reason"])),
         }
@@ -32,7 +30,7 @@ def rows(found: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
 
 
 def _number(value: float) -> str:
-    return localised(f"{value:.2f}")
+    return f"{value:.2f}"
 
 
 def table(found: dict[str, Any]) -> str:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Any
 
 from stimrig.api.effect_words import fact_of
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _
 from stimrig.identify.yardstick import repetition_sentences
 
 if TYPE_CHECKING:
@@ -172,12 +171,12 @@ class Followed:
 def followed(fit: Mapping[str, Any]) -> Followed:
     """The figure of a model's `fit`: of pulses not used for fitting where there are any."""
     if fit.get("held_out_fit_percent") is None:
-        where = _("On the pulses that it was fitted to")
+        where = "On the pulses that it was fitted to"
         return Followed(fit.get("fit_percent"), fit.get("ceiling_percent"), where, held_out=False)
     if fit.get("held_out_by") == "cross-validation":
-        where = _("On parts of the recording that were left out in turn")
+        where = "On parts of the recording that were left out in turn"
     else:
-        where = _("On held-out pulses (not used for fitting)")
+        where = "On held-out pulses (not used for fitting)"
     return Followed(fit["held_out_fit_percent"], fit.get("held_out_ceiling_percent"), where)
 
 

@@ -7,7 +7,6 @@ from itertools import pairwise
 from typing import Any
 
 from stimrig.api.effect_words import fact_of
-from stimrig.api.language import _, localised, translated
 from stimrig.api.models import explanation
 from stimrig.api.models.explanation import place
 from stimrig.identify.conclusion import why_ended
@@ -34,8 +33,7 @@ def story(
     why = diagnosis and explanation.view(diagnosis, before, [])
     healed = healed_places(before, after) if why is None or why["places"] else []
     places = [
-        {**place(found, number), **found, "became": translated(place_words(found))}
-        for number, found in enumerate(healed, start=1)
+        {**place(found, number), **found, "became": place_words(found)} for number, found in enumerate(healed, start=1)
     ]
     return {
         "title": _title(rows, error, fell),
@@ -45,27 +43,27 @@ def story(
         "places": places,
         "why": why,
         "steps": [_step(row, previous, error) for previous, row in pairwise(rows)],
-        "ended": last and translated(why_ended(last)),
+        "ended": last and why_ended(last),
         "then": last and explanation.view(last, after, rows[-1].get("effects") or []),
         "noise_sd_nm": after.get("noise_sd_nm"),
     }
 
 
 def _title(rows: Sequence[dict[str, Any]], error: str, fell: bool) -> str:
-    first, now = (localised(f"{row[error]:.3g}") for row in (rows[0], rows[-1]))
+    first, now = (f"{row[error]:.3g}" for row in (rows[0], rows[-1]))
     held_out = error.startswith("held_out")
     if len(rows) == 1:
-        return _("The held-out error is %(now)s N·m", now=now) if held_out else _("The error is %(now)s N·m", now=now)
+        return f"The held-out error is {now} N·m" if held_out else f"The error is {now} N·m"
     given = {"first": first, "now": now}
     if fell:
-        falls = _("The held-out error fell from %(first)s to %(now)s N·m", **given)
-        return falls if held_out else _("The error fell from %(first)s to %(now)s N·m", **given)
-    stays = _("The held-out error did not fall: %(first)s, then %(now)s N·m", **given)
-    return stays if held_out else _("The error did not fall: %(first)s, then %(now)s N·m", **given)
+        falls = "The held-out error fell from {first} to {now} N·m".format(**given)
+        return falls if held_out else "The error fell from {first} to {now} N·m".format(**given)
+    stays = "The held-out error did not fall: {first}, then {now} N·m".format(**given)
+    return stays if held_out else "The error did not fall: {first}, then {now} N·m".format(**given)
 
 
 def _step(row: dict[str, Any], before: dict[str, Any], error: str) -> dict[str, Any]:
     """What a version added, in plain words, and what that did to the error."""
     added = (row.get("added_effect") or "").split(",")
-    plain = " ".join(translated(fact_of(effect, "plain", "")) for effect in added)
+    plain = " ".join(fact_of(effect, "plain", "") for effect in added)
     return {**row, "plain": plain, "before_nm": before[error], "after_nm": row[error]}

@@ -9,12 +9,12 @@ from typing import Any
 
 from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _, clock, day, lazy, localised, when
+from stimrig.api.local_time import clock, day, when
 
 LEAST_PERCENT, MOST_PERCENT, USUAL_PERCENT = 0.0, 60.0, 20.0
 QUANTITIES = {"gain": "gain", "threshold_shift_us": "threshold", "time_scale": "time scale"}
 """The quantities of `stimrig.identify.tracking`, named here, too, so that the service need not load it, and what people
-read; the same words stand in `stimrig.api.language.extract`."""
+read."""
 CONTRADICTS, NO_TORQUE, NOT_FOLLOWED = "contradicts", "no-torque", "not-followed"
 NEW_TEST = "A new test is needed; the shortest is the adaptive test, which stops by itself."
 
@@ -139,12 +139,12 @@ def _left(number: int, name: str, value: float, low: float, high: float) -> str:
 
 
 OUTCOMES = {
-    "followed": lazy("followed"),
-    "little": lazy("too little to learn from"),
-    "odd": lazy("unlike the trials before; the model hardly moved"),
-    "contradicts": lazy("does not fit the model"),
-    "no-torque": lazy("next to no torque came: look at electrodes and cables"),
-    "not-followed": lazy("not followed"),
+    "followed": "followed",
+    "little": "too little to learn from",
+    "odd": "unlike the trials before; the model hardly moved",
+    "contradicts": "does not fit the model",
+    "no-torque": "next to no torque came: look at electrodes and cables",
+    "not-followed": "not followed",
 }
 SENTENCES = {
     "gain": (
@@ -183,22 +183,22 @@ def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
         if sign := _sure(now, name):
             value = now[name]["value"]
             shift = name == "threshold_shift_us"
-            change = localised(f"{abs(value):.1f} µs") if shift else _percent(value)
-            found.append(_(lower if sign < 0 else higher, change=change, **said))
+            change = f"{abs(value):.1f} µs" if shift else _percent(value)
+            found.append((lower if sign < 0 else higher) % {"change": change, **said})
     if found:
         return found
     if all(_narrow(now, name) for name in MIDDLES):
-        return [_("In trial %(number)s the muscle is as it was %(than)s.", **said)]
+        return ["In trial {number} the muscle is as it was {than}.".format(**said)]
     since = clock(since_utc)[:5] if same_day else when(since_utc)
-    return [_("By trial %(number)s no change since %(since)s is certain.", number=said["number"], since=since)]
+    return [f"By trial {said['number']} no change since {since} is certain."]
 
 
 def _than(since_utc: str, same_day: bool) -> str:
     time = clock(since_utc)[:5]
     if same_day:
-        return _("at %(time)s", time=time)
+        return f"at {time}"
     number, __, month = day(since_utc).partition(" ")
-    return _("on %(day)s %(month)s at %(time)s", day=number, month=month, time=time)
+    return f"on {number} {month} at {time}"
 
 
 def _sure(now: Mapping[str, Mapping[str, float]], name: str) -> int:
@@ -213,4 +213,4 @@ def _narrow(now: Mapping[str, Mapping[str, float]], name: str) -> bool:
 
 def _percent(factor: float) -> str:
     change = abs(100.0 * (factor - 1.0))
-    return localised(f"{change:.0f} %" if change >= 9.5 else f"{change:.1f} %")
+    return f"{change:.0f} %" if change >= 9.5 else f"{change:.1f} %"

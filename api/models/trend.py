@@ -16,7 +16,6 @@ from sqlalchemy import Row, select
 
 from stimrig.api.clock import Clock, local_day
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.models.family import family_of
@@ -89,9 +88,8 @@ class Session:
         found = followed(self.model.fit)
         one = {"value": found.percent, "sd": None, "uncertainty": None, "unit": "%", "where": found.where}
         kept = {name: figure for name, figure in document["figures"].items() if not name.endswith("fit_percent")}
-        kept["charge_uc"]["where"] = _(
-            "charge of one phase, over all pulses of that day's tests (%(count)s), stopped ones, too",
-            count=len(self.test_ids),
+        kept["charge_uc"]["where"] = (
+            f"charge of one phase, over all pulses of that day's tests ({len(self.test_ids)}), stopped ones, too"
         )
         # as the participant's page and the model's own name the model
         own = {"at_utc": self.model.created_utc, "without_evidence": self.model.fit.get("without_evidence") or []}

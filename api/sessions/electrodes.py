@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from stimrig.api.errors import ApiError
-from stimrig.api.language import lazy
 from stimrig.api.sessions import channels
 from stimrig.api.sessions.channels import ChannelName
 from stimrig.api.sessions.kinds import Kind, Planned
@@ -28,10 +27,10 @@ FARTHEST_PITCHES = 2.3
 EARLIER = 2
 """So many former searches of a person count."""
 WISHES = {
-    "balanced": lazy("Torque, selectivity and comfort, each at a price."),
-    "strong": lazy("The largest torque that is bearable; a strong spill-over is never acceptable."),
-    "selective": lazy("The wanted muscle alone; a slight spill-over costs more than half."),
-    "comfortable": lazy("Torque that can be borne for long: what feels bad counts little."),
+    "balanced": "Torque, selectivity and comfort, each at a price.",
+    "strong": "The largest torque that is bearable; a strong spill-over is never acceptable.",
+    "selective": "The wanted muscle alone; a slight spill-over costs more than half.",
+    "comfortable": "Torque that can be borne for long: what feels bad counts little.",
 }
 """As `stimrig.identify.electrodes.PRESETS`, which the service does not load."""
 

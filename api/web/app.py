@@ -26,10 +26,10 @@ from stimrig.api.workers.pool import WORKER
 
 
 class Service(FastAPI):
-    """The application. Its headers and language are outermost: an unexpected error's answer has them, too."""
+    """The application. Its headers are outermost: an unexpected error's answer has them, too."""
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Starlette's, within the headers and the language."""
+        """Starlette's, within the headers."""
         return Headers(super().build_middleware_stack())
 
 

@@ -1,4 +1,4 @@
-"""What stands around every route: bounds and strict JSON for what comes in, headers and language for what goes out."""
+"""What stands around every route: bounds and strict JSON for what comes in, headers for what goes out."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import json
 import logging
 import re
 from concurrent.futures import ThreadPoolExecutor
-from http.cookies import CookieError, SimpleCookie
 from typing import Any
 
 from starlette import datastructures
@@ -16,7 +15,6 @@ from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from stimrig.api import language
 from stimrig.api.clock import asked_s
 from stimrig.api.errors import ApiError
 from stimrig.api.store import seen
@@ -47,7 +45,6 @@ class HttpMiddleware:
 
 # ---- what every answer tells a browser: load from and post to this service alone, guess nothing, keep nothing private
 
-LANGUAGE_COOKIE = "stimrig_language"
 """The choice; it says nothing about who chose."""
 
 
@@ -79,7 +76,7 @@ DATA = {  # should a browser be led to show it
 
 
 class Headers(HttpMiddleware):
-    """A header that a route has set itself stays as it is; a page is in the language that was chosen or asked for."""
+    """A header that a route has set itself stays as it is."""
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As the base class."""
@@ -96,23 +93,11 @@ class Headers(HttpMiddleware):
                 for name, value in (PAGE if page else DATA).items():
                     headers.setdefault(name, value)
                 if page:
-                    headers.setdefault("Content-Language", language.code())
-                    headers.add_vary_header("Accept-Language")
+                    headers.setdefault("Content-Language", "en")
                     headers.add_vary_header("Cookie")
             await send(message)
 
-        with language.using(chosen_language(datastructures.Headers(scope=scope))):
-            await self.app(scope, receive, send_more)
-
-
-def chosen_language(headers: datastructures.Headers) -> str:
-    """The language for a request with these headers: that of its cookie, else one that the browser asks for."""
-    try:
-        cookies = SimpleCookie(headers.get("cookie", "")[:4096])
-    except CookieError:
-        cookies = SimpleCookie()
-    kept = cookies[LANGUAGE_COOKIE].value if LANGUAGE_COOKIE in cookies else ""
-    return kept if kept in language.CODES else language.best(headers.get("accept-language", ""))
+        await self.app(scope, receive, send_more)
 
 
 def entity_tags(field: str) -> list[str]:

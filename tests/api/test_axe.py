@@ -189,31 +189,6 @@ def test_trials_of_a_controller(tab: Any, service: Service, client: httpx.Client
     visit(tab, service, "/participants/X7", tab.get_by_text("All trials as a table").click)
 
 
-def test_in_german(tab: Any, service: Service, client: httpx.Client) -> None:
-    """The longest pages in the language with the longer words."""
-    done = play_test(client, "X6")
-
-    def opened() -> None:
-        tab.get_by_role("link", name="Ermüdung").wait_for()
-        tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-        chart(tab, "comparison")
-
-    tab.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
-    visit(tab, service, f"/models/{done['model_id']}", opened)
-    for path in ("/participants/X6", f"/tests/{done['id']}", "/participants/X6/trend"):
-        visit(tab, service, path)
-    assert tab.locator("html").get_attribute("lang") == "de"
-    long = {"effects": ["torque_velocity"], "force": True, "reason": "its name is long in German"}
-    version = client.post(f"/v1/models/{done['model_id']}/effects", json=long)
-    assert version.status_code == 201, version.text
-    for width, height in (WIDE, (1366, 768)):  # a person at a desk does not look for a state beyond the edge
-        tab.set_viewport_size({"width": width, "height": height})
-        tab.goto(f"{service.url}/models/{version.json()['id']}")
-        tab.get_by_text("diese", exact=True).wait_for()
-        settled(tab)
-        assert tab.locator(".scroll:has(> .versions)").evaluate("(e) => e.scrollWidth <= e.clientWidth"), width
-
-
 def test_widths_for_a_torque_and_a_controllers_key(tab: Any, service: Service, tmp_path: Path) -> None:
     model = service.play_test("X7")["model_id"]
     reference = tmp_path / "reference.csv"

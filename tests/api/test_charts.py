@@ -21,7 +21,6 @@ from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import LIGHT, in_light, interpolate
 from stimrig.api.charts.strokes import ticks
 from stimrig.api.charts.svg import svg
-from stimrig.api.language import using
 from stimrig.api.sessions import joint_plan
 from stimrig.api.workers.curves import curves
 from tests.api import made_up_joint
@@ -275,11 +274,8 @@ def test_every_line_that_is_seen_says_its_unit(figures: dict[str, Any]) -> None:
 
 def test_a_curves_band_is_said_at_the_curves_own_points() -> None:
     band = {"at": [0.0, 10.0], "whole_lower": [1.0, 2.0], "whole_upper": [1.2, 2.6]}
-    with using("en"):
-        found = fig.hover_band("model", fig.TORQUE, [0.0, 5.0, 10.0, 12.0], band, "at")
+    found = fig.hover_band("model", fig.TORQUE, [0.0, 5.0, 10.0, 12.0], band, "at")
     assert found["customdata"] == ["0.10", "0.20", "0.30", "0.30"]
-    with using("de"):
-        assert fig.hover_band("model", fig.TORQUE, [0.0], band, "at")["customdata"] == ["0,10"]
     assert "±" not in fig.hover_band("model", fig.TORQUE, [0.0], {}, "at")["hovertemplate"]
 
 
@@ -323,8 +319,7 @@ NEAR_DEG = 3.0
 
 @pytest.fixture(scope="module")
 def of_joint() -> dict[str, Any]:
-    with using("en"):
-        return joint_charts.joint_figures({"joint": JOINT})
+    return joint_charts.joint_figures({"joint": JOINT})
 
 
 def drawn(figure: dict[str, Any]) -> dict[str, list[float | None]]:
@@ -388,8 +383,7 @@ def test_the_rest_of_a_line_is_dotted_and_the_legend_says_so(of_joint: dict[str,
 def test_all_seen_needs_no_dots_and_no_band_none_of_it() -> None:
     bare = {key: value for key, value in JOINT.items() if "lower" not in key and "upper" not in key}
     ones = [[1] * len(row) for row in JOINT["seen_g"]]
-    with using("en"):
-        found = joint_charts.joint_figures({"joint": {**bare, "seen_g": ones, "seen_h": ones}})
+    found = joint_charts.joint_figures({"joint": {**bare, "seen_g": ones, "seen_h": ones}})
     for figure in found.values():
         assert len(figure["data"]) == 5 and "dash" not in str(figure["data"])
         assert all("±" not in each["hovertemplate"] for each in figure["data"])
@@ -400,13 +394,12 @@ def test_a_model_of_a_joint_at_rest_has_none(document: dict[str, Any]) -> None:
     assert joint_charts.joint_figures(document) == {}
 
 
-def test_the_pointer_reads_value_and_band_in_the_pages_language() -> None:
-    with using("de"):
-        line = next(
-            each for each in joint_charts.joint_figures({"joint": JOINT})["joint_h"]["data"] if "hovertemplate" in each
-        )
+def test_the_pointer_reads_value_and_band() -> None:
+    line = next(
+        each for each in joint_charts.joint_figures({"joint": JOINT})["joint_h"]["data"] if "hovertemplate" in each
+    )
     assert line["hovertemplate"].endswith("%{y:.2f} N·m ± %{customdata}<extra></extra>")
-    assert line["customdata"][0] == f"{made_up_joint.half(math.radians(20)):.2f}".replace(".", ",")
+    assert line["customdata"][0] == f"{made_up_joint.half(math.radians(20)):.2f}"
 
 
 def test_ways_to_move_are_those_of_the_guided_tests() -> None:
@@ -456,10 +449,9 @@ def test_reports_have_them_and_pages_of_other_models_do_not(client: httpx.Client
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize(("language", "scheme"), [("en", "dark"), ("de", "light")])
-def test_the_page_is_examined(browser: Any, service: Service, models: tuple[str, str], language: str, scheme: str):
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_the_page_is_examined(browser: Any, service: Service, models: tuple[str, str], scheme: str):
     for page in open_tab(browser, service, color_scheme=scheme):
-        page.context.add_cookies([{"name": "stimrig_language", "value": language, "url": service.url}])
         page.set_viewport_size(LAPTOP)
         opened(page, service, models[1])
         assert page.evaluate(COVERED) == []

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy import select
 from websockets.exceptions import ConnectionClosed
 
-from stimrig.api import language
+from stimrig.api import local_time
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import AuditEntry, Test, Token
 from stimrig.api.web.guards import OPEN
@@ -456,7 +456,7 @@ def test_key_and_trials_are_in_the_trail(shared: Service, admin: httpx.Client) -
 def test_its_end_reads_the_same_on_every_page(admin: httpx.Client, done: dict[str, Any]) -> None:
     made(admin, name="ends tonight")
     (key,) = [row for row in admin.get("/v1/tokens").json() if row["name"].startswith("ends tonight (")]
-    end = language.until(key["expires_utc"])
+    end = local_time.until(key["expires_utc"])
     assert end.endswith("23:59")
     for address, rows in (("/participants/P1", 1), ("/administration", 2)):  # there it is in the audit trail, too
         page = admin.get(address, headers=HTML).text

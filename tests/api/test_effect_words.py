@@ -1,16 +1,13 @@
-"""A person reads an effect's title in the page's language; its id stays in titles, links and REST."""
+"""A person reads an effect's title; its id stays in titles, links and REST."""
 
 from __future__ import annotations
 
-import json
 import re
 
 import httpx
 
-from stimrig.api import language
-from stimrig.api.effect_words import effects_words, library, parameter_words
-from stimrig.api.language import translated
-from stimrig.api.models import changes, explanation, stored_model
+from stimrig.api.effect_words import library, parameter_words
+from stimrig.api.models import explanation, stored_model
 from stimrig.identify import effects
 from tests.api.conftest import Service, play_test, run_test, shared_service, signed_in, soon
 
@@ -37,17 +34,6 @@ def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -
     assert set(library()) == set(effects.registry())
 
 
-def test_words_in_german() -> None:
-    with language.using("de"):
-        assert effects_words(["fatigue:by_pulses", "mains_hum"]) == "Ermüdung, Netzbrummen"
-        assert effects_words(["fatigue", "my_swing"]) == "Ermüdung, My swing", "a person's own effect: its id in words"
-        assert changes.name_of("fatigue.depth", "1").words == "Ermüdung, Tiefe"
-        assert translated("recruitment_hysteresis: the evidence is too weak (log evidence +0.3): what it explains "
-                          "looks like noise.").startswith("Hysterese der Rekrutierung: ")  # fmt: skip
-        for effect in library():
-            assert translated(effect) not in (effect, f'<span lang="en">{effect}</span>') or effect == "tremor"
-
-
 def test_a_parameter_is_told_by_what_it_is() -> None:
     library = {entry["id"]: entry for entry in effects.library()}
     given = {name: {"value": 1.0, "sd": 0.1, "unit": "1"} for name in ("depth", "onset_s")}
@@ -63,14 +49,15 @@ def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
     row = {"id": "M-1", "added_effect": "fatigue,threshold_drift"}
     rival = {"effect": "fatigue", "confused_with": ["threshold_drift"]}
     library = {entry["id"]: entry for entry in effects.library()}
-    with language.using("de"):
-        assert explanation.label(row) == "+ Ermüdung, Drift der Rekrutierungsschwelle"
-        for known in ({}, library):
-            assert explanation.card(rival, known, {})["rivals"] == ["Drift der Rekrutierungsschwelle"]
+    title = library["threshold_drift"]["name"]
+    assert explanation.label(row) == f"+ {library['fatigue']['name']}, {title}"
+    for known in ({}, library):
+        assert explanation.card(rival, known, {})["rivals"] == [title]
 
 
 def test_no_page_shows_an_id(service: Service, client: httpx.Client) -> None:
     client.post("/v1/participants", json={"code": "E1"})
+    title = library()["threshold_drift"]["name"]
     other, plain = (run_test(client, "E1")["model_id"] for _ in range(2))
     body = {"effects": ["threshold_drift"], "force": True, "reason": "seen last week"}
     added = client.post(f"/v1/models/{plain}/effects", json=body)
@@ -79,44 +66,22 @@ def test_no_page_shows_an_id(service: Service, client: httpx.Client) -> None:
     pages = ("/participants/E1", "/participants/E1/trend", f"/compare?model={better}&model={other}",
              f"/models/{better}", f"/models/{better}/report")  # fmt: skip
     with signed_in(service) as browser:
-        browser.cookies.set("stimrig_language", "de")
         for place in pages:
             page = browser.get(place).text
-            assert 'lang="de"' in page
             shown = re.sub(r"<script\b.*?</script>|<[^>]*>", " ", page, flags=re.DOTALL)
-            assert not re.search(r"(?i)threshold[_ ]drift|recruitment threshold", shown), place
-            assert "Drift der Rekrutierungsschwelle" in shown, place
+            assert not re.search(r"threshold_drift", shown), place
+            assert re.search(rf"(?i){title}", shown), place
 
 
-GERMAN = {"Accept-Language": "de"}
-
-
-def test_a_page_that_waits_reads_its_own_language(service: Service) -> None:
+def test_a_page_that_waits_reads_how_far_the_work_is(service: Service) -> None:
     slow = service.context.settings.recordings_dir / "slow"
     slow.parent.mkdir(parents=True, exist_ok=True)
     slow.write_text("0.4")
     with service.client() as http, signed_in(service) as browser:
         model = play_test(http, "G1")["model_id"]
         job = http.get(f"/v1/models/{model}/diagnosis", params={"wait": False}).json()["id"]
-        now = soon(lambda: (told := browser.get(f"/jobs/now/{job}", headers=GERMAN).json())["text"] and told)
-        assert now == {"progress": 0.4, "text": "geprüft: Ermüdung", "time_left_s": now["time_left_s"], "done": False}
-        assert http.get(f"/v1/jobs/{job}", headers=GERMAN).json()["text"] == "tried fatigue", "REST speaks English"
+        now = soon(lambda: (told := browser.get(f"/jobs/now/{job}").json())["text"] and told)
+        assert now == {"progress": 0.4, "text": "tried fatigue", "time_left_s": now["time_left_s"], "done": False}
+        assert http.get(f"/v1/jobs/{job}").json()["text"] == "tried fatigue"
         slow.unlink()
         assert http.delete(f"/v1/jobs/{job}").is_success  # it would stand still for a minute
-
-
-def test_the_live_page_hears_its_own_language(service: Service, client: httpx.Client) -> None:
-    carrying = service.context.settings.recordings_dir / "carrying-slowly"
-    first = play_test(client, "G2")["model_id"]
-    added = client.post(f"/v1/models/{first}/effects", json={"effects": ["tremor"], "force": True, "reason": "seen"})
-    client.post(f"/v1/models/{added.json()['id']}/approve", json={"reason": "follows the measurement well"})
-    carrying.touch()
-    test = client.post("/v1/tests", json={"participant": "G2"}).json()["id"]
-    with service.live(test, **GERMAN) as socket:
-        heard = {}
-        for message in map(json.loads, socket):
-            if message["type"] == "test":
-                heard[(message["test"]["identification"] or {}).get("text")] = message["words"]["work"]
-            if "fitting last session's structure" in heard:
-                carrying.unlink(missing_ok=True)
-    assert heard["fitting last session's structure"] == "Anpassen der Struktur der letzten Sitzung"

@@ -10,7 +10,7 @@ import httpx
 import pytest
 from sqlalchemy import event
 
-from stimrig.api import language
+from stimrig.api import local_time
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
 from tests.api.browser import chart
@@ -264,11 +264,11 @@ def test_what_an_effect_would_leave_is_called_an_estimate(pages: httpx.Client, m
 
 def test_a_day_ends_at_its_last_minute_everywhere(pages: httpx.Client, client: httpx.Client, model: str) -> None:
     ends = client.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"}).json()
-    end = language.until(ends["expires_utc"])
-    assert end.endswith("23:59") and language.when(ends["expires_utc"]).endswith("00:00")
+    end = local_time.until(ends["expires_utc"])
+    assert end.endswith("23:59") and local_time.when(ends["expires_utc"]).endswith("00:00")
     assert f"until {end}" in pages.get(f"/models/{model}").text
     assert f"until {end}" in pages.get(f"/models/{model}/report").text
-    assert language.until("2026-01-02T09:30:00.000Z") == language.when("2026-01-02T09:30:00.000Z")
+    assert local_time.until("2026-01-02T09:30:00.000Z") == local_time.when("2026-01-02T09:30:00.000Z")
 
 
 @pytest.mark.browser

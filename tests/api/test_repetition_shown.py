@@ -1,4 +1,4 @@
-"""What repeats stands on the page, in the reports and on the command line, in both languages."""
+"""What repeats stands on the page, in the reports and on the command line."""
 
 from __future__ import annotations
 
@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.api import language
 from stimrig.api.cli.terminal import model_report, repetition_lines
-from stimrig.api.language import translated
 from stimrig.api.models import stored_model
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.api.workers.curves import curves
@@ -49,14 +47,3 @@ def test_a_model_of_an_older_version_has_none(made):
     assert stored_model.repetition(document)["sentences"] == []
     assert repetition_lines(document["fit"]) == []
     assert "not known" in comparison_html(document, json_value(curves(model, record)), "a record")
-
-
-def test_every_sentence_is_translated():
-    estimate = {**FOUND, "found_by": "estimate", "repeats": None, "held_out_rms_nm": None}
-    for found in (FOUND, estimate, dict.fromkeys(FOUND)):
-        for line in stored_model.repetition({"fit": {"repetition": found}})["sentences"]:
-            with language.using("de"):
-                assert str(translated(line)) != line
-    with language.using("de"):
-        said = [str(translated(line)) for line in stored_model.repetition({"fit": {"repetition": FOUND}})["sentences"]]
-    assert said[1] == "Das Modell erklärt 93,0 % der Varianz, die sich wiederholt."

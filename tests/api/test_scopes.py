@@ -28,7 +28,6 @@ GET    /rig/now                                            anybody        200
 GET    /stopped/x                                          anybody        404
 GET    /sign-in                                            anybody        200
 POST   /sign-in                                            anybody        401
-POST   /language                                           anybody        4xx
 POST   /colours                                            anybody        4xx
 POST   /v1/sessions                                        anybody        401
 POST   /v1/stop                                            anyone         200

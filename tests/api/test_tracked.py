@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-import re
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
 
-from stimrig.api import language
 from stimrig.api.errors import ApiError
 from stimrig.api.models import tracking
 from stimrig.api.models.tracking import NEW_TEST, Limits
@@ -431,17 +429,3 @@ def test_next_to_no_torque_asks_for_a_look_at_the_electrodes_first() -> None:
     said = tracking.ask(3, step("no-torque"), Limits().bounds(80.0))
     assert said is not None and said.startswith("In trial 3 the pulses gave next to no torque. Look at the electrodes")
     assert said.endswith(tracking.NEW_TEST)
-
-
-ASKED = [{"gain": 0.7}, {"gain": 0.7999}, {"threshold_shift_us": 30.0}, {"threshold_shift_us": 16.01},
-         {"time_scale": 1.4}, {"time_scale": 1.2001}, {"time_scale": math.nan}]  # fmt: skip
-
-
-@pytest.mark.parametrize("coming", ASKED)
-@pytest.mark.parametrize("outcome", ["followed", "contradicts", "no-torque"])
-def test_the_question_is_asked_in_german(coming: dict[str, float], outcome: str) -> None:
-    said = tracking.ask(3, step(outcome, **coming), Limits().bounds(80.0))
-    with language.using("de"):
-        german = language.plain(said)
-    assert german != said and " the " not in german and "Durchgang 3" in german
-    assert not re.search(r"\b(gain|threshold|time scale|just|unknown)\b", german), german

@@ -306,8 +306,7 @@ def test_notes_are_text_and_pictures_have_no_markup_of_theirs(tab: Any, service:
 
 
 @pytest.mark.browser
-def test_the_table_of_the_sessions_fits_a_laptop_in_german(tab: Any, service: Service, weeks: list[str]) -> None:
-    tab.context.add_cookies([{"name": "stimrig_language", "value": "de", "url": service.url}])
+def test_the_table_of_the_sessions_fits_a_laptop(tab: Any, service: Service, weeks: list[str]) -> None:
     tab.set_viewport_size(LAPTOP)
     tab.goto(service.url + "/participants/WEEKS/trend")
     table = tab.locator(".scroll:has(.over-time)")

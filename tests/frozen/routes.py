@@ -306,7 +306,7 @@ def everything(day: Day) -> None:
 
 
 def pages(day: Day) -> None:
-    """What a person sees and sends, in both languages."""
+    """What a person sees and sends."""
     seen = (
         "/", "/?q=p2", "/?archived=1", "/participants/P1", "/participants/P2", "/participants/P1/next",
         "/participants/P1/calibration", "/participants/P1/trend", "/participants/P1/trials", "/participants/P1/joint",
@@ -315,7 +315,7 @@ def pages(day: Day) -> None:
         "/tests/{test_held}", "/tests/{test_trial}", "/compare?model={model_first}&model={model_second}", "/rig/angle",
         "/rig/now", "/rig/notice", "/administration", "/sign-in", "/locked", "/models/none", "/nowhere", "/docs",
     )  # fmt: skip
-    for language in ("en", "de"):
+    for language in ("en",):
         heads = HTML | {"Accept-Language": language}
         with day.service.client(None, headers=heads, follow_redirects=False) as http:
             day.ask("GET", "/", note=f"{language} nobody", http=http)
@@ -354,7 +354,7 @@ def decisions(day: Day, http: httpx.Client, language: str) -> None:
         ("/administration/users", {"name": f"Cy {language}", "role": "clinician", "password": PASSWORD}),
         (f"/administration/users/Cy {language}/password", {"password": "short"}),
         (f"/administration/users/Cy {language}/remove", {}), ("/administration/keys", {"name": "page", "days": "7"}),
-        ("/rearm", {"back": "/"}), ("/language", {"language": "xx"}), ("/colours", {"colours": "dark"}),
+        ("/rearm", {"back": "/"}), ("/colours", {"colours": "dark"}),
         ("/colours", {"colours": "x"}),
         ("/lock", {}), ("/unlock", {"secret": "wrong"}), ("/sign-out", {}),
     )  # fmt: skip

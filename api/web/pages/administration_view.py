@@ -9,8 +9,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import PlainTextResponse, RedirectResponse, Response
 
-from stimrig.api import language
-from stimrig.api.language import lazy
+from stimrig.api import local_time
 from stimrig.api.people.auth import ROLES
 from stimrig.api.store import audit
 from stimrig.api.store.tables import AuditEntry
@@ -24,10 +23,10 @@ from stimrig.api.web.routes import people
 router = APIRouter(include_in_schema=False, prefix="/administration")
 NEWEST = 60
 MAY: dict[str, Any] = {
-    "clinician": lazy("runs tests, approves models"),
-    "operator": lazy("runs tests; approves nothing"),
-    "reader": lazy("looks on; may stop, like everyone"),
-    "administrator": lazy("everything"),
+    "clinician": "runs tests, approves models",
+    "operator": "runs tests; approves nothing",
+    "reader": "looks on; may stop, like everyone",
+    "administrator": "everything",
 }
 
 
@@ -125,7 +124,7 @@ def detail_words(detail: dict[str, Any]) -> str:
         elif isinstance(value, list):
             value = ", ".join(str(item) for item in value)
         elif name == "until":
-            value = language.until(value)
+            value = local_time.until(value)
         text = str(value)
         short = f"{text[:12]}…" if len(text) == 64 and " " not in text else text
         parts.append(f"{name.replace('_', ' ')} {short}")

@@ -13,7 +13,6 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
-from stimrig.api.language import lazy
 from stimrig.api.sessions import channels, profiles
 from stimrig.api.sessions.channels import Channel
 from stimrig.api.sessions.questions import Question, Row
@@ -32,9 +31,9 @@ FIRST = ("current_ma", "step_us")
 """The form's fields on a rig of one channel."""
 DEFAULTS = CalibrationIn.model_validate({})
 MARKS = {
-    "sensory": (lazy("It is felt"), lazy("the narrowest pulse the participant feels")),
-    "motor": (lazy("The muscle moves"), lazy("the narrowest pulse at which the muscle visibly moves")),
-    "comfort": (lazy("As strong as is comfortable"), lazy("no pulse of today's tests will be wider")),
+    "sensory": ("It is felt", "the narrowest pulse the participant feels"),
+    "motor": ("The muscle moves", "the narrowest pulse at which the muscle visibly moves"),
+    "comfort": ("As strong as is comfortable", "no pulse of today's tests will be wider"),
 }
 LAST = {"sensory": "sensory_pulse_width_us", "motor": "motor_pulse_width_us", "comfort": "max_pulse_width_us"}
 FINE_US = (1.0, 25.0)

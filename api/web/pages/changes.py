@@ -9,7 +9,6 @@ from fastapi import Request
 
 from stimrig.api import decisions
 from stimrig.api.clinical_words import WORDS
-from stimrig.api.language import _, lazy, localised, plain, translated
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import profiles
 from stimrig.api.store.seen import MOST_TOLD, ChangedError
@@ -17,14 +16,14 @@ from stimrig.api.web.pages.starting import site_words
 
 KEPT_OUT = ("csrf", "seen", "password", "latch")
 """Fields of a form that are not sent again as they were."""
-ALL_THE_SAME = lazy("Do it all the same")
+ALL_THE_SAME = "Do it all the same"
 BUTTONS = {
-    "approve": lazy("Approve all the same"), "reject": lazy("Reject all the same"), "undo": lazy("Undo all the same"),
-    "profile": lazy("Set the limits all the same"), "muscle": lazy("Set this side and muscle all the same"),
-    "keys": lazy("Make the key all the same"), "rearm": lazy("I have seen this and checked: re-arm"),
+    "approve": "Approve all the same", "reject": "Reject all the same", "undo": "Undo all the same",
+    "profile": "Set the limits all the same", "muscle": "Set this side and muscle all the same",
+    "keys": "Make the key all the same", "rearm": "I have seen this and checked: re-arm",
 }  # fmt: skip
-ARCHIVED = {"create participant": lazy("not in the archive"), "archive": lazy("in the archive"),
-            "unarchive": lazy("not in the archive")}  # fmt: skip
+ARCHIVED = {"create participant": "not in the archive", "archive": "in the archive",
+            "unarchive": "not in the archive"}  # fmt: skip
 PLAN = {"duration": ("max_duration_s", "s"), "current": ("current_ma", "mA"), "width": ("max_pulse_width_us", "µs")}
 """Fields of a key's form, with their units."""
 DECIDED = {"approve": WORDS["decision"]["approved"], "reject": WORDS["decision"]["rejected"]}
@@ -71,22 +70,22 @@ def rows(changes: list[dict[str, Any]]) -> list[Row]:
 
 def what(entry: dict[str, Any]) -> str:
     """What an entry is about."""
-    names = {"set profile": _("Limits"), "finish calibration": _("Limits"), "set muscle": _("Side and muscle"),
-             "archive": _("Archive"), "unarchive": _("Archive"), "latched": _("The rig")}  # fmt: skip
+    names = {"set profile": "Limits", "finish calibration": "Limits", "set muscle": "Side and muscle",
+             "archive": "Archive", "unarchive": "Archive", "latched": "The rig"}  # fmt: skip
     if entry["action"] in DECIDED:
         return model_words(entry["subject"])
-    return f"{names.get(entry['action'], _('Change'))} {entry['subject']}".removesuffix(" rig")
+    return f"{names.get(entry['action'], 'Change')} {entry['subject']}".removesuffix(" rig")
 
 
 def model_words(model_id: str) -> str:
     """A model as its pages head it."""
-    return f"{_('Model')} {model_id[:8]}"
+    return f"{'Model'} {model_id[:8]}"
 
 
 def words(entry: dict[str, Any] | None, of: str) -> str:
     """What an entry has set of what the action `of` sets."""
     if entry is None:
-        return _("nothing decided")
+        return "nothing decided"
     detail = entry["detail"]
     if entry["action"] in DECIDED:
         return ": ".join(part for part in (str(DECIDED[entry["action"]]), detail.get("reason")) if part)
@@ -95,18 +94,18 @@ def words(entry: dict[str, Any] | None, of: str) -> str:
     if detail.get("ran_by"):
         return str(detail["ran_by"])
     if entry["action"] == "latched":
-        return translated(detail["reason"])
+        return detail["reason"]
     if of == "set muscle":
         return site_words((detail.get("side"), detail.get("muscle"), detail.get("placement")))
     if detail.get("profile"):
         return limits(detail["profile"])
-    return translated(entry["action"])
+    return entry["action"]
 
 
 def limits(profile: dict[str, Any]) -> str:
     """A participant's limits."""
     known = {name: limit.unit for name, limit in profiles.LIMITS.items() if profile.get(name) is not None}
-    found = [localised(f"{profile[name]:g} {unit}") for name, unit in known.items()]
+    found = [f"{profile[name]:g} {unit}" for name, unit in known.items()]
     range_rad = profiles.range_of(profile)
     return ", ".join([*found, *([] if range_rad is None else [profiles.range_words(range_rad)])])
 
@@ -162,7 +161,7 @@ def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[st
         plan["trials"] = texts.get("trials", "")
         return [
             texts.get("name", ""),
-            _("trials: %(trials)s of at most %(duration)s, %(current)s, %(width)s", **plan),
+            "trials: {trials} of at most {duration}, {current}, {width}".format(**plan),
         ]
-    return [f"{plain(limit.label)} {texts[name]}" for name, limit in profiles.LIMITS.items()
+    return [f"{limit.label} {texts[name]}" for name, limit in profiles.LIMITS.items()
             if name in texts and texts[name] != texts.get(f"seen_{name}")]  # fmt: skip

@@ -14,7 +14,6 @@ from fastapi.responses import RedirectResponse, Response
 from starlette.datastructures import FormData
 
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _, lazy, localised
 from stimrig.api.models import advice, registry, stored_model
 from stimrig.api.models.family import family_of
 from stimrig.api.models.tracking import QUANTITIES, Limits
@@ -28,9 +27,9 @@ from stimrig.api.web.routes import models
 
 router = APIRouter(include_in_schema=False, prefix="/models/{model_id}")
 LABELS = {
-    "gain_percent": lazy("Gain (± %%)"),
-    "threshold_percent": lazy("Threshold (± %%)"),
-    "time_scale_percent": lazy("Time scale (± %%)"),
+    "gain_percent": "Gain (± %)",
+    "threshold_percent": "Threshold (± %)",
+    "time_scale_percent": "Time scale (± %)",
 }
 
 
@@ -121,18 +120,17 @@ def tracking_words(limits: Mapping[str, Any] | None, threshold_us: float | None)
     allowed = Limits(**given)
     bounds = allowed.bounds(threshold_us)
     if not bounds:
-        return _("The model does not follow the muscle from trial to trial: all stays as approved.")
+        return "The model does not follow the muscle from trial to trial: all stays as approved."
     said = {
-        quantity: f"±{localised(typed.number_text(percent))}\u00a0%" if quantity in bounds else _("as approved")
+        quantity: f"±{typed.number_text(percent)}\u00a0%" if quantity in bounds else "as approved"
         for quantity, percent in zip(QUANTITIES, allowed.to_dict().values(), strict=True)
     }
     if shift_us := bounds.get("threshold_shift_us", (0.0, 0.0))[1]:
-        said["threshold_shift_us"] += localised(f" (±{shift_us:.3g}\u00a0µs)")
-    return _(
-        "The model follows the muscle from trial to trial, at most: gain %(gain)s, threshold %(threshold)s, "
-        "time scale %(time_scale)s.",
-        gain=said["gain"], threshold=said["threshold_shift_us"], time_scale=said["time_scale"],
-    )  # fmt: skip
+        said["threshold_shift_us"] += f" (±{shift_us:.3g}\u00a0µs)"
+    return (
+        f"The model follows the muscle from trial to trial, at most: gain {said['gain']}, "
+        f"threshold {said['threshold_shift_us']}, time scale {said['time_scale']}."
+    )
 
 
 environment.globals["tracking_fields"] = tracking_fields

@@ -11,7 +11,6 @@ from fastapi import APIRouter, Request, Response
 
 from stimrig.api.charts.electrode_map import array_map, named
 from stimrig.api.errors import ApiError, require_found
-from stimrig.api.language import _
 from stimrig.api.sessions import channels, electrodes
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import typed
@@ -49,7 +48,7 @@ async def show_page(
     return page(
         request, "electrodes.html", status, participant=person, array=array, found=found, problem=problem, row=row,
         texts=texts or kept, errors=errors or {}, wishes=electrodes.WISHES, named=named, rows=ranked(found),
-        picture=array_map(found, _("Map of the array")) if found else "",
+        picture=array_map(found, "Map of the array") if found else "",
         voids=array is not None and searches.loses_calibration(person, array.key, ""),
     )  # fmt: skip
 

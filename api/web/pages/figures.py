@@ -15,11 +15,9 @@ from stimrig.api.charts.figure import PAGE_CONFIG
 from stimrig.api.charts.pdf import paper
 from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import NotFoundError
-from stimrig.api.language import decimal
 from stimrig.api.web.dependencies import Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.pages import model_view, trend_view
-from stimrig.api.web.pages.environment import in_words
 
 router = APIRouter(include_in_schema=False)
 KINDS = {"html": "text/html; charset=utf-8", "svg": "image/svg+xml", "json": "application/json",
@@ -53,18 +51,17 @@ def answer(request: Request, figures: Figures, name: str, width: int) -> Respons
     if stem not in figures or kind not in KINDS:
         raise NotFoundError("chart", name)
     if kind == "json":
-        body = json.dumps(
-            lines(figures[stem], f"{request.path_params.get('model_id', 'compare')}-{stem}"), default=in_words
-        ).encode()
+        name = f"{request.path_params.get('model_id', 'compare')}-{stem}"
+        body = json.dumps(lines(figures[stem], name)).encode()
     else:
         body = figures.still(stem, width).encode() if kind == "html" else paper(figures, stem, kind, width)
     return to_keep(request, body, KINDS[kind])
 
 
 def lines(figure: dict[str, Any], file_name: str) -> dict[str, Any]:
-    """A figure as the plot library takes it, with the decimal sign of the page's language."""
+    """A figure as the plot library takes it."""
     config = {**PAGE_CONFIG, "toImageButtonOptions": {"filename": file_name, "scale": 2}}
-    return {**figure, "layout": {**figure["layout"], "separators": f"{decimal()} "}, "config": config}
+    return {**figure, "layout": {**figure["layout"], "separators": ". "}, "config": config}
 
 
 def to_keep(request: Request, body: bytes, kind: str) -> Response:

@@ -9,7 +9,6 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
-from stimrig.api import language
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts, muscle_charts
 from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
@@ -263,9 +262,9 @@ def result_page(job: Job) -> str | None:
 
 @router.get("/jobs/now/{job_id}")
 async def job_now(context: Ctx, _who: ModelReader, job_id: str) -> dict[str, Any]:
-    """How far long work is, in the words of the page's language: what a page that waits asks for again and again."""
+    """How far long work is: what a page that waits asks for again and again."""
     found = context.jobs.get(job_id).document()
-    return {key: found[key] for key in ("progress", "time_left_s", "done")} | {"text": language.plain(found["text"])}
+    return {key: found[key] for key in ("progress", "time_left_s", "done")} | {"text": found["text"]}
 
 
 @router.get("/jobs/{job_id}")

@@ -10,8 +10,7 @@ from zlib import crc32
 from fastapi import APIRouter
 from sqlalchemy import or_
 
-from stimrig.api import language
-from stimrig.api.language import _, lazy
+from stimrig.api import local_time
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.joint_plan import KINDS
@@ -28,26 +27,26 @@ Kind = Literal[
 ]  # fmt: skip
 BUSY = ("arming", "running", "stopping", "sealing", "calibrating", render.PASSIVE)
 """States in which the rig plays something, or lets go of it."""
-REARM = lazy("The rig has stopped and needs a re-arm. Look at the participant, then press the button above.")
-SILENT = lazy("The rig does not answer. A test is possible when it does.")
+REARM = "The rig has stopped and needs a re-arm. Look at the participant, then press the button above."
+SILENT = "The rig does not answer. A test is possible when it does."
 STANDS = {
     "latched": REARM, "uncertain": REARM, "unreachable": SILENT, "silent": SILENT,
-    "disconnected": lazy("A device is not connected. See above what to check."),
+    "disconnected": "A device is not connected. See above what to check.",
 }  # fmt: skip
 """What to do about a rig that plays nothing."""
 BEFORE = {
-    "poor": lazy("The last model is not usable."),
-    "rejected": lazy("The last model was rejected."),
-    "stopped": lazy("The last test was stopped."),
-    "fault": lazy("The last test ended by a fault."),
-    "refused": lazy("The last test was not started."),
-    "failed": lazy("The last test gave no model."),
+    "poor": "The last model is not usable.",
+    "rejected": "The last model was rejected.",
+    "stopped": "The last test was stopped.",
+    "fault": "The last test ended by a fault.",
+    "refused": "The last test was not started.",
+    "failed": "The last test gave no model.",
 }
 TRIAL_BEFORE = {
-    "stopped": lazy("The last trial was stopped."),
-    "fault": lazy("The last trial ended by a fault."),
-    "refused": lazy("The last trial was not started."),
-    "failed": lazy("The last trial was not finished."),
+    "stopped": "The last trial was stopped.",
+    "fault": "The last trial ended by a fault.",
+    "refused": "The last trial was not started.",
+    "failed": "The last trial was not finished.",
 }
 
 
@@ -120,34 +119,34 @@ def next_step(now: Situation) -> Step:
 def _under_way(now: Situation) -> Step | None:
     """Their test, or their calibration."""
     if now.state in OPEN_STATES:
-        button = _("Go to the trial") if now.of == "trial" else _("Go to the test")
+        button = "Go to the trial" if now.of == "trial" else "Go to the test"
         kind: Kind = "running" if now.state in ("requested", "running") else "identifying"
         return Step(kind, _playing(now), button, f"/tests/{now.test}")
     if now.unstored or (now.rig == "calibrating" and now.holder == now.code):
-        words = _("A calibration waits to be stored.") if now.unstored else _("The calibration has begun.")
-        return Step("calibrating", words, _("Go on with the calibration"), f"/participants/{now.code}/calibration")
+        words = "A calibration waits to be stored." if now.unstored else "The calibration has begun."
+        return Step("calibrating", words, "Go on with the calibration", f"/participants/{now.code}/calibration")
     return None
 
 
 def _playing(now: Situation) -> str:
     """What their open test does, as far as it is known."""
     if now.state == "identifying":
-        return _("The test is done. The model is being made; it takes a few seconds.")
+        return "The test is done. The model is being made; it takes a few seconds."
     if now.rig in ("unreachable", "silent"):
-        return _("A test was running when the rig was last heard of. Its state is not known.")
+        return "A test was running when the rig was last heard of. Its state is not known."
     if now.state == "sealing":
-        return _("The test is over. Its recording is being saved.")
+        return "The test is over. Its recording is being saved."
     if now.rig == "stopping":
-        return _("The test is being stopped.")
-    return _("The controller plays a trial.") if now.of == "trial" else _("The test is running.")
+        return "The test is being stopped."
+    return "The controller plays a trial." if now.of == "trial" else "The test is running."
 
 
 def _archived(now: Situation) -> Step | None:
     """Nothing is begun with a participant in the archive."""
     if not now.archived_since:
         return None
-    words = _("In the archive since %(time)s: no test starts.", time=now.archived_since)
-    return Step("archived", words, _("Take out of the archive"), f"/participants/{now.code}/unarchive")
+    words = f"In the archive since {now.archived_since}: no test starts."
+    return Step("archived", words, "Take out of the archive", f"/participants/{now.code}/unarchive")
 
 
 def _model_waits(now: Situation) -> Step | None:
@@ -155,8 +154,8 @@ def _model_waits(now: Situation) -> Step | None:
     model = now.model
     if model is None or model.decided or model.verdict == "not usable":
         return None
-    words = _("The model is ready. Look at it, then approve or reject it.")
-    return Step("look", _ended(now) + words, _("Look at the model"), f"/models/{model.id}")
+    words = "The model is ready. Look at it, then approve or reject it."
+    return Step("look", _ended(now) + words, "Look at the model", f"/models/{model.id}")
 
 
 def _rig_stands(now: Situation) -> Step | None:
@@ -170,30 +169,30 @@ def _rig_stands(now: Situation) -> Step | None:
 def _served(now: Situation) -> Step | None:
     """Done where the controller has a model, unless its trials, or tests of the joint, ask for more."""
     if now.served_until and now.asked:
-        words = _("The trials say that a new test is needed.")
-        return Step("asked", words, _("See why"), f"/participants/{now.code}#trials")
+        words = "The trials say that a new test is needed."
+        return Step("asked", words, "See why", f"/participants/{now.code}#trials")
     if now.of == "joint":
         return None
     if now.served_until:
-        said = f"{_ended(now) or ('' if now.lacks_key else _('Done.') + ' ')}{_has_model(now)}"
+        said = f"{_ended(now) or ('' if now.lacks_key else 'Done.' + ' ')}{_has_model(now)}"
         if now.lacks_key == "mine":
-            return Step("done", said, _("Make a controller key"), f"/participants/{now.code}#keys")
-        return Step("done", said, _("Back to the participants"), "/")
+            return Step("done", said, "Make a controller key", f"/participants/{now.code}#keys")
+        return Step("done", said, "Back to the participants", "/")
     return None
 
 
 def _has_model(now: Situation) -> str:
     if now.lacks_key:
-        return _("Today's model is approved until %(time)s, but no controller has a key yet.", time=now.served_until)
-    return _("The controller has today's model until %(time)s.", time=now.served_until)
+        return f"Today's model is approved until {now.served_until}, but no controller has a key yet."
+    return f"The controller has today's model until {now.served_until}."
 
 
 def _rig_is_busy(now: Situation) -> Step | None:
     if now.holder and now.holder != now.code:
-        words = _("The rig is in use for %(code)s. Wait until it is free.", code=now.holder)
+        words = f"The rig is in use for {now.holder}. Wait until it is free."
         return Step("wait", words)
     if now.rig in BUSY:
-        return Step("wait", _("The rig is in use. Wait until it is free."))
+        return Step("wait", "The rig is in use. Wait until it is free.")
     return None
 
 
@@ -201,18 +200,18 @@ def _test_waits(now: Situation) -> Step:
     """Calibrate, then test; with what came of today's last test."""
     before = _before(now)
     if now.calibration != "valid":
-        words = _("Calibrate for today: find the pulse widths that are felt, move the limb and are comfortable.")
+        words = "Calibrate for today: find the pulse widths that are felt, move the limb and are comfortable."
         if now.calibration == "expired":
-            words = _("The last calibration was for another day. Calibrate for today.")
-        button = _("Begin the calibration: %(current)s", current=now.current)
+            words = "The last calibration was for another day. Calibrate for today."
+        button = f"Begin the calibration: {now.current}"
         return Step("calibrate", before + words, button)
     if now.of == "joint":
-        words = _("Go on with the tests of the joint, or make the model of them.")
-        return Step("joint", before + words, _("To the tests of the joint"), f"/participants/{now.code}/joint")
-    button = _("Start the pre-session test")
+        words = "Go on with the tests of the joint, or make the model of them."
+        return Step("joint", before + words, "To the tests of the joint", f"/participants/{now.code}/joint")
+    button = "Start the pre-session test"
     if before and now.of == "test":
-        return Step("again", before + _("Test again."), button)
-    return Step("test", before + _("Calibrated. Start the pre-session test."), button)
+        return Step("again", before + "Test again.", button)
+    return Step("test", before + "Calibrated. Start the pre-session test.", button)
 
 
 def _before(now: Situation) -> str:
@@ -261,9 +260,9 @@ def step(context: Context, row: Participant, who: Principal) -> Step:
         state=context.runner.document(test)["state"] if test else "",
         model=Today(kept["id"], kept["verdict"], kept["decision"] == "approved") if kept else None,
         rejected=bool(models) and kept is None,
-        served_until=language.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
+        served_until=local_time.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
         lacks_key="" if not keyless else "mine" if who.may(Scope.APPROVE_MODEL) else "another's",
-        archived_since=language.when(row.archived_utc) if row.archived_utc else "",
+        archived_since=local_time.when(row.archived_utc) if row.archived_utc else "",
         asked=served is not None and context.tracked.asks(served.id) is not None,
         unstored=kept_by_rig is not None and kept_by_rig.participant == row.code,
     )

@@ -13,7 +13,7 @@ from starlette.datastructures import FormData
 from stimrig.api.charts import trend_charts
 from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.language import _, clock, lazy, ngettext
+from stimrig.api.local_time import clock
 from stimrig.api.models.places import site_of
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
@@ -256,8 +256,8 @@ async def revoke_key(context: Ctx, who: Tester, code: str, key_id: str) -> Respo
 
 
 environment.globals["note_kinds"] = {
-    "spasm": lazy("Spasm"), "posture": lazy("Posture"), "electrodes": lazy("Electrodes"), "side": lazy("Side"),
-    "medication": lazy("Medication"), "other": lazy("Other"),
+    "spasm": "Spasm", "posture": "Posture", "electrodes": "Electrodes", "side": "Side",
+    "medication": "Medication", "other": "Other",
 }  # fmt: skip
 environment.globals["muscles"] = ("biceps brachii", "triceps brachii")
 """Offered where a muscle is typed; any other may be."""
@@ -278,7 +278,7 @@ async def write_note(
         try:
             at_s = typed.number(at)
         except ValueError as error:
-            raise ApiError(422, "invalid-input", _("This time cannot be used"), str(error)) from None
+            raise ApiError(422, "invalid-input", "This time cannot be used", str(error)) from None
     fields = {"kind": kind, "text": text, "test_id": test_id or None, "at_s": at_s, "now": bool(now and test_id)}
     await participants.write_note(context, who, code, typed.checked(NoteIn, **fields))
     return RedirectResponse(local(back or f"/participants/{code}") + "#notes", 303)
@@ -338,15 +338,15 @@ async def say_site(
     before, after = site_words(site_of(row, channel)), site_words(participants.site_in(body))
     warnings = []
     if participants.loses_calibration(row, body, channel):
-        warnings += [_("The calibration is lost with it: its thresholds were found at %(muscle)s.", muscle=before)]
+        warnings += [f"The calibration is lost with it: its thresholds were found at {before}."]
     if before != after and await asyncio.to_thread(context.versions.approved, code) is not None:
-        warnings += [_("The approved model and its keys are of %(muscle)s. Here there is none.", muscle=before)]
+        warnings += [f"The approved model and its keys are of {before}. Here there is none."]
     question = Question(
         participant=code,
-        title=_("Change side and muscle of %(code)s?", code=code),
-        button=_("Yes, it is %(muscle)s", muscle=after),
+        title=f"Change side and muscle of {code}?",
+        button=f"Yes, it is {after}",
         action=save,
-        rows=[Row(_("Side and muscle"), after, before)],
+        rows=[Row("Side and muscle", after, before)],
         warnings=warnings,
     )
     return RedirectResponse(await context.questions.ask_if_doubtful(question, who), 303)
@@ -388,14 +388,11 @@ def trials_card(context: Context, code: str) -> dict[str, Any] | None:
 def served_age(context: Context, told: dict[str, Any]) -> str:
     """Since when that is known which the controller gets."""
     minutes = int(max(0.0, context.clock.unix_s() - unix_of(told["served_utc"])) // 60)
-    ago = ngettext("%(num)s minute ago", "%(num)s minutes ago", minutes) if minutes else _("just now")
+    ago = f"{minutes} minute{'' if minutes == 1 else 's'} ago" if minutes else "just now"
     if not told["served_trial"]:
-        return _("The controller gets the approved model.")
+        return "The controller gets the approved model."
     time = clock(told["served_utc"])
-    return _(
-        "The controller gets the model as of trial %(number)s, %(time)s (%(ago)s).",
-        number=told["served_trial"], time=time, ago=ago,
-    )  # fmt: skip
+    return f"The controller gets the model as of trial {told['served_trial']}, {time} ({ago})."  # fmt: skip
 
 
 def trial_row(trial: dict[str, Any]) -> dict[str, Any]:

@@ -13,10 +13,10 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from markupsafe import Markup
 from sqlalchemy.exc import SQLAlchemyError
 
-from stimrig.api import language
+from stimrig.api import local_time
 from stimrig.api.clock import zone_name
 from stimrig.api.errors import ApiError
-from stimrig.api.language import clock, lazy
+from stimrig.api.local_time import clock
 from stimrig.api.people.auth import LOCKED, Principal, Scope
 from stimrig.api.sessions.joint_plan import PASSIVE
 from stimrig.api.store import seen
@@ -80,7 +80,7 @@ def signed(principal: Principal | None) -> Markup:
 
 def zone(context: Context) -> str:
     """The time zone of all times on the page: Europe/Berlin (UTC+1)."""
-    name, offset = zone_name(), language.zone(context.clock.utc())
+    name, offset = zone_name(), local_time.zone(context.clock.utc())
     return offset if name in ("", offset, "Etc/UTC") else f"{name} ({offset})"
 
 
@@ -169,18 +169,18 @@ TORQUE_OLD_S = 1.0
 """An older torque is not shown as the torque of now."""
 
 WORDS: dict[str, tuple[Any, Any]] = {
-    "ready": (lazy("No stimulation"), lazy("ready")),
-    "calibrating": (lazy("No stimulation"), lazy("a calibration is open")),
-    "arming": (lazy("Stimulating"), lazy("begins")),
-    "running": (lazy("Stimulating"), ""),
-    PASSIVE: (lazy("No stimulation"), lazy("passive movement")),
-    "stopping": (lazy("Stopping"), lazy("not confirmed yet")),
-    "sealing": (lazy("No stimulation"), lazy("saving the recording")),
-    "latched": (lazy("Stopped"), lazy("needs re-arm")),
-    "uncertain": (lazy("Restarted"), lazy("needs re-arm")),
-    "disconnected": (lazy("Disconnected"), lazy("see below what to check")),
-    "unreachable": (lazy("Unknown"), lazy("the rig cannot be reached")),
-    "silent": (lazy("Unknown"), lazy("the rig does not answer")),
+    "ready": ("No stimulation", "ready"),
+    "calibrating": ("No stimulation", "a calibration is open"),
+    "arming": ("Stimulating", "begins"),
+    "running": ("Stimulating", ""),
+    PASSIVE: ("No stimulation", "passive movement"),
+    "stopping": ("Stopping", "not confirmed yet"),
+    "sealing": ("No stimulation", "saving the recording"),
+    "latched": ("Stopped", "needs re-arm"),
+    "uncertain": ("Restarted", "needs re-arm"),
+    "disconnected": ("Disconnected", "see below what to check"),
+    "unreachable": ("Unknown", "the rig cannot be reached"),
+    "silent": ("Unknown", "the rig does not answer"),
 }
 """For each state: whether stimulation is on, and one more thing to know."""
 

@@ -10,7 +10,6 @@ from fastapi.responses import Response
 
 from stimrig.api.charts.svg import svg
 from stimrig.api.clock import local_day
-from stimrig.api.language import _
 from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.places import site_of, site_of_recording
 from stimrig.api.store.tables import Note, Participant, Recording, Test
@@ -36,11 +35,11 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
     figures = draw_own(document, measured)
     words = {
-        "comparison": _("Torque measured and predicted, what is left, and the pulse width, over time"),
-        "recruitment": _("Steady torque over pulse width"),
-        "step": _("Step response over time"),
-        "joint_g": _("Share of the muscle's torque over the angle of the joint"),
-        "joint_h": _("Passive torque over the angle of the joint"),
+        "comparison": "Torque measured and predicted, what is left, and the pulse width, over time",
+        "recruitment": "Steady torque over pulse width",
+        "step": "Step response over time",
+        "joint_g": "Share of the muscle's torque over the angle of the joint",
+        "joint_h": "Passive torque over the angle of the joint",
     }
     drawn = {name: svg(figures[name], *SIZES[name], words[name], on_paper=True) for name in words if name in figures}
     return page(

@@ -9,11 +9,9 @@ from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Resp
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.errors import ApiError
-from stimrig.api.language import CODES
 from stimrig.api.people.auth import LOCKED
 from stimrig.api.web.dependencies import Anyone, Ctx, Rearmer
 from stimrig.api.web.guards import local, same_origin
-from stimrig.api.web.middleware import LANGUAGE_COOKIE
 from stimrig.api.web.pages import render
 from stimrig.api.web.pages.render import COLOURS, MEDIA, fragment, look, page
 from stimrig.api.web.pages.typed import Text
@@ -70,15 +68,6 @@ async def rearm(context: Ctx, who: Rearmer, back: Text = "/") -> Response:
 
 
 KEPT_S = 365 * 24 * 3600
-
-
-@router.post("/language")
-async def choose_language(request: Request, context: Ctx, language: Text = "", back: Text = "/") -> Response:
-    """Write the pages in this language from now on."""
-    answer = _back(request, language, CODES, back, ("no-such-language", "There is no such language"))
-    secure = context.settings.secure_cookies
-    answer.set_cookie(LANGUAGE_COOKIE, language, KEPT_S, httponly=True, samesite="lax", secure=secure)
-    return answer
 
 
 @router.post("/colours")

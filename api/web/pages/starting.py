@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 from stimrig.api.clinical_words import degrees, label_rows, words
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _, lazy, localised, ngettext, translated, until, when
+from stimrig.api.local_time import until, when
 from stimrig.api.models.changes import dose_words
 from stimrig.api.models.places import Site, site_of
 from stimrig.api.people.auth import Principal
@@ -26,7 +26,7 @@ from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment, number
 from stimrig.api.web.routes import participants
 
-NOBODY = lazy("today nobody has tested which pulse widths are felt, move the limb and are comfortable")
+NOBODY = "today nobody has tested which pulse widths are felt, move the limb and are comfortable"
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,15 @@ def calibrated(context: Context, row: Participant, channel: str = "") -> Calibra
     state = profiles.calibration(profile, context.clock.utc())
     if state == "none":
         required = bool(context.rig.status and context.rig.status.require_calibration)
-        return Calibrated(state, _("not calibrated"), not required)
+        return Calibrated(state, "not calibrated", not required)
     with context.store.read() as session:
         entry = seen.last(session, seen.actions_on(row.code, "finish calibration"))
     said = {"time": when(profile.get("set_at_utc")), "end": until(profile.get("expires_at_utc"))}
     said["name"] = entry.who if entry else "–"
     if state == "expired":
-        words = _("found on %(time)s by %(name)s, expired %(end)s", **said)
+        words = "found on {time} by {name}, expired {end}".format(**said)
     else:
-        words = _("found on %(time)s by %(name)s, valid until %(end)s", **said)
+        words = "found on {time} by {name}, valid until {end}".format(**said)
     return Calibrated(state, words, state == "valid")
 
 
@@ -81,8 +81,8 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
     joint = preview.get("joint")
     question = Question(
         participant=row.code,
-        title=_("Start the %(kind)s of %(code)s?", kind=words(body.kind, "kind"), code=row.code),
-        button=_("Start now: %(strength)s", strength=strength) if stimulates else _("Start now: no stimulation"),
+        title=f"Start the {words(body.kind, 'kind')} of {row.code}?",
+        button=f"Start now: {strength}" if stimulates else "Start now: no stimulation",
         action=action,
         rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context), playing)
         + [Row(*said) for said in label_rows(vars(body))],
@@ -98,7 +98,7 @@ def warnings(row: Participant, standing: Calibrated) -> list[str]:
     """What deserves a second look."""
     if standing.state == "valid":
         return []
-    return [_("%(code)s is not calibrated: %(why)s.", code=row.code, why=NOBODY)]
+    return [f"{row.code} is not calibrated: {NOBODY}."]
 
 
 def out_of_reach(preview: dict[str, Any]) -> list[str]:
@@ -114,46 +114,45 @@ def rows(
     """What a person has to know before saying yes; `playing`: the channels of a test of several."""
     pulses = sum(width > 0 for width in preview["pulse_width_us"])
     torque_time = preview.get("torque_time_nms")
-    dose = ngettext(
-        "%(num)s pulse, %(charge)s (charge of one phase)",
-        "%(num)s pulses, %(charge)s (charge of one phase, all pulses together)",
-        pulses, charge=dose_words(preview["charge_uc"]),
-    )  # fmt: skip
+    charge = dose_words(preview["charge_uc"])
+    dose = f"{pulses} pulses, {charge} (charge of one phase, all pulses together)"
+    if pulses == 1:
+        dose = f"1 pulse, {charge} (charge of one phase)"
     if torque_time is not None:
-        dose += _(", about %(effort)s of torque", effort=number(torque_time, 0, "N·m·s"))
+        dose += f", about {number(torque_time, 0, 'N·m·s')} of torque"
     long = number(preview["duration_s"], 0, "s")
     more = []
     if joint := preview.get("joint"):
         long, dose, more = joint_rows(joint, row.profile, long, dose)
     elif bounds := preview.get("bounds"):
         reach, most = preview["reach"], number(bounds["max_torque_time_nms"], 0, "N·m·s")
-        long = _("at most %(most)s", most=number(bounds["max_duration_s"], 0, "s"))
-        dose = _("at most %(most)s of torque", most=most)
-        more = [Row(_("Stops once known within"), number(preview["target"]["curve_percent"], 1, "%"))]
-        more += [Row(_("Expected"), translated(reach["words"]))] if reach["reachable"] else []
-        none = _("none that can be used: a test as ever")
-        more += [] if reach["bank"] is None else [Row(_("Earlier models"), str(reach["bank"] or none))]
+        long = f"at most {number(bounds['max_duration_s'], 0, 's')}"
+        dose = f"at most {most} of torque"
+        more = [Row("Stops once known within", number(preview["target"]["curve_percent"], 1, "%"))]
+        more += [Row("Expected", reach["words"])] if reach["reachable"] else []
+        none = "none that can be used: a test as ever"
+        more += [] if reach["bank"] is None else [Row("Earlier models", str(reach["bank"] or none))]
     widest, most = number(widest_us(preview), 0, "µs"), number(row.profile["max_pulse_width_us"], 0, "µs")
     current = [
-        Row(_("Side and muscle"), site_words(site_of(row))),
-        Row(_("Current of every pulse"), current_words(row)),
-        Row(_("Widest pulse"), _("%(widest)s, comfort maximum %(most)s", widest=widest, most=most)),
+        Row("Side and muscle", site_words(site_of(row))),
+        Row("Current of every pulse", current_words(row)),
+        Row("Widest pulse", f"{widest}, comfort maximum {most}"),
     ]
     stimulates = widest_us(preview) > 0.0
     if playing:
         current = [channel_row(one, preview["channels"][one.name]) for one in playing]
-        dose = _("all together: %(dose)s", dose=dose)
+        dose = f"all together: {dose}"
     stops_nm = min([row.profile["max_torque_nm"], *(one.profile["max_torque_nm"] for one in playing)])
     return [
-        Row(_("Who"), row.code),
+        Row("Who", row.code),
         *(current if stimulates else []),
         *more,
-        Row(_("How long"), long),
-        Row(_("Dose"), dose),
-        Row(_("Stops at"), number(stops_nm, 1, "N·m")),
-        *([Row(_("Calibration"), standing.words)] if stimulates else []),
-        Row(_("Run by"), ran_by),
-        Row(_("Rig"), rig),
+        Row("How long", long),
+        Row("Dose", dose),
+        Row("Stops at", number(stops_nm, 1, "N·m")),
+        *([Row("Calibration", standing.words)] if stimulates else []),
+        Row("Run by", ran_by),
+        Row("Rig", rig),
     ]
 
 
@@ -161,13 +160,13 @@ def channel_row(one: Channel, planned: Mapping[str, Any]) -> Row:
     """What one of several channels gets: where, its current, its widest pulse, its dose."""
     said = {
         "site": site_words(one.site),
-        "current": localised(f"{one.profile['current_ma']:g} mA"),
+        "current": f"{one.profile['current_ma']:g} mA",
         "widest": number(max(planned["pulse_width_us"], default=0.0), 0, "µs"),
         "most": number(one.profile["max_pulse_width_us"], 0, "µs"),
         "pulses": sum(width > 0 for width in planned["pulse_width_us"]),
         "charge": dose_words(planned["charge_uc"]),
     }
-    words = _("%(site)s · %(current)s · at most %(widest)s of %(most)s · %(pulses)s pulses, %(charge)s", **said)
+    words = "{site} · {current} · at most {widest} of {most} · {pulses} pulses, {charge}".format(**said)
     return Row(one.name, words, muscle=one.number)
 
 
@@ -186,30 +185,30 @@ def joint_rows(
     range_rad = profiles.range_of(profile)
     more = [
         Row(
-            _("Joint angles"),
-            _("%(range)s; beyond them the test stops", range=profiles.range_words(range_rad or (0, 0))),
+            "Joint angles",
+            f"{profiles.range_words(range_rad or (0, 0))}; beyond them the test stops",
         )
     ]
     if joint["kind"] == HELD:
-        more.insert(0, Row(_("Hold at"), degrees(joint["target_rad"])))
+        more.insert(0, Row("Hold at", degrees(joint["target_rad"])))
         expected = joint["doses"]["held_each"]
     else:
-        long = _("at most %(most)s; ends by itself once enough was seen", most=number(joint["longest_s"], 0, "s"))
+        long = f"at most {number(joint['longest_s'], 0, 's')}; ends by itself once enough was seen"
         expected = joint["doses"]["moving"]
     if joint["kind"] == PASSIVE:
-        return long, _("none: no current flows"), more
+        return long, "none: no current flows", more
     if joint["known"]:
-        dose = _("about %(effort)s of torque", effort=number(expected, 1, "N·m·s"))
+        dose = f"about {number(expected, 1, 'N·m·s')} of torque"
     elif joint["doses"]["paper"] > 0:
         percent = number(100 * expected / joint["doses"]["paper"], 0, "%")
-        dose = _("about %(percent)s of the pre-session test's", percent=percent)
+        dose = f"about {percent} of the pre-session test's"
     return long, dose, more
 
 
 def site_words(site: Site) -> str:
     """A site as a person says it: left, biceps brachii, A. Muscles keep their Latin names."""
-    sides = {"left": _("left"), "right": _("right")}
-    return ", ".join(part for part in (sides.get(site[0] or ""), *site[1:]) if part) or _("not said")
+    sides = {"left": "left", "right": "right"}
+    return ", ".join(part for part in (sides.get(site[0] or ""), *site[1:]) if part) or "not said"
 
 
 environment.globals |= {"site_words": site_words, "site_of": site_of}
@@ -218,8 +217,8 @@ environment.globals |= {"site_words": site_words, "site_of": site_of}
 def current_words(row: Participant, playing: Sequence[Channel] = ()) -> str:
     """The current of every pulse; of several channels each one's."""
     if playing:
-        return localised(", ".join(f"{one.name} {one.profile['current_ma']:g} mA" for one in playing))
-    return localised(f"{row.profile['current_ma']:g} mA")
+        return ", ".join(f"{one.name} {one.profile['current_ma']:g} mA" for one in playing)
+    return f"{row.profile['current_ma']:g} mA"
 
 
 def widest_us(preview: dict[str, Any]) -> float:
@@ -231,9 +230,8 @@ def rig_words(context: Context) -> str:
     """What the current comes from."""
     status = context.rig.status
     if status is None or not context.rig.connected:
-        return _("cannot be reached")
+        return "cannot be reached"
     stimulator = status.stimulator
     parts = [str(stimulator.get("device") or "stimulator unknown").upper(), str(stimulator.get("firmware") or "")]
-    words = f"{' '.join(part for part in parts if part)}, {translated(status.state)}"
-    emulated = _("emulated: no person is connected")  # babel reads no call within an f-string
-    return f"{words}, {emulated}" if context.settings.emulated else words
+    words = f"{' '.join(part for part in parts if part)}, {status.state}"
+    return f"{words}, emulated: no person is connected" if context.settings.emulated else words

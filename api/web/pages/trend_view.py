@@ -10,7 +10,7 @@ from urllib.parse import urlencode
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from stimrig.api import language
+from stimrig.api import local_time
 from stimrig.api.charts import model_charts, trend_charts
 from stimrig.api.charts.model_charts import MOST
 from stimrig.api.charts.svg import Figures
@@ -44,7 +44,7 @@ async def compare(
     sessions = await context.trend.for_models(participant, [row.id for row in rows])
     at = next((number for number, row in enumerate(rows) if row.id == reference), 0)
     sides = await asyncio.gather(*(side(context, rows, number) for number in range(len(rows))))
-    names = [language.when(row.created_utc) for row in rows]
+    names = [local_time.when(row.created_utc) for row in rows]
     return page(
         request,
         "compare.html",
@@ -63,7 +63,7 @@ async def compare(
 
 def draw(rows: Sequence[Model], curves: Sequence[dict[str, Any] | None]) -> Figures:
     """The models' curves over one another."""
-    names, asked = [language.when(row.created_utc) for row in rows], urlencode([("model", row.id) for row in rows])
+    names, asked = [local_time.when(row.created_utc) for row in rows], urlencode([("model", row.id) for row in rows])
     figures = {
         "recruitment": model_charts.compared_recruitment([stored_model.read(row) for row in rows], names),
         "step": model_charts.compared_step(curves, names),

@@ -13,7 +13,6 @@ from stimrig.api.charts import model_charts
 from stimrig.api.charts.svg import svg
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _, plain, translated
 from stimrig.api.models import stored_model
 from stimrig.api.sessions.requests import RanByIn, tighter
 from stimrig.api.store.tables import Test
@@ -38,7 +37,7 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     fixed = [] if grows or row.plan.get("channels") else (row.plan.get("preview") or {}).get("pulse_width_us") or []
     bounds = limits_of(row, status)
     if told := document["adaptive"]:
-        document = {**document, "adaptive": {**told, **{name: plain(told[name]) for name in ("words", "problem")}}}
+        document = {**document, "adaptive": {**told, **{name: told[name] for name in ("words", "problem")}}}
     data = {
         "test": document, "planned_us": fixed, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
         "sensor": joint is not None or (status is not None and status.angle.present), "channels": channels_of(row),
@@ -128,7 +127,7 @@ async def measured(context: Context, model_id: str) -> Markup | None:
     if found["curves"] is None:
         return None
     figure = draw_own(stored_model.read(row), found)["comparison"]
-    return svg(figure, 1160.0, 520.0, _("Torque measured and predicted, what is left, and the pulse width, over time"))
+    return svg(figure, 1160.0, 520.0, "Torque measured and predicted, what is left, and the pulse width, over time")
 
 
 async def what_was_recorded(context: Context, row: Test) -> Markup:
@@ -136,5 +135,5 @@ async def what_was_recorded(context: Context, row: Test) -> Markup:
     path = await asyncio.to_thread(context.analyses.path, str(row.recording_id))
     found = await context.pool.submit("recorded", urgent=True, data=path).result
     plan_us = [] if row.plan.get("adaptive") else (row.plan.get("preview") or {}).get("pulse_width_us") or []
-    figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), translated(row.state))
-    return svg(figure, 1160.0, 460.0, _("Torque that was measured and pulses that were sent, over time"))
+    figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), row.state)
+    return svg(figure, 1160.0, 460.0, "Torque that was measured and pulses that were sent, over time")

@@ -11,7 +11,6 @@ from fastapi.responses import PlainTextResponse, Response
 from stimrig.api.charts.model_charts import inversion
 from stimrig.api.charts.svg import svg
 from stimrig.api.errors import ApiError
-from stimrig.api.language import _
 from stimrig.api.models import inverted as words
 from stimrig.api.models.family import family_of
 from stimrig.api.store.tables import Model
@@ -68,7 +67,7 @@ async def render_widths(
     version = await asyncio.to_thread(context.versions.document, row)
     picture, lacking, pulses = None, [], ""
     if found is not None:
-        label = _("Reference and predicted torque, and pulse width, over time; shaded where it is out of reach")
+        label = "Reference and predicted torque, and pulse width, over time; shaded where it is out of reach"
         picture, lacking = svg(inversion(found), 1160.0, 460.0, label), words.rows(found["unreachable"])
         pulses = "torque_nm\n" + "\n".join(f"{torque:g}" for torque in found["reference_torque_nm"])
     return page(

@@ -10,7 +10,6 @@ from typing import Any
 from fastapi import APIRouter, Response, WebSocket, WebSocketDisconnect
 from sqlalchemy.exc import SQLAlchemyError
 
-from stimrig.api import language
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.people.auth import Principal, Scope
@@ -22,7 +21,6 @@ from stimrig.api.store.holds import KEY_TURN
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, context_of
 from stimrig.api.web.guards import refuse_outside, same_origin
-from stimrig.api.web.middleware import chosen_language
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import LeftOut, TestOut
 
@@ -157,22 +155,19 @@ async def _pump(
     if history["test_id"] == row.id:
         await socket.send_json(history)
     document = await asyncio.to_thread(lambda: context.runner.document(find(context, row.id)))
-    words = chosen_language(socket.headers)
-    await socket.send_json(_test_message(document, words))
+    await socket.send_json(_test_message(document))
     while not document["done"]:
         message = await _next(queue) or {"type": "idle", "rig_connected": context.rig.connected}
         if message["type"] == "test":
             if message["test"]["id"] != row.id:
                 continue
-            document, message = message["test"], _test_message(message["test"], words)
+            document, message = message["test"], _test_message(message["test"])
         if message["type"] in ("live", "adaptive", "joint") and message["test_id"] != row.id:
             continue
         if by_key and message["type"] == "state" and message["rig"]["test_id"] != row.id:
             continue  # the rig is with somebody else, or says why it stopped then
-        if message["type"] == "adaptive":
-            message = _in_words(message, words)
         if message["type"] == "joint":
-            message = _what_is_missing(message, words)
+            message = _what_is_missing(message)
         await socket.send_json(message)
 
 
@@ -199,25 +194,15 @@ async def _until_refused(socket: WebSocket, context: Context) -> None:
             log.warning("whether a live channel is still allowed could not be read")
 
 
-def _test_message(document: dict[str, Any], language_code: str) -> dict[str, Any]:
-    """How the test stands; `words`: what a page shows of it, in the language of the page."""
+def _test_message(document: dict[str, Any]) -> dict[str, Any]:
+    """How the test stands; `words`: what a page shows of it."""
     work = (document["identification"] or {}).get("text") or ""
-    with language.using(language_code):
-        words = {"reason": language.plain(document["reason"]), "work": language.plain(work)}
-    return {"type": "test", "test": document, "words": words}
+    return {"type": "test", "test": document, "words": {"reason": document["reason"], "work": work}}
 
 
-def _in_words(message: dict[str, Any], language_code: str) -> dict[str, Any]:
-    """How an adaptive test stands, its sentences in the language of the page."""
-    with language.using(language_code):
-        return {**message, **{name: language.plain(message[name]) for name in ("words", "problem")}}
-
-
-def _what_is_missing(message: dict[str, Any], language_code: str) -> dict[str, Any]:
-    """How a guided test stands, with what is still to be done, in the language of the page."""
-    with language.using(language_code):
-        problem, words = language.plain(message["problem"]), missing_words((message["coverage"] or {}).get("missing"))
-    return {**message, "problem": problem, "words": words}
+def _what_is_missing(message: dict[str, Any]) -> dict[str, Any]:
+    """Add to the state of a guided test what is still to be done."""
+    return {**message, "words": missing_words((message["coverage"] or {}).get("missing"))}
 
 
 async def _until_gone(socket: WebSocket) -> None:

@@ -8,7 +8,6 @@ from typing import Any
 from fastapi import APIRouter
 from fastapi.responses import Response
 
-from stimrig.api import language
 from stimrig.api.models import changes
 from stimrig.api.models.family import SEVERAL_MUSCLES
 from stimrig.api.models.stored_model import JOINT
@@ -51,8 +50,7 @@ async def trend(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     """Figures with their uncertainty over the sessions, and what changed since the last approved one."""
     found, lacking = await sessions(context, code), await left_out(context, code)
     more = {} if lacking is None else {"left_out": lacking}
-    with language.using("en"):
-        return {"participant": code, "sessions": [one.document() for one in found], "changes": newest(found), **more}
+    return {"participant": code, "sessions": [one.document() for one in found], "changes": newest(found), **more}
 
 
 def newest(found: list[Session]) -> dict[str, Any] | None:

@@ -11,7 +11,7 @@ const state = {
   time: [], low: [], high: [], pulseTime: [], width: [], elapsed: 0,
 };
 
-function shown(text) { return String(text).replace("-", "−").replace(".", words.decimal); }
+function shown(text) { return String(text).replace("-", "−"); }
 function segmentWords(name) { const [kind, number] = name.split(" "); return words.segments[name] || (words.segments[kind] ? words.segments[kind] + " " + number : name); }
 const playing = data.channels.map((one) => ({ ...one, pulseTime: [], width: [] })); // of a test of several channels
 const ownColour = (one) => colours[one.number > 2 ? "series-" + (one.number - 2) : "muscle-" + one.number];
