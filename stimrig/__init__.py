@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from stimrig.identify.effects import library as effects
     from stimrig.identify.tracking.trials import track
     from stimrig.progress import carry, diagnose, explain, fit, improve
-    from stimrig.verbs import emulate, export, import_recording, invert, join, recover, table1
+    from stimrig.verbs import emulate, export, invert, join, recover, table1
 
 _PLACES = {
     "read": ("stimrig.identify.records", "read"),
@@ -44,12 +44,12 @@ _PLACES = {
     "Client": ("stimrig.api.client.rest", "Client"),
     **{name: ("stimrig.progress", name) for name in ("carry", "diagnose", "explain", "fit", "improve")},
     **{name: ("stimrig.verbs", name)
-       for name in ("emulate", "export", "import_recording", "invert", "join", "recover", "table1")},
+       for name in ("emulate", "export", "invert", "join", "recover", "table1")},
 }  # fmt: skip
 
 __all__ = [
     "Client", "Model", "Record", "carry", "cohort", "compare", "diagnose", "effects", "emulate", "errors", "explain",
-    "export", "fit", "import_recording", "improve", "invert", "join", "next_experiment", "plot", "predict", "read",
+    "export", "fit", "improve", "invert", "join", "next_experiment", "plot", "predict", "read",
     "recover", "save", "schema", "table1", "track",
 ]  # fmt: skip
 

@@ -106,37 +106,28 @@ def invert(
 
 def export(
     data: Sequence[str | Path],
-    parquet: str | Path | None = None,
-    bids: str | Path | None = None,
+    output: str | Path,
+    format: str = "csv",
     select: str = "",
     no_dates: bool = False,
-    shift_days: int = 0,
     map: Sequence[str] = (),
-    format: str = "",
-    output: str | Path | None = None,
 ) -> Report:
-    """Recordings as Parquet, BIDS, NWB, FHIR, REDCap or MATLAB. One that is cut off goes on with the same call.
+    """Write records as CSV, MAT or Parquet, one file each, with a table of them.
 
     Parameters
     ----------
     data : sequence of path
         Files, folders, buckets.
-    parquet : path, optional
-        Folder for Parquet files.
-    bids : path, optional
-        Folder in the style of BIDS.
+    output : path
+        Folder to write, new or empty.
+    format : str
+        "csv", "mat" or "parquet".
     select : str
         Which recordings, as `participant == "P001"`.
     no_dates : bool
-        Leave out all days and times of the day.
-    shift_days : int
-        Move all days by so many.
+        Leave out days, times of day and what a person typed.
     map : sequence of str
         As of `read`.
-    format : str
-        One of `stimrig export --format`, in place of `parquet` or `bids`.
-    output : path, optional
-        Folder for files of that format.
 
     Returns
     -------
@@ -145,56 +136,7 @@ def export(
     """
     from stimrig.api.cli.commands.export import exported
 
-    given = {"parquet": parquet, "bids": bids, "output": output}
-    folders = {name: Path(path) for name, path in given.items() if path is not None}
-    options = {"format": format, "select": select, "no_dates": no_dates, "shift_days": shift_days}
-    told = exported([str(place) for place in data], **folders, **options, columns=list(map))  # pyright: ignore
-    return Report("export", told)
-
-
-def import_recording(
-    path: str | Path,
-    map: Mapping[str, str] | None = None,
-    segments: str = "",
-    sign: int | None = None,
-    lever_arm_m: float | None = None,
-    pulse_width_us: float | None = None,
-    pulse_rate_hz: float | None = None,
-    clock_offset_s: float | None = None,
-) -> identify.Record:
-    """A record from another tool's file (NWB, BIDS, XDF, Parquet, FHIR); its `notes` say what was taken.
-
-    Parameters
-    ----------
-    path : path
-        The file, or a BIDS recording's `.tsv.gz`.
-    map : mapping, optional
-        The signal that a column is, and its unit: `{"torque_nm": "Dynamometer/torque:Nm"}`.
-    segments : str
-        What names the segments in the file, or "none".
-    sign : int, optional
-        1 where the torque of the stimulated muscle is positive, -1 where it is negative.
-    lever_arm_m : float, optional
-        Of a force.
-    pulse_width_us, pulse_rate_hz : float, optional
-        Of pulses that are only marked; of widths that are a signal.
-    clock_offset_s : float, optional
-        What is added to the pulses' times.
-
-    Returns
-    -------
-    Record
-
-    Raises
-    ------
-    BadRecord, BadRequest
-        The file cannot be read; it does not say something that was not given either.
-    """
-    from stimrig.api.cli.commands.import_ import answers, taken
-
-    numbers = {"sign": sign, "lever_arm_m": lever_arm_m, "pulse_width_us": pulse_width_us,
-               "pulse_rate_hz": pulse_rate_hz, "clock_offset_s": clock_offset_s}  # fmt: skip
-    return taken(Path(path), answers(map, segments, numbers))[0]
+    return Report("export", exported([str(place) for place in data], Path(output), format, select, no_dates, list(map)))
 
 
 def recover(journal: str | Path, folder: str | Path | None = None) -> Report:

@@ -29,15 +29,13 @@ from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.version import software_version
 from stimrig.identify.errors import IdentifyError
 
-COMPUTES = {"compare", "diagnose", "explain", "export", "fit", "import", "improve", "invert", "predict", "table1"}
+COMPUTES = {"compare", "diagnose", "explain", "export", "fit", "improve", "invert", "predict", "table1"}
 """Verbs that only compute: they hold no device, and Ctrl-C may end them whatever they are in."""
 PACKAGE = Path(__file__).resolve().parents[1]
 GRACE_S = 0.7
 """For what is to be tidied up after Ctrl-C."""
 interrupted = threading.Event()
-FILES = {info.name.rstrip("_"): info.name for info in pkgutil.iter_modules(commands.__path__)}
-"""Verbs with their files: one that is a word of Python itself has a sign more."""
-VERBS = sorted(FILES)
+VERBS = sorted(info.name for info in pkgutil.iter_modules(commands.__path__))
 INPUT_AT_FAULT = (Unreachable, Unauthorized, Forbidden, NotFound, Invalid)
 """Errors of a service that stand for a wrong address, a wrong token or a request that cannot be used."""
 
@@ -49,11 +47,11 @@ def build(verb: str = "") -> typer.Typer:
     """
     app = _empty()
     for name in [verb] if verb in VERBS else VERBS:
-        module = importlib.import_module(f"{commands.__name__}.{FILES[name]}")
+        module = importlib.import_module(f"{commands.__name__}.{name}")
         if hasattr(module, "register"):
             module.register(app)
         else:
-            app.command(name)(getattr(module, FILES[name]))
+            app.command(name)(getattr(module, name))
     return app
 
 
@@ -61,9 +59,9 @@ def _overview() -> typer.Typer:
     """The command line as its help lists it: what each verb does, read from its file and not loaded."""
     app, groups = _empty(), {}
     for name in VERBS:
-        tree = ast.parse((Path(commands.__path__[0]) / f"{FILES[name]}.py").read_text("utf-8"))
+        tree = ast.parse((Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8"))
         defined = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
-        does = {node.name.rstrip("_"): ast.get_docstring(node) for node in defined}
+        does = {node.name: ast.get_docstring(node) for node in defined}
         if name in does:
             app.command(name, help=does[name])(_nothing)
         else:

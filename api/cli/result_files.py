@@ -18,8 +18,9 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
     Parameters
     ----------
     what : Model, Record, Inversion or Explanation
-        A model: MODEL.json, `.mat` for other tools, or `.html`, a report beside its record. A record, joined ones too:
-        `.csv`, as `read` takes it. An inversion: `.csv`, as `stimrig invert -o`. An explanation: `.html`.
+        A model: MODEL.json, `.mat` for other tools, or `.html`, a report beside its record. A record: `.csv` (joined
+        ones, too), `.mat` or `.parquet`, as `read` takes them. An inversion: `.csv`, as `stimrig invert -o`. An
+        explanation: `.html`.
     path : str or Path
         The file; one that is there is replaced.
     record : Record, optional
@@ -37,8 +38,8 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
     OSError
         It cannot be written.
     """
+    from stimrig.api.export.record_file import WRITERS, write_record
     from stimrig.api.models import inverted
-    from stimrig.identify.records.join import write_joined
 
     path = Path(path)
     kind = path.suffix.lower()
@@ -47,12 +48,13 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
             place.write_text(report(what, record, path.stem), "utf-8", newline="")
         elif isinstance(what, identify.Model) and kind in (".json", ".mat"):
             write_model(place, what)
-        elif isinstance(what, identify.Record) and kind == ".csv":
-            write_joined(what, place)
+        elif isinstance(what, identify.Record) and kind[1:] in WRITERS:
+            write_record(what, place, kind[1:])
         elif isinstance(what, Inversion) and kind == ".csv":
             place.write_text(inverted.table(what.to_dict()), "utf-8", newline="")
         else:
-            fix = "A model is .json, .mat or .html, an explanation .html, a record and an inversion .csv."
+            fix = "A model is .json, .mat or .html, an explanation .html, a record .csv, .mat or .parquet, an "
+            fix += "inversion .csv."
             raise identify.BadRequest(f"no {kind or 'such'} file of a {type(what).__name__}", place=str(path), fix=fix)
     return path
 

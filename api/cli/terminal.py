@@ -20,7 +20,7 @@ LARGEST_MODEL_BYTES = 32 * 2**20
 
 DATA_HELP = (
     "sealed recording (HDF5); CSV file with the columns time_s,pulse_width_us,torque_nm,segment; or another tool's "
-    "table or MAT file"
+    "table, MAT or Parquet file"
 )
 Json = Annotated[bool, typer.Option("--json", help="one JSON object on standard output, nothing else there")]
 Data = Annotated[Path, typer.Argument(help=DATA_HELP, metavar="DATA", show_default=False)]

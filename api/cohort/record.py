@@ -28,6 +28,7 @@ SAID = ("day", *REPEATED)
 LIBRARIES = (
     "stimrig.identify.fitting", "stimrig.identify.diagnosis", "stimrig.identify.diagnosis.improvement",
     "stimrig.identify.records.csv", "stimrig.identify.records.mat", "stimrig.identify.records.recording",
+    "pyarrow.parquet", "pyarrow.compute",
 )  # fmt: skip
 KINDS: tuple[tuple[type[IdentifyError], str], ...] = (
     (BadRecord, "bad record"), (NotIdentifiable, "not identifiable"), (BadRequest, "bad request"),

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 
 from stimrig.api.cohort.tasks import CohortError
 
-SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
+SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat", ".parquet")
 """What counts as a record in a folder. A file that is named itself is taken whatever its name."""
 
 
@@ -177,9 +177,9 @@ class Bucket(Source):
 
     def _files(self) -> tuple[Any, str]:
         """The file system and the path in it."""
-        import fsspec
-
         try:
+            import fsspec
+
             return fsspec.core.url_to_fs(self.url, use_listings_cache=False)
         except (ImportError, ValueError) as error:
             protocol = self.url.partition("://")[0]

@@ -19,7 +19,7 @@ PREFIX, JOINED = "upload-", "joined-"
 PARTS = "parts"
 PLAIN = ".plain"
 """What a table of another tool is turned into, until it takes its place."""
-SUFFIXES = (".csv", ".h5", ".mat", PLAIN)
+SUFFIXES = (".csv", ".h5", ".mat", ".parquet", PLAIN)
 MOST_TOLD = 10
 log = logging.getLogger("stimrig.uploads")
 

@@ -1,4 +1,4 @@
-"""Records from files: tables of text (CSV), MAT files, or a sealed recording (HDF5); see docs/recording.md."""
+"""Records from files: tables (CSV, MAT, Parquet) or a sealed recording (HDF5); see docs/recording.md."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 """How a sealed recording begins; the service asks, too, and loads no reader for it."""
+PARQUET_MAGIC = b"PAR1"
 
 
 def read(
@@ -24,8 +25,8 @@ def read(
     ----------
     path : str or Path
         CSV with the header `time_s,pulse_width_us,torque_nm,segment` (and optionally `angle_rad`, `velocity_rad_s`,
-        `late_s`, `doubted`, and the columns of a joined record), a table or MAT file of another tool, or a sealed
-        recording.
+        `late_s`, `doubted`, and the columns of a joined record), a table, MAT or Parquet file of another tool, or a
+        sealed recording. Parquet needs pyarrow.
     pulse_rate_hz : float, optional
         Pulses a second; by default what the recording says, else 40.
     map : mapping or sequence of str, optional
@@ -57,6 +58,10 @@ def read(
         return read_recording(content, path, pulse_rate_hz)
     if is_mat(content) or path.suffix.lower() == ".mat":
         return read_mat(content, path, pulse_rate_hz, given)
+    if content.startswith(PARQUET_MAGIC) or path.suffix.lower() == ".parquet":
+        from stimrig.identify.records.parquet import read_parquet
+
+        return read_parquet(content, path, pulse_rate_hz, given)
     from stimrig.identify.records.csv import read_csv
 
     return read_csv(content, path, pulse_rate_hz, given)

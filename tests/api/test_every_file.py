@@ -88,11 +88,11 @@ def test_what_holds_too_little_is_read_and_refused_in_one_line(folder: Path, kin
         assert code in (0, 2) and (code == 0 or (out == "" and err.count("\n") == 1 and str(data) in err)), err
 
 
-@pytest.mark.parametrize("way", ["--parquet", "--bids"])
+@pytest.mark.parametrize("way", ["csv", "mat", "parquet"])
 def test_every_kind_is_exported(folder: Path, tmp_path: Path, way: str) -> None:
-    told = json.loads(done("export", folder, way, tmp_path / "out", "--json"))
+    told = json.loads(done("export", folder, "-o", tmp_path / "out", "--format", way, "--json"))
     assert told["errors"] == 0, (tmp_path / "out" / "errors.csv").read_text()
-    assert told["written"] == len(SEALED)
+    assert told["records"] == len(SEALED)
 
 
 def test_a_journal_becomes_a_recording_that_is_read(folder: Path, tmp_path: Path) -> None:
@@ -116,8 +116,8 @@ def test_a_long_plan_is_no_reason_to_refuse_a_recording(folder: Path, tmp_path: 
     with h5py.File(data, "r+") as file:
         plan = json.dumps({"segments": [{"name": "prbs", "settings": {"width_us": list(range(300))}}] * 200})
         file.attrs["configuration"] = plan
-    told = json.loads(done("export", data, "--parquet", tmp_path / "out", "--json"))
-    assert (told["written"], told["errors"]) == (1, 0)
+    told = json.loads(done("export", data, "-o", tmp_path / "out", "--json"))
+    assert (told["records"], told["errors"]) == (1, 0)
     for verb in ("fit", "diagnose"):
         done(verb, data)
 
@@ -126,7 +126,7 @@ def test_a_verb_that_did_nothing_of_what_was_asked_does_not_end_well(folder: Pat
     bad = tmp_path / "in" / "bad.h5"
     bad.parent.mkdir()
     bad.write_bytes(b"\x89HDF\r\n\x1a\nand nothing more")
-    for number, verb in enumerate((("export", "--parquet"), ("cohort", "fit", "--workers", 1, "-o"))):
+    for number, verb in enumerate((("export", "-o"), ("cohort", "fit", "--workers", 1, "-o"))):
         code, _out, err = run(*verb, tmp_path / f"{number}.parquet", bad.parent)
         assert code == 1 and "nothing was done" in err and err.count("\n") <= 2, err
         nobodys = ("--select", "participant == 'nobody'", folder / "plain.h5")

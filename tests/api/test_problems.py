@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
 import httpx
 import pytest
 
+import stimrig
 from stimrig.api import errors
 from stimrig.api.sessions import runner
 from stimrig.rig.messages import Problem as RigProblem
@@ -155,6 +157,21 @@ def test_upload_of_a_table_whose_columns_are_named(client: httpx.Client, service
     assert [float(cell) for cell in cells[2].split(",")[:3]] == pytest.approx([0.05, 0.0, 0.025])
     assert hashlib.sha256(sent).hexdigest() in kept
     assert [path.suffix for path in (service.data / "recordings").rglob("upload-*")] == [".csv"]
+
+
+@pytest.mark.parametrize("columns", [[], ["torque_nm=torque_nm:Nm"]])
+def test_upload_of_a_parquet_file(client: httpx.Client, participant: str, columns: list[str], tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="pip install pyarrow")
+    (tmp_path / "sent.csv").write_text(
+        GOOD_HEADER + "".join(f"{k / 40},{100 * (k // 20 % 2)},{k % 7},prbs\n" for k in range(400))
+    )
+    sent = stimrig.save(stimrig.read(tmp_path / "sent.csv"), tmp_path / "sent.parquet").read_bytes()
+    where = f"/v1/participants/{participant}/recordings"
+    answer = client.post(where, content=sent, params={"map": columns})
+    assert answer.status_code == 201, answer.text
+    kept = client.get(answer.headers["location"])
+    kind = "text/csv" if columns else "application/vnd.apache.parquet"
+    assert kept.headers["content-type"].startswith(kind) and (kept.content == sent) == (not columns)
 
 
 def test_upload_of_a_table_with_a_wrong_name_is_one_line(client: httpx.Client, service: Service, participant: str):

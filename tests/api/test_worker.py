@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+import stimrig
 from stimrig.api.errors import ApiError
 from stimrig.api.workers import process
 from stimrig.api.workers.pool import WORKER, Pool
@@ -168,9 +169,21 @@ def made_up_csv(path: Path) -> Path:
     return path
 
 
-def test_real_worker_fits_draws_and_tells_bad_data(tmp_path: Path) -> None:
-    from stimrig.api.workers.pool import WORKER
+def test_a_confined_worker_reads_parquet(tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow", reason="pip install pyarrow")
+    good = stimrig.save(stimrig.read(made_up_csv(tmp_path / "good.csv")), tmp_path / "good.parquet")
+    cut = tmp_path / "cut.parquet"
+    cut.write_bytes(good.read_bytes()[:-9])
 
+    async def work(pool: Pool) -> dict[str, Any]:
+        with pytest.raises(ApiError, match="damaged Parquet"):
+            await pool.submit("fit", data=str(cut)).result
+        return await pool.submit("fit", data=str(good)).result
+
+    assert with_pool(work, command=WORKER)["model"]["fit"]["fit_percent"] > 95
+
+
+def test_real_worker_fits_draws_and_tells_bad_data(tmp_path: Path) -> None:
     good, bad = made_up_csv(tmp_path / "good.csv"), tmp_path / "bad.csv"
     bad.write_text("time_s,pulse_width_us,segment\n0,0,prbs\n")
 

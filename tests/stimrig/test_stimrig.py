@@ -33,7 +33,7 @@ pytestmark = pytest.mark.slow
 
 NAMES = {
     "read", "fit", "predict", "compare", "diagnose", "improve", "next_experiment", "effects", "plot", "Model", "Record",
-    "Client", "emulate", "explain", "export", "import_recording", "invert", "join", "recover", "save", "schema",
+    "Client", "emulate", "explain", "export", "invert", "join", "recover", "save", "schema",
     "table1", "track",
 }  # fmt: skip
 HEAVY = {"numpy", "scipy", "numba", "h5py", "plotly", "httpx", "tqdm", "pydantic", "fastapi", "sqlalchemy"}

@@ -22,7 +22,7 @@ COMMAND_ONLY = {
     "retention": "it deletes, alone with the data folder; it is asked for by a person, or by a timer",
     "serve": "it runs until it is ended, and may own a rig; `Client` talks to it",
 }  # fmt: skip
-ELSEWHERE = {"test": "Client.run_test", "import": "import_recording"}
+ELSEWHERE = {"test": "Client.run_test"}
 MORE = ("read", "join", "save", "carry", "next_experiment", "track", "plot", "Client")
 """What the page of the service and options of verbs do: `-o`, `--carry`, several DATA, what decides, trials."""
 

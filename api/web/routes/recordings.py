@@ -24,21 +24,24 @@ from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import UploadOut
 from stimrig.api.web.routes import participants
-from stimrig.identify.records import HDF5_MAGIC
+from stimrig.identify.records import HDF5_MAGIC, PARQUET_MAGIC
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
 BINARY = {"schema": {"type": "string", "format": "binary"}}
 UPLOAD = {"requestBody": {"required": True, "content": {"application/octet-stream": BINARY}}}
 CSV = {"description": "one row a sample", "content": {"text/csv": {"schema": {"type": "string"}}}}
-RAW_KINDS = ("application/octet-stream", "application/x-hdf5", "text/csv", "application/x-matlab-data")
+KINDS = {
+    ".h5": "application/x-hdf5", ".csv": "text/csv", ".mat": "application/x-matlab-data",
+    ".parquet": "application/vnd.apache.parquet",
+}  # fmt: skip
+RAW_KINDS = ("application/octet-stream", *KINDS.values())
 RAW = {
     "description": "the file as it was sealed or sent in; `X-Content-SHA256` is its checksum",
     "content": dict.fromkeys(RAW_KINDS, BINARY),  # the first one for clients that know no other kind of bytes
 }
 GONE = problem("the file is not in its place any more")
 MOST_COLUMNS = 8
-KINDS = {".csv": "text/csv", ".mat": "application/x-matlab-data"}
 
 
 @router.get("/recordings/{recording_id}", response_class=FileResponse, responses={200: RAW, 410: GONE})
@@ -93,7 +96,7 @@ async def upload(
     columns: Annotated[list[str], Query(alias="map", max_length=MOST_COLUMNS)] = [],  # noqa: B006
     of: Annotated[str, Query(description="whose recording it is, where the participant's it is not")] = "",
 ) -> dict[str, Any]:
-    """Upload a recording of another tool (CSV, MAT or HDF5 as the request's body) and identify a model from it.
+    """Upload a recording of another tool (CSV, MAT, Parquet or HDF5 as the body) and identify a model from it.
 
     `map` says what a column is called there and its unit, once for each column: `map=torque_nm=Drehmoment:Nm`.
     What was assumed is told in `warnings`. A recording that says that it is another participant's is refused, but with
@@ -102,7 +105,7 @@ async def upload(
     await asyncio.to_thread(participants.find, context, code)
     data = await request.body()  # `stimrig.api.web.middleware` bounds it
     if not data:
-        raise ApiError(422, "empty", "The upload is empty", "Send a CSV or MAT file or a sealed recording as the body.")
+        raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
     row, model, warnings = await take_in(context, code, data, who, columns, of)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
@@ -186,7 +189,8 @@ def _about_the_upload(path: Path) -> Iterator[None]:
 
 
 def _suffix(data: bytes) -> str:
-    return ".h5" if data.startswith(HDF5_MAGIC) else ".mat" if data.startswith(b"MATLAB ") else ".csv"
+    kinds = {HDF5_MAGIC: ".h5", b"MATLAB ": ".mat", PARQUET_MAGIC: ".parquet"}
+    return next((suffix for magic, suffix in kinds.items() if data.startswith(magic)), ".csv")
 
 
 def _write(context: Context, data: bytes, suffix: str) -> Path:
