@@ -116,8 +116,19 @@ def moved(model: Model, base: Model, factor: float = 1.0) -> dict[str, float]:
 # ---- the fit ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("relation", COUNTING)
-@pytest.mark.parametrize("hidden", HIDDEN)
+def whole_grid(cases: list[tuple[str, ...]], always: set[tuple[str, ...]]) -> list:
+    """All cases; those that are not of `always` are for a campaign."""
+    assert always <= set(cases)
+    return [pytest.param(*case, marks=[] if case in always else [pytest.mark.campaign]) for case in cases]
+
+
+@pytest.mark.parametrize(
+    ("hidden", "relation"),
+    whole_grid(
+        [(hidden, relation) for hidden in HIDDEN for relation in COUNTING],
+        {*(("", relation) for relation in COUNTING), *((hidden, "the other way") for hidden in HIDDEN)},
+    ),
+)
 def test_fit_does_not_depend_on_how_torque_and_time_are_counted(hidden, relation):
     change, factor, offset_nm = COUNTING[relation]
     record, base = change(record_of(hidden)), fitted(hidden)
@@ -142,7 +153,8 @@ def _fits() -> list:
     for hidden in HIDDEN:
         for relation in SAMPLING:
             bent = (hidden, relation) == ("electromechanical_delay", "every second sample")
-            cases.append(pytest.param(hidden, relation, marks=[DELAY_SHORT_OF_A_SAMPLE] if bent else []))
+            marks = [] if hidden in ("", "fatigue") or bent else [pytest.mark.campaign]
+            cases.append(pytest.param(hidden, relation, marks=[*marks, *([DELAY_SHORT_OF_A_SAMPLE] if bent else [])]))
     return cases
 
 
@@ -155,8 +167,16 @@ def test_fit_hardly_depends_on_which_samples_show_the_muscle(hidden, relation):
     assert all(found[name] <= allowed[name] for name in found), found
 
 
-@pytest.mark.parametrize("relation", ["begun in the PRBS", "a gap of 0.5 s", "every second sample"])
-@pytest.mark.parametrize("hidden", HIDDEN[1:])
+BY_TURNS = ("begun in the PRBS", "a gap of 0.5 s", "every second sample")
+
+
+@pytest.mark.parametrize(
+    ("hidden", "relation"),
+    whole_grid(
+        [(hidden, relation) for hidden in HIDDEN[1:] for relation in BY_TURNS],
+        {(hidden, BY_TURNS[place % 3]) for place, hidden in enumerate(HIDDEN[1:])},
+    ),
+)
 def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
     """Its dynamics keep to 1 %; the form may be another of the same effect, and its curve then stands a little else."""
     record = record_of(hidden)
@@ -168,12 +188,6 @@ def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
 
 
 # ---- the diagnosis ------------------------------------------------------------------------------------------
-
-
-def whole_grid(cases: list[tuple[str, ...]], always: set[tuple[str, ...]]) -> list:
-    """All cases: those of `always` in every run of the tests, the others with `--campaigns`."""
-    assert always <= set(cases)
-    return [pytest.param(*case, marks=[] if case in always else [pytest.mark.campaign]) for case in cases]
 
 
 EACH = [(hidden,) for hidden in HIDDEN]

@@ -77,6 +77,7 @@ def test_false_alarms_are_rare(trials):
         assert 0.35 < np.mean(p) < 0.65, name
 
 
+@pytest.mark.campaign
 def test_false_alarms_are_rare_with_an_effect_that_is_not_there(trials):
     """Its parameters stand at a bound or are next to undetermined, and the search stops near the top."""
     models = [identify.fit(record, effects=["fatigue"]) for _, record, *_ in trials[:30]]
