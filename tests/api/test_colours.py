@@ -135,30 +135,6 @@ def test_text_stands_out_from_what_it_stands_on(mode: str) -> None:
     assert faint == {}
 
 
-def test_a_rule_that_sets_ink_and_surface_sets_a_pair_that_is_checked() -> None:
-    """`--stop` with `--on-accent`, say, might be read in one mode only."""
-    pairs = set(TEXT) | {("on-off", "off")}
-    for path in STATIC.glob("*.css"):
-        for rule in re.findall(r"\{([^{}]*)\}", path.read_text("utf-8")):
-            ink = re.search(r"(?:^|[;\s])color: var\(--([\w-]+)\)", rule)
-            surface = re.search(r"background(?:-color)?: var\(--([\w-]+)\)", rule)
-            if ink and surface:
-                assert (ink[1], surface[1]) in pairs, (path.name, rule)
-
-
-def test_colours_stand_in_the_two_lists_only() -> None:
-    """A colour that a rule holds itself would stay as it is in the dark."""
-    light, dark = variables("page.css"), variables("dark.css")
-    kept = {"bar", "stop-width", "torque"}  # two lengths, and a name for another colour
-    assert set(light) - kept == set(dark), "both lists name the same"
-    for path in STATIC.glob("*.css"):
-        rules = re.sub(r":root \{.*?\n\}|/\*.*?\*/", "", path.read_text("utf-8"), count=0, flags=re.DOTALL)
-        literal = re.findall(r"[:,\s](#[0-9a-fA-F]{3,8}\b|rgba?\([^)]*\)|\bwhite\b|\bblack\b)(?=[;,\s}])", rules)
-        assert literal == [], path.name
-        used = set(re.findall(r"var\(--([\w-]+)\)", rules))
-        assert used - set(light) == set(), path.name
-
-
 @pytest.mark.parametrize("vision", VISION)
 @pytest.mark.parametrize("mode", MODES)
 def test_lines_of_a_chart_are_told_apart(mode: str, vision: str) -> None:
