@@ -33,8 +33,8 @@ types: setup-test ## types
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
 
-docs: setup-test ## the site of the documentation, in build/site; its notebooks are run (NOTEBOOKS=off: not), a warning is an error
-	@$(BIN)/python -m sphinx -c docs -W -n --keep-going -q -d build/doctrees . build/site
+docs: $(VENV)-docs/.docs ## the site of the documentation, in build/site; its notebooks are run (NOTEBOOKS=off: not), a warning is an error
+	@$(VENV)-docs/bin/python -m sphinx -c docs -W -n --keep-going -q -d build/doctrees . build/site
 	@echo "build/site/index.html"
 
 soak: setup-test ## an hour of recording with fits beside it (docs/results/soak.md)
@@ -63,6 +63,9 @@ $(VENV)/.run: requirements/run.txt pyproject.toml deploy/setup.sh
 $(VENV)/.test: requirements/test.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh test
 
+$(VENV)-docs/.docs: requirements/docs.txt pyproject.toml deploy/setup.sh
+	@bash deploy/setup.sh docs
+
 $(VENV)-bench/.bench: requirements/bench.txt pyproject.toml deploy/setup.sh
 	@bash deploy/setup.sh bench
 
@@ -70,4 +73,4 @@ lock: ## resolve the locked lists anew (needs uv; for maintainers)
 	@bash deploy/lock.sh
 
 clean: ## remove the environment and what tools left
-	@rm -rf $(VENV) $(VENV)-bench build *.egg-info .ruff_cache .pytest_cache
+	@rm -rf $(VENV) $(VENV)-bench $(VENV)-docs build *.egg-info .ruff_cache .pytest_cache

@@ -16,5 +16,6 @@ pins=$(mktemp); trap 'rm -f "$pins"' EXIT
 grep -E '^[a-z0-9_-]+==' requirements/run.txt | sed 's/ \\$//' > "$pins"
 constraint=(-c "$pins") # tests run with the very versions that users run
 compile test build test
+compile docs build page docs
 constraint=() # the peers ask for an older scipy: the bench has an environment of its own
 compile bench build page bench

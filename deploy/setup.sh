@@ -1,11 +1,11 @@
 #!/usr/bin/env bash
-# Set up .venv from a hash-locked list: deploy/setup.sh run|test|bench
+# Set up .venv from a hash-locked list: deploy/setup.sh run|test|docs|bench
 # Debian packages are installed only where they are missing, and only as root.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 what=$1
 venv=.venv
-[ "$what" = bench ] && venv=.venv-bench # the peers pin an older scipy
+case $what in docs | bench) venv=.venv-$what ;; esac # the peers of bench pin an older scipy
 
 say() { printf '\033[1m[setup]\033[0m %s\n' "$*"; }
 
@@ -51,8 +51,10 @@ say "installing the locked list requirements/$what.txt (the first time takes a m
 $venv/bin/python -m pip install --quiet --disable-pip-version-check --require-hashes -r "requirements/$what.txt"
 $venv/bin/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation -e .
 
-say "compiling, once (half a minute)"
-$venv/bin/python -m stimrig.identify.diagnosis.warm_up
+if [ "$what" != docs ]; then
+  say "compiling, once (half a minute)"
+  $venv/bin/python -m stimrig.identify.diagnosis.warm_up
+fi
 
 shell=chromium-headless-shell # opens no windows: with the whole browser each tab costs three times the processor
 if [ "$what" = test ] && ! command -v $shell >/dev/null 2>&1; then

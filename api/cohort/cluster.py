@@ -73,8 +73,8 @@ def connected(workers: Workers) -> Iterator[Client]:
 
 def quiet() -> None:
     """Keep Dask's log from the terminal: what matters to the person is said in one line."""
-    for name in ("distributed", "bokeh", "tornado", *logging.root.manager.loggerDict):
-        if name.partition(".")[0] in ("distributed", "bokeh", "tornado"):
+    for name in ("distributed", "tornado", *logging.root.manager.loggerDict):
+        if name.partition(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL)
 
 

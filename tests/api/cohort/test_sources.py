@@ -1,4 +1,4 @@
-"""Folders and a bucket (moto's server): what they list and open, what is wrong with them."""
+"""Folders and buckets (in memory; with S3 by moto's server): what they list and open, what is wrong with them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import pickle
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import pytest
 
 from stimrig.api.cohort.select import FIELDS, Selection
@@ -119,6 +120,14 @@ def test_a_bucket_lists_and_opens_its_objects(bucket: Any) -> None:
     assert all(entry.stamp for entry in found) and found[0].bytes == 4
     assert [entry.name for entry in listed(Bucket("s3://records/P2"))] == ["c.h5"]
     assert [entry.name for entry in listed(Bucket("s3://records/P1/a.h5"))] == ["a.h5"]
+
+
+def test_objects_of_any_protocol_of_fsspec_are_listed_and_opened() -> None:
+    fsspec.filesystem("memory").pipe({"/held/P1/a.h5": b"aaaa", "/held/readme.pdf": b"x"})
+    (entry,) = listed(Bucket("memory://held"))
+    assert (entry.address, entry.bytes) == ("memory:///held/P1/a.h5", 4)
+    assert Bucket("memory://held").open(entry, MOST) == b"aaaa"
+    assert "memory://nowhere" in refused("memory://nowhere")
 
 
 def test_an_object_that_changes_has_another_stamp(bucket: Any) -> None:
