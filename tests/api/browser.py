@@ -30,6 +30,7 @@ def watched(browser: Any, **options: Any) -> Any:
     """A tab that takes down every request, error and console message."""
     # a color on its way to another one is neither of the two
     context = browser.new_context(viewport={"width": WIDE[0], "height": WIDE[1]}, reduced_motion="reduce", **options)
+    context.set_default_timeout(120_000)  # a busy machine is slow
     page = context.new_page()
     page.requests, page.errors = [], []
     page.on("request", lambda request: page.requests.append(request.url))
@@ -168,7 +169,7 @@ def expected(locator: Any) -> Any:
     """What is to be true of it soon, on whichever page: a script of ours would fail on a page that is half loaded."""
     from playwright.sync_api import expect
 
-    expect.set_options(timeout=30_000)
+    expect.set_options(timeout=120_000)
     return expect(locator)
 
 

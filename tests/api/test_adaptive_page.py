@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import expected, open_tab, participant
+from tests.api.browser import participant
 from tests.api.conftest import Service, csrf, own_service, signed_in, wait_done
 from tests.api.test_axe import examined
 from tests.api.test_forms import fields
@@ -57,51 +57,6 @@ def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> Non
     after.get_by_text("A person said that it is enough").wait_for()
     examined(after, "after it")
     assert tab.errors == []
-
-
-@pytest.mark.browser
-def test_in_german(tab: Any, service: Service) -> None:
-    """Also where somebody else has seen the same page in English before."""
-    participant(tab, service, "X1")
-    chosen(tab, "0,2")
-    tab.locator("form.steps button.stimulate").click()
-    tab.locator("#knows").wait_for()
-    tab.get_by_role("button", name="Deutsch").click()
-    tab.locator("#segment", has_text="Erster Blick").wait_for()
-    tab.get_by_text("Hört auf, sobald beide auf 0,2 % bekannt sind.").wait_for()
-    tab.locator("#known-words", has_text="Die Kurve ist auf 8,0 % bekannt").wait_for()
-    tab.get_by_role("button", name="Genug").wait_for()
-    examined(tab, "in German")
-    assert tab.locator("#knows [lang=en]").count() == 0
-
-
-LOOKS = (
-    "(name) => { const is = getComputedStyle(document.getElementById(name)); return [is.fontStyle, is.fontWeight]; }"
-)
-
-
-@pytest.mark.browser
-def test_numbers_that_are_out_of_date_look_so_and_can_be_read(browser: Any, service: Service) -> None:
-    cut: list[bool] = []
-
-    def forward(socket: Any) -> None:
-        server = socket.connect_to_server()
-        server.on_message(lambda message: None if cut else socket.send(message))
-
-    for page in open_tab(browser, service, color_scheme="dark"):
-        participant(page, service, "X1")
-        page.route_web_socket("**/live", forward)
-        begun(page, "0,2")
-        page.locator("#known-words", has_text="known within 8.0 %").wait_for()
-        numbers = ("left", "current", "dose-used", "known-words")
-        for name in numbers:
-            expected(page.locator(f"#{name}")).to_have_css("font-style", "normal")
-        cut.append(True)
-        page.locator("#live.is-stale").wait_for()
-        assert [page.evaluate(LOOKS, name) for name in numbers] == [["italic", "400"]] * 4
-        assert page.evaluate(LOOKS, "age")[0] == "normal", "this one is still right"
-        examined(page, "out of date")
-        assert page.locator("#live.is-stale").count() == 1
 
 
 @pytest.mark.browser

@@ -235,7 +235,7 @@ def test_without_a_rig(tab: Any, service: Service) -> None:
         tab.get_by_text("The rig cannot be reached.").wait_for()
         examined(tab, "no rig")
         tab.get_by_role("button", name="Stop stimulation").click()
-        tab.get_by_role("heading", name="The stop is not confirmed").wait_for(timeout=15_000)
+        tab.get_by_role("heading", name="The stop is not confirmed").wait_for()
         assert "emergency switch" in tab.locator("section [role=alert]").first.inner_text()
         examined(tab, "stop without a rig")
     finally:

@@ -180,22 +180,6 @@ def test_a_page_is_light_until_a_chart_is_taken_hold_of(tab: Any, service: Servi
     assert not any("step.json" in url or "comparison" in url for url in tab.requests), "one chart's lines alone"
 
 
-def test_a_chart_is_taken_hold_of_by_keyboard_and_by_touch(browser: Any, service: Service, model: str) -> None:
-    for page in open_tab(browser, service, has_touch=True):
-        page.goto(f"{service.url}/models/{model}?diagnose=0")
-        button = page.get_by_role(
-            "button", name="Look closer: zoom, and read values: Measured and predicted torque, and"
-        )
-        button.focus()
-        page.keyboard.press("Enter")
-        page.locator("[data-figure=overview] .modebar-btn").first.wait_for()
-        assert button.get_attribute("aria-pressed") == "true" and button.evaluate("e => e === document.activeElement")
-        page.keyboard.press("Enter")
-        chart(page, "overview").tap(position={"x": 200, "y": 60})
-        page.locator("[data-figure=overview] .modebar-btn").first.wait_for()
-        assert page.errors == []
-
-
 def test_a_still_says_the_values_under_the_pointer(browser: Any, service: Service, model: str) -> None:
     for page in open_tab(browser, service):
         page.goto(f"{service.url}/models/{model}?diagnose=0")
@@ -207,18 +191,6 @@ def test_a_still_says_the_values_under_the_pointer(browser: Any, service: Servic
         assert abs(measured - predicted - left) < 0.1, "what the pointer reads agrees"
         page.mouse.move(5, 5)
         assert page.locator(".read-out").count() == 0
-
-
-def test_stills_follow_the_colours_and_fit_their_boxes(tab: Any, service: Service, model: str) -> None:
-    tab.set_viewport_size(LAPTOP)
-    tab.goto(f"{service.url}/models/{model}?diagnose=0")
-    line = "() => getComputedStyle(document.querySelector('[data-figure=overview] [data-name]')).stroke"
-    wide = "() => document.querySelector('[data-figure=overview] > svg.still').viewBox.baseVal.width"
-    for words in ("Light", "Dark"):
-        tab.locator(".bar").get_by_role("button", name=words).click()
-        assert tab.evaluate(line) == tab.evaluate(NAMED, "measured")
-    tab.set_viewport_size({"width": 390, "height": 844})
-    tab.wait_for_function(f"() => ({wide})() < 390")
 
 
 def test_without_scripts_stills_are_pictures(browser: Any, service: Service, model: str) -> None:

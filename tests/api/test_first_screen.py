@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import bring_to_rest, chart, expected
+from tests.api.browser import chart, expected
 from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
@@ -57,7 +57,7 @@ def test_verdict_chart_and_missing_effect_stand_in_the_first_screen(tab: Any, se
     assert tab.locator(".first-screen .primary").count() == 1, "one button is the first one"
 
 
-@pytest.mark.parametrize("size", [LAPTOP, TABLET], ids=["laptop", "tablet"])
+@pytest.mark.parametrize("size", [LAPTOP])
 def test_a_diagnosis_under_way_moves_nothing(tab: Any, service: Service, size: tuple[int, int]) -> None:
     marker = service.data / "recordings" / "slow"
     marker.write_text("0.4")
@@ -82,18 +82,6 @@ def test_a_diagnosis_under_way_moves_nothing(tab: Any, service: Service, size: t
     assert places(tab) == before
 
 
-def test_a_folded_chart_is_drawn_as_wide_as_its_box_when_it_is_opened(tab: Any, service: Service, model: str) -> None:
-    show(tab, f"{service.url}/models/{model}", LAPTOP)
-    folded = tab.locator("#curves [data-figure=recruitment]")
-    assert not folded.is_visible() and folded.locator("svg.still").count() == 0
-    tab.locator("#curves > summary").focus()
-    tab.keyboard.press("Enter")
-    assert chart(tab, "recruitment").bounding_box()["width"] > 300
-    tab.locator("#curves > summary").click()
-    tab.locator("#curves > summary").click()
-    assert sum("recruitment.html" in url for url in tab.requests) == 1, "fetched once"
-
-
 def test_a_link_to_a_folded_part_opens_it(tab: Any, service: Service, model: str) -> None:
     show(tab, f"{service.url}/models/{model}", LAPTOP)
     link = tab.locator(".missing").get_by_role("link", name="Fatigue")
@@ -115,21 +103,3 @@ def test_paper_shows_all_with_its_charts(tab: Any, service: Service, model: str)
         assert tab.locator(f"[data-figure={figure}] > svg.still").count() == 1, "a print waits for nothing"
     tab.evaluate("dispatchEvent(new Event('afterprint'))")
     assert not tab.locator("#curves").evaluate("part => part.open")
-
-
-def test_the_line_follows_the_rig_and_takes_nothing_away(tab: Any, service: Service) -> None:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "F3"})
-        tab.goto(service.url + "/participants/F3")
-        tab.get_by_text("Calibrate for today").wait_for()
-        service.rig.speed = 0.5
-        http.post("/v1/tests", json={"participant": "F3"})
-        tab.get_by_text("The test is running.").wait_for()
-        expected(tab.get_by_role("link", name="Go to the test")).to_be_visible()
-        bring_to_rest(service)
-        tab.get_by_text("The last test was stopped.").wait_for()
-        tab.get_by_label("Current of every pulse").fill("19")
-        http.post("/v1/tests", json={"participant": "F3"})
-        tab.get_by_role("button", name="Show it").wait_for()
-        assert tab.get_by_label("Current of every pulse").input_value() == "19"
-    service.rig.speed = 8.0

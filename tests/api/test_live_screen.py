@@ -16,7 +16,7 @@ from stimrig.api.charts import model_charts
 from stimrig.api.store.tables import Test
 from stimrig.api.web.pages.views import limits_of
 from stimrig.api.workers.curves import recorded
-from stimrig.rig.messages import Bound, Pause, Status
+from stimrig.rig.messages import Bound, Status
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service, signed_in, soon
 from tests.api.test_stop_right import stops_noted
@@ -53,16 +53,6 @@ def test_everything_is_on_one_screen(running: Any) -> None:
         assert running.evaluate("document.documentElement.scrollWidth") <= width
 
 
-@pytest.mark.browser
-def test_a_pause_of_the_computer_is_told_in_plain_words_and_frightens_nobody(running: Any, service: Service) -> None:
-    told = running.locator("#paused")
-    assert not told.is_visible()
-    service.rig.pauses = [Pause(at_s=3.0, for_s=0.64, blocked_s=0.5)]
-    told.get_by_text("The computer stopped for 0.6 s. No current flowed meanwhile. The test goes on.").wait_for()
-    assert "bad" not in (told.get_attribute("class") or "") and told.get_attribute("role") == "status"
-    service.rig.pauses = []
-
-
 LIMIT_PIXELS = """(id) => { const c = document.getElementById(id), pen = c.getContext('2d');
   const probe = document.createElement('canvas').getContext('2d');
   probe.fillStyle = getComputedStyle(document.documentElement).getPropertyValue('--limit'); probe.fillRect(0, 0, 1, 1);
@@ -74,7 +64,7 @@ LIMIT_PIXELS = """(id) => { const c = document.getElementById(id), pen = c.getCo
 
 @pytest.mark.browser
 def test_what_flows_is_told_in_numbers_and_a_clinicians_words(running: Any, service: Service) -> None:
-    running.locator("#segment", has_text="Random pulses").wait_for(timeout=30_000)
+    running.locator("#segment", has_text="Random pulses").wait_for()
     assert running.locator("#segment").get_attribute("title") == "prbs"
     assert running.locator("#current").inner_text() == "20.0 mA"
     expected(running.locator("#dose")).not_to_have_text(re.compile("^0.00 mC"))
@@ -120,16 +110,6 @@ def test_a_space_in_a_note_is_a_space_and_esc_stops_there_too(running: Any, serv
     running.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
 
-@pytest.mark.browser
-def test_a_page_that_was_signed_out_says_so_and_stops_all_the_same(running: Any, service: Service) -> None:
-    expected(running.locator("#stale")).to_be_hidden()
-    (cookie,) = running.context.cookies()
-    service.context.auth.sign_out(cookie["value"])  # in another tab
-    running.locator("#stale", has_text="You are signed out").wait_for(timeout=15_000)
-    running.get_by_role("button", name="Stop stimulation").click()
-    running.get_by_text("The rig confirms that stimulation is off.").wait_for()
-
-
 # ---- A stopped test's page shows what was recorded, who stopped it and when; loading a stop's page again stops nothing
 
 
@@ -142,7 +122,7 @@ def stops(service: Service) -> int:
 def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service) -> None:
     participant(tab, service, f"W{time.time_ns() % 10**9}")
     start(tab)
-    tab.locator("#segment", has_text="Random pulses").wait_for(timeout=60_000)
+    tab.locator("#segment", has_text="Random pulses").wait_for()
     test_page = tab.url
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_role("heading", name=re.compile(r"Stopped at \d\d:\d\d:\d\d")).wait_for()

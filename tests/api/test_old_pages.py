@@ -95,6 +95,33 @@ def test_a_stop_gets_through_where_only_the_state_is_not_heard_of(tab: Any, serv
     service.rig.speed = 30.0
 
 
+def test_a_stop_without_an_answer_says_so_in_time_and_can_be_pressed_again(paced: Any, service: Service) -> None:
+    paced.goto(service.url + "/participants/O2")
+    heard_of(paced)
+    held: list[Any] = []
+    paced.route("**/v1/stop", lambda route: held.append(route))  # and no answer ever
+    paced.route("**/rig/now", lambda route: route.abort())
+    paced.clock.fast_forward(3_000)
+    expected(doubt(paced)).to_contain_text("has not answered")
+    stop = paced.get_by_role("button", name="Stop stimulation")
+    for press in (1, 2):
+        stop.click()
+        expected(doubt(paced)).to_contain_text("Stop is being sent")
+        while len(held) < press:
+            paced.wait_for_timeout(20)
+        if press == 2:  # who presses on does not wait longer
+            paced.clock.fast_forward(4_000)
+            stop.click()
+            paced.clock.fast_forward(2_000)
+            assert "No answer to stop came" in doubt(paced).inner_text()  # now: the page's clock goes on by itself
+        else:
+            paced.clock.fast_forward(6_000)
+        expected(doubt(paced)).to_contain_text("No answer to stop came. Use the emergency switch on the stimulator.")
+    paced.unroute("**/v1/stop")
+    stop.click()
+    paced.get_by_text("The rig confirms that stimulation is off.").wait_for()
+
+
 def test_after_an_hour_of_sleep_the_page_says_how_old_it_is(paced: Any, service: Service, ids: dict[str, str]) -> None:
     paced.goto(f"{service.url}/models/{ids['model']}")
     heard_of(paced)

@@ -48,14 +48,14 @@ def test_a_clinicians_whole_way(tab: Any, service: Service, client: httpx.Client
     expected(tab.get_by_text("No model yet.")).to_be_visible()
     expected(tab.get_by_text("No test yet.")).to_be_visible()
     start(tab)
-    tab.locator("#segment", has_text="Ramp").wait_for(timeout=20_000)
+    tab.locator("#segment", has_text="Ramp").wait_for()
     assert painted_soon(tab, "torque-chart") > 3000 and painted_soon(tab, "width-chart") > 2000
     assert float(tab.locator("#progress").get_attribute("value") or 0) >= 0
     left = int(tab.locator("#left").inner_text().split()[0])
     assert 0 < left < 25
     expected(tab.locator("#stale")).to_be_hidden()
     service.rig.speed = 60.0
-    tab.wait_for_url("**/models/M-*", timeout=60_000)
+    tab.wait_for_url("**/models/M-*")
     chart(tab, "overview")
     tab.locator("[data-job]").wait_for(state="detached")  # the diagnosis adds more when it is ready
     assert "the fit is 97.9 %" in tab.inner_text("main")
@@ -96,7 +96,7 @@ def test_stop_works_while_the_live_channel_is_cut(tab: Any, service: Service) ->
     participant(tab, service, f"C{time.time_ns() % 10**9}")
     tab.route_web_socket("**/live", lambda socket: socket.close())
     start(tab)
-    tab.locator("#stale").wait_for(timeout=15_000)
+    tab.locator("#stale").wait_for()
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
@@ -122,11 +122,21 @@ def test_data_grow_stale_within_a_second_when_the_rig_dies(tab: Any, service: Se
     tab.locator("#age", has_text="ms").wait_for()
     tab.evaluate(SEEN_STALE)
     service.rig_thread.__exit__()
-    tab.locator("#stale").wait_for(timeout=15_000)
+    tab.locator("#stale").wait_for()
     assert tab.evaluate("staleAt - state.heard") < 1000, "by the page's own clock, since the last frame"
     assert tab.locator("#live.is-stale").count() == 1
     service.rig_thread.__enter__()
-    tab.get_by_text("rig's process ended").first.wait_for(timeout=30_000)
+    tab.get_by_text("rig's process ended").first.wait_for()
+
+
+def test_keyboard_alone_reaches_stop_and_start(tab: Any, service: Service) -> None:
+    participant(tab, service, f"K{time.time_ns() % 10**9}")
+    reached: list[str] = []
+    for _ in range(18):
+        tab.keyboard.press("Tab")
+        reached.append(tab.evaluate("document.activeElement.textContent.trim()"))
+    assert reached[:2] == ["Skip to content", "Stop stimulation"]
+    assert "Start the pre-session test" in reached
 
 
 def test_limits_for_today_are_set_by_a_key(tab: Any, service: Service) -> None:
@@ -231,7 +241,7 @@ def test_stop_during_a_fit_is_confirmed_and_the_model_still_comes(tab: Any, serv
     marker.touch()
     try:
         start(tab)
-        tab.locator("#state", has_text="identifying").wait_for(timeout=20_000)
+        tab.locator("#state", has_text="identifying").wait_for()
         tab.get_by_role("button", name="Stop stimulation").click()
         tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
     finally:

@@ -13,7 +13,6 @@ from sqlalchemy import event
 from stimrig.api import local_time
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
-from tests.api.browser import chart
 from tests.api.conftest import Service, csrf, run_test, shared_service, signed_in, soon, wait_done
 
 service = shared_service()
@@ -269,24 +268,6 @@ def test_a_day_ends_at_its_last_minute_everywhere(pages: httpx.Client, client: h
     assert f"until {end}" in pages.get(f"/models/{model}").text
     assert f"until {end}" in pages.get(f"/models/{model}/report").text
     assert local_time.until("2026-01-02T09:30:00.000Z") == local_time.when("2026-01-02T09:30:00.000Z")
-
-
-@pytest.mark.browser
-def test_a_fold_stays_as_it_was_left(tab: Any, service: Service, model: str) -> None:
-    tab.goto(f"{service.url}/models/{model}")
-    fold = tab.locator("#curves")
-    assert fold.get_attribute("open") is None
-    fold.locator("summary").click()
-    tab.locator("#figures summary").first.click()
-    tab.locator("#figures summary").first.click()
-    tab.wait_for_function(
-        "sessionStorage.length === 1 && 'figures' in JSON.parse(sessionStorage.getItem(sessionStorage.key(0)))"
-    )
-    tab.reload()
-    assert fold.get_attribute("open") is not None
-    chart(tab, "recruitment")
-    assert tab.locator("#figures").get_attribute("open") is None
-    assert tab.errors == []
 
 
 def test_new_pulses_come_first() -> None:

@@ -315,21 +315,6 @@ def test_the_table_of_the_sessions_fits_a_laptop(tab: Any, service: Service, wee
     assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth"), "it scrolls within its own box"
 
 
-@pytest.mark.browser
-def test_no_violation(tab: Any, service: Service, weeks: list[str]) -> None:
-    made(service, "EMPTY", [])
-    from tests.api.test_axe import examined
-
-    compared = "/compare?" + "&".join(f"model={model}" for model in weeks[:6])
-    for path in ("/participants/WEEKS/trend", "/participants/EMPTY/trend", compared):
-        tab.goto(service.url + path)
-        examined(tab, path)
-    tab.emulate_media(color_scheme="dark")
-    for path in ("/participants/WEEKS/trend", compared):
-        tab.goto(service.url + path)
-        examined(tab, f"{path}, dark")
-
-
 def test_the_band_of_a_single_value_is_within_the_picture() -> None:
     low, high = trend_charts.span([{"value": -0.5, "half": 1.4}])
     assert low < -1.9 and high > 0.9
