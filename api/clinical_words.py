@@ -37,7 +37,6 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "held": "held-angle test",
         "moving": "movement under stimulation",
         "muscles": "test of both muscles",
-        "electrode": "stimulus of a search",
     },
     "title": {
         "pre-session": "Pre-session test",
@@ -48,7 +47,6 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "held": "Held angle",
         "moving": "Movement under stimulation",
         "muscles": "Test of both muscles",
-        "electrode": "Stimulus of a search",
     },
     "end": {
         "known-enough": "Enough is known",

@@ -45,8 +45,6 @@ DECISIONS = (
     Decision("PUT", "/v1/tests/{test_id}/ran-by", "/v1/tests/{test_id}", "/tests/{test_id}/ran-by"),
     Decision("POST", "/v1/rearm", "/v1/rig", "/rearm", "latch"),
     Decision("POST", "/v1/rig/angle/pose", "/v1/rig/angle", "/rig/angle/pose"),
-    *(Decision("POST", f"/v1/searches/{{search_id}}/{word}", "/v1/searches/{search_id}",
-               f"{OF_PERSON}/electrodes/{{search_id}}/{word}") for word in ("stimuli", "choice")),
     Decision("PUT", "/v1/users/{name}/password", "/v1/users", "/administration/users/{name}/password"),
 )  # fmt: skip
 _PATHS = [

@@ -36,7 +36,7 @@ SAYS: Mapping[str, Callable[[object], bool]] = {
     "http.route": words(r"/[A-Za-z0-9_.{}:/-]{0,119}"),
     "http.response.status_code": number,
     "stimrig.test.id": words(r"T\d{8}T\d{6}-[0-9a-f]{6}"),
-    "stimrig.test.kind": words("pre-session|adaptive|sequence|passive|held|moving|electrode|muscles"),
+    "stimrig.test.kind": words("pre-session|adaptive|sequence|passive|held|moving|muscles"),
     "stimrig.test.outcome": words("completed|stopped|fault"),
     "stimrig.test.state": _CODE,
     "stimrig.pulses": number,

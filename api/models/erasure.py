@@ -30,7 +30,6 @@ from stimrig.api.store.tables import (
     Note,
     Participant,
     Recording,
-    Search,
     Test,
     Token,
     Tracked,
@@ -248,7 +247,7 @@ def _rows_of(session: Session, code: str) -> list[tuple[Any, Any]]:
         (Analysis, Analysis.model_id.in_(models)),
         (Tracked, or_(Tracked.participant == code, Tracked.model_id.in_(models))),
         (Approval, or_(Approval.participant == code, Approval.model_id.in_(models))), (Note, Note.participant == code),
-        (Model, of_models), (Recording, Recording.participant == code), (Search, Search.participant == code),
+        (Model, of_models), (Recording, Recording.participant == code),
         (Test, Test.participant == code), (Token, Token.participant == code), (Participant, Participant.code == code),
     ]  # fmt: skip
 

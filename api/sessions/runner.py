@@ -24,9 +24,8 @@ from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.operation.counted import Counted
 from stimrig.api.people.auth import Scope
-from stimrig.api.sessions import channels, electrodes, steps
+from stimrig.api.sessions import channels, steps
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
-from stimrig.api.sessions.electrodes import ElectrodeTests
 from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Follower, Lifecycle
@@ -77,9 +76,7 @@ class Runner(Playing):
         self.hub, self.counted, self.tracer = Hub(clock), Counted(), tracer
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
-        self.kinds = Kinds(
-            Kind(rig), trials, self.adaptive, self.joint, MusclesTests(rig, store), ElectrodeTests(rig, store)
-        )
+        self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint, MusclesTests(rig, store))
         self.lifecycle = Lifecycle(
             store, clock, rig, pool, versions, analyses, self.kinds, recordings_dir, follower, self.announce
         )
@@ -226,7 +223,7 @@ class Runner(Playing):
         if planned.plan.channels is None and any(one.channels for one in body.segments or ()):
             several, sites = channels.for_all(planned.plan, participant, self.rig.status)
             planned = replace(planned, plan=several, kept=planned.kept | sites)
-        return replace(planned, plan=electrodes.connected(planned.plan, participant, self.rig.status))
+        return planned
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:
         """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""

@@ -119,30 +119,6 @@ class Model(Table):
     created_by: Mapped[str] = mapped_column(String)
 
 
-class Search(Table):
-    """A search for the electrode of an array; its stimuli are tests that name it in their plans."""
-
-    __tablename__ = "searches"
-    id: Mapped[str] = mapped_column(String, primary_key=True)
-    participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
-    channel: Mapped[str] = mapped_column(String)
-    state: Mapped[str] = mapped_column(String)
-    """open, enough (another stimulus is hardly worth it) or closed (an electrode was chosen)."""
-    asked: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """Wish, direction, width_us, current_ma, rows, columns and pitch_mm."""
-    document: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """As `stimrig.identify.electrodes.Search.to_dict`."""
-    standing: Mapped[dict[str, Any]] = mapped_column(JSON)
-    """What follows from that: proposal, map, whether it is enough."""
-    told: Mapped[list[dict[str, Any]]] = mapped_column(JSON, default=list)
-    """What was seen of each stimulus, by its test's id, who told it and when."""
-    chosen: Mapped[list[int] | None] = mapped_column(JSON(none_as_null=True), default=None)
-    created_by: Mapped[str] = mapped_column(String)
-    created_utc: Mapped[str] = mapped_column(String)
-    closed_by: Mapped[str | None] = mapped_column(String, default=None)
-    closed_utc: Mapped[str | None] = mapped_column(String, default=None)
-
-
 class Approval(Table):
     """A person's decision on a model; the newest approval of a participant is what the controller gets."""
 

@@ -14,7 +14,7 @@ import numpy as np
 from stimrig import identify
 from stimrig.api.record_files import Progress, export_csv, find_recording, joined, plain_csv
 from stimrig.api.structure import held_by
-from stimrig.api.workers import adaptive_verbs, electrode_verbs, muscle_verbs, tracking_verbs
+from stimrig.api.workers import adaptive_verbs, muscle_verbs, tracking_verbs
 from stimrig.api.workers.curves import comparison, page_curves, recorded
 from stimrig.identify.json_text import json_value
 
@@ -231,5 +231,4 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     "join": joined,
     **adaptive_verbs.VERBS,
     **tracking_verbs.VERBS,
-    **electrode_verbs.VERBS,
 }

@@ -84,26 +84,6 @@ def joint_curves() -> dict[str, Any]:
     return {**found, "muscles": own}
 
 
-def searched(search: dict[str, Any], stimulus: Any = None, left_out: Any = ()) -> dict[str, Any]:
-    """A search over four elements that proposes the first one that was not seen yet."""
-    kept = search if "seen" in search else {**search, "seen": [], "prior": search.get("prior")}
-    if stimulus:
-        kept = {**kept, "seen": [*kept["seen"], {"elements": stimulus["elements"], "torque_nm": 2.0}]}
-    done = [one["elements"] for one in kept["seen"]]
-    every = [[1], [2], [3], [4], [1, 2], [3, 4]]
-    rows = [
-        {"elements": one, "stimulated": one in done,
-         **{name: {"mean": 1.0 / (k + 1), "sd": 0.2} for name in ("torque_nm", "spill", "comfort", "utility")}}
-        for k, one in enumerate(every)
-    ]  # fmt: skip
-    best = done[0] if done else None
-    following = next((one for one in every if one not in done and one not in list(left_out)), [1])
-    why = f"Element {following[0]}: nothing of use is known yet; probability 50% that this is."
-    standing = {"proposal": {"elements": following, "why": why, "expected": 1.0, "sd": 0.2}, "enough": None,
-                "best": best, "sure": 0.83 if best else None, "map": rows, "left_out": list(left_out)}  # fmt: skip
-    return {"search": kept, "standing": standing, "torque_nm": 2.0 if stimulus else None}
-
-
 CROSS_TALK = "cross_talk:biceps>triceps"
 
 
@@ -333,8 +313,6 @@ class Stub:
             if is_joint(arguments):
                 document = joint_model([effect.removesuffix(":made-up") for effect in arguments.get("effects", [])])
             return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
-        if verb == "electrodes":
-            return {"result": json.loads(json.dumps(searched(**arguments)))}
         if verb == "carry":
             return carried(Path(arguments["data"]).parent, json.loads(arguments["model_json"]), say, self.pause)
         if verb == "comparison":

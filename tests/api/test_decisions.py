@@ -158,22 +158,6 @@ def two_approved(world: World) -> Any:
     return [world.colleague.post(f"/v1/models/{model}/approve", json=body) for model in models][-1]
 
 
-def searching(world: World) -> None:
-    """A search over an array of four; the colleague changes what it rests on, and not its width and current."""
-    world.service.rig.channels = ["biceps"]
-    world.service.rig.switch = {"device": "fake", "channel": "biceps", "elements": 4}
-    world.service.rig.become("ready")
-    soon(lambda: world.me.get("/v1/rig").json().get("switch"))
-    asked = {"rows": 2, "columns": 2, "pitch_mm": 12.0}
-    begun = world.me.post(f"/v1/participants/{world.code}/searches", json=asked)
-    assert begun.status_code == 201, begun.text
-    world.names["search_id"] = begun.json()["id"]
-
-
-def less_torque(world: World) -> httpx.Response:
-    return world.colleague.put(f"/v1/participants/{world.code}/profile", json={"max_torque_nm": 9.0})
-
-
 PROFILE = Case(World.lower, LIMITS, {"current_ma": "21", "seen_current_ma": "20"})
 MODEL = Case(
     lambda world: world.colleague.post(f"/v1/models/{world.names['model_id']}/reject", json={"reason": "wrong arm"}),
@@ -215,8 +199,6 @@ CASES = {
         lambda world: world.colleague.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}),
         {"angle_rad": 1.5}, {"angle_deg": "80"}, sensor, "/rig/angle"),
     "password": ACCOUNT,
-    "stimuli": Case(less_torque, {}, {"elements": "1"}, searching, "/participants/{code}/electrodes"),
-    "choice": Case(less_torque, {"elements": [1]}, {"elements": "1"}, searching, "/participants/{code}/electrodes"),
 }  # fmt: skip
 shared = shared_service()
 
@@ -226,7 +208,7 @@ def world(shared: Service, request: pytest.FixtureRequest) -> Iterator[World]:
     made = World.made(shared, f"P{abs(hash(request.node.name)) % 10**9}")
     yield made
     made.me.post(f"/v1/participants/{made.code}/calibration/finish", json={"discard": True})
-    shared.rig.arm.way, shared.rig.switch, shared.rig.channels = None, None, []
+    shared.rig.arm.way, shared.rig.channels = None, []
     shared.rig.become(shared.rig.state, shared.rig.reason)
 
 

@@ -277,5 +277,5 @@ def test_every_button_that_stimulates_looks_like_it() -> None:
             with_class[path.name] = count
     assert with_class == {
         "next.html": 1, "participant.html": 1, "calibration.html": 1, "question.html": 1,
-        "trials.html": 1, "experiment_form.html": 1, "electrodes.html": 2,
+        "trials.html": 1, "experiment_form.html": 1,
     }  # fmt: skip

@@ -102,7 +102,7 @@ def test_it_says_what_it_would_do_and_what_it_did(rig: Rig, capsys: pytest.Captu
     assert main.run([*verb, "asked", "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     assert found["rows"] == {
-        "analyses": 0, "tracked": 0, "approvals": 2, "notes": 0, "models": 2, "recordings": 2, "searches": 0,
+        "analyses": 0, "tracked": 0, "approvals": 2, "notes": 0, "models": 2, "recordings": 2,
         "tests": 2, "tokens": 0, "participants": 1,
     }  # fmt: skip
     assert found["files"] == 2 and len(found["remains"]) == 4 and unmet("retention", found) == []

@@ -112,17 +112,6 @@ POST   /participants                                       run-test       4xx
 POST   /participants/x/profile                             run-test       428
 POST   /participants/x/tests                               run-test       428
 POST   /participants/x/recordings                          run-test       428
-GET    /v1/participants/x/searches                         run-test       404
-POST   /v1/participants/x/searches                         run-test       422
-GET    /v1/searches/x                                      run-test       404
-POST   /v1/searches/x/stimuli                              run-test       428
-POST   /v1/searches/x/seen                                 run-test       422
-POST   /v1/searches/x/choice                               run-test       428
-GET    /participants/x/electrodes                          run-test       404
-POST   /participants/x/electrodes                          run-test       404
-POST   /participants/x/electrodes/x/stimuli                run-test       428
-POST   /participants/x/electrodes/x/seen                   run-test       404
-POST   /participants/x/electrodes/x/choice                 run-test       428
 GET    /participants/x/calibration                         run-test       404
 POST   /participants/x/calibration                         run-test       428
 POST   /participants/x/calibration/step/up                 run-test       428

@@ -17,7 +17,7 @@ from stimrig.api.local_time import clock
 from stimrig.api.models.places import site_of
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import channels, controllers, electrodes, profiles
+from stimrig.api.sessions import channels, controllers, profiles
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
 from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MUSCLES, MuscleIn, NoteIn, TargetIn, TestIn
 from stimrig.api.store import seen
@@ -71,7 +71,6 @@ async def show_page(
             "made": made,
             "trials": trials_of(context, who, code),
             "sensor": limits_form.has_sensor(context.rig.status),
-            "array": electrodes.array_of(context.rig.status),
         }
 
     ask_password = not await context.people.is_confirmed(who.session_hash)

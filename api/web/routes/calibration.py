@@ -13,7 +13,7 @@ from fastapi import APIRouter, Response
 from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError
-from stimrig.api.sessions import channels, electrodes, profiles
+from stimrig.api.sessions import channels, profiles
 from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import audit, seen
@@ -176,15 +176,14 @@ def _store(
 
 def _several(context: Context, row: Participant, body: CalibrationIn) -> list[requests.CalibrateChannel] | None:
     """The channels of a calibration of several, each with its own current and last marks; None of one of one."""
-    found, array = [], electrodes.array_of(context.rig.status)
+    found = []
     for one in body.channels or ():
         name, own = one.name, channels.held(row, channels.key_of(context.rig.status, one.name))["profile"]
         current_ma = own.get("current_ma") if one.current_ma is None else one.current_ma
         if current_ma is None:
             raise ApiError(422, "no-limits", "The participant has no limits", f"Send the current of {name}, too.")
         last = messages.Profile.model_validate(own) if own and body.large_steps else None
-        elements = electrodes.held_elements(row, array) if array is not None and array.channel == name else []
-        found.append(requests.CalibrateChannel(name=name, current_ma=current_ma, last=last, elements=elements))
+        found.append(requests.CalibrateChannel(name=name, current_ma=current_ma, last=last))
     return found or None
 
 
@@ -216,7 +215,6 @@ async def begin_calibration(
                 by=who.name,
                 last=last,
                 channels=several,
-                elements=[] if several else electrodes.elements_of_first(row, context.rig.status),
                 **{name: value for name, value in asked.items() if name != "channels"},
             )
         )
