@@ -1,9 +1,8 @@
 """The control line for tests: a Unix socket with one JSON object per line each way. It is no part of the rig.
 
 Commands: `{"cmd": "state"}`, `{"cmd": "pulses", "since": 0}`, `{"cmd": "faults"}` (lists them),
-`{"cmd": "fault", "name": …, "on": true, "for_s": …, <settings>}`, where there is an arm
-`{"cmd": "arm", "mode": …, <settings of the mode>}`, and where there is an array `{"cmd": "array"}` (what clinician and
-person say of the last pulse). Answers carry `"ok"`; if it is false, `"error"`.
+`{"cmd": "fault", "name": …, "on": true, "for_s": …, <settings>}`, and where there is an arm
+`{"cmd": "arm", "mode": …, <settings of the mode>}`. Answers carry `"ok"`; if it is false, `"error"`.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from stimrig.hardware_sim.devices import Devices
-from stimrig.hardware_sim.errors import ArmError, FaultError, HardwareSimError, SettingsError
+from stimrig.hardware_sim.errors import ArmError, FaultError, HardwareSimError
 from stimrig.hardware_sim.ports import Reactor
 from stimrig.hardware_sim.timeline import WallClock
 
@@ -50,7 +49,6 @@ class Control:
             "faults": lambda _: {"faults": devices.faults.describe(), "active": devices.faults.active()},
             "fault": self._fault,
             "arm": self._arm,
-            "array": self._array,
         }
 
     def close(self) -> None:
@@ -105,11 +103,6 @@ class Control:
             raise ArmError("this rig has no arm; start it with --arm")
         limb.move(str(request.pop("mode", "")), request, time_s)
         return {"time_s": time_s, "monotonic_s": self._clock.monotonic_s(time_s), **limb.state()}
-
-    def _array(self, _request: dict[str, Any]) -> dict[str, Any]:
-        if self._devices.array is None:
-            raise SettingsError("this rig has no array; start it with --array")
-        return self._devices.array.asked()
 
     def _accept(self) -> None:
         try:

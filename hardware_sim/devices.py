@@ -14,7 +14,6 @@ from typing import Any
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.limb import Limb
-from stimrig.hardware_sim.electrode_array import ArrayMuscle
 from stimrig.hardware_sim.errors import SettingsError
 from stimrig.hardware_sim.faults import Faults
 from stimrig.hardware_sim.joint import LiveJoint
@@ -25,7 +24,6 @@ from stimrig.hardware_sim.sampling import take_in_order
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators import STIMULATORS
 from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware, Output
-from stimrig.hardware_sim.switch import RelayMatrix
 from stimrig.hardware_sim.tables import pick
 from stimrig.hardware_sim.timeline import Timeline
 
@@ -60,7 +58,6 @@ class Devices:
         self.settings = settings
         self.random = random.Random(settings.noise_seed)
         self.timeline = Timeline()
-        self.array = muscle if isinstance(muscle, ArrayMuscle) else None
         pairs = muscle.electrodes if isinstance(muscle, LiveJoint) else ()
         self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
         muscle = self.limb or muscle
@@ -72,8 +69,6 @@ class Devices:
         )
         self.timeline.followers.append(self._sample_until)
         self.electrodes = Electrodes(self._wired(pairs or (muscle,)), self.load_cell.raise_sync)
-        self._switch_bytes: list[tuple[float, bytes]] = []
-        self.switch = self._plug_in_switch(self.array) if self.array else None
         self.stimulator_plugged = self.cell_plugged = True
         self.unread_bytes: Callable[[], int] = lambda: 0
         self.on_stimulator_cable: Callable[[bool], None] = lambda _plugged: None
@@ -92,17 +87,6 @@ class Devices:
             sent = hook(sent) if sent else None
         if sent:
             self.firmware.received(sent)
-
-    def switch_received(self, time_s: float, data: bytes) -> None:
-        """Bytes from the host on the switch's line at `time_s`, or now if that has passed."""
-        self.advance(time_s)
-        if self.switch is not None:
-            self.switch.received(data)
-
-    def take_switch_bytes(self) -> list[tuple[float, bytes]]:
-        """What the switch has written since the last call, each with its emulated time."""
-        taken, self._switch_bytes = self._switch_bytes, []
-        return taken
 
     def frame_received(self, time_s: float, can_id: int, data: bytes) -> None:
         """A CAN frame from the host to the load cell at `time_s`, or now if that has passed."""
@@ -147,8 +131,6 @@ class Devices:
         """
         self.firmware.reset()
         self.load_cell.restart()
-        if self.switch is not None:
-            self.switch.reset()
         if self.angle_sensor is not None:
             self.angle_sensor.counter = 0
         self._bytes.clear()
@@ -167,7 +149,6 @@ class Devices:
             "torque_nm": self.load_cell.torque_nm,
             "samples": self.load_cell.clock.samples,
             **(self.limb.state() if self.limb else {}),
-            **({"switch": self.switch.state()} if self.switch else {}),
             "faults": self.faults.active(),
         }
 
@@ -176,14 +157,6 @@ class Devices:
         if len(outputs) < len(pairs):
             raise SettingsError(f"--outputs {self.settings.outputs}: the patient has {len(pairs)} pairs of electrodes")
         return dict(zip(outputs, pairs, strict=False))
-
-    def _plug_in_switch(self, array: ArrayMuscle) -> RelayMatrix:
-        """The switch between the first output and the array."""
-        write = lambda data: self._switch_bytes.append((self.timeline.now_s, data))  # noqa: E731
-        switch = RelayMatrix(self.timeline, array.session.array.elements, write)
-        array.closed = lambda: switch.closed
-        self.electrodes.ways[self.settings.wired[0]] = lambda: bool(switch.closed)
-        return switch
 
     def _sample_until(self, time_s: float) -> None:
         if self.angle_sensor is None:

@@ -40,9 +40,6 @@ class Emulator:
         devices.on_cell_cable = self._plug_cell
         self._plug_stimulator(True)
         self._plug_cell(True)
-        self._switch_port = PseudoTerminal() if devices.switch else None
-        if self._switch_port:
-            self._reactor.add(self._switch_port, self._read_switch)
         self.clock = WallClock(devices.settings.speed)
         path = self._folder / "control"
         self._control = Control(self._reactor, path, devices, self.clock, self.catch_up, self.state)
@@ -71,7 +68,6 @@ class Emulator:
             "sync": settings.sync and cell.has_sync,
             **({"arm": limb.mode, "angle_sensor": angle_sensor.describe(settings)} if limb else {}),
             **({"outputs": [list(output) for output in wired]} if len(wired) > 1 else {}),
-            **({"switch": self._switch_port.path, "elements": settings.elements} if self._switch_port else {}),
         }
 
     def run(self, stopping: Callable[[], bool]) -> None:
@@ -81,9 +77,8 @@ class Emulator:
         while not stopping():
             self.catch_up()
             self._deliver()
-            for port in filter(None, (self.port, self._switch_port)):
-                port.flush()
-                port.forget_speed()
+            self.port.flush()
+            self.port.forget_speed()
             now_s = time.monotonic()
             next_tick_s = max(next_tick_s + tick_s, now_s)
             while (left_s := self._wait_s(next_tick_s)) > 0 and not stopping():
@@ -100,9 +95,6 @@ class Emulator:
         self._control.close()
         self._plug_stimulator(False)
         self._plug_cell(False)
-        if self._switch_port:
-            self._reactor.remove(self._switch_port)
-            self._switch_port.close()
         shutil.rmtree(self._folder, ignore_errors=True)
 
     def state(self) -> dict[str, Any]:
@@ -158,20 +150,12 @@ class Emulator:
         self.devices.received(self.clock.now_s(), data)
         self._write()
 
-    def _read_switch(self) -> None:
-        if self._switch_port:
-            self.devices.switch_received(self.clock.now_s(), self._switch_port.read())
-            self._write()
-
     def _receive_frame(self, can_id: int, data: bytes) -> None:
         self.devices.frame_received(self.clock.now_s(), can_id, data)
 
     def _write(self) -> None:
         for _, data in self.devices.take_bytes():
             self.port.write(data)
-        for _, data in self.devices.take_switch_bytes():
-            if self._switch_port:
-                self._switch_port.write(data)
 
     def _deliver(self) -> None:
         frames = self.devices.take_frames()

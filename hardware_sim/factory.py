@@ -11,8 +11,7 @@ from stimrig.hardware_sim.arm import description as arms
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.tissue import bare
 from stimrig.hardware_sim.devices import Devices
-from stimrig.hardware_sim.electrode_array import ArrayMuscle, draw_array
-from stimrig.hardware_sim.errors import ArmError, PatientError, SettingsError
+from stimrig.hardware_sim.errors import ArmError, PatientError
 from stimrig.hardware_sim.joint import LiveJoint, draw_joint
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.settings import Settings
@@ -29,8 +28,7 @@ def make_devices(
     Parameters
     ----------
     settings : Settings
-        Its `patient` is a name, the path of a file, `hidden:SEED`, `two_muscles:SEED`, or `SET:SEED` of other physics;
-        with `array` it is left out.
+        Its `patient` is a name, the path of a file, `hidden:SEED`, `two_muscles:SEED`, or `SET:SEED` of other physics.
     arm : str, optional
         As `--arm` takes it: a mode with settings, or a file; for a hidden patient also `design`. None: the joint is
         held still and has no sensor.
@@ -44,16 +42,12 @@ def make_devices(
     HardwareSimError
         Patient, arm or a setting cannot be used.
     """
-    if settings.array is not None:
-        settings = _array_alone(settings)
     seed, joint_seed = (_seed(settings.patient, kind) for kind in (HIDDEN, TWO_MUSCLES))
     if min(seed or 0, joint_seed or 0) < 0:
         raise PatientError(f"patient '{settings.patient}': give a seed of 0 or above")
     if joint_seed is not None and arm is not None:
         raise ArmError("--arm: the joint of a patient with two muscles is held still")
-    if settings.array is not None:
-        muscle = _array(settings.array, settings.elements)
-    elif joint_seed is not None:
+    if joint_seed is not None:
         muscle = LiveJoint(draw_joint(joint_seed))
     else:
         muscle = _muscle(settings.patient) if seed is None else hidden.make(seed, moving=arm is not None)
@@ -69,17 +63,6 @@ def _seed(patient: str, kind: str) -> int | None:
         return int(patient.removeprefix(kind)) if patient.startswith(kind) else None
     except ValueError:
         return None
-
-
-def _array_alone(settings: Settings) -> Settings:
-    if settings.patient != Settings.patient:
-        raise SettingsError("--array brings a muscle of its own; leave --patient and --hidden out")
-    return replace(settings, patient=f"array:{settings.array}")
-
-
-def _array(described: str, elements: int) -> ArrayMuscle:
-    seed, _, number = described.partition(":")
-    return ArrayMuscle(draw_array(int(seed), elements).session(int(number or 1)))
 
 
 def _muscle(patient: str) -> Muscle:

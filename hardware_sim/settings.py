@@ -57,13 +57,6 @@ class Settings:
         metavar="CONNECTOR.CHANNEL,…",
         help="where the patient's pairs of electrodes are plugged in, in order (default: %(default)s)",
     )
-    array: str | None = option(
-        None,
-        metavar="SEED[:SESSION]",
-        help="an electrode array on a limb instead of the patient, drawn by SEED, at the first of --outputs, behind a "
-        "switch on a line of its own",
-    )
-    elements: int = option(16, type=int, choices=(16, 24), help="of the array (default: %(default)s)")
     angle: str = option(
         "own",
         choices=("own", "in-cell"),
@@ -87,8 +80,6 @@ class Settings:
     def __post_init__(self) -> None:
         if not re.fullmatch(r"[12]\.[1-4](,[12]\.[1-4])*", self.outputs) or len(set(self.wired)) < len(self.wired):
             raise SettingsError(f"--outputs {self.outputs}: give each of 1.1 to 1.4 and 2.1 to 2.4 at most once")
-        if self.array is not None and not re.fullmatch(r"[0-9]{1,17}(:[0-9]{1,9})?", self.array):
-            raise SettingsError(f"--array {self.array}: give SEED or SEED:SESSION, whole numbers")
         for each in dataclasses.fields(self):
             value, span = getattr(self, each.name), each.metadata.get("span")
             if span and not (math.isfinite(value) and span[0] <= value <= span[1]):

@@ -19,7 +19,6 @@ from stimrig.hardware_sim.errors import FaultError
 from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.stimulators.board import Board, Firmware
-from stimrig.hardware_sim.switch import RelayMatrix
 from stimrig.hardware_sim.timeline import Timeline
 
 Undo = Callable[[], None]
@@ -31,8 +30,7 @@ _FAULTS: dict[str, Callable[..., Undo]] = {}
 class Target(Protocol):
     """The emulated devices and their cables; `random` gives every random number that a fault needs.
 
-    The encoder is there where the rig has an arm, the angle sensor where the angle comes in frames of its own, the
-    switch where it has an array.
+    The encoder is there where the rig has an arm, the angle sensor where the angle comes in frames of its own.
     """
 
     random: random.Random
@@ -42,7 +40,6 @@ class Target(Protocol):
     load_cell: LoadCell
     encoder: Encoder | None
     angle_sensor: AngleSensor | None
-    switch: RelayMatrix | None
 
     def plug_stimulator(self, plugged: bool = True) -> None:
         """Connect the stimulator, or pull its cable."""

@@ -37,15 +37,13 @@ class Electrodes:
     """Pairs at the stimulator's outputs, each on a muscle; one muscle alone has its pair at the first output.
 
     `raise_sync` is called for each pulse that flows. `cut` is the emergency switch: some devices report it, to the
-    others it looks like an open electrode. `off` are outputs whose pair has come off, `ways` what lies between an
-    output and its pair, and whether it conducts.
+    others it looks like an open electrode. `off` are outputs whose pair has come off.
     """
 
     def __init__(self, wired: Muscle | Mapping[Output, Muscle], raise_sync: Callable[[], None] = lambda: None) -> None:
         self.attached = True
         self.cut = False
         self.off: set[Output] = set()
-        self.ways: dict[Output, Callable[[], bool]] = {}
         self.wired = wired if isinstance(wired, Mapping) else {(0, 0): wired}
         self.unbalanced_pulses = 0
         self.delivered_pulses = 0
@@ -66,8 +64,7 @@ class Electrodes:
         return flows
 
     def _reaches(self, output: Output) -> bool:
-        on = self.attached and not self.cut and output in self.wired and output not in self.off
-        return on and self.ways.get(output, lambda: True)()
+        return self.attached and not self.cut and output in self.wired and output not in self.off
 
     def pulses(self, since: int = 0) -> list[dict[str, Any]]:
         """The log from entry `since` on, as plain values."""

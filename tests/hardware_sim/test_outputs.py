@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-import serial
 
 from stimrig.hardware_sim.errors import ArmError, HardwareSimError
 from stimrig.hardware_sim.factory import make_devices
@@ -106,21 +105,4 @@ def test_what_makes_no_rig_of_two_muscles(described: dict[str, Any], arm: str | 
 def test_two_muscles_on_the_wire() -> None:
     with emulated("--patient", "two_muscles:5", "--noise-nm", "0") as rig:
         assert rig.ready["outputs"] == [[0, 0], [0, 1]]
-        assert "switch" not in rig.ready
-        assert not rig.ask(cmd="array")["ok"] and not rig.ask(cmd="fault", name="switch_silent")["ok"]
     assert draw_joint(5).truth["seed"] == 5
-
-
-@pytest.mark.wire
-def test_an_array_on_the_wire_has_a_switch_with_a_port() -> None:
-    with emulated("--array", "4:2", "--elements", "24") as rig:
-        assert (rig.ready["patient"], rig.ready["elements"]) == ("array:4:2", 24)
-        with serial.Serial(rig.ready["switch"], 9600, timeout=20) as line:
-            line.write(b"*IDN?\nROUT:CLOS (@3,24)\n*OPC?\nROUT:CLOS? (@3,4,24)\n")
-            assert line.readline().count(b",") == 3
-            assert (line.readline(), line.readline()) == (b"1\n", b"1,0,1\n")
-            assert rig.ask(cmd="state")["switch"]["closed"] == [3, 24]
-            assert rig.ask(cmd="fault", name="switch_relay_stuck", relay=3)["ok"]
-            line.write(b"ROUT:OPEN:ALL\n*OPC?\nROUT:CLOS? (@3,4,24)\n")
-            assert (line.readline(), line.readline()) == (b"1\n", b"1,0,0\n")
-        assert rig.ask(cmd="array") == {"ok": True, "elements": []}

@@ -1,4 +1,4 @@
-"""Two muscles, and an electrode array behind its switch, over the wire: what is sealed is what each electrode felt."""
+"""Two muscles over the wire: what is sealed is what each electrode felt."""
 
 from __future__ import annotations
 
@@ -70,28 +70,6 @@ def test_two_muscles(make_bench: Callable[..., Bench], stimulator: str):
     assert {name: of["pulses"] for name, of in counts.items()} == {
         name: sum(channel == place for channel, *_ in felt) for place, name in enumerate(("biceps", "triceps"))
     }
-
-
-def test_an_array_behind_its_switch(make_bench: Callable[..., Bench]):
-    bench = make_bench("--array", "3", "--noise-seed", "7", speed=1.0)
-    client = bench.start_rig()
-    client.ask("subscribe")
-    status = client.ask("status")["body"]
-    assert status["switch"]["elements"] == 16
-    channels = [{"name": "biceps", "profile": BICEPS, "elements": [99]}]
-    plan = short_plan("array", profile=BICEPS, channels=channels)
-    refused = client.start(plan)
-    assert not refused["ok"]
-    assert "from 1 to 16" in refused["problem"]["detail"]
-    channels[0]["elements"] = [5, 6]
-    assert client.start(plan)["ok"]
-    event = client.wait_finished("array", 60.0)
-    assert event["outcome"] == "completed", event
-    with h5py.File(event["recording_path"]) as file:
-        assert json.loads(file.attrs["channels"])[0]["elements"] == [5, 6]
-        told = [(one["event"], one["elements"]) for one in json.loads(file.attrs["events"]) if "elements" in one]
-    assert told == [("relays", [5, 6]), ("relays_set", [5, 6]), ("relays_open", [])]
-    assert bench.felt()
 
 
 def test_both_muscles_are_identified_from_what_was_sealed(make_bench: Callable[..., Bench]):
