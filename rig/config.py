@@ -73,7 +73,6 @@ class RigConfig(_Table):
     stimulator: DeviceSettings
     load_cell: DeviceSettings
     angle_sensor: DeviceSettings | None = None
-    switch: DeviceSettings | None = several(None, "relays between one channel and an array's elements")
     limits: LimitSettings = LimitSettings.model_validate({})
     watch: Watch = DEFAULT_WATCH
 
@@ -89,16 +88,14 @@ class RigConfig(_Table):
         found: dict[Kind, DeviceSettings] = {"stimulator": self.stimulator, "load_cell": self.load_cell}
         if self.angle_sensor is not None:
             found["angle_sensor"] = self.angle_sensor
-        return found if self.switch is None else {**found, "switch": self.switch}
+        return found
 
     def channels(self) -> tuple[RigChannel, ...]:
         """The channels that have names; none where the rig has one without."""
-        switch = None if self.switch is None else self.switch.model_dump()
         return tuple(
             RigChannel(
                 **{name: one[name] for name in ("name", "muscle", "side", "electrode")},
                 limits={name: value for name, value in one["limits"].items() if value is not None},
-                elements=switch["elements"] if switch and switch["channel"] == one["name"] else 0,
             )
             for one in self.stimulator.model_dump().get("channels", [])
         )
@@ -179,12 +176,11 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
             f"--emulator-json: stimulator {stimulator} is not a pseudo-terminal of an emulator; real "
             "devices need a rig file"
         )
-    named = _emulated_channels(line)
     content: dict[str, Any] = {
         "clock_speed": line.get("speed", 1.0),
         "require_calibration": False,  # no person is connected to an emulator
         "watch": line.get("watch", EMULATOR_WATCH),
-        "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator, **named},
+        "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator, **_emulated_channels(line)},
         "load_cell": {
             "device": "can_load_cell",
             "bus": can,
@@ -194,9 +190,6 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         },
         "angle_sensor": sensor,
     }
-    if line.get("switch"):
-        fed = {"channel": named["channels"][0]["name"], "elements": line.get("elements")}
-        content["switch"] = {"device": "scpi_matrix", "port": line["switch"], **fed}
     return check(content, "--emulator-json", **overrides)
 
 
@@ -204,11 +197,10 @@ EMULATED = ("biceps", "m. biceps brachii"), ("triceps", "m. triceps brachii")
 
 
 def _emulated_channels(line: dict[str, Any]) -> dict[str, Any]:
-    """The rig-file settings of an emulator's outputs, where it has several, or an array of electrodes."""
-    outputs = line.get("outputs") or ([[0, 0]] if line.get("switch") else [])
+    """The rig-file settings of an emulator's outputs, where it has several."""
     of_p24 = line.get("stimulator_device", "p24") == "p24"
     channels = []
-    for place, (connector, channel) in enumerate(outputs):
+    for place, (connector, channel) in enumerate(line.get("outputs", [])):
         name, muscle = EMULATED[place] if place < len(EMULATED) else (f"muscle-{place + 1}", f"muscle {place + 1}")
         plug = (
             {"channel": channel + 1, "connector": connector + 1} if of_p24 else {"channel": 4 * connector + channel + 1}
@@ -249,8 +241,6 @@ def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
     content = {**content, **{key: value for key, value in overrides.items() if value is not None}}
     for kind in ("stimulator", "load_cell"):
         content[kind] = _device(kind, content.get(kind), place)
-    if content.get("switch") is not None:
-        content["switch"] = _device("switch", content["switch"], place)
     if content.get("angle_sensor") is not None:
         content["angle_sensor"] = _device("angle_sensor", content["angle_sensor"], place).beside(content["load_cell"])
     try:
@@ -260,9 +250,6 @@ def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
         raise ConfigError(f"{place}: {_first(error, RigConfig)}") from None
     except RefusedError as error:
         raise ConfigError(f"{place}: limits: {error}") from None
-    if config.switch is not None and not any(channel.elements for channel in config.channels()):
-        has = ", ".join(channel.name for channel in config.channels()) or "none: add [[stimulator.channels]]"
-        raise ConfigError(f"{place}: switch.channel: not one of the stimulator's channels ({has})")
     return config
 
 

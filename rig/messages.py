@@ -389,11 +389,6 @@ class Status(Message):
         description="device, id, firmware, port, shortest_us (no narrower pulse is sent), and of a rig with several "
         "channels: channels, each with name, muscle, side and electrode",
     )
-    switch: dict[str, Any] | None = several(
-        None,
-        "of a rig with a switch: device, id, port, channel (its name), elements (how many); rows, columns and "
-        "pitch_mm where the rig file tells them",
-    )
     load_cell: dict[str, Any] = Field(default_factory=dict, description="device, measured sample rate, bus")
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: there was none")
     torque_nm: float | None = None

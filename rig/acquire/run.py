@@ -31,7 +31,6 @@ from stimrig.rig.limits import Limit
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import StopEvidence, TestOutcome
 from stimrig.rig.plan import PlannedTest
-from stimrig.rig.relays import Relays
 from stimrig.rig.score import Score
 from stimrig.rig.signals import Pulse, PulseStatus, Recorded
 from stimrig.rig.tasks import Signal
@@ -106,8 +105,6 @@ class TestRun:
         Ends the test early.
     angle
         The angle sensor's receiver; None: the rig has none.
-    relays
-        Of the switch; None: the rig has none.
     """
 
     __test__ = False
@@ -123,7 +120,6 @@ class TestRun:
         halt: Halt,
         watch: Watch = DEFAULT_WATCH,
         angle: AngleReceiver | None = None,
-        relays: Relays | None = None,
     ) -> None:
         self.plan = test.plan
         self.score = Score(test, table, journal, machine.tasks)
@@ -138,7 +134,7 @@ class TestRun:
         """From its arming on."""
         self._table = table
         self.journal = journal
-        self.gate, self._relays = gate, relays
+        self.gate = gate
         self._receiver = receiver
         self._machine, self._tasks, self._clock = machine, machine.tasks, machine.tasks.clock
         self._watch = watch
@@ -244,10 +240,6 @@ class TestRun:
         self._plausibility.rate.begin()
         self._angle.begin()
         self._rest_nm = self._receiver.torque_around(0.1 * self._clock.speed)
-        for channel in self.score.channels:
-            if channel.elements:
-                assert self._relays is not None  # `rig.channels` refuses elements without a switch
-                await self._relays.connect(channel.elements, self.journal)
         await self.gate.open(self.journal, self._table, self.halt.signal.is_set, self.score.channels)
         return self.gate.is_open
 
@@ -304,8 +296,6 @@ class TestRun:
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
         safe, state, said = await stop_device(self.gate)
-        if safe and (stuck := await self._disconnect()):
-            safe, said = False, stuck
         well = cause in (None, "withdrawn")
         if well and not safe:  # without the device's confirmation the end is a fault
             self._fault(f"the end of stimulation is not confirmed: {said or state}")
@@ -327,15 +317,6 @@ class TestRun:
             pulse_may_follow=self.gate.on_its_way is not None,
             device_state=state,
         )
-
-    async def _disconnect(self) -> str:
-        """Open the relays, once the stop is confirmed: what went wrong; empty: nothing."""
-        try:
-            if self._relays is not None and any(channel.elements for channel in self.score.channels):
-                await self._relays.open_all(self.journal)
-        except DeviceError as error:
-            return str(error)
-        return ""
 
     def _end_journal(self, cause: Cause | None, end_s: float) -> None:
         self.score.shut()

@@ -14,7 +14,6 @@ from stimrig.rig.config import RigConfig
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.gate import Gate
 from stimrig.rig.machine import Machine
-from stimrig.rig.relays import Relays
 from stimrig.rig.signals import AngleScale
 
 log = logging.getLogger("rig.pair")
@@ -36,8 +35,6 @@ class Pair:
         self.gate: Gate | None = None
         self.receiver: Receiver | None = None
         self.angle: AngleReceiver | None = None
-        self.relays: Relays | None = None
-        """Of a rig with a switch."""
         self.found_state = ""
         """State that the stimulator reported when it was connected."""
         self.steps = limits.FINEST
@@ -47,8 +44,7 @@ class Pair:
 
     @property
     def identity(self) -> dict[str, dict[str, Any]]:
-        found = self._identity if self.relays is None else {**self._identity, "switch": self.relays.identity}
-        return found if self.angle is None else {**found, "angle_sensor": self.angle.identity}
+        return self._identity if self.angle is None else {**self._identity, "angle_sensor": self.angle.identity}
 
     async def connect(self) -> None:
         """Open both. A stimulator that is found able to stimulate is stopped at once, since no test runs.
@@ -63,27 +59,12 @@ class Pair:
         self._identity["stimulator"] = await gate.identify()
         try:
             await self._stop_what_was_left(gate)
-            await self._open_switch(gate)
             self._identity["load_cell"] = await receiver.open()
         except DeviceError:
-            await self._leave(gate)
+            await gate.disconnect()
             raise
         self.gate, self.receiver, self.steps = gate, receiver, stimulator.steps
         self._watch_angle()
-
-    async def _open_switch(self, gate: Gate) -> None:
-        """Once the stimulator is stopped: all relays are opened. Raises DeviceError."""
-        settings = self._config.switch
-        if settings is not None:
-            switch = devices.find("switch", settings.device).create(settings, self._machine)
-            self.relays = Relays(switch, gate, self._clock)
-            await self.relays.open(self._on_lost)
-
-    async def _leave(self, gate: Gate) -> None:
-        await gate.disconnect()
-        relays, self.relays = self.relays, None
-        if relays is not None:
-            relays.close()
 
     def _watch_angle(self) -> None:
         """After the load cell: the angle sensor may share its bus."""
@@ -116,7 +97,7 @@ class Pair:
         gate, angle, receiver = self.gate, self.angle, self.receiver
         self.gate = self.receiver = self.angle = None
         if gate is not None:
-            await self._leave(gate)
+            await gate.disconnect()
         if angle is not None:
             await angle.close()
         if receiver is not None:
@@ -137,8 +118,6 @@ class Pair:
         try:
             await gate.stop()
             safe, _ = await gate.state()  # of the same one: the rig may be shutting down meanwhile
-            if safe and self.relays is not None:
-                await self.relays.open_all()
         except DeviceError:
             return False
         return safe and await self.torque_comes()

@@ -88,9 +88,7 @@ class Player:
         except Exception:
             await self._not_begun(before)
             raise
-        self.run = TestRun(
-            test, table, journal, gate, receiver, self._machine, halt, self._watch, sensor, self.pair.relays
-        )
+        self.run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, sensor)
         self.run.on_evidence = self._take_evidence
         self.playing = self.tasks.spawn(self._execute(self.run), "test")
 

@@ -103,7 +103,6 @@ class Rig:
             elapsed_s=run.elapsed_s() if run else 0.0,
             duration_s=run.score.longest_s if run else 0.0,
             stimulator=stimulator and {**stimulator, "shortest_us": self.pair.steps.shortest_us, **named},
-            switch=self.pair.identity.get("switch"),
             load_cell=cell,
             torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
             torque_nm=finite(receiver.last_torque_nm) if receiver else None,

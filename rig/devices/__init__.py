@@ -1,6 +1,6 @@
-"""Devices behind four small Protocols; each device is one file here, found by its id (the file's name).
+"""Devices behind three small Protocols; each device is one file here, found by its id (the file's name).
 
-A device module has `KIND` ("stimulator", "load_cell", "angle_sensor" or "switch"), `Settings` (a pydantic model, the
+A device module has `KIND` ("stimulator", "load_cell" or "angle_sensor"), `Settings` (a pydantic model, the
 device's part of the rig file) and `create(settings, machine)`: the device, not yet opened; it raises ConfigError where
 a DBC file lacks the message or signal. To add a device, add a file.
 """
@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache
 from types import ModuleType
 from typing import Any, Literal, Protocol, Self
@@ -20,7 +20,7 @@ from stimrig.rig.errors import ConfigError
 from stimrig.rig.limits import Admitted, Steps
 from stimrig.rig.signals import Ack, AngleScale, Block
 
-Kind = Literal["stimulator", "load_cell", "angle_sensor", "switch"]
+Kind = Literal["stimulator", "load_cell", "angle_sensor"]
 
 
 class DeviceSettings(BaseModel):
@@ -83,26 +83,6 @@ class Stimulator(Protocol):
 
     def close(self) -> None:
         """Close the line; never raises."""
-        ...
-
-
-class Switch(Protocol):
-    """Relays between one stimulator channel and the elements of an array. Only `stimrig.rig.relays` may hold one."""
-
-    async def open(self, on_lost: Callable[[str], None]) -> dict[str, Any]:
-        """Open its line; returns the identity to display. Moves no relay. Raises DeviceError."""
-        ...
-
-    async def connect(self, elements: Sequence[int]) -> None:
-        """Close the relays of these elements and no others, and ask whether they are closed. Raises DeviceError."""
-        ...
-
-    async def open_all(self) -> None:
-        """Open all relays, and ask whether they are. Raises DeviceError."""
-        ...
-
-    def close(self) -> None:
-        """Close its line; never raises."""
         ...
 
 

@@ -66,13 +66,13 @@ def rate(plan: m.TestPlan) -> float:
     return PULSE_RATE_HZ * len(plan.channels or [0])
 
 
-def of_channels(plan: m.TestPlan, rig: list[str], elements: int = 0) -> tuple[list[float], list[dict[str, Any]]]:
+def of_channels(plan: m.TestPlan, rig: list[str]) -> tuple[list[float], list[dict[str, Any]]]:
     """As the real rig lays them: a round has one slot of each channel."""
     from stimrig.rig.channels import RigChannel
     from stimrig.rig.limits import HARD_LIMITS, SUM_LIMITS, for_plan
     from stimrig.rig.plan import build
 
-    channels = [RigChannel(name, "", "", "", elements=elements) for name in rig]
+    channels = [RigChannel(name, "", "", "") for name in rig]
     built = build(plan, for_plan({**HARD_LIMITS, **SUM_LIMITS}, plan), channels)
     told = [
         {"name": s.name, "start_s": s.start / rate(plan), "end_s": s.end / rate(plan)} for s in built.segments
@@ -129,7 +129,6 @@ class FakeRig:
         self.shortest_us = 20.0
         self.channels: list[str] = []
         """Names of several channels; empty: it has one without a name."""
-        self.switch: dict[str, Any] | None = None
         """Of a rig whose first channel has one."""
         self.calibrated: m.Calibrated | None = None
         self.withdrawn: list[rig_requests.WithdrawRequest] = []
@@ -183,7 +182,7 @@ class FakeRig:
             participant=self.plan.participant if self.plan else None, segment=self.segment,
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
             stimulator={"device": "fake P24", "firmware": "1.0", "shortest_us": self.shortest_us, **self._named()},
-            load_cell={"device": "fake cell", "rate_hz": 400.0}, switch=self.switch,
+            load_cell={"device": "fake cell", "rate_hz": 400.0},
             torque_age_s=self.torque_age_s, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
             limits=self.limits, require_calibration=self.require_calibration, check=self.check,
@@ -263,7 +262,7 @@ class FakeRig:
         if plan.kind in ("sequence", "held") and plan.segments:
             return trial_widths(plan.segments)
         if plan.adaptive is None and plan.channels:
-            return of_channels(plan, self.channels, (self.switch or {}).get("elements", 0))
+            return of_channels(plan, self.channels)
         if plan.adaptive is None:
             return default_widths()
         score = FakeScore(plan, [], [])

@@ -68,7 +68,6 @@ class TestTests:
         for words in (told, event.model_dump_json(), live.finished.model_dump_json()):
             assert '"channel' not in words
             assert "profiles" not in words
-            assert "switch" not in words
         assert not set(SUM_LIMITS) & set(live.rig.status().limits)
 
     def test_a_channel_that_the_rig_does_not_have(self, make: Make) -> None:

@@ -205,7 +205,7 @@ TWO = """
 name = "biceps"
 muscle = "m. biceps brachii"
 side = "right"
-electrode = "array, 16 elements"
+electrode = "5 x 5 cm"
 channel = 1
 [[stimulator.channels]]
 name = "triceps"
@@ -217,16 +217,9 @@ connector = 2
 pulse_width_us = 250
 charge_per_phase_uc = 9
 """
-SWITCH = """
-[switch]
-device = "scpi_matrix"
-port = "/dev/ttyUSB1"
-channel = "biceps"
-elements = 16
-"""
 
 
-def of_channels(tmp_path: Path, more: str = TWO + SWITCH, **replaced: str) -> config.RigConfig:
+def of_channels(tmp_path: Path, more: str = TWO, **replaced: str) -> config.RigConfig:
     for old, new in replaced.items():
         more = more.replace(old.replace("_eq_", " = "), new)
     head, load_cell = GOOD.split("[load_cell]")
@@ -237,15 +230,14 @@ def test_several_channels(tmp_path: Path):
     loaded = of_channels(tmp_path)
     biceps, triceps = loaded.channels()
     assert biceps.described() == {
-        "name": "biceps", "muscle": "m. biceps brachii", "side": "right", "electrode": "array, 16 elements",
+        "name": "biceps", "muscle": "m. biceps brachii", "side": "right", "electrode": "5 x 5 cm",
     }  # fmt: skip
-    assert (biceps.elements, triceps.elements, biceps.limits) == (16, 0, {})
+    assert biceps.limits == {}
     assert triceps.limits == {"pulse_width_us": 250.0, "charge_per_phase_uc": 9.0}
     table = loaded.table()
     assert set(table) == {*limits.HARD_LIMITS, *limits.SUM_LIMITS}
     assert table["pulse_width_us"].hi == 400, "of the rig, not of one channel"
     assert loaded.public()["stimulator"]["channels"][1]["connector"] == 2
-    assert loaded.public()["switch"]["elements"] == 16
 
 
 def test_one_channel_sees_nothing_of_it(tmp_path: Path):
@@ -254,7 +246,6 @@ def test_one_channel_sees_nothing_of_it(tmp_path: Path):
     assert loaded.table() == loaded.limits.table()
     assert set(loaded.table()) == set(limits.HARD_LIMITS)
     assert "channels" not in loaded.public()["stimulator"]
-    assert "switch" not in loaded.public()
 
 
 @pytest.mark.parametrize(
@@ -270,12 +261,8 @@ def test_one_channel_sees_nothing_of_it(tmp_path: Path):
         ({"pulse_width_us = 250": "pulse_width_us = nan"}, "stimulator.channels.1.limits.pulse_width_us"),
         ({"pulse_width_us = 250": "pulse_width_us = true"}, "stimulator.channels.1.limits.pulse_width_us"),
         ({"pulse_width_us = 250": "torque_nm = 2"}, "torque_nm"),
-        ({'channel = "biceps"': 'channel = "deltoid"'}, "switch.channel: not one of"),
-        ({"elements = 16": "elements = 0"}, "switch.elements"),
-        ({"scpi_matrix": "other"}, "switch.device: unknown device"),
         ({"[[stimulator.channels]]\nname = \"biceps\"": "channel = 3\n[[stimulator.channels]]\nname = \"biceps\""},
          "each of them names its output"),
-        ({TWO: ""}, "add [[stimulator.channels]]"),
     ],
 )  # fmt: skip
 def test_a_wrong_channel_is_one_line(tmp_path: Path, replaced: dict[str, str], words: str):
@@ -300,11 +287,12 @@ def test_a_rehastim_2_has_channels(tmp_path: Path):
         ("rehastim2", [{"channel": 1}, {"channel": 6}]),
     ],
 )
-def test_an_emulator_tells_its_outputs_and_its_switch(device: str, plugs: list[dict[str, int]]):
+def test_an_emulator_tells_its_outputs(device: str, plugs: list[dict[str, int]]):
     line = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}, "stimulator_device": device}
-    more = {"outputs": [[0, 0], [1, 1]], "switch": "/dev/pts/gone2", "elements": 16}
-    loaded = config.for_emulator(json.dumps({**line, **more}), data_dir=Path("d"), socket=Path("s"))
-    assert [(one.name, one.elements) for one in loaded.channels()] == [("biceps", 16), ("triceps", 0)]
+    loaded = config.for_emulator(
+        json.dumps({**line, "outputs": [[0, 0], [1, 1]]}), data_dir=Path("d"), socket=Path("s")
+    )
+    assert [one.name for one in loaded.channels()] == ["biceps", "triceps"]
     told = loaded.stimulator.model_dump()["channels"]
     assert [{name: one[name] for name in plug} for one, plug in zip(told, plugs, strict=True)] == plugs
     assert config.for_emulator(json.dumps(line), data_dir=Path("d"), socket=Path("s")).channels() == ()
