@@ -133,7 +133,7 @@ def _described(header: dict[str, Any], train: Train) -> list[dict[str, Any]]:
     known = {one["name"]: one for one in header.get("channels", [])}
     blank = {"muscle": "", "side": "", "electrode": ""}
     return [
-        {**blank, **known.get(one["name"], {}), "name": one["name"], "offset_s": offset_s, "elements": one["elements"]}
+        {**blank, **known.get(one["name"], {}), "name": one["name"], "offset_s": offset_s}
         for one, offset_s in zip(header["plan"]["channels"], train.offsets_s, strict=True)
     ]
 
@@ -202,7 +202,6 @@ def _channels_of(contents: JournalContents, intents: list[Intent], rate_hz: floa
                 "name": f"output-{own[0].output + 1}" if own else f"unknown-{place + 1}",
                 "profile": {"current_ma": max((intent.current_ma for intent in own), default=0.0)},
                 "offset_s": None if offset_s is None or of_first_s is None else round(offset_s - of_first_s, 6),
-                "elements": [],
             }
         )
     return {"channels": found}

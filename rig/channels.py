@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from stimrig.rig import limits
-from stimrig.rig.errors import PlanError, RefusedError
+from stimrig.rig.errors import PlanError
 from stimrig.rig.limits import Limit, refuse
 from stimrig.rig.messages import ChannelPlan, TestPlan
 from stimrig.rig.train import Train, train_of
@@ -21,7 +21,6 @@ class RigChannel:
     side: str
     electrode: str
     limits: Mapping[str, float] = field(default_factory=dict)  # tighter ones, by the names of the rows
-    elements: int = 0  # that a switch can connect it to; 0: it has no switch
 
     def described(self) -> dict[str, str]:
         return {"name": self.name, "muscle": self.muscle, "side": self.side, "electrode": self.electrode}
@@ -39,19 +38,16 @@ class Channel:
     current_ma: float
     largest_us: float
     table: dict[str, Limit]
-    elements: tuple[int, ...] = ()
 
 
 def played(plan: TestPlan, table: dict[str, Limit], rig: Sequence[RigChannel]) -> tuple[Channel, ...]:
     """The channels of a test, in the order of its slots.
 
     `table`: the limits of the whole test (`limits.for_plan`). `rig`: the rig's channels; empty: it has one without a
-    name. Raises PlanError, RefusedError: a channel that the rig does not have, or one twice; wrong elements; a limit.
+    name. Raises PlanError, RefusedError: a channel that the rig does not have, or one twice; a limit.
     """
     profile = plan.profile
     if plan.channels is None:
-        if rig and rig[0].elements:
-            raise PlanError(f"plan.channels: {rig[0].name} has a switch; name the channel, and the elements to connect")
         table = limits.narrowed(table, rig[0].limits, f"rig file, {rig[0].name}") if rig else table
         return (Channel("", 0, profile.current_ma, plan.largest_us, table),)
     names = [channel.name for channel in plan.channels]
@@ -73,21 +69,8 @@ def _channel(one: ChannelPlan, output: int, of: RigChannel, plan: TestPlan, tabl
     asked_us = [width_us for width_us in (one.max_pulse_width_us, plan.max_pulse_width_us) if width_us is not None]
     for width_us in asked_us:
         table = limits.tightened(table, "pulse_width_us", width_us, "request")
-    _check_elements(one, of)
     largest_us = min(one.profile.max_pulse_width_us, *asked_us, float("inf"))
-    return Channel(one.name, output, one.profile.current_ma, largest_us, table, tuple(one.elements))
-
-
-def _check_elements(one: ChannelPlan, of: RigChannel) -> None:
-    place = f"plan.channels, {one.name}: elements {one.elements}"
-    if not of.elements:
-        if one.elements:
-            raise RefusedError(f"{place}: this channel has no switch; leave them out")
-        return
-    if not one.elements:
-        raise RefusedError(f"{place}: this channel has a switch; name one element or a pair")
-    if len(set(one.elements)) < len(one.elements) or not all(1 <= number <= of.elements for number in one.elements):
-        raise RefusedError(f"{place}: give different ones from 1 to {of.elements}")
+    return Channel(one.name, output, one.profile.current_ma, largest_us, table)
 
 
 def train(plan: TestPlan) -> Train:

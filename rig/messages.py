@@ -40,8 +40,6 @@ client is late."""
 
 
 MOST_CHANNELS = 8
-MOST_ELEMENTS = 2
-"""Of an array that one channel stimulates over at the same time: one, or a pair."""
 CHANNEL_NAME = r"^[a-z][a-z0-9_-]{0,31}$"
 RESERVED_NAMES = ("joint", "predicted")
 """Words of files of several channels, which no channel may have for a name."""
@@ -175,11 +173,6 @@ class ChannelPlan(Message):
         default=None,
         description="of each of its pulses after the first channel's, s; rises from channel to channel, 0 for the "
         "first. None: the channels share the pulse period evenly",
-    )
-    elements: list[int] = Field(
-        default_factory=list,
-        max_length=MOST_ELEMENTS,
-        description="elements of its array, from 1, that the switch connects before the test; empty: it has no switch",
     )
 
 

@@ -15,7 +15,6 @@ from stimrig.rig.messages import (
     CHANNEL_NAME,
     LONGEST_NAME,
     MOST_CHANNELS,
-    MOST_ELEMENTS,
     Direction,
     Message,
     Profile,
@@ -135,9 +134,6 @@ class CalibrateChannel(Message):
     current_ma: float | None = None
     max_pulse_width_us: float | None = None
     last: Profile | None = Field(None, description="what the last calibration found for it; with large_steps")
-    elements: list[int] = Field(
-        default_factory=list, max_length=MOST_ELEMENTS, description="of its array, connected during each train"
-    )
 
 
 class CalibrateStartRequest(Message):
@@ -158,7 +154,6 @@ class CalibrateStartRequest(Message):
     pulse_rate_hz: float = 40.0
     max_pulse_width_us: float | None = Field(None, description="widest pulse allowed, µs; None: the hard limits")
     max_torque_nm: float = Field(30.0, description="torque at which a train stops, N·m")
-    elements: list[int] = several([], "where its channel has a switch: one element, or a pair; no channels")
     channels: list[CalibrateChannel] | None = several(
         None,
         "several channels in one calibration, each with its own trains, marks and profile. None: the rig's first "

@@ -220,8 +220,7 @@ class Bench:
             SegmentPlan(name="rest", sequence="rest", settings={"duration_s": TAIL_S}),
         ]
         name = channel or next(iter(self.outputs))
-        elements = next((one.elements for one in self.rig.channels if one.name == name), 0)
-        channels = [ChannelPlan(name=name, profile=profile, elements=[1] if elements else [])] if name else None
+        channels = [ChannelPlan(name=name, profile=profile)] if name else None
         return TestPlan(
             test_id=f"check-{self._played}", participant="rig-check", kind="rig-check", profile=profile,
             segments=segments, pulse_rate_hz=min(RATE_HZ, self.table["pulse_rate_hz"].hi), channels=channels,

@@ -222,7 +222,7 @@ class Calibration:
             participant=request.participant,
             kind="calibration",
             profile=profile,
-            channels=[ChannelPlan(name=of.name, profile=profile, elements=of.elements)] if of else None,
+            channels=[ChannelPlan(name=of.name, profile=profile)] if of else None,
             segments=[rest, SegmentPlan(name="train", sequence="steps", settings=steps), rest],
             pulse_rate_hz=request.pulse_rate_hz,
         )
@@ -343,15 +343,8 @@ class CalibrationOfChannels:
     ) -> None:  # fmt: skip
         self.request, self._playing = request, ""
         if request.channels is None:
-            of = None
-            if rig and (rig[0].elements or request.elements):
-                of = CalibrateChannel(
-                    name=rig[0].name, current_ma=request.current_ma, last=request.last, elements=request.elements
-                )
-                self._check([of], table, rig)
-                self._playing = of.name
             table = limits.narrowed(table, rig[0].limits, f"rig file, {rig[0].name}") if rig else table
-            self._of = {self._playing: Calibration(request, table, unix_s, steps, of)}
+            self._of = {"": Calibration(request, table, unix_s, steps)}
             return
         self._check(request.channels, table, rig)
         own = {one.name: limits.narrowed(table, one.limits, f"rig file, {one.name}") for one in rig}
@@ -371,8 +364,6 @@ class CalibrationOfChannels:
 
     def channel(self, name: str) -> Calibration:
         """That channel's. Raises PlanError: it is none of this calibration's, or not named."""
-        if self.request.channels is None and not name:
-            name = self._playing
         if name not in self._of:
             known = ", ".join(filter(None, self._of)) or "leave it out: there is one"
             raise PlanError(f"calibration: channel {name!r} is not calibrated ({known})")
@@ -408,9 +399,9 @@ class CalibrationOfChannels:
 
     @staticmethod
     def _check(channels: Sequence[CalibrateChannel], table: dict[str, Limit], rig: Sequence[RigChannel]) -> None:
-        """As for a test: the rig's channels, each once, with their elements."""
+        """As for a test: the rig's channels, each once."""
         profile = Profile(current_ma=0.0, max_pulse_width_us=0.0, max_torque_nm=1.0)
-        plans = [ChannelPlan(name=one.name, profile=profile, elements=one.elements) for one in channels]
+        plans = [ChannelPlan(name=one.name, profile=profile) for one in channels]
         played(TestPlan(test_id="", participant="", profile=profile, segments=None, channels=plans), table, rig)
 
 

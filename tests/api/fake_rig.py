@@ -641,7 +641,7 @@ def write_recording(folder: Path, plan: m.TestPlan, widths: list[float], torque:
         "segments/start_s": (np.array([s["start_s"] for s in kept]), "s"),
         "segments/end_s": (np.array([min(s["end_s"], end) for s in kept]), "s"),
     }  # fmt: skip
-    nowhere = {"muscle": "", "side": "", "electrode": "", "elements": []}
+    nowhere = {"muscle": "", "side": "", "electrode": ""}
     names = [{"name": one.name, **nowhere, "offset_s": k / rate(plan)} for k, one in enumerate(plan.channels or [])]
     if names:
         sets["pulses/channel"] = (np.arange(pulses) % len(names)).astype("u1"), "1"

@@ -11,13 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from stimrig.rig import limits, plan
-from stimrig.rig.channels import RigChannel
 from stimrig.rig.clock import utc_text
-from stimrig.rig.control.calibration import ORDER, Calibration, CalibrationOfChannels, check_profile, end_of_day_s
+from stimrig.rig.control.calibration import ORDER, Calibration, check_profile, end_of_day_s
 from stimrig.rig.devices.p24 import P24
 from stimrig.rig.devices.rehastim2 import RehaStim2
 from stimrig.rig.errors import PlanError, RefusedError
-from stimrig.rig.limits import HARD_LIMITS, SUM_LIMITS, Steps
+from stimrig.rig.limits import HARD_LIMITS, Steps
 from stimrig.rig.messages import FinishedEvent, Profile
 from stimrig.rig.requests import CalibrateStartRequest
 
@@ -481,21 +480,3 @@ def test_whatever_is_pressed(
         assert (action == "down") == (width_us < now_us) and (action == "repeat") == (width_us == now_us)
         calibration.played(width_us, 0.1, FinishedEvent(test_id="t", outcome="completed", summary={"pulses": 20}))
         now_us = width_us
-
-
-def test_the_only_channel_is_calibrated_at_the_elements_behind_its_switch() -> None:
-    rig, table = [RigChannel("biceps", "", "left", "", elements=16)], {**HARD_LIMITS, **SUM_LIMITS}
-    request = opened().request
-    for elements in ([], [3, 3], [17]):
-        with pytest.raises(RefusedError, match="elements"):
-            CalibrationOfChannels(request.model_copy(update={"elements": elements}), table, NOON_S, rig=rig)
-    found = CalibrationOfChannels(request.model_copy(update={"elements": [3, 4]}), table, NOON_S, rig=rig)
-    only = found.channel("")
-    train = only.train(only.next_width_us("up"))
-    assert train.channels and (train.channels[0].name, train.channels[0].elements) == ("biceps", [3, 4])
-    assert plan.build(train, limits.for_plan(table, train), rig).segments
-    found.played(train, 0.5, FinishedEvent(test_id=train.test_id, outcome="completed", summary={"pulses": 40}))
-    assert found.status().channels is None and found.status().pulse_width_us == train.profile.max_pulse_width_us
-    with pytest.raises(RefusedError, match="no switch"):
-        plain = [RigChannel("biceps", "", "left", "")]
-        CalibrationOfChannels(request.model_copy(update={"elements": [3]}), table, NOON_S, rig=plain)

@@ -212,7 +212,6 @@ class TestCalibration:
         [
             ([{"name": "deltoid"}], "no channel 'deltoid'"),
             ([{"name": "biceps"}, {"name": "biceps"}], "given twice"),
-            ([{"name": "biceps", "elements": [1]}], "no switch"),
             ([{"name": "biceps", "current_ma": 200.0}], "current_ma 200"),
         ],
     )
