@@ -153,7 +153,7 @@ class Machine(Protocol):
     """Of this boot of the machine; empty if the system has none."""
 
     def port(self, path: str, **arguments: Any) -> Port:
-        """A serial port, not yet opened; arguments of `serial.Serial`, and `device`: what messages call it."""
+        """The stimulator's serial port, not yet opened; arguments of `serial.Serial`."""
         ...
 
     def open_bus(self, arguments: dict[str, Any], name: str) -> Bus:

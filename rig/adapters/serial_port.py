@@ -25,29 +25,26 @@ Post = Callable[[Callable[[], None]], None]
 class SerialPort:
     """See `stimrig.rig.machine.Port`."""
 
-    def __init__(self, path: str, clock: Clock, post: Post, device: str = "stimulator", **arguments: Any) -> None:
+    def __init__(self, path: str, clock: Clock, post: Post, **arguments: Any) -> None:
         self.port, self._clock, self._post, self._arguments = path, clock, post, arguments
-        self._device = device
         self._serial: serial.Serial | None = None
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
 
     def open(self, on_bytes: Callable[[bytes, float], None], on_lost: Callable[[str], None]) -> None:
         if not Path(self.port).exists():
-            raise DeviceError(
-                f"{self._device}.port: {self.port} is missing; plug in the {self._device} or correct the port"
-            )
+            raise DeviceError(f"stimulator.port: {self.port} is missing; plug in the stimulator or correct the port")
         try:
             port = serial.Serial(self.port, timeout=READ_TIMEOUT_S, exclusive=True, **self._arguments)
         except (serial.SerialException, OSError, ValueError) as error:
             raise DeviceError(
-                f"{self._device}.port: {self.port} cannot be opened ({error}); is another program using it?"
+                f"stimulator.port: {self.port} cannot be opened ({error}); is another program using it?"
             ) from None
         self._serial = port
         self._refuse_fast_clock(port)
         self._closing = threading.Event()
         arguments = port, self._closing, on_bytes, on_lost
-        self._thread = threading.Thread(target=self._read, args=arguments, name=f"{self._device}-reader", daemon=True)
+        self._thread = threading.Thread(target=self._read, args=arguments, name="stimulator-reader", daemon=True)
         self._thread.start()
 
     def write(self, data: bytes) -> int:
@@ -78,7 +75,7 @@ class SerialPort:
         if self._clock.speed != 1.0 and not place.startswith(PSEUDO_TERMINALS):
             self.close()
             raise DeviceError(
-                f"{self._device}.port: {self.port} is {place}, a real device, and the rig's clock runs "
+                f"stimulator.port: {self.port} is {place}, a real device, and the rig's clock runs "
                 f"{self._clock.speed:g} times as fast as real time; use a rig file"
             )
 
