@@ -37,7 +37,6 @@ class Workers:
     scheduler: str = ""  # address of a scheduler; empty: this machine
     count: int = 2  # processes on this machine
     memory_bytes: int = 2**30  # what a record may take beyond the libraries
-    dashboard: bool = False  # whether a local scheduler shows its dashboard
     wait_s: float = 60.0  # how long to wait for the first worker of a scheduler
 
 
@@ -92,7 +91,7 @@ def _local(workers: Workers) -> Iterator[Client]:
             processes=True,
             host="127.0.0.1",
             memory_limit=max(WORKER_BYTES, workers.memory_bytes),
-            dashboard_address="127.0.0.1:0" if workers.dashboard else None,  # pyright: ignore[reportArgumentType]
+            dashboard_address=None,  # pyright: ignore[reportArgumentType]
             silence_logs=logging.CRITICAL,
             security=Security.temporary(),  # whoever reaches an open scheduler's port runs programs as its user
         )

@@ -104,9 +104,6 @@ def run(
     renew: Annotated[
         int, typer.Option(min=1, help="after so many records a worker's computing process is started anew")
     ] = 500,
-    dashboard: Annotated[
-        bool, typer.Option("--dashboard", help="Dask's dashboard on this machine; its address is shown")
-    ] = False,
     wait: Annotated[
         float, typer.Option(min=0.1, help="with --scheduler: how long to wait for its first worker, s")
     ] = 60.0,
@@ -126,8 +123,7 @@ def run(
 def computed(
     verb: str, data: Sequence[str], output: Path, *, select: str = "", method: str = METHOD, effects: str = "",
     scheduler: str = "", workers: int = 2, memory: str = "1GB", limit: float = 600.0, renew: int = 500,
-    dashboard: bool = False, wait: float = 60.0, again: bool = False,
-    columns: Sequence[str] | None = None,
+    wait: float = 60.0, again: bool = False, columns: Sequence[str] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """One run, and the keys of `--json`. Raises InputError, CommandError."""
     need_extra()
@@ -142,7 +138,7 @@ def computed(
 
     given = (verb, Selection(select).text, method, names(effects), tuple(columns or ()), software_version())
     task = checked(Task(*given))
-    place = cluster.Workers(scheduler, workers, cluster.memory_of(memory), dashboard, wait)
+    place = cluster.Workers(scheduler, workers, cluster.memory_of(memory), wait)
     sources = sources_of(data)
     bounds = Bounds(limit, place.memory_bytes, renew)
     for source in sources:
@@ -150,8 +146,7 @@ def computed(
     began_s = time.monotonic()
     try:
         with Table(output, task, again) as results, cluster.connected(place) as client:
-            link = str(client.dashboard_link) if place.dashboard or place.scheduler else ""
-            with telling(link) as tell:
+            with telling() as tell:
                 tally = Run(client, sources, task, bounds, results, tell).go()
             counts = results.join()
     except CutOffError as error:
@@ -240,13 +235,8 @@ LEAST_S = 5.0
 
 
 @contextmanager
-def telling(dashboard: str = "") -> Iterator[Callable[[Tally], None]]:
-    """A function that shows a tally on standard error.
-
-    `dashboard`: address of Dask's dashboard, said first; empty: none.
-    """
-    if dashboard:
-        print(f"dashboard      {dashboard}", file=sys.stderr, flush=True)
+def telling() -> Iterator[Callable[[Tally], None]]:
+    """Give a function that shows a tally on standard error."""
     watched = sys.stderr.isatty() or in_notebook()
     began_s = told_s = time.monotonic()
     with progress_bar() as bar:

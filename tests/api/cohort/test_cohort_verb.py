@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -193,14 +192,11 @@ def test_killed_and_with_a_worker_killed_it_is_whole_in_the_end(folder: Path, tm
     assert not parts.exists()
 
 
-def test_the_dashboard_is_told_and_people_are_given_words(
-    capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path
-) -> None:
+def test_people_are_given_words(capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "r.parquet"
     one = str(next((folder / "P001").iterdir()))
-    assert main.run(["cohort", "fit", one, "-o", str(output), "--workers", "1", "--dashboard"]) == 0
-    out, err = capsys.readouterr()
-    assert re.search(r"dashboard +http://127\.0\.0\.1:\d+/status", err)
+    assert main.run(["cohort", "fit", one, "-o", str(output), "--workers", "1"]) == 0
+    out = capsys.readouterr().out
     assert "1 with a result" in out and str(output) in out
     assert main.run(["cohort", "changed", str(output), str(output), "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
@@ -251,6 +247,6 @@ def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
     until(lambda: rows_in(tmp_path / "r.parquet.parts") >= 3, "three rows", run)
     process.kill()
     _, err = run.communicate(timeout=PATIENCE_S)
-    said = [line for line in err.splitlines() if not line.startswith("dashboard")]
+    said = err.splitlines()
     assert run.returncode == 1 and len(said) == 1 and "the scheduler is gone" in said[0], err
     assert rows_in(tmp_path / "r.parquet.parts") >= 3
