@@ -32,7 +32,7 @@ def here() -> Answers:
     return answered("here")
 
 
-@pytest.fixture(params=["nudged", "another processor"])
+@pytest.fixture(params=["nudged", pytest.param("another processor", marks=pytest.mark.campaign)])
 def again(request: pytest.FixtureRequest) -> Answers:
     return answered(request.param)
 
