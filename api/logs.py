@@ -8,15 +8,15 @@ import sys
 import threading
 from contextvars import ContextVar
 
-from stimrig.api.traces import current_span
-
 log = logging.getLogger("stimrig")
 current_test: ContextVar[str | None] = ContextVar("test_id", default=None)
 """The test that is being dealt with: every line that comes of it carries its id, whoever writes the line."""
+current_request: ContextVar[str | None] = ContextVar("request_id", default=None)
+"""The HTTP request that is being answered, and what it started in the background; `RequestId` draws the id."""
 
 
 class JsonLines(logging.Formatter):
-    """One object a line: time, level, process, logger, message; the test's id, the trace's and the step's where known.
+    """One object a line: time, level, process, logger, message; the ids of test and request where known.
 
     `process`: which one writes it.
     """
@@ -36,8 +36,8 @@ class JsonLines(logging.Formatter):
         test_id = getattr(record, "test_id", None) or current_test.get()
         if test_id is not None:
             line["test_id"] = test_id
-        if (span := current_span.get()) is not None:
-            line |= {"trace_id": span.trace_id, "span_id": span.span_id}
+        if (request_id := current_request.get()) is not None:
+            line["request_id"] = request_id
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
         return json.dumps(line, ensure_ascii=False)

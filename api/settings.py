@@ -54,9 +54,6 @@ class Settings(BaseSettings):
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
     )
-    otlp_endpoint: str | None = Field(
-        default=None, description="OpenTelemetry collector that gets traces, as http://127.0.0.1:4318; default: nowhere"
-    )
     retention_participants_days: Annotated[float, Field(ge=1)] | None = Field(
         default=None, description="days after the last test or recording, then all of a participant goes; default: kept"
     )

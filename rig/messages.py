@@ -240,7 +240,7 @@ class Reply(Message):
     problem: Problem | None = None
     body: dict[str, Any] = Field(default_factory=dict)
     """status, subscribe, start, rearm, calibrate-start, -step, -mark and -stored, angle_pose: a `Status`; preview: a
-    `Preview`; sequences: a `Sequences`; stop: a `StopAnswer`; withdraw: a `Withdrawn`; calibrate-finish: a
+    `Preview`; sequences: a `Sequences`; stop: a `StopEvidence`; withdraw: a `Withdrawn`; calibrate-finish: a
     `CalibrationResult`; extend and enough: an `Extended`."""
 
 
@@ -441,16 +441,6 @@ class Preview(Message):
     )
 
 
-class Traced(Message):
-    """When a request that carried a trace context passed its steps. For monitoring only: nothing is decided by it."""
-
-    traceparent: str = Field(description="as it came with the request")
-    at_unix_s: dict[str, float] = Field(
-        description="host's UTC, s. Of a start: received, checked, begun (the test's clock), first_sent, "
-        "first_acknowledged, ended, sealed; of a stop: received, confirmed. A step that was not reached is not there"
-    )
-
-
 class StopEvidence(Message):
     """Whether a stop took effect: what the device answered, and what the torque did."""
 
@@ -461,12 +451,6 @@ class StopEvidence(Message):
     pulse_may_follow: bool = Field(
         default=False, description="a pulse sent before the stop was not acknowledged and may still be felt"
     )
-
-
-class StopAnswer(StopEvidence):
-    """What a stop's request is answered by: the evidence, and times for who traces it."""
-
-    traced: Traced | None = several(None, "of a stop with a trace context")
 
 
 class Withdrawn(Message):
@@ -607,7 +591,6 @@ class FinishedEvent(Message):
         "high, never too low) and doubtful_pulses, warnings (sentences for people about possible errors), "
         "notes (sentences about what happened and leaves nothing in doubt)",
     )
-    traced: Traced | None = several(None, "of a test whose start had a trace context")
 
 
 Event = Annotated[StateEvent | LiveEvent | FinishedEvent, Field(discriminator="event")]

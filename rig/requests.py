@@ -7,7 +7,7 @@ accepts only `stop`, so that nothing on the first socket can delay a stop. A req
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field
 
@@ -56,11 +56,6 @@ class SequencesRequest(Message):
     id: int = 0
 
 
-TRACEPARENT: Any = several(
-    None, "W3C trace context of who asks, for monitoring only; one that is none is ignored. See `messages.Traced`"
-)
-
-
 class StartRequest(Message):
     kind: Literal["start"] = "start"
     id: int = 0
@@ -68,7 +63,6 @@ class StartRequest(Message):
     key: str = Field(
         default="", description="of an adaptive test: only who knows it may extend it; it is stored nowhere"
     )
-    traceparent: Any = TRACEPARENT
 
 
 class ExtendRequest(Message):
@@ -115,7 +109,6 @@ class StopRequest(Message):
     id: int = 0
     reason: str
     by: str = ""
-    traceparent: Any = TRACEPARENT
 
 
 class RearmRequest(Message):

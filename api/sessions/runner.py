@@ -22,9 +22,8 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.operation.counted import Counted
 from stimrig.api.people.auth import Scope
-from stimrig.api.sessions import channels, steps
+from stimrig.api.sessions import channels
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
@@ -34,11 +33,11 @@ from stimrig.api.sessions.muscles import MusclesTests
 from stimrig.api.sessions.playing import Current, Playing, busy, other_than, refuse_archived, rests_of, right_ended
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
+from stimrig.api.sessions.stop_counter import StopCounter
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.tables import Participant, Test, Token
-from stimrig.api.traces import Span, Tracer, current_span
 from stimrig.api.workers.pool import Adviser, Pool, Tasks
 from stimrig.rig import messages, requests
 
@@ -69,11 +68,11 @@ class Runner(Playing):
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
-        adviser: Adviser, trials: Trials, recordings_dir: Path, follower: Follower, tracer: Tracer,
+        adviser: Adviser, trials: Trials, recordings_dir: Path, follower: Follower,
     ) -> None:  # fmt: skip
         super().__init__(store, clock, rig)
         self.versions, self.pool, self.trials, self.follower = versions, pool, trials, follower
-        self.hub, self.counted, self.tracer = Hub(clock), Counted(), tracer
+        self.hub, self.counted = Hub(clock), StopCounter()
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
         self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint, MusclesTests(rig, store))
@@ -146,12 +145,10 @@ class Runner(Playing):
         current_test.set(plan.test_id)
         self.pool.cancel_background()
         try:
-            with self.tracer.step("rig preview"):
-                preview = await self._previewed(plan)
+            preview = await self._previewed(plan)
             if confirmed is not None and not same(confirmed, preview):
                 raise not_what_was_seen()
-            with self.tracer.step("intent is written down"):
-                row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant)
+            row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant)
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
@@ -176,10 +173,7 @@ class Runner(Playing):
                     raise right_ended()
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.kinds[plan.kind].begin(planned)
-                with self.tracer.step("rig start") as says:
-                    says |= {"stimrig.test.id": plan.test_id, "stimrig.test.kind": plan.kind}
-                    asked = requests.StartRequest(plan=plan, key=key, traceparent=self.tracer.traceparent)
-                    await self.rig.ask(asked, timeout_s=ANSWER_S)
+                await self.rig.ask(requests.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
             if error.code == "rig-unreachable":  # it may have heard us all the same
                 await self.stop_quietly(f"start of {plan.test_id} was not answered")
@@ -303,10 +297,8 @@ class Runner(Playing):
         self._halted_s = self.clock.monotonic_s()
         subject = self.current.test_id if self.current else "rig"
         try:
-            with self.tracer.step("rig stop") as says:
-                asked = {"reason": reason or "stop pressed", "by": by, "traceparent": self.tracer.traceparent}
-                answer = await self.rig.ask_for(messages.StopAnswer, requests.StopRequest(**asked), timeout_s=8.0)
-                evidence = steps.tell_stop(self.tracer, answer, says)
+            request = requests.StopRequest(reason=reason or "stop pressed", by=by)
+            evidence = await self.rig.ask_for(messages.StopEvidence, request, timeout_s=8.0)
         except ApiError as error:
             self.counted.stopped("failed", 0.0)
             await self._note(by, "stop failed", subject, detail=error.detail)
@@ -354,7 +346,7 @@ class Runner(Playing):
                 self.hub.begin(event.test_id)  # another service began it
             self.hub.live(event)
         elif isinstance(event, messages.FinishedEvent):
-            self._follow(event.test_id, self._finish(event), steps.tell_test(self.tracer, event))
+            self._follow(event.test_id, self._finish(event))
         else:
             if event.status.state in HALTED:
                 self._halted_s = self.clock.monotonic_s()
@@ -382,17 +374,16 @@ class Runner(Playing):
                 self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"),
             )
 
-    def _follow(self, test_id: str, work: Coroutine[Any, Any, None], span: Span | None = None) -> None:
-        """Do what leads a test to its last state, in the background and under the one guard; `span`: a step of it."""
-        self._tasks.begin(self._guarded(test_id, work, span))
+    def _follow(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
+        """Do what leads a test to its last state, in the background and under the one guard."""
+        self._tasks.begin(self._guarded(test_id, work))
 
-    async def _guarded(self, test_id: str, work: Coroutine[Any, Any, None], span: Span | None) -> None:
+    async def _guarded(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
         """Follow a test to its last state: an unexpected error is told as its reason, and the rig is let go.
 
         Where the state cannot be written either, the next start of the service takes the test up.
         """
         current_test.set(test_id)
-        current_span.set(span)
         try:
             await work
         except Exception as error:
@@ -416,8 +407,7 @@ class Runner(Playing):
                 await self.trials.follow(row.id, event.last_sample_unix_s)
         if row.state == "identifying":
             self._release(event.test_id)
-            with self.tracer.step("identification", root=current_span.get() is None):
-                await self.lifecycle.identify(row.id, event.last_sample_unix_s)
+            await self.lifecycle.identify(row.id, event.last_sample_unix_s)
 
     def _release(self, test_id: str) -> None:
         """The rig is free again; the identification goes on beside it."""

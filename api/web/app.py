@@ -20,8 +20,7 @@ from stimrig.api.store.holds import ServiceLock
 from stimrig.api.version import software_version
 from stimrig.api.web import openapi, pages, problems, routes
 from stimrig.api.web.dependencies import build
-from stimrig.api.web.middleware import BodyLimit, Headers, LookAgain, StrictBody
-from stimrig.api.web.traced import Traced
+from stimrig.api.web.middleware import BodyLimit, Headers, LookAgain, RequestId, StrictBody
 from stimrig.api.workers.pool import WORKER
 
 
@@ -73,7 +72,7 @@ def create_app(
     app.add_middleware(LookAgain, context=context)
     app.add_middleware(StrictBody)
     app.add_middleware(BodyLimit, context=context)
-    app.add_middleware(Traced, tracer=context.tracer)  # the last one added stands outside
+    app.add_middleware(RequestId)  # the last one added stands outside
     problems.install(app)
     openapi.describe(app)
     return app

@@ -22,8 +22,6 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.models.trend import Trend
-from stimrig.api.operation.clock_watch import LOOK_S, ClockWatch
-from stimrig.api.operation.telemetry import Telemetry
 from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock, Principal, Scope
 from stimrig.api.people.pace import Guesses
@@ -65,7 +63,7 @@ class Context:
             set_zone(settings.time_zone)
         store = Store(settings.database)
         self.clock, self.store, self.started_s = clock, store, time.monotonic()
-        self.settings, self.lock, self.clock_watch = settings, lock, ClockWatch(clock)
+        self.settings, self.lock = settings, lock
         guesses = self.guesses = Guesses(clock)
         idle = IdleLock(store, clock, settings.idle_lock_min)
         self.auth = Auth(store, clock, guesses, idle, settings.session_hours)
@@ -74,7 +72,6 @@ class Context:
         )
         self.people = People(store, clock, self.auth, guesses)
         self.versions = Versions(store, clock)
-        self.tracer = Telemetry(settings)
         rig = self.rig = RigClient(settings.rig_socket, clock)
         pool = self.pool = Pool(settings.workers, worker, places(settings, store))
         self.analyses = Analyses(store, clock, pool, self.versions, settings)
@@ -85,18 +82,17 @@ class Context:
         trials = Trials(rig, store, clock, self.tracked, tracker)
         self.runner = Runner(
             store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
-            Follower(store, self.holds, settings.rig), self.tracer,
+            Follower(store, self.holds, settings.rig),
         )  # fmt: skip
         self.trend, self.jobs = Trend(store, clock, pool), Jobs(pool)
         self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
         stop_key = shared_secret(store, "stop-right")
         self.stop_rights = StopRights(stop_key, clock)
-        self._tasks: list[asyncio.Task[None]] = []
+        self._flushing: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open; begin the regular work."""
         await asyncio.to_thread(uploads.settle, self.settings.recordings_dir, self.store)
-        await asyncio.to_thread(self.clock_watch.look)
         self.rig.start()
         self.pool.warm()
         for _ in range(20):  # a rig that is there answers within milliseconds
@@ -104,17 +100,15 @@ class Context:
                 break
             await asyncio.sleep(0.05)
         await self.runner.resume()
-        regular = [(FLUSH_S, self.auth.idle.flush), (LOOK_S, self.clock_watch.look)]
-        self._tasks = [asyncio.create_task(_repeat(every_s, work)) for every_s, work in regular]
+        self._flushing = asyncio.create_task(_repeat(FLUSH_S, self.auth.idle.flush))
 
     async def close(self) -> None:
         """Let everything go."""
         for part in (self.runner, self.jobs, self.pool, self.rig):
             await part.close()
         self.holds.close()
-        await asyncio.to_thread(self.tracer.close)
-        for task in self._tasks:
-            task.cancel()
+        if self._flushing is not None:
+            self._flushing.cancel()
         with contextlib.suppress(SQLAlchemyError):
             await asyncio.to_thread(self.auth.idle.flush)
         self.people.close()

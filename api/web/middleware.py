@@ -6,6 +6,7 @@ import asyncio
 import json
 import logging
 import re
+import secrets
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -17,6 +18,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from stimrig.api.clock import asked_s
 from stimrig.api.errors import ApiError
+from stimrig.api.logs import current_request
 from stimrig.api.store import seen
 from stimrig.identify.json_text import BadJson, NotJson, parse
 
@@ -192,6 +194,15 @@ REFUSALS = {
     "408": "the body did not come in time",
     "413": "the body is too long",
 }
+
+
+class RequestId(HttpMiddleware):
+    """Give each request an id of its own, which its log lines carry; an id that a client sends could hold anything."""
+
+    async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """As the base class."""
+        current_request.set(secrets.token_hex(8))
+        await self.app(scope, receive, send)
 
 
 class StrictBody(HttpMiddleware):

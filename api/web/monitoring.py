@@ -11,7 +11,6 @@ from typing import get_args
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from stimrig.api.operation import state
 from stimrig.api.store.tables import Model, Participant, Test
 from stimrig.api.version import software_version
 from stimrig.api.web.dependencies import Context
@@ -113,21 +112,6 @@ def _jobs(context: Context) -> Iterator[Metric]:
 
 
 def _operation(context: Context) -> Iterator[Metric]:
-    """The process, its machine's clock, and the backups."""
-    kept, watch = state.read(context.settings.data_dir), context.clock_watch
-    by_service, error_s = watch.synchronised.by_service, watch.synchronised.error_s
+    """The process."""
     yield by_label("stimrig_build_info", "1; the label names the release", "version", {software_version(): 1.0})
-    yield from gauges((
-        ("stimrig_up_seconds", "Time since start", time.monotonic() - context.started_s),
-        ("stimrig_backup_created_timestamp_seconds", "When the newest backup was made; 0: never", kept.created_unix_s),
-        ("stimrig_backup_bytes", "Its size", kept.created_bytes),
-        ("stimrig_backup_verified_timestamp_seconds", "When one was last restored for trial, and held; 0: never",
-         kept.verified_unix_s),
-        ("stimrig_backup_failed", "1 where the last trial found something wrong", float(bool(kept.problem))),
-        ("stimrig_clock_synchronised", "1: a time service sets the clock; 0: none; -1: not known",
-         known(by_service)),
-        ("stimrig_clock_error_seconds", "The kernel's bound for its error; -1: not known",
-         known(error_s)),
-        ("stimrig_clock_jump_seconds", "How far the clock jumped last; 0: it has not", watch.last_jump_s),
-    ))  # fmt: skip
-    yield CounterMetricFamily("stimrig_clock_jumps_total", "Jumps of the clock by more than 2 s", watch.jumps)
+    yield from gauges((("stimrig_up_seconds", "Time since start", time.monotonic() - context.started_s),))

@@ -18,7 +18,6 @@ from pathlib import Path
 from pydantic import ValidationError
 
 from stimrig.rig.control.replies import id_of, internal_error, refusal, to_line
-from stimrig.rig.control.trace import with_steps
 from stimrig.rig.errors import ConfigError, RigError
 from stimrig.rig.messages import Reply, StopEvidence
 from stimrig.rig.requests import StopRequest
@@ -104,15 +103,13 @@ class StopServer:
 
     async def answer(self, line: bytes) -> Reply:
         """Stop the rig, also where the request cannot be read; the reply contains the evidence."""
-        came_unix_s = time.time()
         try:
             request = StopRequest.model_validate_json(line)
         except ValidationError:
             request = StopRequest(id=id_of(line), reason=UNREADABLE)
         try:
             evidence = await asyncio.wrap_future(self._stop(request.reason, request.by))
-            told = with_steps(evidence, request.traceparent, came_unix_s)
-            return Reply(id=request.id, ok=True, body=told.model_dump(mode="json"))
+            return Reply(id=request.id, ok=True, body=evidence.model_dump(mode="json"))
         except RigError as error:
             return refusal(request.id, error)
         except Exception as error:

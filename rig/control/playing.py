@@ -20,7 +20,6 @@ from stimrig.rig.control.memory import Rest
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
-from stimrig.rig.control.trace import Steps
 from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError, WithdrawnError
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import Event, Extended, FinishedEvent, StopEvidence, Withdrawn
@@ -56,7 +55,6 @@ class Player:
         """Tests that must not begin any more, and why: the newest ones."""
         self._halt: Halt | None = None
         self._key = ""
-        self._steps: Steps | None = None
 
     def refuse_withdrawn(self, test_id: str) -> None:
         """Raise WithdrawnError if that test was withdrawn meanwhile."""
@@ -65,18 +63,18 @@ class Player:
 
     async def launch(
         self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Phase, angle: dict[str, Any] | None,
-        key: str = "", steps: Steps | None = None,
+        key: str = "",
     ) -> None:  # fmt: skip
         """Create latch file and journal, then play: for every test and every train of a calibration.
 
         From here on a stop ends this test, also while its files are being made. Raises RigError: it does not begin.
 
         `following`: the state from now on. `angle`: what the journal says of the angle sensor; None: there is none.
-        `key`: what extensions of an adaptive test must know. `steps`: who started it may trace it.
+        `key`: what extensions of an adaptive test must know.
         """
         state, before, halt = self.state, self.state.phase, Halt(self._clock)
         halt.on_set(lambda: self._ending(halt))
-        self._halt, self.evidence, self._key, self._steps = halt, None, key, steps
+        self._halt, self.evidence, self._key = halt, None, key
         self.evidence_ready.clear()
         state.change(following)
         try:
@@ -194,8 +192,6 @@ class Player:
                 await self.rest.pulse_at(result.last_pulse_s if confirmed else self._clock.now_s(), ended=confirmed)
             self.state.change(self.state.phase.ended())
             finished = await self.tasks.work(self.store.finish, run.journal.path, run.plan.test_id, result)
-            if self._steps is not None and (traced := self._steps.told(run, result)) is not None:
-                finished = finished.model_copy(update={"traced": traced})
             await self._finish(run, result, finished)
         except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
             log.exception("the test could not be ended properly")

@@ -22,7 +22,6 @@ from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
 from stimrig.rig.control.replies import internal_error, refusal
 from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
-from stimrig.rig.control.trace import Steps
 from stimrig.rig.errors import ConfigError, DeviceError, LatchChangedError, PlanError, RigError
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
@@ -184,8 +183,8 @@ class Rig:
         await self.state.written()  # of a stop that came meanwhile
         self._folder_lock.__exit__(None, None, None)
 
-    async def start(self, request: TestPlan, key: str = "", traceparent: object = None) -> Status:
-        """Start a test; `key` is what extensions of an adaptive test must know. `traceparent`: see `Steps`.
+    async def start(self, request: TestPlan, key: str = "") -> Status:
+        """Start a test; `key` is what extensions of an adaptive test must know.
 
         Raises
         ------
@@ -200,7 +199,7 @@ class Rig:
         JournalError, RigError
             The journal or the latch file cannot be written.
         """
-        state, steps = self.state, Steps(traceparent, self._clock)
+        state = self.state
         state.phase.may_start()  # before its turn: a start that was asked for while stopped must not run later
         latch = state.latch
         await self.joint.await_angle(request)
@@ -225,9 +224,8 @@ class Rig:
             self.rest.check(test, table["rest_between_tests_s"])
             self.joint.check(request, table)
             self.player.refuse_withdrawn(request.test_id)
-            steps.passed("checked")
             # nothing is waited for from here until it can be halted
-            await self.player.launch(test, table, following, self.joint.described(), key, steps)
+            await self.player.launch(test, table, following, self.joint.described(), key)
         return self.status()
 
     async def angle_pose(self, request: AnglePoseRequest) -> Status:
@@ -330,7 +328,7 @@ class Rig:
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
 _DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
-    "start": lambda rig, asked: rig.start(asked.plan, asked.key, asked.traceparent),
+    "start": lambda rig, asked: rig.start(asked.plan, asked.key),
     "stop": lambda rig, asked: rig.stop(asked.reason, asked.by),
     "withdraw": lambda rig, asked: rig.player.withdraw(asked),
     "extend": lambda rig, asked: rig.player.extend(asked),

@@ -51,7 +51,6 @@ def test_sound_machine_exits_0_and_one_json_object(tmp_path: Path, capsys: pytes
         "data folder",
         "disk",
         "disk speed",
-        "clock",
         "wake-up",
         "priority",
         "compiled code",
@@ -114,8 +113,8 @@ def test_open_door_fails(tmp_path: Path) -> None:
 
 
 def test_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "check_clock", Mock(side_effect=RuntimeError("no such thing")))
-    assert "no such thing" in finding("clock", data_dir=tmp_path).says
+    monkeypatch.setattr(doctor, "check_wake_up", Mock(side_effect=RuntimeError("no such thing")))
+    assert "no such thing" in finding("wake_up", data_dir=tmp_path).says
 
 
 def test_log_lines_are_json_with_the_tests_id(client: httpx.Client, participant: str) -> None:

@@ -1,120 +1,111 @@
-"""`stimrig backup`: make a backup of database and recordings, restore it for trial and compare, put it back."""
+"""`stimrig backup`: copy the database, the recordings and the journals into one folder, with checked hashes."""
 
 from __future__ import annotations
 
+import contextlib
+import hashlib
+import json
+import shutil
 import sqlite3
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import closing
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
+from sqlalchemy.engine import make_url
 
-from stimrig.api.cli.errors import CommandError
+from stimrig.api.cli.commands.audit import DataDir, settings_of
+from stimrig.api.cli.errors import CommandError, InputError
 from stimrig.api.cli.terminal import Json, say, say_json
-from stimrig.api.clock import Clock
-from stimrig.api.operation import state
-from stimrig.api.operation.copying import BackupError, manifest, size_of
-from stimrig.api.progress_bar import progress_bar
+from stimrig.api.store.copies import copy_database
+from stimrig.api.store.database import sqlite_file
+from stimrig.api.whole_file import sha256_of, to_disk
 
-RIG_DATA, API_DATA = Path("/var/lib/stimrig/rig"), Path("/var/lib/stimrig/api")
-RigData = Annotated[Path, typer.Option(help="the rig's data folder; of `stimrig serve` the same for both")]
-ApiData = Annotated[Path, typer.Option("--data", help="the service's data folder, with the database")]
-Backup = Annotated[Path, typer.Argument(help="folder that `stimrig backup create` has made", metavar="BACKUP")]
+DATABASE, SUMS = "api/stimrig.db", "SHA256SUMS"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb and what it can do."""
-    verbs = typer.Typer(no_args_is_help=True, help="Make a backup, restore it for trial, put it back.")
-    verbs.command("create")(create)
-    verbs.command("verify")(verify)
-    verbs.command("restore")(restore)
-    app.add_typer(verbs, name="backup")
-
-
-def create(
-    to: Annotated[Path, typer.Option(help="folder for backups, best on another disk")],
-    rig_data: RigData = RIG_DATA,
-    api_data: ApiData = API_DATA,
+def backup(
+    to: Annotated[Path, typer.Argument(help="folder for backups, best on another disk", metavar="FOLDER")],
+    data: DataDir = None,
+    rig_data: Annotated[Path | None, typer.Option(help="the rig's data folder, where it has one of its own")] = None,
     as_json: Json = False,
 ) -> None:
-    """A checked copy of database, recordings, journals and latch; also while a test runs."""
-    from stimrig.api.operation import backup
-
-    with one_line(), progress_bar() as tell:
-        done = backup.create(rig_data, api_data, to, tell)
-        made, size = manifest(done), size_of(done)
-    with suppress(OSError):  # the backup is there all the same
-        state.note(api_data, created_utc=made["created_utc"], created_bytes=size)
-    found = {"backup": str(done), "files": len(made["sha256"]), "bytes": size}
-    tell_found(found, f"{done}: {found['files']} files, {size / 1e6:.1f} MB, each with its SHA-256", as_json)
-
-
-def verify(
-    backup: Backup,
-    place: Annotated[Path | None, typer.Option(help="folder to restore it in for trial; default: beside it")] = None,
-    api_data: ApiData = API_DATA,
-    as_json: Json = False,
-) -> None:
-    """Restore a backup into a new place, compare all of it, remove the place. Exit 1: something does not hold."""
-    from stimrig.api.operation import drill
-
-    now = Clock().utc()
+    """Copy database, recordings and journals into a new folder below FOLDER, and check it; also while a test runs."""
+    settings = settings_of(data)
+    database = sqlite_file(make_url(settings.database))
+    if database is not None and not database.is_file():
+        raise InputError(f"{database}: there is no database. Give the data folder with --data.")
+    created = to / f"stimrig-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
+    partial = created.with_name(f"{created.name}.partial")
     try:
-        with one_line(), progress_bar() as tell:
-            found = drill.verify(backup, place, tell)
-    except CommandError as error:
-        if error.exit_code == 1:  # else nothing was tried
-            _note(api_data, failed_utc=now, problem=str(error))
-        raise
-    told = {"verified_utc": now, "verified_of_utc": found.created_utc, "verified_s": found.seconds}
-    noted = _note(api_data, **told, failed_utc="", problem="")
-    words = [
-        f"restored and compared in {found.seconds:g} s: {found.files_same} files ({found.bytes / 1e6:.1f} MB) with the "
-        "same SHA-256",
-        f"database: sound, {found.rows} rows{', as when it was made' if found.rows_compared else ''}",
-        f"{found.recordings} recordings opened, {found.models} models read",
-        *([] if noted else [f"not noted: {api_data} is not there, or may not be written"]),
-    ]
-    tell_found(found.as_dict() | {"noted": noted}, "\n".join(words), as_json)
+        to.mkdir(parents=True, exist_ok=True)
+        partial.mkdir(mode=0o700)
+        # the database first: the files that it names are there by then, and are copied after it
+        sums = {} if database is None else {DATABASE: copy_database(database, partial / DATABASE)}
+        sums |= copy_files(partial, rig_data or settings.data_dir, settings.data_dir)
+        if database is not None:
+            check_recordings(partial / DATABASE, sums)
+        (partial / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())), "utf-8")
+        to_disk(partial / SUMS)
+        partial.rename(created)
+        to_disk(to)
+    except (OSError, sqlite3.Error, CommandError) as error:
+        shutil.rmtree(partial, ignore_errors=True)
+        raise CommandError(f"{error}. No backup was made.") from error
+    size = sum((created / name).stat().st_size for name in sums)
+    if as_json:
+        say_json({"backup": str(created), "files": len(sums), "bytes": size, "database": database is not None})
+        return
+    say(f"{created}: {len(sums)} files, {size / 1e6:.1f} MB; `sha256sum --check {SUMS}` checks them again")
+    if database is None:
+        say("The database is not in it. Before each backup of the files make a dump: pg_dump --format=custom")
 
 
-def _note(api_data: Path, **told: Any) -> bool:
-    """Keep when it was tried, for `stimrig doctor` and the service's figures; False: there is no place for it."""
-    try:
-        state.note(api_data, **told)
-    except OSError:
-        return False
-    return True
+def copy_files(target: Path, rig_data: Path, api_data: Path) -> dict[str, str]:
+    """Copy journals, recordings and the latch; return the SHA-256 of each by its name in the backup.
+
+    Recordings are looked for after the journals were copied, so a test that ends meanwhile is not lost. One folder for
+    rig and service counts as the rig's; `recordings/rig` of the service is the rig's own folder, mounted there.
+    """
+    places = [(rig_data, "rig", "journals"), (rig_data, "rig", "recordings")]
+    places += [(api_data, "api", "recordings")] if api_data.resolve() != rig_data.resolve() else []
+    sums = {}
+    for root, label, folder in places:
+        for path in sorted((root / folder).rglob("*")):
+            name = label / path.relative_to(root)
+            if path.is_symlink() or path.name.startswith(".") or name.parts[:3] == ("api", "recordings", "rig"):
+                continue  # a hidden file is still being written
+            with contextlib.suppress(FileNotFoundError) if folder == "journals" else contextlib.nullcontext():
+                if path.is_file():
+                    sums[str(name)] = write(target / name, path.read_bytes())
+    sealed = {Path(name).stem.partition("Z_")[2] for name in sums if "/recordings/" in name}
+    for name in [name for name in sums if "/journals/" in name and Path(name).stem in sealed]:
+        (target / name).unlink()
+        del sums[name]
+    latch = rig_data / "latch.json"
+    content = latch.read_bytes() if latch.is_file() else b'{"state": "latched"}'
+    if b'"latched"' in content:  # of any other state the rig comes up uncertain, which says more
+        content = json.dumps({"state": "latched", "reason": f"the data were restored from {target.stem}"}).encode()
+    return sums | {"rig/latch.json": write(target / "rig/latch.json", content)}
 
 
-def restore(
-    backup: Backup,
-    rig_data: RigData = RIG_DATA,
-    api_data: ApiData = API_DATA,
-    force: Annotated[bool, typer.Option("--force", help="where data are: set them aside, then restore")] = False,
-    as_json: Json = False,
-) -> None:
-    """Put a backup back: into empty data folders, or with what is there set aside. The rig comes up latched."""
-    from stimrig.api.operation import restore as back
-    from stimrig.api.operation.copying import Meter
-
-    with one_line(), progress_bar() as tell:
-        words = back.restore(backup, rig_data, api_data, force, Meter(tell, 3 * size_of(backup))).words
-    tell_found({"restored": words}, "\n".join(words), as_json)
+def write(path: Path, content: bytes) -> str:
+    """Write a file to the disk, read it again and return its SHA-256. Raises OSError: it is another one."""
+    path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+    path.write_bytes(content)
+    to_disk(path)
+    if (digest := sha256_of(path)) != hashlib.sha256(content).hexdigest():
+        raise OSError(f"{path}: differs from what was written; is the disk sound?")
+    return digest
 
 
-def tell_found(found: dict[str, Any], words: str, as_json: bool) -> None:
-    """One object, or lines for people."""
-    say_json(found) if as_json else say(words)
-
-
-@contextmanager
-def one_line() -> Iterator[None]:
-    """What goes wrong, as a line and an exit code."""
-    try:
-        yield
-    except BackupError as error:
-        raise CommandError(str(error), error.code) from error
-    except (OSError, sqlite3.Error) as error:
-        raise CommandError(str(error)) from error
+def check_recordings(database: Path, sums: dict[str, str]) -> None:
+    """Raise CommandError if a recording that the database names is not in the backup as the database knows it."""
+    copied = {Path(name).name: digest for name, digest in sums.items()}
+    with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as opened:
+        rows = opened.execute("SELECT path, file_sha256 FROM recordings").fetchall()
+    for path, digest in rows:
+        if copied.get(Path(path).name) != digest:
+            state = "differs from what the database says" if Path(path).name in copied else "is missing"
+            raise CommandError(f"{path}: the recording {state}")

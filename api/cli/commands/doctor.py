@@ -26,8 +26,6 @@ Verdict = Literal["ok", "care", "fails"]
 LEAST_FREE_GB, GOOD_FREE_GB = 0.5, 5.0
 SENDER_PRIORITY = 50
 LATE_MS, SLOW_DISK_MS = 5.0, 200.0
-LONGEST_BACKUP_D, LONGEST_DRILL_D = 2.0, 90.0
-"""Days since a backup was made, and since one was restored for trial."""
 
 
 @dataclass(frozen=True)
@@ -211,39 +209,8 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "fails", f"the audit trail is broken at entry {broken}", fix)
 
 
-def check_backup(settings: Settings) -> Iterator[Finding]:
-    """Is there a backup that was restored for trial? Nothing on a machine that has no database yet."""
-    if settings.database_url is not None or not (settings.data_dir / "stimrig.db").exists():
-        return
-    from stimrig.api.clock import Clock
-    from stimrig.api.operation import state
-
-    kept, now_s = state.read(settings.data_dir), Clock().unix_s()
-    says = f"newest made {kept.created_utc or 'never'}; restored for trial {kept.verified_utc or 'never'}"
-    if kept.problem:
-        yield Finding(
-            "backup", "care", f"{says}; a trial of {kept.failed_utc} failed: {kept.problem}", "make a new one"
-        )
-    elif not (now_s - kept.created_unix_s <= LONGEST_BACKUP_D * 86400):
-        yield Finding("backup", "care", says, "stimrig backup create --to FOLDER; docs/operation.md")
-    elif not (now_s - kept.verified_unix_s <= LONGEST_DRILL_D * 86400):
-        yield Finding("backup", "care", says, "stimrig backup verify BACKUP restores it for trial")
-    else:
-        yield Finding("backup", "ok", says)
-
-
-def check_clock(_settings: Settings) -> Iterator[Finding]:
-    """Is UTC a label to be trusted, and does this machine wake up in time?"""
-    from stimrig.api.operation.clock_watch import ask_machine
-
-    found = ask_machine()
-    if found.by_service:
-        error = "" if found.error_s is None else f", its error at most {found.error_s * 1e3:.0f} ms"
-        yield Finding("clock", "ok", f"set by NTP{error}")
-    else:
-        says = "not set by NTP" if found.by_service is False else "it is not known whether NTP sets it"
-        fix = "timedatectl set-ntp true; without a network set it by hand: recordings and approvals carry its date"
-        yield Finding("clock", "care", says, fix)
+def check_wake_up(_settings: Settings) -> Iterator[Finding]:
+    """Does this machine wake up in time?"""
     late_ms = []
     for _ in range(200):
         began = time.perf_counter()
@@ -325,7 +292,7 @@ def doctor(
     socket: Annotated[Path | None, typer.Option(help="a running rig's socket, or STIMRIG_RIG_SOCKET")] = None,
     as_json: Json = False,
 ) -> None:
-    """Check devices, permissions, clock, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
+    """Check devices, permissions, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
     found = examine(Settings(**given(rig_file=rig, data_dir=data, rig_socket=socket)))
     report = as_dict(found)
     if as_json:

@@ -264,22 +264,12 @@ class UploadOut(Document):
     warnings: list[str]
 
 
-class ClockHealth(Document):
-    """The machine's clock, which labels files and entries. No decision on time reads it."""
-
-    synchronised: bool | None = Field(description="whether a time service sets it; null: not known")
-    jumps: int = Field(description="by more than 2 s against the monotonic clock, since the service's start")
-    last_jump_s: float | None = Field(description="how far, s; null: none")
-    last_jump_utc: str | None = Field(description="when, by the new time")
-
-
 class HealthOut(Document):
     """Whether the service does its work."""
 
     status: Literal["ok", "degraded"]
     database: Literal["ok"]
     rig: RigHealth
-    clock: ClockHealth
     uptime_s: float
 
 

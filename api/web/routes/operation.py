@@ -38,7 +38,6 @@ def health(context: Ctx) -> dict[str, Any]:
         "status": "ok" if context.rig.connected else "degraded",
         "database": "ok",
         "rig": rig,
-        "clock": context.clock_watch.as_dict(),
         "uptime_s": round(time.monotonic() - context.started_s, 1),
     }
 

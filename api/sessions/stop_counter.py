@@ -1,4 +1,4 @@
-"""What the service counts while it runs, for `/metrics`; no label holds anything of a person."""
+"""Counts of stops for `/metrics`; no label holds anything of a person."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STOP_ENDS = ("confirmed", "not-confirmed", "failed")
 """`not-confirmed`: the rig answered without evidence; `failed`: it did not answer."""
 
 
-class Counted:
+class StopCounter:
     """Stops, and how long each took to be confirmed."""
 
     def __init__(self) -> None:
