@@ -15,7 +15,7 @@ from stimrig.api.cli.launcher import Services
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
 from tests.api.conftest import TOKEN, soon, wait_done
-from tests.api.test_operation_wire import all_as_documented
+from tests.api.test_logs import check_log_lines
 from tests.harness.looks_first import LooksFirst
 
 pytestmark = pytest.mark.wire
@@ -39,20 +39,20 @@ def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
     with Services(settings(tmp_path), [], TOKEN) as services, Client(services.url, TOKEN) as rest:
         http = rest.http
         assert http.get("/rig/now").json()["emulated"] is True
-        document = rest.run_test(rest.make_participant("P1")["code"])
+        document = rest.run_test(rest.make_participant("P-SECRET-7")["code"])
         assert document["summary"]["lost_samples"] == 0
         fit = document["fit"]
         assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 90
         curves = http.get(f"{document['model_url']}/curves").json()
         assert {part["name"] for part in curves["segments"]} >= {"rest", "prbs", "ramp", "validate"}
-        preview = http.post("/v1/preview", json={"participant": "P1"}).json()
+        preview = http.post("/v1/preview", json={"participant": "P-SECRET-7"}).json()
         assert preview["torque_time_nms"] is None
         # Where the machine stalled, the model may be poor: then an approval needs a reason.
         reason = "Nobody is stimulated: this test looks at the launcher only."
         http.post(f"{document['model_url']}/approve", json={"reason": reason}).raise_for_status()
-        assert http.post("/v1/preview", json={"participant": "P1"}).json()["torque_time_nms"] > 5
+        assert http.post("/v1/preview", json={"participant": "P-SECRET-7"}).json()["torque_time_nms"] > 5
     assert [child.alive() for child in (services.rig, services.api)] == [False, False]
-    all_as_documented(tmp_path / "logs", document["id"], (TOKEN, "Nobody is stimulated"))
+    check_log_lines(tmp_path / "logs", document["id"], (TOKEN, "P-SECRET-7", "Nobody is stimulated"))
 
 
 def test_only_the_emulator_makes_an_emulated_rig(tmp_path: Path) -> None:

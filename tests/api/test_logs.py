@@ -8,20 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import httpx
 import pytest
 
-from stimrig.api.cli.launcher import Services
-from stimrig.api.client.rest import Client
-from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Participant
-from tests.api.conftest import TOKEN, wait_done
-from tests.harness.looks_first import LooksFirst
 
 DOCS = Path(__file__).parents[2] / "docs" / "operation.md"
 ALWAYS = {"time", "level", "process", "logger", "message"}
-PERSON, CODE, TYPED = "Anna-Schmidt", "P-SECRET-7", "she-felt-unwell"
 
 SAYS = """
 import logging, threading, warnings
@@ -45,6 +38,18 @@ def documented() -> set[str]:
     """The fields of log lines."""
     rows = DOCS.read_text("utf-8").partition("| field | is |")[2].partition("\n\n")[0].splitlines()[2:]
     return {name for row in rows for name in re.findall(r"`(\w+)`", row.split("|")[1])}
+
+
+def check_log_lines(folder: Path, test_id: str, secrets: tuple[str, ...]) -> None:
+    """Assert that every line of rig and service is an object with the fields of the docs and holds no secret."""
+    found = [line for path in folder.glob("*.log") for line in path.read_text("utf-8").splitlines()]
+    lines = [json.loads(line) for line in found]
+    assert all(set(line) >= ALWAYS and set(line) <= documented() for line in lines)
+    assert not [line for line in found for word in secrets if word in line]
+    assert {line["process"] for line in lines if line.get("test_id") == test_id} >= {"service", "rig"}
+    assert any("uvicorn" in line["logger"] for line in lines), "uvicorn's own lines, too"
+    (start,) = (line for line in lines if line["message"].startswith("test requested"))
+    assert start["test_id"] == test_id and start["request_id"], "a line names the request that it comes of"
 
 
 @pytest.mark.parametrize(("module", "process"), [("stimrig.api", "worker"), ("stimrig.rig", "lsl")])
@@ -79,29 +84,3 @@ def test_an_error_of_the_database_names_no_participant(tmp_path) -> None:
                 session.add(Participant(code="P017-secret", profile={}, created_utc="", created_by="Anna"))
     assert "P017" not in str(told.value) and "Anna" not in str(told.value)
     store.close()
-
-
-@pytest.mark.wire
-def test_no_log_line_names_anybody(tmp_path: Path) -> None:
-    """Of the rig's process and the service, over a test and a stop; each is an object with the fields of the docs."""
-    rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 1.0}}
-    widths = {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [150.0] * 200, "jumps": True}}
-    asked = {"participant": CODE, "kind": "sequence", "segments": [rest, widths, rest]}
-    password = "a long enough password"
-    settings = Settings(data_dir=tmp_path, port=0)
-    with Services(settings, ["--speed", "4"], TOKEN) as services, Client(services.url, TOKEN) as admin:
-        admin.http.post("/v1/users", json={"name": PERSON, "password": password}).raise_for_status()
-        token = admin.issue_token(PERSON, ["run-test", "rearm", "read-live"])
-        admin.make_participant(CODE)
-        with httpx.Client(base_url=services.url, auth=LooksFirst(token), timeout=60) as person:
-            test_id = person.post("/v1/tests", json=asked).raise_for_status().json()["id"]
-            assert wait_done(admin.http, test_id, 120)["state"] == "completed"
-            person.post("/v1/stop", json={"reason": TYPED}).raise_for_status()
-    found = [line for path in (tmp_path / "logs").glob("*.log") for line in path.read_text("utf-8").splitlines()]
-    lines = [json.loads(line) for line in found]
-    assert all(set(line) >= ALWAYS and set(line) <= documented() for line in lines)
-    assert not [line for line in found for word in (CODE, PERSON, TYPED, TOKEN, token, password) if word in line]
-    assert {line["process"] for line in lines if line.get("test_id") == test_id} >= {"service", "rig"}
-    assert any("uvicorn" in line["logger"] for line in lines), "uvicorn's own lines, too"
-    of_start = {line["request_id"] for line in lines if "requested" in line["message"] and "request_id" in line}
-    assert len(of_start) == 1, "a line names the request that it comes of"
