@@ -4,8 +4,8 @@
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. The records come from the emulator's physics, whose
 equations are not the library's. Each set is scored as the goals of issue 4 ask. `--recorder` gives the same records as
-other recorders do (`hardware_sim.recorders`; `both` is plain,real; `joined`: the patient tested twice, a minute apart),
-side by side. Of the set `kept` only totals are told: nobody who tunes should learn what is in it.
+other recorders do (`bench.muscles.recorders`; `both` is plain,real; `joined`: the patient tested twice, a minute
+apart), side by side. Of the set `kept` only totals are told: nobody who tunes should learn what is in it.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ PAIRS = (
 
 def as_joined(made: dict[str, Any], kind: str, seed: int) -> tuple[Record, dict[str, Any]]:
     """Two tests of one patient, each as its own recorder gives it, as one record; and what the first recorder did."""
-    from stimrig.hardware_sim.recorders import recorded
+    from bench.muscles.recorders import recorded
 
     time_s = made["time_s"]
     cut = int(np.argmax(np.diff(time_s))) + 1
@@ -68,8 +68,8 @@ def as_joined(made: dict[str, Any], kind: str, seed: int) -> tuple[Record, dict[
 
 def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
     """One record diagnosed; None where the generator can't make it."""
-    from stimrig.hardware_sim.hidden_records import generate
-    from stimrig.hardware_sim.recorders import recorded
+    from bench.muscles.hidden_records import generate
+    from bench.muscles.recorders import recorded
 
     workers.WORKERS = 1
     effect, strength, seed, options = job
@@ -130,7 +130,8 @@ def _structure_said(result: dict[str, Any]) -> bool:
 
 def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str, Any]]]:
     """What a set is made of."""
-    from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS, OUTSIDERS_HELD_BACK
+    from bench.muscles.outsiders_held_back import OUTSIDERS_HELD_BACK
+    from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS
 
     seeds = list(seeds)
     if kind == "single":
@@ -272,7 +273,7 @@ def _confusions(rows: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def _recorders(text: str) -> list[str]:
-    from stimrig.hardware_sim.recorders import KINDS
+    from bench.muscles.recorders import KINDS
 
     found = [name for word in text.split(",") for name in ({"both": ["plain", "real"]}.get(word) or [word])]
     known = {*KINDS, "joined"}
@@ -287,7 +288,7 @@ def run(arguments: list[str] | None = None) -> None:
     """Make, diagnose, tell."""
     made = parser(__doc__, "1003:1004")
     made.add_argument("--only", default=",".join(SETS))
-    words = "with commas: both, joined, or as in hardware_sim.recorders"
+    words = "with commas: both, joined, or as in bench.muscles.recorders"
     made.add_argument("--recorder", type=_recorders, default=["plain"], help=words)
     settings = made.parse_args(arguments)
     everything = {}

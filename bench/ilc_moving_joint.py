@@ -16,8 +16,8 @@ import numpy as np
 
 from bench.common import ROOT, in_processes, keep, parser, written_by
 from bench.moving_joint import MOVING_JOINT, as_record, guided_tests, joined
-from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
-from stimrig.hardware_sim.arm_records import record
+from bench.muscles.arm_patient import ArmPatient, arm_patient
+from bench.muscles.arm_records import record
 from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
 from stimrig.identify.simulation.pulses import Motion, above_rest

@@ -22,9 +22,9 @@ from typing import Any
 import numpy as np
 
 from bench.common import in_processes, keep, parser, written_by
+from bench.muscles.arm_patient import ArmPatient, arm_patient
+from bench.muscles.arm_records import ENCODER, AngleSensor, record
 from stimrig.api.sessions import joint_plan
-from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
-from stimrig.hardware_sim.arm_records import ENCODER, AngleSensor, record
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.fitting import MOVING_JOINT, fit
 from stimrig.identify.model import Model

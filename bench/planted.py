@@ -21,7 +21,7 @@ LONGEST_S = 1200.0
 SUITES = {
     "simulator": ("-m", "tests.simulator", "--seed", "900000", "--lives", "200", "--first"),
     "unit tests": ("-m", "pytest", "-x", "-q", "-n", "2", "-p", "no:cacheprovider",
-                   "-m", "not realtime and not wire", "tests/rig"),
+                   "-m", "not wire", "tests/rig"),
 }  # fmt: skip
 
 

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from bench.common import parser, seed_range, table
+from bench.muscles.hidden_records import sampled
 from stimrig.hardware_sim.hidden.design import Design, make_design
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario, rng_of
-from stimrig.hardware_sim.hidden_records import sampled
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.fitting import fit
@@ -107,7 +107,7 @@ def _record(scenario: Scenario, design: Design, rng: np.random.Generator | None,
     def noise_nm(count: int) -> np.ndarray:
         return np.zeros(count) if rng is None else sd_nm * rng.standard_normal(count)
 
-    return as_record(sampled(scenario, design, RATE_HZ, 0.0, noise_nm))
+    return as_record(sampled(scenario, design, RATE_HZ, noise_nm))
 
 
 def _unseen(record: Record, truth: Record) -> float:

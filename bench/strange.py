@@ -29,9 +29,9 @@ from typing import Any
 import numpy as np
 
 from bench.common import ROOT, in_processes, keep, line, parser, table
+from bench.muscles.bout_records import Peculiar, record_of_bouts
+from bench.muscles.physics_records import DISTURBED, SETS, alike_record, further_record, record_of_physics
 from stimrig import identify
-from stimrig.hardware_sim.bout_records import Peculiar, record_of_bouts
-from stimrig.hardware_sim.physics_records import DISTURBED, SETS, alike_record, further_record, record_of_physics
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.diagnosis.free import searched
 from stimrig.identify.diagnosis.result import diagnosis_of

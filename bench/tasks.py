@@ -16,10 +16,10 @@ from typing import Any
 import numpy as np
 
 from bench.measured import benchmarks, frogs
+from bench.muscles.bout_records import record_of_bouts
+from bench.muscles.hidden_records import generate
+from bench.muscles.physics_records import record_of_physics
 from bench.strange import repeated
-from stimrig.hardware_sim.bout_records import record_of_bouts
-from stimrig.hardware_sim.hidden_records import generate
-from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify import paper
 from stimrig.identify.records.record import HELD_OUT, Part, Record
 from tests.harness.carried_sessions import as_record

@@ -22,10 +22,10 @@ import numpy as np
 
 from bench.adaptive import paper_test
 from bench.common import keep_lines, parser, table
+from bench.muscles.offline import simulate
 from examples import ilc_controller as ilc
 from stimrig import identify
 from stimrig.hardware_sim import patients
-from stimrig.hardware_sim.offline import simulate
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.tracking import QUANTITIES, follow, model_for_next

@@ -28,7 +28,7 @@ def make_devices(
     Parameters
     ----------
     settings : Settings
-        Its `patient` is a name, the path of a file, `hidden:SEED`, `two_muscles:SEED`, or `SET:SEED` of other physics.
+        Its `patient` is a name, the path of a file, `hidden:SEED` or `two_muscles:SEED`.
     arm : str, optional
         As `--arm` takes it: a mode with settings, or a file; for a hidden patient also `design`. None: the joint is
         held still and has no sensor.

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from stimrig.hardware_sim.hidden.kernels import Floats
 
 PULSES_PER_S = 40
-DESIGNS = ("full", "short", "long")
+DESIGNS = ("full", "short")
 UNRECORDED = "unrecorded"
 """Segment of a pause between two tests."""
 
@@ -22,7 +22,6 @@ class Design:
     width_us: Floats
     segment: np.ndarray
     movement: tuple[Floats, Floats, Floats] | None = None  # frequencies Hz, amplitudes rad, phases rad
-    early_s: float = 0.0  # the pulses come this much before their time
 
     @property
     def held_out(self) -> np.ndarray:
@@ -53,8 +52,7 @@ class Design:
     def fine(self, step_s: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Width, pulse, angle and velocity at every step. Torque at step k depends on widths before k."""
         count = round(self.duration_s / step_s)
-        early = round(self.early_s / step_s)
-        held = np.floor((np.arange(count) - 1 + early) * (step_s * PULSES_PER_S) + 1e-9).astype(int)
+        held = np.floor((np.arange(count) - 1) * (step_s * PULSES_PER_S) + 1e-9).astype(int)
         held = np.minimum(held, self.width_us.size - 1)
         width = np.where(held >= 0, self.width_us[np.maximum(held, 0)], 0.0)
         pulse = np.zeros(count)
@@ -109,7 +107,7 @@ def make_design(
     """A pre-session test.
 
     `full`: rest 2 s, PRBS 12.7 s, rest 3 s, ramp 5 s up and 5 s down, rest 2 s, multi-level `validate`, rest 2 s.
-    `short`: PRBS and ramp only. `long`: full with a second ramp, a staircase and a fast ramp before `validate`.
+    `short`: PRBS and ramp only.
 
     Raises
     ------
@@ -125,9 +123,6 @@ def make_design(
         parts = [bits, ramp]
     else:
         parts = [rest(2), bits, rest(3), ramp, rest(2)]
-        if name == "long":
-            parts += [rest(2), ramp, rest(2), ("staircase", staircase(top_us, 5, 1.2)), rest(1)]
-            parts += [("ramp", triangle(top_us, 1.5)), rest(2)]
         if with_validate:
             parts += [("validate", levels(rng, top_us, validate_s)), rest(2)]
     width = np.asarray(np.round(np.concatenate([w for _, w in parts])), dtype=np.float64)  # stimulators set whole µs

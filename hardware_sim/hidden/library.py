@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib import import_module
 from pkgutil import iter_modules
+from types import MappingProxyType
 
 from stimrig.hardware_sim.hidden import effects
 from stimrig.hardware_sim.hidden.forms import Effect, Form
 from stimrig.hardware_sim.hidden.outsiders import OUTSIDERS
-from stimrig.hardware_sim.hidden.outsiders_held_back import OUTSIDERS_HELD_BACK
 
 HELD_BACK_FROM = 1000
 """Seeds from here on may also draw an effect's forms that are held back."""
@@ -21,8 +22,8 @@ MOVING = frozenset(name for name, effect in EFFECTS.items() if effect.moving)
 STILL = [name for name in EFFECTS if name not in MOVING]
 
 
-def find_effect(name: str) -> Effect:
-    """The effect of this name.
+def find_effect(name: str, more: Mapping[str, Effect] = MappingProxyType({})) -> Effect:
+    """Return the effect of this name; `more` holds effects beside those of this package.
 
     Raises
     ------
@@ -30,12 +31,11 @@ def find_effect(name: str) -> Effect:
         There is none.
     """
     try:
-        return (EFFECTS | OUTSIDERS | OUTSIDERS_HELD_BACK)[name]
+        return {**EFFECTS, **OUTSIDERS, **more}[name]
     except KeyError:
         raise ValueError(f"effect {name!r}: one of {', '.join((*EFFECTS, *OUTSIDERS))}") from None
 
 
-def find_forms(name: str, seed: int = HELD_BACK_FROM) -> list[Form]:
-    """The forms of an effect; under seed 1000 without those held back from development."""
-    effect = find_effect(name)
+def find_forms(effect: Effect, seed: int = HELD_BACK_FROM) -> list[Form]:
+    """Return the forms of an effect; under seed 1000 without those held back from development."""
     return effect.forms if seed < HELD_BACK_FROM else effect.forms + effect.held_back_forms

@@ -20,7 +20,7 @@ _Saved = tuple[Floats, Floats, float]
 
 
 class Staged(Protocol):
-    """What is made of stages: a scenario, or a muscle of other physics."""
+    """What is made of stages: a scenario, or another muscle."""
 
     @property
     def base(self) -> Base:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from numpy.random import Generator
 from stimrig.hardware_sim.hidden.base import Base, draw_base
 from stimrig.hardware_sim.hidden.chain import combine
 from stimrig.hardware_sim.hidden.design import Design, make_design
-from stimrig.hardware_sim.hidden.forms import Form, Formulation
+from stimrig.hardware_sim.hidden.forms import Effect, Formulation
 from stimrig.hardware_sim.hidden.kernels import NotSuited, Stage
 from stimrig.hardware_sim.hidden.library import EFFECTS, MOVING, STILL, find_effect, find_forms
 from stimrig.hardware_sim.hidden.strength import find_magnitude
@@ -78,11 +80,13 @@ def draw_scenario(
     moving: bool = False,
     pulsed: bool = False,
     design: str = "full",
+    more: Mapping[str, Effect] = MappingProxyType({}),
     **design_settings: Any,
 ) -> Scenario:
     """A scenario with the effects `names`, each of the given strength on its own.
 
-    Bases, formulations and magnitudes are drawn until the strength's band is reached.
+    Bases, formulations and magnitudes are drawn until the strength's band is reached. `more` holds effects beside those
+    of this package.
 
     Raises
     ------
@@ -91,6 +95,7 @@ def draw_scenario(
     """
     if strength not in BANDS:
         raise ValueError(f"strength {strength!r}: one of {', '.join(BANDS)}")
+    effects = [(name, find_effect(name, more)) for name in names]
     moving = moving or bool(MOVING & set(names))
     for attempt in range(ATTEMPTS):
         rng = rng_of(seed, *names, strength, str(attempt))
@@ -100,7 +105,7 @@ def draw_scenario(
         sequence = make_design(design, rng, float(base.largest_width_us), moving=moving, **design_settings)
         try:
             hidden = tuple(
-                _draw_effect(rng, name, strength, noise_sd_nm, base, sequence, find_forms(name, seed)) for name in names
+                _draw_effect(rng, name, effect, strength, noise_sd_nm, base, sequence, seed) for name, effect in effects
             )
             combine(base, [(one.formulation, one.magnitude) for one in hidden])
         except NotSuited:
@@ -111,20 +116,22 @@ def draw_scenario(
 
 def _draw_effect(
     rng: Generator,
-    effect: str,
+    name: str,
+    effect: Effect,
     strength: str,
     noise_sd_nm: float,
     base: Base,
     design: Design,
-    forms: list[Form],
+    seed: int,
 ) -> HiddenEffect:
-    """One effect of this strength on this base, in one of these forms."""
+    """Draw the effect with this strength on this base, in one of the forms that the seed allows."""
     low, high = BANDS[strength]
+    forms = find_forms(effect, seed)
     formulation = forms[int(rng.integers(len(forms)))](rng, base)
     target_nm = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
     band_nm = noise_sd_nm * low, noise_sd_nm * high
-    magnitude, excess = find_magnitude(find_effect(effect).counted, formulation, base, design, target_nm, band_nm)
-    return HiddenEffect(effect, formulation, magnitude, strength, excess)
+    magnitude, excess = find_magnitude(effect.counted, formulation, base, design, target_nm, band_nm)
+    return HiddenEffect(name, formulation, magnitude, strength, excess)
 
 
 def draw_pair(rng: Generator) -> tuple[str, str]:

@@ -14,13 +14,13 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from bench.muscles import hidden_records
 from stimrig import identify
 from stimrig.api.cli import main
 from stimrig.api.cli.commands.explain import story_lines
 from stimrig.api.models.explanation import place
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.workers import verbs
-from stimrig.hardware_sim import hidden_records
 from stimrig.identify.healing import place_words
 from stimrig.identify.records.join import write_joined
 from tests.api.test_worker import made_up_csv

@@ -32,7 +32,7 @@ def error_of(row: Any) -> float:
 
 
 def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service: Service, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "stimrig.hardware_sim.hidden_records", "--out", str(tmp_path), *HIDDEN]
+    command = [sys.executable, "-m", "bench.muscles.hidden_records", "--out", str(tmp_path), *HIDDEN]
     subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
     (record,) = tmp_path.glob("*.csv")
     participant(tab, service, "H1")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from stimrig.hardware_sim import hidden_records
+from bench.muscles import hidden_records
 from tests.harness.processes import READY_TIMEOUT_S
 
 BUSY = """

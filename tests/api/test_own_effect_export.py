@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from bench.muscles.physics_records import record_of_physics
 from stimrig import identify
 from stimrig.api.cli.commands.effects import effects
 from stimrig.api.cli.errors import InputError
-from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.effects import own_file
 from tests.harness.carried_sessions import as_record
 

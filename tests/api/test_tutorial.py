@@ -24,7 +24,7 @@ def blocks(language: str) -> list[str]:
 @pytest.mark.slow
 def test_every_block_runs_in_order(tmp_path: Path) -> None:
     (command,) = blocks("sh")
-    assert command.startswith("python -m stimrig.hardware_sim.hidden_records")
+    assert command.startswith("python -m bench.muscles.hidden_records")
     words = [sys.executable, *command.split()[1:]]
     words[words.index("data")] = str(tmp_path)
     subprocess.run(words, check=True, cwd=ROOT, capture_output=True)

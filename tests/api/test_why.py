@@ -12,10 +12,10 @@ import h5py
 import httpx
 import pytest
 
+from bench.muscles import hidden_records
 from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.web.pages.report_file import missing_parts
-from stimrig.hardware_sim import hidden_records
 from stimrig.identify import effects
 from stimrig.identify.conclusion import conclude, why_ended
 from tests.api.conftest import Service, csrf, run_test, signed_in, soon, wait_done

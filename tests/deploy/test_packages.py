@@ -16,8 +16,8 @@ from pathlib import Path
 import pytest
 import yaml
 
+from bench.muscles import hidden_records
 from stimrig.api.cli.errors import PAGE
-from stimrig.hardware_sim import hidden_records
 
 ROOT = Path(__file__).parents[2]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]

@@ -10,8 +10,8 @@ import h5py
 import numpy as np
 import scipy.io
 
-from stimrig.hardware_sim import arm_records, recorders
-from stimrig.hardware_sim.hidden_records import generate, patient_record, write_csv
+from bench.muscles import arm_records, recorders
+from bench.muscles.hidden_records import generate, patient_record, write_csv
 from tests.frozen.rig_records import KINDS, of_kind
 from tests.harness import cohort_records
 

@@ -7,9 +7,9 @@ import pytest
 from scipy.signal import lsim
 from scipy.stats import weibull_min
 
+from bench.muscles.offline import simulate
 from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.errors import PatientError
-from stimrig.hardware_sim.offline import simulate
 from stimrig.hardware_sim.patients.changing import ChangingMuscle, Parameters
 
 pytestmark = pytest.mark.slow

@@ -7,12 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from bench.muscles.outsiders_held_back import OUTSIDERS_HELD_BACK
 from stimrig.hardware_sim.hidden.base import Base, draw_base
 from stimrig.hardware_sim.hidden.chain import Chain, combine, simulate
 from stimrig.hardware_sim.hidden.design import make_design
 from stimrig.hardware_sim.hidden.forms import Formulation
 from stimrig.hardware_sim.hidden.kernels import NotSuited
-from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS, OUTSIDERS_HELD_BACK, find_forms
+from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS, find_forms
 from stimrig.hardware_sim.hidden.scenario import BANDS, draw_scenario, rng_of
 from stimrig.hardware_sim.hidden.strength import EffectFreeFit, excess_nm
 
@@ -20,8 +21,9 @@ pytestmark = pytest.mark.slow
 
 STEP_S = 1.0 / 1600.0
 NOISE_SD_NM = 0.04
-NAMES = [*EFFECTS, *OUTSIDERS, *OUTSIDERS_HELD_BACK]
-ALL = [(effect, index) for effect in NAMES for index in range(len(find_forms(effect)))]
+KNOWN = {**EFFECTS, **OUTSIDERS, **OUTSIDERS_HELD_BACK}
+NAMES = list(KNOWN)
+ALL = [(effect, index) for effect in NAMES for index in range(len(find_forms(KNOWN[effect])))]
 # noise drawn at each step, or a moment that is rounded to a step and changes all that follows
 RANDOM_BY_STEP = {
     ("voluntary_effort", "effort whenever a slow random drive is high"),
@@ -37,7 +39,7 @@ def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
         rng = rng_of(seed, effect, str(index), str(attempt))
         base = draw_base(rng)
         try:
-            return base, find_forms(effect)[index](rng, base)
+            return base, find_forms(KNOWN[effect])[index](rng, base)
         except NotSuited:
             continue
     raise AssertionError("no suitable base in 30")
@@ -47,7 +49,7 @@ def test_some_effects_are_foreign() -> None:
     """That every effect of the library has its file here: tests/identify/test_effects.py."""
     assert {"rate_dependent_recruitment", "antagonist", "slipped_electrode"} <= set(OUTSIDERS)
     assert len(OUTSIDERS) >= 8 and len(OUTSIDERS_HELD_BACK) >= 5
-    assert len(set(NAMES)) == len(NAMES)
+    assert len(NAMES) == len(EFFECTS) + len(OUTSIDERS) + len(OUTSIDERS_HELD_BACK)
 
 
 @pytest.mark.parametrize(("effect", "index"), ALL)
@@ -62,11 +64,11 @@ def test_magnitude_zero_is_the_base_muscle(effect: str, index: int) -> None:
 
 
 def depends_on_the_step(effect: str, index: int) -> bool:
-    return effect in BY_STEP or (effect, find_forms(effect)[index].name) in RANDOM_BY_STEP
+    return effect in BY_STEP or (effect, find_forms(KNOWN[effect])[index].name) in RANDOM_BY_STEP
 
 
 def test_what_depends_on_the_step_is_there() -> None:
-    known = {(effect, form.name) for effect in EFFECTS for form in find_forms(effect)}
+    known = {(effect, form.name) for effect in EFFECTS for form in find_forms(EFFECTS[effect])}
     assert known >= RANDOM_BY_STEP
     assert set(NAMES) >= BY_STEP
 
@@ -104,7 +106,7 @@ SOME = {(0, ("weak", KEPT_BACK)), (3, ("strong", DEVELOPMENT))}
     ],
 )
 def test_strength_lands_in_its_band(effect: str, strength: str, seed: int) -> None:
-    scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM)
+    scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM, more=OUTSIDERS_HELD_BACK)
     low, high = BANDS[strength]
     assert low <= scenario.hidden[0].excess["counted_nm"] / NOISE_SD_NM <= high
     torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)
@@ -149,7 +151,7 @@ def test_the_base_follows_the_closed_form_step_response() -> None:
 
 def test_formulations_kept_back_are_not_drawn_for_development() -> None:
     for effect in EFFECTS:
-        assert len(find_forms(effect, 1000)) > len(find_forms(effect, 999)) >= 3
+        assert len(find_forms(EFFECTS[effect], 1000)) > len(find_forms(EFFECTS[effect], 999)) >= 3
 
 
 def test_bursts_of_pulses_ripple_about_the_held_width() -> None:

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 import serial
 
+from bench.muscles.offline import simulate
 from stimrig.hardware_sim import load_cells, patients
-from stimrig.hardware_sim.offline import simulate
 from stimrig.hardware_sim.stimulators import STIMULATORS
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2, ScienceMode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config

@@ -10,9 +10,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
+from bench.muscles.offline import simulate
 from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.errors import PatientError
-from stimrig.hardware_sim.offline import simulate
 from stimrig.hardware_sim.patients.calcium import CalciumMuscle
 from stimrig.hardware_sim.patients.paper import PaperMuscle
 from stimrig.hardware_sim.patients.paper import Parameters as PaperParameters

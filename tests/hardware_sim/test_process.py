@@ -112,7 +112,7 @@ BAD_INPUT = {
     "--fault late_ack,delay=1": "no setting 'delay'; it has delay_s",
     "--hidden x": "--hidden",
     "--hidden -5": "give a seed of 0 or above",
-    "--patient /dev/zero": "neither a file nor SET:SEED",
+    "--patient /dev/zero": "neither a file nor one of",
     "--samples-per-frame 2": "--samples-per-frame must be 1 or 3 with --cell plain, not 2",
     "--cell canopen --samples-per-frame 3": "must be 1 with --cell canopen",
     "--wrong": "--wrong",

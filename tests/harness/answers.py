@@ -16,7 +16,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from stimrig.hardware_sim.bout_records import record_of_bouts
+from bench.muscles.bout_records import record_of_bouts
 from stimrig.identify import Record, improve
 from stimrig.identify.diagnosis import side_by_side
 from stimrig.identify.estimation.plain import fit_plain

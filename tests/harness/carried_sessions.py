@@ -8,11 +8,11 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import Any
 
+from bench.muscles.hidden_records import SLOWEST_SIMULATION_HZ, sampled
+from bench.muscles.recorders import recorded
 from stimrig.hardware_sim.hidden import NOISE_SD_NM
 from stimrig.hardware_sim.hidden.design import make_design
 from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario, rng_of
-from stimrig.hardware_sim.hidden_records import SLOWEST_SIMULATION_HZ, sampled
-from stimrig.hardware_sim.recorders import recorded
 from stimrig.identify.records.record import Record
 
 LASTING = (
@@ -68,5 +68,5 @@ def _sampled(
     design = make_design("full", rng_of(seed, "pulses", label), float(of.base.largest_width_us))
     scenario = replace(of, hidden=tuple(of.hidden[index] for index in effects), design=design)
     noise = rng_of(seed, "noise", label)
-    made = sampled(scenario, design, rate_hz, 0.0, lambda count: noise.normal(0.0, NOISE_SD_NM, count))
+    made = sampled(scenario, design, rate_hz, lambda count: noise.normal(0.0, NOISE_SD_NM, count))
     return scenario, made

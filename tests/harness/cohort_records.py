@@ -13,7 +13,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from stimrig.hardware_sim.hidden_records import generate
+from bench.muscles.hidden_records import generate
 
 PULSES_HZ = 40.0
 NOISE_NM = 0.035

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.muscles.physics_records import further_record, record_of_physics
 from stimrig import identify
-from stimrig.hardware_sim.physics_records import further_record, record_of_physics
 from stimrig.identify.estimation.effect_fit import fitted_with
 from stimrig.identify.experiments import plan_further
 from stimrig.identify.experiments.designs import SHAPES, held_levels

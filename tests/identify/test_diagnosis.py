@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
+from bench.muscles.hidden_records import generate
 from stimrig import identify
-from stimrig.hardware_sim.hidden_records import generate
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.errors import Cancelled
 from stimrig.identify.records.record import Record

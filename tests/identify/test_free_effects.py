@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.muscles.physics_records import record_of_physics
 from stimrig import identify
-from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import free, result
 from stimrig.identify.diagnosis.search import resembles_earlier, search_effects, silent
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free

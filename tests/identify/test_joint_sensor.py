@@ -9,9 +9,9 @@ from functools import cache
 import numpy as np
 import pytest
 
+from bench.muscles.arm_patient import arm_patient
+from bench.muscles.arm_records import ENCODER, AngleSensor, record
 from stimrig import identify
-from stimrig.hardware_sim.arm_patient import arm_patient
-from stimrig.hardware_sim.arm_records import ENCODER, AngleSensor, record
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.candidates import SLOW, trusted
 from stimrig.identify.estimation.effect_fit import fitted_with

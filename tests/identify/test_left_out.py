@@ -8,10 +8,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from bench.muscles.bout_records import record_of_bouts
+from bench.muscles.hidden_records import generate
+from bench.muscles.physics_records import record_of_physics
 from stimrig import identify
-from stimrig.hardware_sim.bout_records import record_of_bouts
-from stimrig.hardware_sim.hidden_records import generate
-from stimrig.hardware_sim.physics_records import record_of_physics
 from stimrig.identify.diagnosis import search, thresholds
 from stimrig.identify.diagnosis.residual import vetoed
 from stimrig.identify.diagnosis.search import required_errors

@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.muscles.arm_patient import arm_patient
+from bench.muscles.arm_records import changed, record
 from stimrig import identify
-from stimrig.hardware_sim.arm_patient import arm_patient
-from stimrig.hardware_sim.arm_records import changed, record
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.passive_torque import relaxed

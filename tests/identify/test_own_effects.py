@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 
 import stimrig
+from bench.muscles import hidden_records
 from stimrig.api.cli import main
-from stimrig.hardware_sim import hidden_records
 from stimrig.identify import effects
 from stimrig.identify.effects import own_file
 from tests.harness import few_effects

@@ -8,9 +8,9 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
+from bench.muscles.arm_patient import ArmPatient, arm_patient
+from bench.muscles.arm_records import record
 from stimrig import identify
-from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
-from stimrig.hardware_sim.arm_records import record
 from stimrig.identify.diagnosis.search import search_effects, steps
 from stimrig.identify.estimation.effect_fit import add_effects, fitted_with
 from stimrig.identify.estimation.joint import Fitted

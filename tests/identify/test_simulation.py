@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from bench.muscles.hidden_records import generate
 from stimrig import identify
-from stimrig.hardware_sim.hidden_records import generate
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import fitted_with, try_effect

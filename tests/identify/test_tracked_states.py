@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from bench.muscles.offline import simulate
 from stimrig.hardware_sim import patients
-from stimrig.hardware_sim.offline import simulate
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import registry as effects
 from stimrig.identify.errors import BadModel

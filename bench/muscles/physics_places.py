@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import math
 
+from bench.muscles.mechanism import mechanism
 from stimrig.hardware_sim.hidden.base import delayed, lag_after
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US, helper
-from stimrig.hardware_sim.hidden.mechanism import mechanism
 
 _muscle = {"first_s": (0.03, 0.08), "second_s": (0.08, 0.25)}
 

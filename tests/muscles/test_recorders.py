@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.hidden_records import generate
-from stimrig.hardware_sim.recorders import COUNT_NM, KINDS, SHIFT_S, recorded
+from bench.muscles.hidden_records import generate
+from bench.muscles.recorders import COUNT_NM, KINDS, SHIFT_S, recorded
 
 COLUMNS = ("time_s", "pulse_width_us", "torque_nm", "segment", "angle_rad", "velocity_rad_s")
 

@@ -10,7 +10,6 @@ import json
 import math
 import sys
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import lfilter
 
+from bench.muscles.outsiders_held_back import OUTSIDERS_HELD_BACK
 from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.design import UNRECORDED, Design, make_design
@@ -43,7 +43,6 @@ def generate(
     steep: bool = False,
     moving: bool = False,
     pulsed: bool = False,
-    sampled_late_s: float = 0.0,
     again_after_s: float | None = None,
 ) -> dict[str, Any]:
     """One record.
@@ -60,7 +59,7 @@ def generate(
     rate_hz
         40 to 2000; torque is point-sampled from a simulation at 1600 Hz or more.
     design
-        `full`, `short` (PRBS and ramp only) or `long`.
+        `full` or `short` (PRBS and ramp only).
     noise
         See `draw_noise`; an autocorrelation is drawn between 0.5 and 0.99.
     steep
@@ -69,8 +68,6 @@ def generate(
         The joint moves slowly, `angle_rad` and `velocity_rad_s` are recorded (always so where an effect needs it).
     pulsed
         Each pulse drives the muscle in a burst of 3 to 12 ms about the middle of its period, not over all of it.
-    sampled_late_s
-        The load cell samples this much later than its time stamps say; negative: earlier. Rounded to a simulation step.
     again_after_s
         After this unrecorded rest the patient does a second test of the same design: two records joined, with a jump of
         time between them.
@@ -98,6 +95,7 @@ def generate(
         moving=moving,
         pulsed=pulsed,
         design=design,
+        more=OUTSIDERS_HELD_BACK,
         with_validate=with_validate,
     )
     sequence = scenario.design
@@ -111,7 +109,7 @@ def generate(
     def noise_nm(count: int) -> Floats:
         return draw_noise(noise, rng, count, rate_hz, noise_sd_nm, rho)
 
-    record = sampled(scenario, sequence, rate_hz, sampled_late_s, noise_nm)
+    record = sampled(scenario, sequence, rate_hz, noise_nm)
     conditions = {"kind": noise, "sd_nm": noise_sd_nm}
     if noise == "ar1":
         conditions["rho_40hz"] = round(rho, 5)
@@ -156,12 +154,10 @@ def patient_record(seed: int, moving: bool = False) -> dict[str, Any]:
     scenario = hidden.draw_patient(seed, moving)
     rng = rng_of(seed, "noise of a patient", "moving" if moving else "still")
     noise_nm = lambda count: rng.normal(0.0, hidden.NOISE_SD_NM, count)  # noqa: E731
-    return sampled(scenario, scenario.design, 400.0, 0.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
+    return sampled(scenario, scenario.design, 400.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
 
 
-def sampled(
-    scenario: Scenario, design: Design, rate_hz: float, late_s: float, noise_nm: Callable[[int], Floats]
-) -> dict[str, Any]:
+def sampled(scenario: Scenario, design: Design, rate_hz: float, noise_nm: Callable[[int], Floats]) -> dict[str, Any]:
     """The columns of a record of this design, without its unrecorded rows."""
     every = math.ceil(SLOWEST_SIMULATION_HZ / rate_hz)
     step_s = 1.0 / (rate_hz * every)
@@ -169,9 +165,7 @@ def sampled(
     count = len(range(0, width.size, every))
     fine_noise = np.zeros(width.size)
     fine_noise[::every] = noise_nm(count)
-    # the noise belongs to the samples, so samples that are late are simulated as pulses that are early
-    early = replace(design, early_s=round(late_s / step_s) * step_s)
-    torque = simulate(scenario.base, scenario.stages(), early, step_s, fine_noise)[::every]
+    torque = simulate(scenario.base, scenario.stages(), design, step_s, fine_noise)[::every]
     held = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), design.width_us.size - 1)
     columns: dict[str, Any] = {
         "time_s": np.arange(count) / rate_hz,
@@ -223,7 +217,7 @@ def _record_of(effect: str | None, strength: str, seed: int, settings: argparse.
 
 def main(arguments: list[str] | None = None) -> int:
     """Write a set of records and `truth.json`."""
-    parser = argparse.ArgumentParser(prog="python -m stimrig.hardware_sim.hidden_records", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m bench.muscles.hidden_records", description=main.__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder, made if absent")
     parser.add_argument("--seeds", type=_seeds, default=range(1), help="first:last, last not included")
     parser.add_argument(

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
+from bench.muscles.other_physics import SETS, SIMULATION_HZ, PhysicsMuscle, draw_muscle
 from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, Design, levels, make_design
 from stimrig.hardware_sim.hidden.kernels import Floats
-from stimrig.hardware_sim.hidden.other_physics import SETS, SIMULATION_HZ, PhysicsMuscle, draw_muscle
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
 DISTURBED = {"hum": "mains_hum", "slow zero": "baseline_drift", "breath": ""}

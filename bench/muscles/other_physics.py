@@ -1,22 +1,20 @@
-"""Muscles of other physics as wholes: drawn by set and seed, or made of the numbers that somebody gives."""
+"""Muscles of other physics as wholes, drawn by set and seed."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import TABLE_SIZE, Base, draw_base, recruit
+from bench.muscles.mechanism import Mechanism
+from bench.muscles.physics import FURTHER, PHYSICS
+from bench.muscles.physics_held_back import SEALED
+from bench.muscles.physics_places import PLACES
+from stimrig.hardware_sim.hidden.base import Base, draw_base, recruit
 from stimrig.hardware_sim.hidden.chain import Chain
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S
 from stimrig.hardware_sim.hidden.kernels import Stage
-from stimrig.hardware_sim.hidden.mechanism import Mechanism, in_us
-from stimrig.hardware_sim.hidden.physics import FURTHER, PHYSICS
-from stimrig.hardware_sim.hidden.physics_held_back import SEALED
-from stimrig.hardware_sim.hidden.physics_places import PLACES
-from stimrig.hardware_sim.hidden.recruitment import SHAPES
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
 SETS: dict[str, dict[str, Mechanism]] = {
@@ -27,18 +25,9 @@ SETS: dict[str, dict[str, Mechanism]] = {
     "plain": {},
 }
 """Kinds of muscles, which seeds take in turn; those of `plain` are of the library's own structure, and lack nothing."""
-OPEN = PHYSICS | FURTHER | PLACES
-"""Those that can be made of given numbers."""
 SIMULATION_HZ = 1600
 STRENGTH = 0.6
 """Largest torque over that of a drawn plain muscle: 1.8 to 9 N·m."""
-RECRUITMENT = {
-    "largest_nm": (1.8, 9.0, 5.0),
-    "largest_width_us": (250.0, 400.0, 300.0),
-    "middle_us": (60.0, 250.0, 190.0),
-    "rise_us": (26.0, 150.0, 107.0),
-}
-"""Lowest, highest and usual: torque of a fresh train of the largest pulses, their width; the paper's sigmoid curve."""
 
 
 @dataclass(frozen=True)
@@ -81,22 +70,6 @@ def draw_muscle(kinds: str, seed: int, rng: Generator | None = None) -> PhysicsM
         return PhysicsMuscle(base, tuple(base.stages()), "plain", {})
     name = names[seed % len(names)]
     return _scaled(name, SETS[kinds][name], SETS[kinds][name].draw(rng, base), base, STRENGTH * base.largest_nm)
-
-
-def parameters(name: str) -> dict[str, tuple[float, float, float]]:
-    """What a muscle of this kind, of `OPEN`, is made of: lowest, highest and usual value of each number."""
-    usual = OPEN[name].middle()
-    return RECRUITMENT | {key: (*bounds, usual[key]) for key, bounds in OPEN[name].draws.items()}
-
-
-def make_muscle(name: str, given: Mapping[str, float]) -> PhysicsMuscle:
-    """A muscle of this kind, of `OPEN`; numbers that are not given have their usual value. See `parameters`."""
-    values = {key: float(given.get(key, usual)) for key, (_, _, usual) in parameters(name).items()}
-    largest_nm, largest_us, middle_us, rise_us = (values.pop(key) for key in RECRUITMENT)
-    curve = SHAPES["the paper's sigmoid"](np.arange(TABLE_SIZE, dtype=float), middle_us, rise_us, rng_of(0))
-    table_nm = curve / curve[round(largest_us)] * largest_nm
-    base = Base("the paper's sigmoid", table_nm, round(largest_us), 0.1, 1.0, None, name, {})
-    return _scaled(name, OPEN[name], in_us(values, base), base, largest_nm)
 
 
 def _scaled(name: str, mechanism: Mechanism, numbers: dict[str, float], base: Base, most_nm: float) -> PhysicsMuscle:

@@ -36,28 +36,19 @@ class Mechanism:
     driven_by: frozenset[str]
 
     def draw(self, rng: Generator, base: Base) -> dict[str, float]:
-        """Its numbers, as its kernel takes them."""
+        """Draw its numbers, as its kernel takes them.
+
+        What ends in `_us_share` is drawn as a share of the way from 10 to 90 % recruitment, and given as a width in µs.
+        """
         drawn = {}
         for name, (low, high) in self.draws.items():
             value = math.exp(rng.uniform(math.log(low), math.log(high))) if low > 0.0 else rng.uniform(low, high)
             drawn[name] = float(value)
-        return in_us(drawn, base)
-
-    def middle(self) -> dict[str, float]:
-        """The middle of its draws: the geometric one where they are log-uniform."""
+        low_us, high_us = base.rise_us()
         return {
-            name: float(f"{math.sqrt(low * high) if low > 0.0 else 0.5 * (low + high):.3g}")
-            for name, (low, high) in self.draws.items()
+            name: low_us + value * (high_us - low_us) if name.endswith("_us_share") else value
+            for name, value in drawn.items()
         }
-
-
-def in_us(drawn: Mapping[str, float], base: Base) -> dict[str, float]:
-    """The same; what ends in `_us_share`, a share of the way from 10 to 90 % recruitment, as a width in µs."""
-    low_us, high_us = base.rise_us()
-    return {
-        name: low_us + value * (high_us - low_us) if name.endswith("_us_share") else value
-        for name, value in drawn.items()
-    }
 
 
 def mechanism(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.arm_records import KINDS, arm_patient, changed, held_angles_rad, record
+from bench.muscles.arm_records import KINDS, arm_patient, changed, held_angles_rad, record
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.bout_records import RAMPS, Peculiar, record_of_bouts
-from stimrig.hardware_sim.physics_records import DISTURBED, NOISE_SD_NM, SETS, record_of_physics
+from bench.muscles.bout_records import RAMPS, Peculiar, record_of_bouts
+from bench.muscles.physics_records import DISTURBED, NOISE_SD_NM, SETS, record_of_physics
 
 SEEDS = range(8)
 

@@ -16,9 +16,9 @@ from __future__ import annotations
 
 import math
 
+from bench.muscles.mechanism import mechanism
 from stimrig.hardware_sim.hidden.base import lag_after
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US
-from stimrig.hardware_sim.hidden.mechanism import mechanism
 
 
 @mechanism(

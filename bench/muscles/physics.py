@@ -10,9 +10,9 @@ from __future__ import annotations
 import math
 from typing import Any
 
+from bench.muscles.mechanism import mechanism
 from stimrig.hardware_sim.hidden.base import lag_after
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US, helper
-from stimrig.hardware_sim.hidden.mechanism import mechanism
 
 _ding: Any = {
     "calcium_s": (0.011, 0.03),

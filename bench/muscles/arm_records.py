@@ -17,10 +17,10 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import savgol_filter
 
+from bench.muscles.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.arm.laws import Floats
 from stimrig.hardware_sim.arm.motion import Begin, Motion, Quintic, lasting_s
 from stimrig.hardware_sim.arm.movers import make_mover
-from stimrig.hardware_sim.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, levels, make_design, staircase
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
@@ -50,7 +50,7 @@ ENCODER = AngleSensor()
 
 @dataclass(frozen=True)
 class Asked:
-    """A record that is wanted; `stimrig.hardware_sim.arm_records.record` says what the fields mean."""
+    """A record that is wanted; `bench.muscles.arm_records.record` says what the fields mean."""
 
     patient: ArmPatient
     rng: Generator

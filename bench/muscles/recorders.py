@@ -68,7 +68,7 @@ def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
     Parameters
     ----------
     made
-        From `stimrig.hardware_sim.hidden_records.generate`; it is not changed.
+        From `bench.muscles.hidden_records.generate`; it is not changed.
     kind
         `plain`: as it is. `offset`: a zero within ±50 N·m. `start`: it begins 0.5 to 3 s into the PRBS, within a
         contraction, its time there 0. `counts`: torque in steps of 5 mN·m. `negative`: torque with the other sign.
