@@ -69,7 +69,6 @@ class RigConfig(_Table):
     socket: Path
     clock_speed: float = Field(1.0, gt=0, le=100, strict=True)
     require_calibration: StrictBool = True
-    require_check: StrictBool = several(False, "no test without a valid check of the rig (`stimrig rig check`)")
     stimulator: DeviceSettings
     load_cell: DeviceSettings
     angle_sensor: DeviceSettings | None = None

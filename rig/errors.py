@@ -55,10 +55,6 @@ class UncertainError(RigError, code="uncertain", title="The rig died in a test a
     """Started after a crash during a test, and no person has re-armed yet."""
 
 
-class CheckNeededError(RigError, code="check-needed", title="The rig must be checked first"):
-    """The rig file requires a valid check of the rig: says why there is none."""
-
-
 class DeviceError(RigError, code="disconnected", title="A device does not answer"):
     """A device cannot be reached, does not answer, or answered with an error."""
 

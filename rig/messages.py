@@ -355,17 +355,6 @@ class AngleStatus(Message):
     calibration: AngleCalibration | None = None
 
 
-class CheckStatus(Message):
-    """The last check of the rig's devices (`stimrig rig check`); all empty: there was none."""
-
-    verdict: Literal["sound", "faults", "incomplete"] | None = None
-    checked_at_utc: str | None = None
-    due_at_utc: str | None = None
-    by: str = Field("", description="who checked")
-    same_rig: bool = Field(True, description="whether devices, limits and watch of the rig file are still the same")
-    due: str = Field("", description="why another check is due; empty: it is not")
-
-
 class Status(Message):
     state: RigState
     reason: str = Field(
@@ -390,7 +379,6 @@ class Status(Message):
     calibrated: Calibrated | None = Field(None, description="newest result, until a client has stored it")
     limits: dict[str, Bound] = Field(default_factory=dict, description="limits of this rig by name")
     require_calibration: bool | None = Field(None, description="None: unknown")
-    check: CheckStatus | None = several(None, "the last check of the rig; None: none is expected, as on an emulator")
     finished: FinishedEvent | None = Field(
         None,
         description="newest one since the rig started, recovered tests included; for clients that connect later",

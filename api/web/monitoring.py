@@ -67,8 +67,6 @@ def _rig(context: Context) -> Iterator[Metric]:
         ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
         ("stimrig_rig_age_seconds", "Time since the rig spoke; -1: never", known(rig.age_s)),
         ("stimrig_rig_torque_age_seconds", "Age of the newest torque; -1: none", known(torque_s)),
-        ("stimrig_rig_check_due", "1 where a check of the rig is due",
-         float(bool(rig.status and rig.status.check and rig.status.check.due))),
     ))  # fmt: skip
 
 

@@ -29,9 +29,9 @@ class Calibrations:
 
     def __init__(
         self, player: Player, joint: Joint, result: Result, table: dict[str, Limit], rig: Sequence[RigChannel],
-        publish: Callable[[], None], refuse_unchecked: Callable[[], None],
+        publish: Callable[[], None],
     ) -> None:  # fmt: skip
-        self._rig, self._refuse_unchecked = rig, refuse_unchecked
+        self._rig = rig
         self._player, self._joint, self._result, self._table, self._publish = player, joint, result, table, publish
         self._state, self._pair, self._rest = player.state, player.pair, player.rest
         self._store, self._tasks = player.store, player.tasks
@@ -40,14 +40,12 @@ class Calibrations:
         """Open a guided calibration; nothing is sent yet.
 
         Raises BusyError, LatchedError, UncertainError, DeviceError: as for a test. PlanError, RefusedError: wrong name
-        or id; step, train, current or rate outside the limits, or too small to stimulate. CheckNeededError: the rig was
-        not checked.
+        or id; step, train, current or rate outside the limits, or too small to stimulate.
         """
         state, latch = self._state, self._state.latch
         async with state.in_turn():
             following = state.phase.calibrate(request.participant)
             state.refuse_unseen(latch)
-            self._refuse_unchecked()
             self._result.refuse_waiting()
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
             now_s = self._tasks.clock.unix_s()

@@ -14,7 +14,6 @@ from stimrig.rig.config import RigConfig
 from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibrating import Calibrations
 from stimrig.rig.control.calibration import check_profiles, check_range
-from stimrig.rig.control.checked import Checked
 from stimrig.rig.control.live import Taken, finite, take
 from stimrig.rig.control.memory import LatchFile, Rest, Result
 from stimrig.rig.control.pair import Pair
@@ -68,11 +67,8 @@ class Rig:
         self.rest = Rest(config.data_dir, machine)
         self.store = RecordingStore(config, machine)
         self._result = Result(config.data_dir, machine)
-        self.checked = Checked(config, machine)
         self.player = Player(self.state, self.pair, self.rest, self.store, machine, config.watch, publish)
-        self.calibrations = Calibrations(
-            self.player, self.joint, self._result, self.table, self.channels, self._tell, self.checked.refuse
-        )
+        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self.channels, self._tell)
 
     @property
     def latch(self) -> str:
@@ -110,7 +106,6 @@ class Rig:
             calibrated=self._result.waiting,
             limits=limits.bounds(self.table),
             require_calibration=self._require_calibration,
-            check=self.checked.status(),
             finished=self.finished,
         )
 
@@ -142,7 +137,7 @@ class Rig:
         """
         work = self._tasks.work
         try:
-            await work(self._look_into_folder)
+            await work(self.store.make_folders)
             self._folder_lock = await work(self._machine.disk.lock, self._data_dir)
         except OSError as error:
             raise ConfigError(f"data_dir: {error.filename or self._data_dir}: {error.strerror}") from None
@@ -168,10 +163,6 @@ class Rig:
                 phase = replace(phase, reason=f"{reason}; the stimulator, asked now: {self.pair.found_state}")
         self.state.change(phase)
 
-    def _look_into_folder(self) -> None:
-        self.store.make_folders()
-        self.checked.recall()
-
     async def close(self) -> None:
         """Stop a running test, wait until it is sealed, disconnect. A start that is under way does not begin."""
         self.state.closing = True
@@ -192,8 +183,6 @@ class Rig:
             See `Phase.start`.
         PlanError, RefusedError
             The plan is wrong, or outside a limit.
-        CheckNeededError
-            The rig file requires a check of the rig that is not there.
         LatchChangedError, WithdrawnError
             The rig was stopped, or this test withdrawn, while this waited.
         JournalError, RigError
@@ -206,7 +195,6 @@ class Rig:
         async with state.in_turn():
             state.phase.may_start()
             state.refuse_unseen(latch)
-            self.checked.refuse()
             check_names("plan", test_id=request.test_id, participant=request.participant)
             if request.adaptive is not None and len(key) < MIN_KEY:  # only who started it extends it
                 raise PlanError(

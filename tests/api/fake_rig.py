@@ -153,7 +153,6 @@ class FakeRig:
         self.device_back = True
         self._idle: asyncio.Task[None] | None = None
         self.require_calibration = False
-        self.check: m.CheckStatus | None = None
         self.limits = {
             "current_ma": m.Bound(lo=0, hi=60, unit="mA", owner="rig file"),
             "pulse_width_us": m.Bound(lo=0, hi=500, unit="µs", owner="hard limit"),
@@ -185,7 +184,7 @@ class FakeRig:
             load_cell={"device": "fake cell", "rate_hz": 400.0},
             torque_age_s=self.torque_age_s, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
-            limits=self.limits, require_calibration=self.require_calibration, check=self.check,
+            limits=self.limits, require_calibration=self.require_calibration,
             finished=self.finished, angle=self.arm.status(self.elapsed_s),
         )  # fmt: skip
 

@@ -34,7 +34,6 @@ def test_every_figure_stands_in_the_docs_and_tells_nothing_of_anybody(
     assert there["stimrig_stop_confirmation_seconds_count"] == [({}, 1.0)]
     assert [labels["state"] for labels, value in there["stimrig_rig_state"] if value] == ["latched"]
     assert {labels["quantile"] for labels, _ in there["stimrig_pulse_lateness_seconds"]} == {"0.5", "0.99", "1"}
-    assert there["stimrig_rig_check_due"] == [({}, 0.0)]
     assert participant not in text and "typed by" not in text
     labels = {key for samples in there.values() for one, _ in samples for key in one}
     assert labels == {"state", "outcome", "quantile", "version", "le"}

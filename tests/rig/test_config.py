@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from stimrig.rig.devices import find, library
 from stimrig.rig.errors import ConfigError
 from stimrig.rig.machine import Frame
 from tests.harness.processes import CLINIC_WATCH
+from tests.simulator.virtual_time import VirtualMachine
 
 GOOD = """
 data_dir = "var"
@@ -59,6 +61,19 @@ def test_the_example_is_good():
     assert loaded.require_calibration
     rest = loaded.limits.table()["rest_between_tests_s"]
     assert (rest.lo, rest.owner) == (60.0, "rig file")
+
+
+def test_the_examples_of_the_page_are_complete(tmp_path: Path):
+    page = (Path(__file__).parents[2] / "docs" / "rig-file.md").read_text("utf-8")
+    examples = [text for text in re.findall(r"^```toml\n(.*?)^```", page, re.M | re.S) if "data_dir" in text]
+    loaded = [load(tmp_path, text) for text in examples]
+    assert [(one.stimulator.device, one.load_cell.model_dump()["bus"]["interface"]) for one in loaded] == [
+        ("rehastim2", "socketcan"),
+        ("p24", "slcan"),
+    ]
+    for one in loaded:
+        one.table()
+        find("load_cell", one.load_cell.device).create(one.load_cell, VirtualMachine())
 
 
 MISTAKES = {

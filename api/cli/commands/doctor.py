@@ -147,10 +147,6 @@ def check_rig(settings: Settings) -> Iterator[Finding]:
         yield Finding("rig", "fails", f"{body['state']}: {body['reason']}", fix)
     else:
         yield Finding("rig", "ok", body["state"])
-    if (checked := body.get("check")) is not None:
-        until = f", valid until {checked['due_at_utc']:.10}" if checked["due_at_utc"] else ""
-        says = f"{checked['due'] or 'checked by ' + checked['by']}{until}"
-        yield Finding("check", "care" if checked["due"] else "ok", says, "stop the rig and run `stimrig rig check`")
 
 
 def check_data(settings: Settings) -> Iterator[Finding]:

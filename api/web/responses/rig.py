@@ -13,7 +13,6 @@ from stimrig.rig.messages import (
     AngleStatus,
     Bound,
     CalibrationStatus,
-    CheckStatus,
     LiveEvent,
     ProtocolInfo,
     RigState,
@@ -71,7 +70,6 @@ class RigOut(RigHealth):
     calibration: CalibrationStatus | None = None
     limits: dict[str, Bound] = Field({}, description="what this rig takes, by quantity")
     require_calibration: bool | None = None
-    check: CheckStatus | None = Field(None, description="the last check of the rig; None: none is expected")
 
 
 class StoppedOut(Document):
