@@ -20,7 +20,7 @@ from stimrig.rig.channels import RigChannel
 from stimrig.rig.devices import DeviceSettings, Kind
 from stimrig.rig.errors import ConfigError, RefusedError
 from stimrig.rig.limits import Limit
-from stimrig.rig.messages import Range, several
+from stimrig.rig.messages import Range
 
 
 class _Table(BaseModel):
