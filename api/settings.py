@@ -54,18 +54,6 @@ class Settings(BaseSettings):
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
     )
-    retention_participants_days: Annotated[float, Field(ge=1)] | None = Field(
-        default=None, description="days after the last test or recording, then all of a participant goes; default: kept"
-    )
-    retention_recordings_days: Annotated[float, Field(ge=1)] | None = Field(
-        default=None, description="days after which a recording's file goes, and its row stays; default: kept"
-    )
-    retention_logs_days: Annotated[float, Field(ge=1)] | None = Field(
-        default=None, description="days after which a log that nobody writes goes; default: kept"
-    )
-    retention_hold: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="participants of whom nothing is deleted, by whatever rule; comma-separated"
-    )
 
     def __init__(self, **given: Any) -> None:
         try:
@@ -93,12 +81,6 @@ class Settings(BaseSettings):
         if odd is not None:
             raise ValueError(f"{odd} is no effect's id (see `stimrig effects`); give ids, separated by commas")
         return tuple(dict.fromkeys(named))
-
-    @field_validator("retention_hold", mode="before")
-    @classmethod
-    def _held(cls, given: object) -> object:
-        """A comma-separated text, as it stands in the environment."""
-        return tuple(part.strip() for part in given.split(",") if part.strip()) if isinstance(given, str) else given
 
     @property
     def database(self) -> str:

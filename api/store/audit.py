@@ -6,6 +6,7 @@ import hashlib
 import json
 from typing import Any
 
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from stimrig.api.store import seen
@@ -43,6 +44,32 @@ def write(session: Session, at_utc: str, who: str, action: str, subject: str, **
 
 ERASED, ERASE = "(erased)", "erase participant"
 """Subject of an entry whose content was taken away, and the action of the entry that vouches for what is left of it."""
+
+
+def erase(session: Session, names: set[str], at_utc: str, who: str, **detail: Any) -> None:
+    """Take away the content of entries that name one of these, and append the entry that vouches for what is left.
+
+    Number, time, person, action and hash of an entry stay, so that the trail stays a chain.
+    """
+    newest, erased = seen.last(session), []
+    subjects = names - {"page", "rig"}  # those of the trail's own words that are no participants
+    for entry in session.scalars(select(AuditEntry).order_by(AuditEntry.seq)):
+        if entry.action != ERASE and (entry.subject in subjects or _mentions(entry.detail, names)):
+            entry.subject, entry.detail = ERASED, {"erased": newest.seq + 1 if newest else 1}
+            if names & {entry.who, *entry.who.split(" ")}:  # what a test does by itself goes by its id
+                entry.who = ERASED
+            erased.append(entry)
+    session.flush()
+    write(session, at_utc, who, ERASE, "a participant", **detail, entries=len(erased), kept=left_of(erased))
+
+
+def _mentions(value: Any, names: set[str]) -> bool:
+    """Return whether a value names one of these, at whatever depth."""
+    if isinstance(value, dict):
+        return any(_mentions(part, names) for pair in value.items() for part in pair)
+    if isinstance(value, list):
+        return any(_mentions(part, names) for part in value)
+    return isinstance(value, str) and value in names
 
 
 def left_of(entries: list[AuditEntry]) -> str:

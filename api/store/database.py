@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -98,6 +98,13 @@ class Store:
         """Append an entry to the audit trail in a transaction of its own."""
         with self.write() as session:
             audit.write(session, clock.utc(), who, action, subject, **detail)
+
+    def compact(self) -> None:
+        """Write a SQLite file anew, so that deleted rows are not left in it; PostgreSQL's autovacuum does that."""
+        if self.engine.dialect.name == "sqlite":
+            with closing(self.engine.raw_connection()) as connection:  # without the transaction of a session
+                for statement in ("VACUUM", "PRAGMA wal_checkpoint(TRUNCATE)"):
+                    connection.cursor().execute(statement)
 
     def close(self) -> None:
         """Let the connections go."""

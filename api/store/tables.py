@@ -242,21 +242,6 @@ class Confirmation(Table):
     at_unix_s: Mapped[float] = mapped_column(Float)
 
 
-class Erasure(Table):
-    """What is taken away for good: written down with the rows that go, before the first file does."""
-
-    __tablename__ = "erasures"
-    id: Mapped[str] = mapped_column(String, primary_key=True)
-    of: Mapped[str] = mapped_column(String)
-    """A participant's code until it is done, or `retention`."""
-    reason: Mapped[str] = mapped_column(Text)
-    asked_by: Mapped[str] = mapped_column(String)
-    asked_utc: Mapped[str] = mapped_column(String)
-    files: Mapped[list[str]] = mapped_column(JSON)
-    """Paths that are still to be removed."""
-    done_utc: Mapped[str | None] = mapped_column(String, default=None)
-
-
 class Secret(Table):
     """What all services on a database share and nobody else knows."""
 

@@ -153,7 +153,7 @@ def make_folders(settings: Settings) -> None:
 
 def places(settings: Settings, store: Store) -> Places:
     """The folders that workers may reach: those of recordings, known ones of a rig that runs by itself included."""
-    reads = {settings.recordings_dir, *(Path(path).parent for path in store.all(Recording.path, Recording.path != ""))}
+    reads = {settings.recordings_dir, *(Path(path).parent for path in store.all(Recording.path))}
     reads |= {settings.effects_dir} if settings.effects_dir else set()
     return Places(reads, [settings.exports_dir])
 

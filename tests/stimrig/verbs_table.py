@@ -19,7 +19,7 @@ COMMAND_ONLY = {
     "demo": "`emulate`, `Client.run_test` and `Client.approve` one after the other",
     "doctor": "it says what this machine lacks for stimulation",
     "rig": "it asks a person who stands at the rig",
-    "retention": "it deletes, alone with the data folder; it is asked for by a person, or by a timer",
+    "erase": "it deletes, alone with the data folder; a person asks for it",
     "serve": "it runs until it is ended, and may own a rig; `Client` talks to it",
 }  # fmt: skip
 ELSEWHERE = {"test": "Client.run_test"}

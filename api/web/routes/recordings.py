@@ -72,9 +72,6 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
     row = context.store.get(Recording, recording_id)
     require_found(row, "recording", recording_id, "A test's document names its recording.")
     path = Path(row.path)
-    if not row.path:
-        detail = f"The file of recording {recording_id!r} was deleted by a rule of retention; its row and models stay."
-        raise ApiError(410, "recording-gone", "The recording's file is missing", detail)
     if not path.is_file():
         detail = f"The file of recording {recording_id!r} is not in its place ({path.name}). Restore it from a backup."
         raise ApiError(410, "recording-gone", "The recording's file is missing", detail)
