@@ -146,7 +146,7 @@ def rows_of(rig: Emulated, can_id: int, layout: struct.Struct, number: int) -> l
 
 @pytest.mark.wire
 class TestOverTheWire:
-    @pytest.mark.parametrize("transport", ["socketcand", "slcan"])
+    @pytest.mark.parametrize("transport", ["socketcand", pytest.param("slcan", marks=pytest.mark.campaign)])
     def test_both_come_on_one_bus_and_none_is_lost(self, transport: str) -> None:
         with emulated("--arm", "held,angle_deg=60", "--angle-offset-deg", "20", "--load-cell", transport) as rig:
             assert rig.ready["angle_sensor"] == {

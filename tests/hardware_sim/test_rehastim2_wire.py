@@ -38,6 +38,7 @@ def pulse_for_ever(path: str) -> None:
         time.sleep(0.02)
 
 
+@pytest.mark.campaign
 def test_init_after_init_and_no_backlog_for_a_late_client() -> None:
     with emulated("--stimulator", "rehastim2", "--speed", "100") as rig:
         time.sleep(0.5)  # a hundred Inits of the device's time
@@ -47,6 +48,7 @@ def test_init_after_init_and_no_backlog_for_a_late_client() -> None:
         line.close()
 
 
+@pytest.mark.campaign
 def test_a_killed_host_is_outlived_by_at_most_1200_ms() -> None:
     """The worst case of ScienceMode 2's channel list: the host dies between two commands."""
     script = f"import sys; from {__name__} import pulse_for_ever; pulse_for_ever(sys.argv[1])"
