@@ -49,7 +49,6 @@ class Settings(BaseSettings):
     )
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
-    lsl: bool = Field(default=False, description="True: torque and pulses go to Lab Streaming Layer, see docs/lsl.md")
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
     structure: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"

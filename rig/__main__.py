@@ -95,7 +95,6 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         overrides = {"data_dir": options.data, "socket": options.socket, "clock_speed": options.clock_speed}
         config = configuration.chosen(options, **overrides)
-        assert config is not None
         if options.check:
             _check(config)
             return 0
@@ -110,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m stimrig.rig", description="The process that owns the rig's devices."
     )
-    configuration.add_arguments(parser, required=True, about="rig file (TOML), see docs/rig-file.md")
+    configuration.add_arguments(parser)
     parser.add_argument("--socket", type=Path, help="Unix socket to listen on; overrides the rig file")
     parser.add_argument("--data", type=Path, help="folder for journals and recordings; overrides the rig file")
     parser.add_argument("--clock-speed", type=float, help="with --emulator-json only: rig seconds per real second")

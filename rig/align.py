@@ -89,14 +89,11 @@ def fit(
     sync: NDArray[np.uint8],
     written_s: Array,
     sample_rate_hz: float,
-    until_s: float = np.inf,
 ) -> Fit:
-    """See `align`; of edges and pulses only those before `until_s` are compared."""
+    """See `align`."""
     points = earliest(cell_s, host_s)
     envelope = line_below(*points)
     edge_s = rising_edges(cell_s, sync, sample_rate_hz)
-    if until_s < np.inf:
-        edge_s, written_s = edge_s[envelope.at(edge_s) < until_s], written_s[written_s < until_s]
     pairs = paired(edge_s, written_s, envelope)
     if pairs is None or len(pairs[0]) < MIN_EDGES:
         return Fit(envelope, *points, envelope, "regression", True)

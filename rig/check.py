@@ -365,7 +365,7 @@ def check_ports(config: RigConfig) -> Step:
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m stimrig.rig.check", description="Check a rig's wiring.")
-    configuration.add_arguments(parser, required=True, about="rig file (TOML), see docs/rig-file.md")
+    configuration.add_arguments(parser)
     parser.add_argument("--data", type=Path, help="data folder; overrides the rig file")
     parser.add_argument("--no-questions", action="store_true", help="what needs a person is not done")
     options = parser.parse_args(arguments)
@@ -373,7 +373,6 @@ def main(arguments: list[str] | None = None) -> int:
     before = {one: signal.signal(one, _end) for one in ENDS}  # each stops the stimulator first
     try:
         config = configuration.chosen(options, data_dir=options.data, socket=Path("check.sock"))
-        assert config is not None
         ask = (lambda _: False) if options.no_questions else ask_at_terminal
         with exclusive(config.data_dir):
             found = check(config, ask, emulated=options.config is None)

@@ -221,18 +221,18 @@ def _emulated_sensor(line: dict[str, Any]) -> dict[str, Any]:
     }
 
 
-def add_arguments(parser: argparse.ArgumentParser, required: bool, about: str) -> None:
-    """The two ways to say which rig; see `chosen`."""
-    source = parser.add_mutually_exclusive_group(required=required)
-    source.add_argument("--config", type=Path, metavar="FILE", help=about)
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the two options that name a rig; see `chosen`."""
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--config", type=Path, metavar="FILE", help="rig file (TOML), see docs/rig-file.md")
     source.add_argument("--emulator-json", metavar="LINE", help="JSON line of `stimrig emulate`, or a file with it")
 
 
-def chosen(options: argparse.Namespace, **overrides: Any) -> RigConfig | None:
-    """The rig of a command line; None: it names none. Raises ConfigError."""
+def chosen(options: argparse.Namespace, **overrides: Any) -> RigConfig:
+    """Load the rig that a command line names. Raises ConfigError."""
     if options.config is not None:
         return load(options.config, **overrides)
-    return None if options.emulator_json is None else for_emulator(options.emulator_json, **overrides)
+    return for_emulator(options.emulator_json, **overrides)
 
 
 def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:

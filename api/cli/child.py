@@ -46,19 +46,14 @@ class Child:
 
         Raises LaunchError: it ended instead, or said nothing: its own last line is the message.
         """
-        line = read_line(self._launch(subprocess.PIPE), READY_S)
+        line = read_line(self._launch(), READY_S)
         try:
             self.ready = json.loads(line)
         except ValueError:
             raise self.failure() from None
         return self.ready
 
-    def start_unheard(self) -> None:
-        """Start it and wait for nothing; one that cannot be started is found to have ended."""
-        with contextlib.suppress(OSError):
-            self._launch(subprocess.DEVNULL)
-
-    def _launch(self, stdout: int) -> subprocess.Popen[bytes]:
+    def _launch(self) -> subprocess.Popen[bytes]:
         self.started_s = time.monotonic()
         with self.log.open("ab") as log:
             self._log_start = log.tell()
@@ -68,7 +63,7 @@ class Child:
                 self.process = subprocess.Popen(
                     self.command,
                     stdin=subprocess.DEVNULL,
-                    stdout=stdout,
+                    stdout=subprocess.PIPE,
                     stderr=log,
                     env={**os.environ, **self.environment},
                     start_new_session=True,  # Ctrl-C reaches the launcher only, which ends them in order

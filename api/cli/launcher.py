@@ -24,56 +24,6 @@ from stimrig.api.cli.errors import LaunchError
 from stimrig.api.settings import Settings
 from stimrig.api.store.holds import HeldError, refuse_if_held
 
-AGAIN_S = (1.0, 5.0, 30.0)
-"""Real seconds until they are started again; the last one for every further time."""
-LASTED_S = 300.0
-
-
-class Streams:
-    """Starts `stimrig.rig.lsl_outlets`, and again when it dies; waits for nothing. `child`: how it is started."""
-
-    def __init__(self, child: Child) -> None:
-        self.child = child
-        self._deaths = 0
-        self._again_s: float | None = None
-        self._given_up = False
-
-    def start(self, source: list[str], data: str) -> None:
-        """Start the process; what goes wrong is told by `watch`."""
-        self.child.command += [*source, "--data", data]
-        self._spawn()
-
-    def watch(self) -> list[str]:
-        """Start it again if it died; what happened, in words."""
-        now_s = time.monotonic()
-        if self._given_up or self.child.alive():
-            return []
-        if self._again_s is None:
-            return [self._say_death(now_s)]
-        if now_s < self._again_s:
-            return []
-        self._spawn()
-        return []
-
-    def _say_death(self, now_s: float) -> str:
-        if now_s - self.child.started_s > LASTED_S:
-            self._deaths = 0
-        process = self.child.process
-        words = (self.child.last_words() if process is not None else "it could not be started").removeprefix("lsl: ")
-        if process is not None and process.poll() == 2:  # it says what is missing; it would say it again and again
-            self._given_up = True
-            return f"lsl: {words}; nothing is streamed, all else goes on"
-        self._again_s = now_s + AGAIN_S[min(self._deaths, len(AGAIN_S) - 1)]
-        self._deaths += 1
-        return f"lsl had ended ({words or 'without a message'}) and is started again; all else goes on"
-
-    def _spawn(self) -> None:
-        self._again_s = None
-        self.child.end()
-        self.child.process = None
-        self.child.start_unheard()
-
-
 SEAL_S = 35.0
 """The rig may still have a test to seal."""
 RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
@@ -139,7 +89,6 @@ class Services:
         self.rig = self._child("rig", ["stimrig.rig"])
         self.api = self._child("api", ["stimrig.api.web.server"])
         self.admin_token = admin_token
-        self.lsl = Streams(self._child("lsl", ["stimrig.rig.lsl_outlets"])) if settings.lsl else None
 
     def _child(self, name: str, module: list[str]) -> Child:
         return Child(name, [sys.executable, "-m", *module], self.settings.logs_dir / f"{name}.log")
@@ -198,8 +147,6 @@ class Services:
             self.api.environment["STIMRIG_ADMIN_TOKEN"] = self.admin_token
         self.api.start()
         self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
-        if self.lsl is not None:
-            self.lsl.start([] if self.attached else self._source(), data)
 
     def _source(self) -> list[str]:
         """What says which devices there are."""
@@ -224,8 +171,7 @@ class Services:
         if self.emulator is not None and not self.emulator.alive():
             raise self.emulator.failure()
         ours = (self.api,) if self.attached else (self.rig, self.api)
-        events = [self._restart(child) for child in ours if not child.alive()]
-        return events + (self.lsl.watch() if self.lsl is not None else [])
+        return [self._restart(child) for child in ours if not child.alive()]
 
     def _restart(self, child: Child) -> str:
         if time.monotonic() - child.started_s > 60:
@@ -244,8 +190,6 @@ class Services:
         self._endings.deaf = True
         self.rig.end(SEAL_S)
         self.api.end()
-        if self.lsl is not None:
-            self.lsl.child.end()
         if self.emulator is not None:
             self.emulator.end()
         shutil.rmtree(self.runtime, ignore_errors=True)

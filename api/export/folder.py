@@ -61,7 +61,7 @@ class Export:
                 counting(self.tally, self.sources, self.selection),
             ):
                 for source in self.sources:
-                    for entry in source.entries(self.selection):
+                    for entry in source.entries():
                         self._export(source, entry, Path(aside))
                         self.tell(self.tally)
             columns = (*UNDATED, *DATED) if self.dates else UNDATED

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from stimrig.api.cli.child import LAST_BYTES, Child
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Participant
 
@@ -52,7 +53,7 @@ def check_log_lines(folder: Path, test_id: str, secrets: tuple[str, ...]) -> Non
     assert start["test_id"] == test_id and start["request_id"], "a line names the request that it comes of"
 
 
-@pytest.mark.parametrize(("module", "process"), [("stimrig.api", "worker"), ("stimrig.rig", "lsl")])
+@pytest.mark.parametrize(("module", "process"), [("stimrig.api", "worker"), ("stimrig.rig", "rig")])
 def test_every_line_is_an_object_also_of_what_ends_the_process(module: str, process: str) -> None:
     code = SAYS.format(module=module, process=process)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
@@ -84,3 +85,18 @@ def test_an_error_of_the_database_names_no_participant(tmp_path) -> None:
                 session.add(Participant(code="P017-secret", profile={}, created_utc="", created_by="Anna"))
     assert "P017" not in str(told.value) and "Anna" not in str(told.value)
     store.close()
+
+
+@pytest.mark.parametrize(
+    ("log", "words"),
+    [
+        (None, ""), ("", ""), ('{"message": "all went well"}\n', "all went well"),
+        ("rig: no room\n", "rig: no room"),
+        ('{"time": "2026-11-23T08:0', ""), ('{"level": "info"}\n', ""), ("{" * 100_000, ""),
+        ("x" * 3 * LAST_BYTES + "\nrig: gone\n", "rig: gone"),
+    ],
+)  # fmt: skip
+def test_the_last_words_of_a_process_are_found_whatever_its_log_is(tmp_path: Path, log: str | None, words: str) -> None:
+    if log is not None:
+        (tmp_path / "rig.log").write_text(log)
+    assert Child("rig", [], tmp_path / "rig.log").last_words() == words

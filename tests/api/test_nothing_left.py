@@ -70,7 +70,7 @@ def held(*given):
 
 child.die_with_parent = held
 with launcher.Endings():
-    child.Child("child", ["sleep", "3600"], folder / "log").start_unheard()
+    child.Child("child", ["sleep", "3600"], folder / "log").start()
     time.sleep(3600)
 """
 """A child that is held between fork and exec, before or after the launcher has readied it."""

@@ -27,12 +27,9 @@ def serve(
     ] = None,
     data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",
-    lsl: Annotated[
-        bool | None, typer.Option("--lsl/--no-lsl", help="torque and pulses to Lab Streaming Layer; or STIMRIG_LSL")
-    ] = None,
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
-    named = given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data, lsl=lsl)
+    named = given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data)
     settings = Settings(**named)
     found = attachable(settings, emulate) if settings.rig_socket else None
     with contextlib.suppress(Ended), Services(settings, emulate.split(), attach=settings.rig_socket) as services:
