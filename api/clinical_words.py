@@ -36,7 +36,6 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "passive": "passive movement",
         "held": "held-angle test",
         "moving": "movement under stimulation",
-        "muscles": "test of both muscles",
     },
     "title": {
         "pre-session": "Pre-session test",
@@ -46,7 +45,6 @@ WORDS: dict[str, dict[str | None, Any]] = {
         "passive": "Passive movement",
         "held": "Held angle",
         "moving": "Movement under stimulation",
-        "muscles": "Test of both muscles",
     },
     "end": {
         "known-enough": "Enough is known",

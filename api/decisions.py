@@ -33,8 +33,7 @@ DECISIONS = (
     *(Decision("POST", f"/v1{OF_MODEL}/{word}", f"/v1{OF_MODEL}", f"{OF_MODEL}/{word}")
       for word in ("approve", "undo")),
     Decision("POST", f"/v1{OF_MODEL}/reject", f"/v1{OF_MODEL}", f"{OF_MODEL}/reject", needed=False),
-    *(Decision("PUT", f"{PERSON}{of}/{word}", PERSON, f"{OF_PERSON}{of}/{word}")
-      for of in ("", "/channels/{channel}") for word in ("profile", "muscle")),
+    *(Decision("PUT", f"{PERSON}/{word}", PERSON, f"{OF_PERSON}/{word}") for word in ("profile", "muscle")),
     *(Decision("POST", f"{PERSON}/{word}", PERSON, f"{OF_PERSON}/{word}")
       for word in ("archive", "unarchive", "recordings", "calibration", "keys")),
     Decision("POST", "/v1/tests", PERSON, f"{OF_PERSON}/tests"),

@@ -21,23 +21,13 @@ def library() -> dict[str, dict[str, Any]]:
 
     The files are read and not loaded: the web process does without their physics.
     """
-    return _read("stimrig.identify.effects", "EFFECT")
-
-
-@cache
-def interplay() -> dict[str, dict[str, Any]]:
-    """The same of what several muscles do to each other."""
-    return _read("stimrig.identify.muscles.interplay", "INTERPLAY")
-
-
-def _read(package: str, called: str) -> dict[str, dict[str, Any]]:
-    spec = find_spec(package)
+    spec = find_spec("stimrig.identify.effects")
     assert spec is not None and spec.origin is not None
     found: dict[str, dict[str, Any]] = {}
     for path in sorted(Path(spec.origin).parent.glob("*.py")):
         for line in ast.parse(path.read_text(encoding="utf-8")).body:
             match line:
-                case ast.Assign(targets=[ast.Name(name)], value=ast.Call(keywords=given)) if name == called:
+                case ast.Assign(targets=[ast.Name(name)], value=ast.Call(keywords=given)) if name == "EFFECT":
                     plain = [part for part in given if isinstance(part.value, ast.Constant | ast.Dict)]
                     said = {str(part.arg): ast.literal_eval(part.value) for part in plain}
                     found[said["id"]] = said
@@ -56,16 +46,8 @@ def _short_names() -> dict[str, str]:
 
 
 def effect_words(effect: str) -> str:
-    """An effect's title; the id of a person's own effect as words. Of several muscles it says whose it is."""
-    muscle, dot, own = effect.partition(".")
-    if dot:
-        return f"{effect_words(own)} ({muscle})"
-    known, _colon, ends = effect.partition(":")
-    giving, _to, taking = ends.partition(">")
-    title = fact_of(effect, "name", interplay().get(known, {}).get("name", ""))
-    if taking:
-        return f"{title} ({giving} → {taking})"
-    return title if title else effect.replace("_", " ").capitalize()
+    """An effect's title; the id of a person's own effect as words."""
+    return fact_of(effect, "name", "") or effect.replace("_", " ").capitalize()
 
 
 def within(effect: str) -> str:
@@ -77,7 +59,7 @@ def within(effect: str) -> str:
 def effects_words(effects: Iterable[str], without_evidence: Collection[str] = ()) -> str:
     """Titles, one after the other, those added without evidence marked; of an effect's form (`fatigue:fitness`) people
     are told nothing."""
-    named = ((effect, within(effect if ">" in effect else effect.partition(":")[0])) for effect in effects)
+    named = ((effect, within(effect.partition(":")[0])) for effect in effects)
     return ", ".join(f"{words} (without evidence)" if effect in without_evidence else words for effect, words in named)
 
 

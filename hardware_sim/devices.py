@@ -8,22 +8,20 @@ ports (`emulator`), or within one process.
 from __future__ import annotations
 
 import random
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.limb import Limb
-from stimrig.hardware_sim.errors import SettingsError
 from stimrig.hardware_sim.faults import Faults
-from stimrig.hardware_sim.joint import LiveJoint
 from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.sampling import take_in_order
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators import STIMULATORS
-from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware, Output
+from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware
 from stimrig.hardware_sim.tables import pick
 from stimrig.hardware_sim.timeline import Timeline
 
@@ -58,7 +56,6 @@ class Devices:
         self.settings = settings
         self.random = random.Random(settings.noise_seed)
         self.timeline = Timeline()
-        pairs = muscle.electrodes if isinstance(muscle, LiveJoint) else ()
         self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
         muscle = self.limb or muscle
         self.encoder = Encoder(self.limb.angle_deg, settings) if self.limb else None
@@ -68,7 +65,7 @@ class Devices:
             AngleSensor(self.encoder, self.load_cell.add_frame, settings, epoch_us) if self.encoder and own else None
         )
         self.timeline.followers.append(self._sample_until)
-        self.electrodes = Electrodes(self._wired(pairs or (muscle,)), self.load_cell.raise_sync)
+        self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
         self.stimulator_plugged = self.cell_plugged = True
         self.unread_bytes: Callable[[], int] = lambda: 0
         self.on_stimulator_cable: Callable[[bool], None] = lambda _plugged: None
@@ -151,12 +148,6 @@ class Devices:
             **(self.limb.state() if self.limb else {}),
             "faults": self.faults.active(),
         }
-
-    def _wired(self, pairs: Sequence[Muscle]) -> dict[Output, Muscle]:
-        outputs = self.settings.wired
-        if len(outputs) < len(pairs):
-            raise SettingsError(f"--outputs {self.settings.outputs}: the patient has {len(pairs)} pairs of electrodes")
-        return dict(zip(outputs, pairs, strict=False))
 
     def _sample_until(self, time_s: float) -> None:
         if self.angle_sensor is None:

@@ -46,7 +46,6 @@ class Emulator:
 
     def ready(self) -> dict[str, Any]:
         """What the host needs to know: the line printed once the devices answer."""
-        wired = self.devices.electrodes.wired
         settings, cell, limb = self.devices.settings, self.devices.load_cell.cell, self.devices.limb
         return {
             "stimulator": self.port.path,
@@ -67,7 +66,6 @@ class Emulator:
             "noise_seed": settings.noise_seed,
             "sync": settings.sync and cell.has_sync,
             **({"arm": limb.mode, "angle_sensor": angle_sensor.describe(settings)} if limb else {}),
-            **({"outputs": [list(output) for output in wired]} if len(wired) > 1 else {}),
         }
 
     def run(self, stopping: Callable[[], bool]) -> None:

@@ -12,12 +12,11 @@ from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.tissue import bare
 from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.errors import ArmError, PatientError
-from stimrig.hardware_sim.joint import LiveJoint, draw_joint
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.settings import Settings
 
 DESIGN = "design"
-HIDDEN, TWO_MUSCLES = "hidden:", "two_muscles:"
+HIDDEN = "hidden:"
 
 
 def make_devices(
@@ -28,7 +27,7 @@ def make_devices(
     Parameters
     ----------
     settings : Settings
-        Its `patient` is a name, the path of a file, `hidden:SEED` or `two_muscles:SEED`.
+        Its `patient` is a name, the path of a file, or `hidden:SEED`.
     arm : str, optional
         As `--arm` takes it: a mode with settings, or a file; for a hidden patient also `design`. None: the joint is
         held still and has no sensor.
@@ -42,15 +41,10 @@ def make_devices(
     HardwareSimError
         Patient, arm or a setting cannot be used.
     """
-    seed, joint_seed = (_seed(settings.patient, kind) for kind in (HIDDEN, TWO_MUSCLES))
-    if min(seed or 0, joint_seed or 0) < 0:
+    seed = _hidden_seed(settings.patient)
+    if seed is not None and seed < 0:
         raise PatientError(f"patient '{settings.patient}': give a seed of 0 or above")
-    if joint_seed is not None and arm is not None:
-        raise ArmError("--arm: the joint of a patient with two muscles is held still")
-    if joint_seed is not None:
-        muscle = LiveJoint(draw_joint(joint_seed))
-    else:
-        muscle = _muscle(settings.patient) if seed is None else hidden.make(seed, moving=arm is not None)
+    muscle = _muscle(settings.patient) if seed is None else hidden.make(seed, moving=arm is not None)
     return Devices(muscle, settings, None if arm is None else _arm(arm, arm_laws, seed), epoch_us)
 
 
@@ -58,9 +52,9 @@ LONGEST_NAME = 256
 """Of a file; the system refuses to look for far longer ones."""
 
 
-def _seed(patient: str, kind: str) -> int | None:
+def _hidden_seed(patient: str) -> int | None:
     try:
-        return int(patient.removeprefix(kind)) if patient.startswith(kind) else None
+        return int(patient.removeprefix(HIDDEN)) if patient.startswith(HIDDEN) else None
     except ValueError:
         return None
 

@@ -77,8 +77,8 @@ def _who(group: argparse._ArgumentGroup) -> None:
         "--patient",
         default=DEFAULTS.patient,
         metavar="NAME|FILE",
-        help=f"{', '.join(NAMES)}, or a TOML or JSON file with 'patient' and a table 'parameters', "
-        "or two_muscles:SEED (default: %(default)s)",
+        help=f"{', '.join(NAMES)}, or a TOML or JSON file with 'patient' and a table 'parameters' "
+        "(default: %(default)s)",
     )
     who.add_argument(
         "--hidden",

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,11 +51,6 @@ class Settings:
         1.0, (0.01, 100.0), type=float, metavar="FACTOR", help="let time run FACTOR times faster, for tests"
     )
     sync: bool = True
-    outputs: str = option(
-        "1.1,1.2",
-        metavar="CONNECTOR.CHANNEL,…",
-        help="where the patient's pairs of electrodes are plugged in, in order (default: %(default)s)",
-    )
     angle: str = option(
         "own",
         choices=("own", "in-cell"),
@@ -71,15 +65,7 @@ class Settings:
     angle_jitter_us: float = number(0.0, (0.0, 100000.0), "SD", "standard deviation of each of its samples' own time")
     angle_direction: int = option(1, type=int, choices=(1, -1), help="-1: its readings fall in flexion (default: 1)")
 
-    @property
-    def wired(self) -> list[tuple[int, int]]:
-        """The outputs that have electrodes: connector and channel, from 0."""
-        places = [one.split(".") for one in self.outputs.split(",")]
-        return [(int(connector) - 1, int(channel) - 1) for connector, channel in places]
-
     def __post_init__(self) -> None:
-        if not re.fullmatch(r"[12]\.[1-4](,[12]\.[1-4])*", self.outputs) or len(set(self.wired)) < len(self.wired):
-            raise SettingsError(f"--outputs {self.outputs}: give each of 1.1 to 1.4 and 2.1 to 2.4 at most once")
         for each in dataclasses.fields(self):
             value, span = getattr(self, each.name), each.metadata.get("span")
             if span and not (math.isfinite(value) and span[0] <= value <= span[1]):

@@ -99,17 +99,7 @@ def adaptive_lines(told: Mapping[str, Any] | None) -> list[str]:
     )
     used = f"{number(told['torque_time_nm_s'], 1)} of at most {number(told['max_torque_time_nm_s'], 1)} N·m·s"
     lines = [f"ended          {words(told['ended'], 'end')}; {used}", f"known          {reached}"]
-    lines += bank_lines(told.get("bank"), (told["reach"] or {}).get("bank"))
     return [*lines, *([f"in doubt       {told['problem']}"] if told["problem"] else [])]
-
-
-def bank_lines(probable: Mapping[str, float] | None, usable: int | None) -> list[str]:
-    """Which earlier models the muscle is like, or that there was none; nothing where none was asked for."""
-    if usable is None:
-        return []
-    like = sorted((probable or {}).items(), key=lambda one: -one[1])
-    named = ", ".join(f"{name} ({100.0 * share:.0f} %)" for name, share in like)
-    return [f"earlier models {named or usable or 'none that can be used: a test as ever'}"]
 
 
 def report_lines(test: Mapping[str, Any], model: dict[str, Any] | None) -> list[str]:

@@ -6,7 +6,7 @@ import contextlib
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -69,8 +69,8 @@ def names(text: str | None) -> tuple[str, ...]:
     return tuple(part.strip() for part in (text or "").split(",") if part.strip())
 
 
-def load_model(path: Path, usage: str = "", reader: Callable[[bytes], Any] | None = None) -> Any:
-    """A model from its file; `usage`: of a verb that takes it before a recording; `reader`: of another kind of model.
+def load_model(path: Path, usage: str = "") -> Any:
+    """A model from its file; `usage`: of a verb that takes it before a recording.
 
     Raises InputError: the file cannot be read, or holds no model.
     """
@@ -78,7 +78,7 @@ def load_model(path: Path, usage: str = "", reader: Callable[[bytes], Any] | Non
         raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
     try:
         with path.open("rb") as file:
-            return (reader or identify.Model.from_json)(file.read(LARGEST_MODEL_BYTES))
+            return identify.Model.from_json(file.read(LARGEST_MODEL_BYTES))
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
     except identify.IdentifyError as error:

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypedDict
 
 if TYPE_CHECKING:
     from stimrig.identify import Model
-    from stimrig.identify.muscles import JointModel
 
 
 class Participant(TypedDict):
@@ -20,8 +19,6 @@ class Participant(TypedDict):
     side: Literal["left", "right"] | None
     muscle: str | None
     placement: str | None
-    channels: dict[str, Any]
-    """By name, side, muscle, placement and profile of each further channel of a rig with several."""
     archived_utc: str | None
 
 
@@ -175,12 +172,8 @@ class ApprovedModel:
     etag: str
     changed: bool = True
 
-    def model(self) -> Model | JointModel:
-        """The model itself, to predict with; of several muscles where the document says so."""
-        if self.document.get("kind") == "joint":
-            from stimrig.identify.muscles import JointModel
-
-            return JointModel.from_dict(self.document)
+    def model(self) -> Model:
+        """The model itself, to predict with."""
         from stimrig.identify import Model  # here: a controller that reads the document alone needs no numpy
 
         return Model.from_dict(self.document)

@@ -319,7 +319,7 @@ class Client(Connection):
     def start_test(self, participant: str, **more: Any) -> SessionTest:
         """Start a test, the pre-session test by default. `more`: `kind`, `segments` or `protocol`, `joins`, limits.
 
-        With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`, `bank`.
+        With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`.
         What it can reach is then asked for before, in a request of its own.
 
         Parameters

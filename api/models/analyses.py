@@ -7,7 +7,6 @@ import hashlib
 import json
 import logging
 from collections.abc import Sequence
-from itertools import permutations
 from typing import Any
 
 from stimrig.api.clock import Clock
@@ -26,8 +25,6 @@ DIAGNOSIS, OWN_DIAGNOSIS = "diagnosis", "diagnosis of its structure"
 """The names under which those of the plain structure and of another are kept."""
 IMPROVEMENT = "improvement"
 """What a diagnosis found by the way, kept apart: the models with the effects that it names."""
-CO_CONTRACTION, CROSS_TALK = "co_contraction", "cross_talk"
-"""What several muscles do to each other (`stimrig.identify.muscles.interplay`)."""
 HALF_DONE = 0.5
 """From here on a diagnosis of low priority is left to finish when somebody begins to wait for it."""
 
@@ -204,7 +201,7 @@ class Analyses:
         if twice:
             detail = f"{', '.join(twice)} is in {model.id} already. Name effects it does not hold."
             raise ApiError(409, "effect-present", "The effect is in the model", detail)
-        await self.check_known(added, model)
+        await self.check_known(added)
         effects = [*model.effects, *added]
         same = await asyncio.to_thread(self.versions.child_with, model, effects, [] if force else added)
         if same is not None:
@@ -227,17 +224,14 @@ class Analyses:
         found = await self.asked("fit", on_call, data=path, method=model.method, effects=asked)
         return await asyncio.to_thread(self._store_added, found["json"], model, added, by, forced, reason)
 
-    async def check_known(self, effects: list[str], model: Model | None = None) -> None:
-        """Refuse effects that are not in the library; of a model of several muscles, that name none of them."""
+    async def check_known(self, effects: list[str]) -> None:
+        """Refuse effects that are not in the library."""
         if self._ids is None:
             found = await self.asked("effects")
             self._ids = sorted(entry["id"] for entry in found["effects"])
-        names = list(stored_model.muscles_of(stored_model.read(model))) if model is not None else []
-        known = [f"{name}.{effect}" for name in names for effect in self._ids] or self._ids
-        known += [CO_CONTRACTION, *(f"{CROSS_TALK}:{a}>{b}" for a, b in permutations(names, 2))] if names else []
-        unknown = [effect for effect in effects if effect not in known]
+        unknown = [effect for effect in effects if effect not in self._ids]
         if unknown:
-            detail = f"There is no effect {', '.join(unknown)}. Take one of {', '.join(known)}."
+            detail = f"There is no effect {', '.join(unknown)}. Take one of {', '.join(self._ids)}."
             raise ApiError(422, "unknown-effect", "No such effect", detail)
 
     def _store_added(

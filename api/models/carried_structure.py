@@ -14,7 +14,6 @@ from typing import Any
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
 from stimrig.api.models.explanation import name_of
-from stimrig.api.models.family import family_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Model
@@ -42,7 +41,7 @@ class CarriedStructure:
 
         Raises ApiError: the recording gives no model in the plain structure either.
         """
-        earlier = await asyncio.to_thread(self._earlier, participant)
+        earlier = await asyncio.to_thread(self.versions.last_approved, participant)
         effects, warning = list(self.settings.structure) if earlier is None else [], ""
         if effects:
             try:
@@ -60,24 +59,14 @@ class CarriedStructure:
         Whatever becomes of the carried structure, the plain model stays; what was found is kept with it, and with the
         child.
         """
-        earlier = await asyncio.to_thread(self._earlier, plain.participant)
-        if (
-            not family_of(plain).can("carried")
-            or earlier is None
-            or earlier.recording_id == plain.recording_id
-            or plain.effects
-        ):
+        earlier = await asyncio.to_thread(self.versions.last_approved, plain.participant)
+        if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
             return plain
         try:
             found = await self._begun("carry", path, on_call, model_json=stored_model.text(earlier), **how)
         except (ApiError, OSError, ValueError) as error:  # all that a call can end with
             found = {"json": None, "found": _not_carried(error)}
         return await asyncio.to_thread(self._store, found, plain, earlier)
-
-    def _earlier(self, participant: str) -> Model | None:
-        """The last approved version, where its structure can be carried over."""
-        found = self.versions.last_approved(participant)
-        return found if found is not None and family_of(found).can("carried") else None
 
     async def _begun(self, verb: str, path: str, on_call: OnCall | None, **arguments: Any) -> dict[str, Any]:
         call = self.pool.submit(verb, data=path, **arguments)

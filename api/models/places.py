@@ -12,23 +12,14 @@ Place = tuple[str | None, str | None, str | None, float | None]
 """A site, and the current, mA; None: not known."""
 
 
-def site_of(row: Participant, channel: str = "") -> Site:
-    """Where a participant is stimulated now; on a further channel by its name."""
-    if not channel:
-        return row.side, row.muscle, row.placement
-    own = (row.channels or {}).get(channel) or {}
-    return own.get("side"), own.get("muscle"), own.get("placement")
-
-
-def further_of(test: Test | None) -> dict[str, Any]:
-    """Where the further channels of a test stimulated, by their names."""
-    return (test.plan.get("sites") or {}) if test is not None else {}
+def site_of(row: Participant) -> Site:
+    """Where a participant is stimulated now."""
+    return row.side, row.muscle, row.placement
 
 
 def holds_at(site: list[Any] | None, row: Participant) -> bool:
-    """Whether all is still where it was when this was written down: the further channels, too."""
-    further = site[3] if site is not None and len(site) > 3 else {}
-    return kept(site) == site_of(row) and all(tuple(own) == site_of(row, name) for name, own in further.items())
+    """Whether all is still where it was when this was written down."""
+    return kept(site) == site_of(row)
 
 
 def site_of_recording(recording: Recording, test: Test | None) -> Site | None:
@@ -52,11 +43,6 @@ def place_of(row: Test) -> Place:
     """Where a test stimulated, and with what current, mA."""
     plan = row.plan
     return plan.get("side"), plan.get("muscle"), plan.get("placement"), plan.get("profile", {}).get("current_ma")
-
-
-def same_muscle(one: Site, other: Site) -> bool:
-    """Whether two people's sites are of one side and muscle, as far as both are known; not where electrodes are."""
-    return not differ((*one[:2], None, None), (*other[:2], None, None))
 
 
 def differ(one: Place, other: Place) -> bool:

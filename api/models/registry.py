@@ -8,7 +8,6 @@ import logging
 import re
 from collections.abc import Collection
 from dataclasses import dataclass
-from itertools import islice
 from typing import Any
 
 from sqlalchemy import select
@@ -17,14 +16,11 @@ from sqlalchemy.orm import Session, defer
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
-from stimrig.api.models.family import family_of
 from stimrig.api.models.places import (
     Site,
-    further_of,
     holds_at,
     in_words,
     place_of,
-    same_muscle,
     site_of,
     site_of_recording,
 )
@@ -238,8 +234,7 @@ class Versions:
         with self.store.write() as session:
             if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
-            followed = tracking if tracking and family_of(row).can("tracking") else None
-            return self._decide(session, row, approved, by, reason, followed.to_dict() if followed else None)
+            return self._decide(session, row, approved, by, reason, tracking.to_dict() if tracking else None)
 
     def _brings_back(self, row: Model) -> bool:
         """Whether without this version another one is served; else a rejection only takes away."""
@@ -274,24 +269,19 @@ class Versions:
             return site_of_recording(recording, test), None if test is None else place_of(test)[3]
 
     def _site(self, session: Session, row: Model, approved: bool) -> list[Any]:
-        """The participant's site, and of several muscles each further one's; 409 where a model is to be approved that
-        was measured at another one."""
+        """The participant's site; 409 where a model is to be approved that was measured at another one."""
         participant, recording = session.get(Participant, row.participant), session.get(Recording, row.recording_id)
         assert participant is not None and recording is not None
         here = site_of(participant)
         test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
-        further = further_of(test)
-        pairs = [(site_of_recording(recording, test), here)]
-        pairs += [(tuple(own), site_of(participant, name)) for name, own in further.items()]
-        moved = next(((there, now) for there, now in pairs if there not in (None, now)), None)
-        if approved and moved is not None:
-            there, now = (in_words(site or here) for site in moved)
+        there = site_of_recording(recording, test)
+        if approved and there not in (None, here):
             detail = (
-                f"{row.id} was measured at {there}. {row.participant} is now stimulated at {now}. "
+                f"{row.id} was measured at {in_words(there)}. {row.participant} is now stimulated at {in_words(here)}. "
                 "Test anew there, or set the site back on the participant's page. Nothing was decided."
             )
             raise ApiError(409, "other-site", "This model is of another site", detail)
-        return [*here, further] if further else list(here)
+        return list(here)
 
     def decision(self, model_id: str) -> Approval | None:
         """The newest decision on a version."""
@@ -337,17 +327,7 @@ class Versions:
             for decision in decided
             if decision is newest[decision.model_id] and decision.approved
         ]
-        rows = [row for row in rows if family_of(row).can("carried")]
         return list({row.recording_id: row for row in reversed(rows)}.values())[::-1]
-
-    def last_of_others(self, participant: Participant, most: int) -> list[Model]:
-        """The versions approved last of others who are not archived, at the same side and muscle, newest first."""
-        others = (Participant.code != participant.code, Participant.archived_utc.is_(None))
-        here = site_of(participant)
-        alike = [row.code for row in self.store.all(Participant, *others) if same_muscle(site_of(row), here)]
-        decided = sorted(self._last_approvals(alike).values(), key=lambda decision: -decision.id)
-        rows = (self.get(decision.model_id) for decision in decided)
-        return list(islice((row for row in rows if family_of(row).can("carried")), most))
 
     def served(self, participant: str) -> Served | None:
         """What the controller gets, or None where nothing is approved. Raises ApiError (500) where that is damaged."""
@@ -373,9 +353,7 @@ class Versions:
             return None
         if served is None:
             return None
-        curve = json.loads(served.body).get("recruitment")
-        if curve is None:  # several muscles have one each
-            return None
+        curve = json.loads(served.body)["recruitment"]
         return {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
 
     def quality(self, row: Model) -> dict[str, Any]:

@@ -45,40 +45,15 @@ def text(row: Model) -> str:
     return whole(row).decode()
 
 
-# ---- of several muscles -------------------------------------------------------------------------------------------
-
-JOINT = "joint"
-"""`kind` of the MODEL.json of several muscles, and the method of its row; that of one muscle has no kind."""
-
-
-def muscles_of(document: Mapping[str, Any]) -> dict[str, dict[str, Any]]:
-    """MODEL.json of each muscle by its channel's name; empty where the document is of one muscle."""
-    if document.get("kind") != JOINT:
-        return {}
-    return {one["name"]: one["model"] for one in document["channels"]}
-
-
 def structure(document: Mapping[str, Any]) -> dict[str, str]:
-    """The effects that a model holds, each with its form where it names one: `id:form`.
-
-    Of several muscles an effect has its channel's name before it, and their interplay the channels behind it:
-    `biceps.fatigue`, `cross_talk:biceps>triceps`, `co_contraction`.
-    """
-    owners = muscles_of(document) or {"": document}
-    found = {
-        f"{name}.{one['id']}".removeprefix("."): one.get("form") or ""
-        for name, own in owners.items() for one in own.get("effects") or []
-    }  # fmt: skip
-    for one in document.get("interplay") or []:
-        ends = f":{one['from']}>{one['to']}" if "from" in one else ""
-        found[f"{one['id']}{ends}"] = one.get("form") or ""
-    return {name: f"{name}:{form}".removesuffix(":") for name, form in found.items()}
+    """The effects that a model holds, each with its form where it names one: `id:form`."""
+    forms = {one["id"]: one.get("form") or "" for one in document.get("effects") or []}
+    return {name: f"{name}:{form}".removesuffix(":") for name, form in forms.items()}
 
 
 def is_plain(document: Mapping[str, Any]) -> bool:
     """Whether its structure is the plain one: no effects around f(u) and a G of second order."""
-    owners = muscles_of(document) or {"": document}
-    return not structure(document) and all("time_constant_s" in own["linear"] for own in owners.values())
+    return not structure(document) and "time_constant_s" in document["linear"]
 
 
 # ---- verdict and fit ----------------------------------------------------------------------------------------------
@@ -266,8 +241,6 @@ def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
 
     Models from before the figures were stored have their values, without standard deviations.
     """
-    if owners := muscles_of(document):
-        return {f"{name}.{key}": one for name, own in owners.items() for key, one in muscle_figures(own).items()}
     stored = (document.get("uncertainty") or {}).get("figures") or {}
     values = {**recruitment(document), **dynamics(document)}
     found = {
@@ -286,5 +259,5 @@ def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
 def threshold_us(row: Model) -> float | None:
     """The threshold of a version's curve, µs; None where it has none. Raises ApiError (500) where it is damaged."""
     known = row.fit.get("figures") or muscle_figures(read(row))
-    value: float | None = known.get("threshold_us", {}).get("value")  # several muscles have none together
+    value: float | None = known.get("threshold_us", {}).get("value")
     return value

@@ -18,7 +18,6 @@ from stimrig.api.clock import Clock, local_day
 from stimrig.api.errors import ApiError
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
-from stimrig.api.models.family import family_of
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Approval, Model, Note, Recording, Test
@@ -117,8 +116,6 @@ class Trend:
 
     async def against(self, model: Model) -> tuple[Session, Session] | None:
         """The last approved session before the model's, and the model's with that model; None where there is none."""
-        if not family_of(model).can("trend"):
-            return None
         sessions, models = await asyncio.to_thread(self._read, model.participant)
         own = _session_of(sessions, models, model.id)
         before = [
@@ -195,8 +192,8 @@ def _models(participant: str) -> Any:
         Model.id, Model.recording_id, Model.method, Model.effects, Model.fit, Model.created_utc,
         Recording.origin, Recording.created_utc.label("recorded_utc"), Recording.test_id,
     )  # fmt: skip
-    of_one = (Model.participant == participant, Model.method != stored_model.JOINT)
-    return select(*columns).join(Recording, Recording.id == Model.recording_id).where(*of_one)
+    of_models = Recording.id == Model.recording_id
+    return select(*columns).join(Recording, of_models).where(Model.participant == participant)
 
 
 def _tests(participant: str) -> Any:

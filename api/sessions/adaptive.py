@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, ClassVar
 
-from stimrig.api.clock import Clock, local_day
+from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
 from stimrig.api.models.places import Place, differ, place_of, site_of
@@ -34,9 +34,6 @@ KEPT = 20
 """Outlooks that are remembered: the question before a test and its start need the same one."""
 MOST_MODELS = 10
 """Sessions from which is learnt how much a person changes between two."""
-MOST_IN_BANK = 20
-"""Models that a bank holds: this participant's own, then the newest of others. With 50 a decision takes twice as long,
-and the muscle rests meanwhile."""
 DURATION_S = 50.0
 """The longest test, where nobody says: the opening, some ten seconds of pieces, then the whole default test fit in."""
 TAIL_S = 0.4
@@ -77,7 +74,7 @@ class AdaptiveTests(Watched):
             "target": body.target.model_dump(),
             "playable_s": bounds.max_duration_s - SAFE_END_S, "max_torque_time_nm_s": bounds.max_torque_time_nms,
             "largest_us": plan.largest_us, "pulse_rate_hz": plan.pulse_rate_hz,
-            **await asyncio.to_thread(self._known, plan, body.bank),
+            "models": await asyncio.to_thread(self._known, plan),
         }  # fmt: skip
         found = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
         default = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None), timeout_s=preview_s)
@@ -85,7 +82,7 @@ class AdaptiveTests(Watched):
         if not found["reach"]["reachable"] and not body.anyway:
             raise out_of_reach(found["reach"])
         plan = plan.model_copy(update={"segments": segments, "adaptive": bounds})
-        reach = {**found["reach"], "known": found["known"], "bank": found["bank"]}
+        reach = {**found["reach"], "known": found["known"]}
         return Planned(plan, {"target": how["target"], "reach": reach, "bounds": bounds.model_dump()}, how)
 
     async def _outlook(self, wanted: dict[str, Any]) -> dict[str, Any]:
@@ -103,25 +100,13 @@ class AdaptiveTests(Watched):
                     self._outlooks.popitem(last=False)
             return self._outlooks[name]
 
-    def _known(self, plan: TestPlan, with_bank: bool) -> dict[str, Any]:
-        """For the adviser: the participant's models, and with a bank that."""
+    def _known(self, plan: TestPlan) -> list[str]:
+        """The participant's models at the place of a plan, oldest first."""
         person = self.versions.store.get(Participant, plan.participant)
-        own = self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
-        return {"models": [text for _, text in own], "bank": self._bank(person, own) if with_bank else None}
+        return self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
 
-    def _bank(self, person: Participant, own: list[tuple[str, str]]) -> list[tuple[str, str]]:
-        """Names and models that the participant may be like.
-
-        Whoever reads a test may be barred from other people, so their names tell nothing of them.
-        """
-        bank = [(f"own model {number} of {day}", text) for number, (day, text) in enumerate(reversed(own), start=1)]
-        for number, row in enumerate(self.versions.last_of_others(person, MOST_IN_BANK - len(bank)), start=1):
-            with contextlib.suppress(ApiError):
-                bank.append((f"another person {number}", stored_model.text(row)))
-        return bank
-
-    def _models(self, participant: str, place: Place) -> list[tuple[str, str]]:
-        """The days of the participant's approved models, and the models, oldest first.
+    def _models(self, participant: str, place: Place) -> list[str]:
+        """The participant's approved models, oldest first.
 
         Without those that are damaged, and those of tests at another place: they say nothing of this one.
         """
@@ -130,10 +115,10 @@ class AdaptiveTests(Watched):
         tests = {test.recording_id: test for test in of_rows}
         found = []
         pairs = [(row, tests.get(row.recording_id)) for row in rows]
-        here = [(row, test) for row, test in pairs if test is None or not differ(place_of(test), place)]
-        for row, test in here[-MOST_MODELS:]:
+        here = [row for row, test in pairs if test is None or not differ(place_of(test), place)]
+        for row in here[-MOST_MODELS:]:
             with contextlib.suppress(ApiError):
-                found.append((local_day(test.requested_utc if test else row.created_utc), stored_model.text(row)))
+                found.append(stored_model.text(row))
         return found
 
     # ---- while it plays, and after it ------------------------------------------------------------------------
@@ -167,8 +152,7 @@ class AdaptiveTests(Watched):
         planned = [segment["name"] for segment in (row.plan.get("preview") or {}).get("segments") or []]
         if ended == "fixed-rest" and HELD_OUT in planned:
             return {}
-        own = self._models(row.participant, place_of(row))
-        return {"recruitment": "near-sigmoid", "models": [text for _, text in own]}
+        return {"recruitment": "near-sigmoid", "models": self._models(row.participant, place_of(row))}
 
     def unwatched(self, row: Test) -> dict[str, Any]:
         """As `Watched`."""

@@ -87,8 +87,6 @@ class Told:
     problem: str = ""
     knowledge: dict[str, Any] | None = None
     least_known: dict[str, Any] | None = None
-    bank: dict[str, float] | None = None
-    """How probable each earlier model is, by its name; None without a bank, and before the first fit."""
     ended: str = ""
     decisions: list[dict[str, Any]] = field(default_factory=list)
 
@@ -203,7 +201,7 @@ class Follower(Watcher):
         # a misfit is told as the problem, and its bands mean nothing; at the end those stay on which it was decided
         fits = said["kind"] != "misfit" and not self.told.ended
         if fits:
-            told.words, told.bank = said["words"], said.get("bank")
+            told.words = said["words"]
         row = {
             "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
             "segments": [segment["name"] for segment in said["segments"]],

@@ -13,9 +13,7 @@ from sqlalchemy import select
 from stimrig.api.decisions import MODEL_TAG
 from stimrig.api.errors import ApiError, forbidden
 from stimrig.api.models.places import site_of
-from stimrig.api.models.stored_model import JOINT
 from stimrig.api.people.auth import Auth, Principal, Scope, outside
-from stimrig.api.sessions import channels
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
@@ -94,8 +92,6 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
         raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
     participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
-    if any(one.channels for one in body.segments or ()):
-        await asyncio.to_thread(_refuse_channels, runner, participant, plan)
     limits: dict[str, Any] = {}
     for name in ("current_ma", "max_pulse_width_us"):
         asked = body.profile.sent().get(name) if body.profile else None
@@ -115,21 +111,6 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
     if not widest_us <= plan["max_pulse_width_us"]:
         raise beyond(f"A pulse of {widest_us:g} µs is above the plan's {plan['max_pulse_width_us']:g} µs")
     return narrowed
-
-
-def _refuse_channels(runner: Runner, participant: Participant, plan: dict[str, Any]) -> None:
-    """A key plays on several channels where the approved model is of several muscles, within its plan on each.
-
-    The widths of all channels stand in the preview; the first one's current is narrowed to the plan, the others'
-    are the participant's own.
-    """
-    served = runner.versions.served(participant.code)
-    if served is None or json.loads(served.body).get("kind") != JOINT:
-        raise beyond("The approved model is of one muscle. Leave the segments' channels out")
-    for one in channels.needed(participant, runner.rig.status):
-        asked_ma = float(one.profile["current_ma"])
-        if one.key and not asked_ma <= plan["current_ma"]:
-            raise beyond(f"{one.name} has {asked_ma:g} mA, above the plan's {plan['current_ma']:g} mA")
 
 
 def _refuse_kind(who: Principal, body: TestIn) -> None:

@@ -60,8 +60,6 @@ class Lifecycle:
         `fits`: documents of models by their ids, where many tests are told of at once.
         """
         planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
-        if several := planned.get("channels"):
-            planned["channels"] = {name: {"charge_uc": one["charge_uc"]} for name, one in several.items()}
         running = row.state in ("requested", "running")
         lasted_s = row.summary.get("duration_s", 0.0)
         there = (position or (0.0, planned.get("duration_s", 0.0), None)) if running else (lasted_s, lasted_s, None)

@@ -35,15 +35,13 @@ class Hub:
         self._angle: tuple[float, float] | None = None
         self.test_id: str | None = None
         self.history: dict[str, list[float]] = {name: [] for name in (*SERIES, *ANGLES)}
-        self.pulses: dict[str, dict[str, list[float]]] = {}
-        """Of each channel of a test of several, by its name."""
         self.newest: LiveEvent | None = None
         self._queues: set[asyncio.Queue[dict[str, Any]]] = set()
 
     def begin(self, test_id: str) -> None:
         """A new test: forget the last one's curves."""
         self.test_id, self.newest = test_id, None
-        self.history, self.pulses = {name: [] for name in (*SERIES, *ANGLES)}, {}
+        self.history = {name: [] for name in (*SERIES, *ANGLES)}
 
     def live(self, event: LiveEvent) -> None:
         """Take a frame, keep it, pass it on."""
@@ -57,10 +55,6 @@ class Hub:
             self.newest = event
             for name in SERIES:
                 self.history[name].extend(getattr(event, name))
-            for one in event.channels or ():
-                kept = self.pulses.setdefault(one.name, {name: [] for name in SERIES[3:]})
-                for name, values in kept.items():
-                    values.extend(getattr(one, name))
             self._keep_angle(event)
         self.send({"type": "live", **event.model_dump(exclude={"event"})})
 
@@ -101,10 +95,7 @@ class Hub:
         queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue(QUEUE_LENGTH)
         position = self.position(self.test_id) if self.test_id else None
         duration_s = position[1] if position else 0.0
-        history: dict[str, Any] = {name: list(values) for name, values in self.history.items()}
-        if self.pulses:
-            own = self.pulses.items()
-            history["channels"] = [{"name": name, **{key: list(one[key]) for key in one}} for name, one in own]
+        history = {name: list(values) for name, values in self.history.items()}
         queue.put_nowait({"type": "history", "test_id": self.test_id, "duration_s": duration_s, **history})
         self._queues.add(queue)
         return queue

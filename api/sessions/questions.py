@@ -31,7 +31,6 @@ class Row:
     label: str
     value: str
     before: str = ""
-    muscle: int = 0  # number of the channel that it is about; its label is that one's name, and has its colour
 
 
 @dataclass

@@ -23,7 +23,6 @@ from stimrig.api.errors import ApiError
 from stimrig.api.models.tracking import USUAL_PERCENT, Limits
 from stimrig.api.people import accounts
 from stimrig.api.sessions import profiles
-from stimrig.api.sessions.channels import ChannelName
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, PULSE_RATES_HZ, Labels, Profile
 
@@ -126,15 +125,6 @@ SETTINGS = {
 }
 
 
-class ChannelSequenceIn(Body):
-    """What one channel plays in a segment."""
-
-    sequence: Annotated[
-        str, StringConstraints(min_length=1, max_length=40), Field(description="an id of `GET /v1/sequences`")
-    ]
-    settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
-
-
 class SegmentIn(Body):
     """One segment of a test: a sequence of the library by name, with its settings."""
 
@@ -145,11 +135,6 @@ class SegmentIn(Body):
         Field(description="an id of `GET /v1/sequences`", examples=["prbs"]),
     ]
     settings: Annotated[dict[str, Any], WithJsonSchema(SETTINGS)] = Field(default_factory=dict)
-    channels: Annotated[dict[str, ChannelSequenceIn], Field(min_length=1, max_length=8)] | None = Field(
-        default=None,
-        description="on a rig of several channels, what each plays, by its name; one that is not named rests, but the "
-        "first, which plays the segment's own sequence. All are padded with rest to the longest",
-    )
 
 
 LEAST_PERCENT, MOST_PERCENT = 0.2, 50.0
@@ -180,15 +165,13 @@ class AngleIn(Body):
 
 
 OWN_FIELDS: dict[str, set[str]] = {
-    "adaptive": {"target", "max_duration_s", "max_torque_time_nm_s", "anyway", "bank"},
+    "adaptive": {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"},
     "sequence": {"reference_torque_nm", "angle"},
     PASSIVE: {"angle", "max_duration_s"},
     HELD: {"angle"},
     MOVING: {"angle", "max_duration_s", "max_torque_time_nm_s"},
 }
 """Fields that only tests of some kinds have."""
-MUSCLES = "muscles"
-"""Kind of a test of several channels, each in turn and all together."""
 PLANNED_BY_ITSELF = {"segments", "protocol", "joins"}
 """What is not chosen for a test that chooses its own segments."""
 
@@ -240,9 +223,6 @@ class TestIn(Labels, Body):
     anyway: StrictBool = Field(
         default=False, description="kind `adaptive`: play it although the target is out of reach"
     )
-    bank: StrictBool = Field(
-        default=False, description="kind `adaptive`: start from earlier models, the participant's own and others'"
-    )
 
     angle: AngleIn | None = Field(
         default=None,
@@ -268,7 +248,7 @@ class TestIn(Labels, Body):
         }
         sent = {name for name in self.model_fields_set if getattr(self, name) not in (None, default[name])}
         others = set().union(*OWN_FIELDS.values()) - OWN_FIELDS.get(self.kind, set())
-        planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING, MUSCLES)
+        planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING)
         if "reference_torque_nm" in sent & others:
             raise ValueError("reference_torque_nm: only a test of the kind sequence has one; leave it out")
         which = "has no such thing" if planned else "has a fixed plan"
@@ -288,13 +268,6 @@ class TestIn(Labels, Body):
         return self
 
 
-class CalibratedIn(Body):
-    """One of several channels that are calibrated in one go."""
-
-    name: ChannelName
-    current_ma: CurrentMa | None = Field(None, description="of every pulse, mA; null: the participant's own there")
-
-
 class CalibrationIn(Body):
     """How a guided calibration goes: one current, small steps, short trains."""
 
@@ -309,18 +282,11 @@ class CalibrationIn(Body):
     max_torque_nm: TorqueNm | None = Field(
         None, description="torque at which a train stops, and later a test, N·m; None: the participant's own"
     )
-    channels: Annotated[list[CalibratedIn], Field(min_length=1, max_length=8)] | None = Field(
-        None, description="several channels in one go; null: the first one alone"
-    )
-
-
-Channel = Annotated[ChannelName | Literal[""], Field(description="its name; of a calibration of several channels")]
 
 
 class StepIn(Body):
     """One train."""
 
-    channel: Channel = ""
     direction: Literal["up", "fine", "down", "repeat"] = "up"
     shown_us: Annotated[
         FiniteFloat | None, Field(description="the width that a person was shown; another one is not sent, µs")
@@ -330,7 +296,6 @@ class StepIn(Body):
 class MarkIn(Body):
     """What the participant feels, or the muscle does, at the last train's width."""
 
-    channel: Channel = ""
     threshold: Literal["sensory", "motor", "comfort"]
 
 
@@ -418,11 +383,7 @@ class ApprovalIn(DecisionIn):
     tracking: TrackingIn = Field(default=TrackingIn())
 
 
-EffectName = Annotated[
-    str,
-    StringConstraints(pattern=r"^([a-z0-9_-]{1,32}\.)?[a-z0-9_]{1,64}(:[a-z0-9_-]{1,32}>[a-z0-9_-]{1,32})?$"),
-    Field(description="`fatigue`; of several muscles `biceps.fatigue`, `co_contraction`, `cross_talk:biceps>triceps`"),
-]
+EffectName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]
 
 
 class EffectsIn(Body):

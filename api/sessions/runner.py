@@ -9,7 +9,6 @@ import secrets
 import time
 from collections.abc import Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +18,14 @@ from stimrig.api.clock import Clock, asked_s
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.logs import current_test
 from stimrig.api.models.analyses import Analyses
-from stimrig.api.models.family import family_of
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.people.auth import Scope
-from stimrig.api.sessions import channels
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Follower, Lifecycle
 from stimrig.api.sessions.live import Hub
-from stimrig.api.sessions.muscles import MusclesTests
 from stimrig.api.sessions.playing import Current, Playing, busy, other_than, refuse_archived, rests_of, right_ended
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
@@ -75,7 +71,7 @@ class Runner(Playing):
         self.hub, self.counted = Hub(clock), StopCounter()
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
-        self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint, MusclesTests(rig, store))
+        self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint)
         self.lifecycle = Lifecycle(
             store, clock, rig, pool, versions, analyses, self.kinds, recordings_dir, follower, self.announce
         )
@@ -199,7 +195,6 @@ class Runner(Playing):
             raise ApiError(503, "too-late", "The start took too long", detail)
 
     async def _planned(self, body: TestIn, participant: Participant) -> Planned:
-        channels.refuse_reordered(participant, self.rig.status)
         segments = None
         if body.segments is not None:
             segments = [messages.SegmentPlan(**segment.model_dump()) for segment in body.segments]
@@ -213,11 +208,7 @@ class Runner(Playing):
         )
         if body.joins is not None:
             await asyncio.to_thread(self._check_joins, body.joins, participant, plan)
-        planned = await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
-        if planned.plan.channels is None and any(one.channels for one in body.segments or ()):
-            several, sites = channels.for_all(planned.plan, participant, self.rig.status)
-            planned = replace(planned, plan=several, kept=planned.kept | sites)
-        return planned
+        return await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:
         """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""
@@ -229,7 +220,6 @@ class Runner(Playing):
     def _check_joins(self, joins: str, participant: Participant, plan: messages.TestPlan) -> None:
         """The model whose recording the new one is to be joined to is the participant's own, and of the same place."""
         model = self.versions.get(joins)
-        family_of(model).require("joined")
         if model.participant != participant.code:
             detail = f"{model.id} is a model of {model.participant}, the test is for {participant.code}."
             raise ApiError(422, "other-participant", "The model is another participant's", detail)
@@ -280,8 +270,7 @@ class Runner(Playing):
         return {**await self._previewed(planned.plan), **planned.kept}
 
     async def _previewed(self, plan: messages.TestPlan) -> dict[str, Any]:
-        several = plan.channels is not None  # the curve is one muscle's
-        curve = None if several else await asyncio.to_thread(self._recruitment, plan.participant)
+        curve = await asyncio.to_thread(self._recruitment, plan.participant)
         return await self.rig.ask(requests.PreviewRequest(plan=plan, recruitment=curve), timeout_s=PREVIEW_S)
 
     def _recruitment(self, participant: str) -> messages.RecruitmentTable | None:
@@ -498,9 +487,8 @@ def _may_play(token: Token | None) -> bool:
 
 
 def _pulses(preview: Mapping[str, Any]) -> int:
-    """How many pulses a test has, those of width 0 included; of several channels, each of them."""
-    several = preview.get("channels") or {"": preview}
-    return max(len(one["pulse_width_us"]) for one in several.values())
+    """How many pulses a test has, those of width 0 included."""
+    return len(preview["pulse_width_us"])
 
 
 def not_what_was_seen() -> ApiError:

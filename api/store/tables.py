@@ -30,14 +30,6 @@ class Participant(Table):
     placement: Mapped[str | None] = mapped_column(String, default=None)
     """Where the electrodes are: with side and muscle the site, to which models and keys belong."""
     archived_utc: Mapped[str | None] = mapped_column(String, default=None)
-    channels: Mapped[dict[str, dict[str, Any]] | None] = mapped_column(JSON(none_as_null=True), default=None)
-    """Of each further channel by its name: muscle, side, placement and profile; all else is of the first channel."""
-
-    def as_dict(self) -> dict[str, Any]:
-        """As `Table`; who has one channel never sees that there are more."""
-        found = super().as_dict()
-        further = {name: one for name, one in (found.pop("channels") or {}).items() if name}
-        return found | ({"channels": further} if further else {})
 
 
 class Test(Table):
@@ -134,8 +126,7 @@ class Approval(Table):
     at_utc: Mapped[str] = mapped_column(String)
     expires_utc: Mapped[str | None] = mapped_column(String, default=None)
     site: Mapped[list[Any] | None] = mapped_column(JSON(none_as_null=True), default=None)
-    """The participant's site then, and with several muscles those of the further channels by their names: at another
-    one it does not hold."""
+    """The participant's site then: at another one it does not hold."""
     tracking: Mapped[dict[str, float] | None] = mapped_column(JSON(none_as_null=True), default=None)
     """How far the model may be tracked, in percent (`api.models.tracking.Limits`); None: nobody has allowed it."""
 

@@ -10,7 +10,7 @@ from stimrig.api import schemas
 from stimrig.api.decisions import DECISIONS
 from stimrig.api.web.middleware import REFUSALS
 from stimrig.api.web.responses.base import Problem
-from stimrig.api.web.responses.models import JointModelOut, TrackedOut
+from stimrig.api.web.responses.models import TrackedOut
 from stimrig.api.web.responses.rig import LiveOut
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
@@ -69,7 +69,7 @@ def describe(app: FastAPI) -> None:
 
 def _complete(document: dict[str, Any]) -> None:
     components = document["components"]["schemas"]
-    for model in (Problem, LiveOut, TrackedOut, JointModelOut):
+    for model in (Problem, LiveOut, TrackedOut):
         own = model.model_json_schema(ref_template="#/components/schemas/{model}")
         components.update(own.pop("$defs", {}) | {model.__name__: own})
     components["JsonValue"] = {"description": "any JSON value: what it holds depends on its key"}
@@ -77,7 +77,6 @@ def _complete(document: dict[str, Any]) -> None:
         components.pop(name, None)
     for name in EMBEDDED:
         components.update(schemas.components(name))
-    components["JointChannelOut"]["properties"]["model"] = {"$ref": "#/components/schemas/ModelJson"}
     components["ModelJson"]["properties"]["tracking"] = {"$ref": "#/components/schemas/TrackedOut"}
     _tell_of_decisions(document)
     for methods in document["paths"].values():

@@ -35,25 +35,20 @@ def outlook(
     max_torque_nm: float,
     pulse_rate_hz: float,
     models: Sequence[str] = (),
-    bank: Sequence[tuple[str, str]] | None = None,
 ) -> dict[str, Any]:
     """The opening's pulse widths, and what the test will probably reach.
 
-    `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first; `bank`: names
-    and models that the person may be like. The reply's `bank` tells how many of them can be used.
+    `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
     from stimrig.identify.experiments.adaptive import Asked, decide, reach
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.1, "playing the test on a simulated muscle")
-    like = bank_of(bank)
-    asked = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models), like)
+    asked = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models))
     opening = decide(None, (), asked)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
     found = reach(asked, NEW_PERSON_SHARE * max_torque_nm)
-    usable = None if bank is None else len(like.candidates) if like else 0
-    known_before = asked.earlier is not None
-    return json_value({"opening_us": widths, "reach": asdict(found), "known": known_before, "bank": usable})
+    return json_value({"opening_us": widths, "reach": asdict(found), "known": asked.earlier is not None})
 
 
 def warm() -> None:
@@ -87,28 +82,13 @@ def model_of(text: str) -> identify.Model:
     return identify.Model.from_json(text)
 
 
-def bank_of(models: Sequence[tuple[str, str]] | None) -> Any:
-    """The `Bank` of those that can be read here and used; None where there is none: then it is a test as ever."""
-    from stimrig.identify.experiments.bank import Bank
-
-    read = {}
-    for name, text in models or ():
-        with suppress(identify.IdentifyError):
-            read[name] = model_of(text)
-    found = Bank.of(read)
-    return found if found.candidates else None
-
-
-def begin(
-    progress: Progress, target: dict[str, float], models: Sequence[str] = (),
-    bank: Sequence[tuple[str, str]] | None = None, **limits: Any,
-) -> dict[str, Any]:  # fmt: skip
+def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any) -> dict[str, Any]:
     """A test begins, within the limits that `Running` has: what was known of another one is forgotten."""
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.5, "beginning")
     _running.clear()
-    _running.append(Running(Target(**target), known(models), bank_of(bank), **limits))
+    _running.append(Running(Target(**target), known(models), **limits))
     return {}
 
 
@@ -124,7 +104,6 @@ class Running:
 
     target: Any
     known: Any
-    bank: Any
     playable_s: float
     max_torque_time_nm_s: float
     largest_us: float
@@ -164,7 +143,7 @@ class Running:
         committed_nm_s = self._expected(laid_us[round(measured_s * self.pulse_rate_hz) :])
         left_s = max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz)
         left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
-        asked = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.known, self.bank)
+        asked = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.known)
         found = decide(record, played_us, asked, self.before)
         self.before = found if found.short is not None else self.before
         told = found.to_dict()

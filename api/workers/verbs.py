@@ -14,7 +14,7 @@ import numpy as np
 from stimrig import identify
 from stimrig.api.record_files import Progress, export_csv, find_recording, joined, plain_csv
 from stimrig.api.structure import held_by
-from stimrig.api.workers import adaptive_verbs, muscle_verbs, tracking_verbs
+from stimrig.api.workers import adaptive_verbs, tracking_verbs
 from stimrig.api.workers.curves import comparison, page_curves, recorded
 from stimrig.identify.json_text import json_value
 
@@ -226,8 +226,8 @@ OWN = (
     find_recording, recorded,
 )  # fmt: skip
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {
-    **{verb.__name__: muscle_verbs.routed(verb.__name__, verb) for verb in OWN},
-    "curves": muscle_verbs.routed("curves", page_curves),
+    **{verb.__name__: verb for verb in OWN},
+    "curves": page_curves,
     "join": joined,
     **adaptive_verbs.VERBS,
     **tracking_verbs.VERBS,

@@ -59,7 +59,6 @@ class Grid:
     """Intervals at whose start the muscle's state is not known, since the stimulation before is not known; int."""
     noise_sd_nm: float = 0.0  # white noise of a sample, estimated from the samples, N·m; 0 if it was not estimated
     readings: Readings | None = None  # the readings behind the samples, if they are fewer or coarse
-    offset_s: float = 0.0  # by how much later than these slots its pulses come, s: of a further channel of a train
 
     def readings_in(self, rows: np.ndarray) -> float:
         """Readings in one of these intervals, at least 1: held samples are not averaged."""
@@ -126,7 +125,7 @@ class Grid:
     def delay_bounds_s(self) -> tuple[float, float]:
         """Bounds of the delay in every model, s: one sample in both directions. A longer delay is an effect."""
         sample_s = min(1.02 / self.record.sample_rate_hz, 1.02 * self.step_s)
-        return self.offset_s - sample_s, self.offset_s + sample_s
+        return -sample_s, sample_s
 
     def stretches(self, rows: np.ndarray) -> list[slice]:
         """Contiguous runs of some intervals, each within one part. Noise is correlated only within a run."""
@@ -272,10 +271,8 @@ def runs(flags: np.ndarray) -> list[slice]:
     return [slice(int(a), int(b)) for a, b in zip(edges[::2], edges[1::2], strict=True)]
 
 
-def make_grid(record: Record, phase_s: float | None = None) -> Grid:
+def make_grid(record: Record) -> Grid:
     """Put a record on the grid of its pulses.
-
-    `phase_s`: time of the slots after the first sample, where it is known; else the changes of width tell it.
 
     Raises BadRecord: fewer than eight pulse intervals, or sampled more slowly than the pulses.
     """
@@ -285,7 +282,7 @@ def make_grid(record: Record, phase_s: float | None = None) -> Grid:
     if not rate_hz >= 0.999 * record.pulse_rate_hz:
         fix = "Record at 40 Hz or faster."
         raise BadRecord(f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second", fix=fix)
-    start_s = record.time_s[0] + (pulse_phase_s(record) if phase_s is None else phase_s)
+    start_s = record.time_s[0] + pulse_phase_s(record)
     # A small shift, so that a sample taken at the pulse itself falls into the interval that starts with the pulse.
     position = (record.time_s - start_s) / step_s + 1e-6 + 1e-3 * min(1.0, record.pulse_rate_hz / rate_hz)
     interval = np.floor(position).astype(np.int64)

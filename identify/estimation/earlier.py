@@ -90,7 +90,6 @@ class Earlier:
 
     model: Model  # the last approved one, with second-order dynamics
     change: Change = USUAL  # by how much it is widened
-    deviations: tuple[Deviation, ...] = EARLIER_DEVIATIONS  # how far the shape of the curve may have changed
 
     def __post_init__(self) -> None:
         if not isinstance(self.model.linear, SecondOrder) or _curve_marks(self.model) is None:
@@ -142,7 +141,7 @@ class Earlier:
         own = np.array([self._sd("plateau_nm") / self._marks[0], 0.0, 0.0])
         plateau = float(self.mean[0]), 2.0 * float(np.hypot(sd[0], own[0]))
         precision = np.diag(1.0 / (sd**2 + own**2))
-        prior = NearShape(basis, self.shape, self.mean, precision, plateau, rise, self.deviations)
+        prior = NearShape(basis, self.shape, self.mean, precision, plateau, rise, EARLIER_DEVIATIONS)
         return replace(prior, doubt=self._doubt(prior))
 
     def _doubt(self, prior: NearShape) -> np.ndarray | None:

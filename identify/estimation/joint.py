@@ -270,7 +270,7 @@ def newton_step(at: Point, damping: float) -> tuple[np.ndarray, float]:
     step[free] = np.linalg.solve(root.T, np.linalg.solve(root, gradient[free] / scale)) / scale
     # The time constant and the damping change by a factor of 2 at most, effects by a third of their range.
     limit = np.full(theta.size, np.inf)
-    limit[problem.cores] = 0.7
+    limit[:2] = 0.7
     for chosen in problem.chosen:
         for place in chosen.places:
             limit[place] = (problem.upper[place] - problem.lower[place]) / 3.0

@@ -14,10 +14,11 @@ from itertools import pairwise
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
-from stimrig.identify.effects import registry
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted, Point, log_posterior, newton_step, solve
 from stimrig.identify.estimation.rests import relaxed
 from stimrig.identify.records.record import FORGOTTEN_S
+from stimrig.identify.simulation.problem import Problem
 
 APART_S = 1.0
 """A pause that separates two bouts of stimulation; the zeros of a PRBS are shorter."""
@@ -168,8 +169,7 @@ def hold_out(fitted: Fitted) -> LeftOut:
 
 def _sporadic(fitted: Fitted) -> frozenset[str]:
     """Effects that nothing foretells: a block that is left out shows none of them."""
-    known = registry()  # what muscles do to each other is no effect
-    return frozenset(effect for effect, _ in fitted.effects if effect in known and known[effect].sporadic)
+    return frozenset(effect for effect, _ in fitted.effects if find_effect(effect).sporadic)
 
 
 def _allowed_nm(fitted: Fitted) -> tuple[float, float]:
@@ -189,7 +189,7 @@ def _allowed_nm(fitted: Fitted) -> tuple[float, float]:
 def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
     """The most probable parameters on some of the fitted rows: one Gauss-Newton step, or more where it is too long."""
     problem, setup = fitted.problem, fitted.problem.setup
-    own = problem.fitted_on(kept)
+    own = Problem(setup.with_(fitted=kept), fitted.effects)
     before = log_posterior(own, fitted.theta, fitted.residual_nm, fitted.noise)
     at = Point(own, fitted.theta, fitted.residual_nm, fitted.slopes, fitted.noise, before, before)
     step = newton_step(at, RIDGE)[0]

@@ -27,8 +27,7 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.estimation.short_record import Short, fit_short
-from stimrig.identify.experiments.bank import Bank, Weighed, weigh
-from stimrig.identify.experiments.designs import Piece, Segment, bursts, pieces
+from stimrig.identify.experiments.designs import Piece, Segment, pieces
 from stimrig.identify.experiments.knowledge import Foresight, Knowledge, Target, knowledge
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.near_shape import KNOTS
@@ -36,11 +35,8 @@ from stimrig.identify.recruitment.near_shape import KNOTS
 Kind = Literal["next", "enough", "misfit", "spent"]
 REST_S, RISE_S, TOP_S, FALL_S = 0.5, 1.0, 0.3, 0.5
 """The opening: rest, a ramp to the largest width, a while there, silence."""
-BANK_OPENING_S = (0.5, 0.4, 0.0, 1.1)
-"""The same with a bank: a glance is enough to see which of its models a person may be like."""
 LEAST_S = 1.9
-"""A record that is shorter tells nothing: the opening is played. Of the shortest one, 2 s, the last sample lies before
-its end."""
+"""A record that is shorter tells nothing: the opening is played."""
 ALARM = 1e-3
 """P-value of a residual test below which the structure fits badly; each test is asked about ten times in one test."""
 CONFIRMED_S = 1.0
@@ -55,12 +51,6 @@ SETTLED_S = 4.0
 SECOND_COST = 2.0
 """A second of a test costs as much as so many seconds of torque at the plateau. With a third of it, tests of the
 paper's muscle took 14 s in place of 9 s for the same accuracy and dose (seeds 51000 and 51100)."""
-ALIKE_SECOND_COST = 0.15
-"""The same for a person who is like a model of the bank: little is left to find out, and a burst with a rest tells it
-at the smallest dose. With 0.3, and a ramp of 0.6 s in the opening, tests of the paper's kind of curve took 0.6 to 0.7
-of the dose from nothing (seeds 4 to 9), not less than a half."""
-PATIENT_S = 8.0
-"""From then on a second costs as much as ever: bursts alone may take half a minute where the torque is small."""
 SHARES = (0.03, 0.15, 0.35, 0.6, 0.85, 0.97)
 """Shares of the plateau whose widths are levels to move between."""
 
@@ -81,7 +71,6 @@ class Decision:
     expected_torque_time_nm_s: float = 0.0  # of the segments, by the mean curve
     short: Short | None = field(default=None, repr=False)  # the fit, which makes the next call faster (`before`)
     doubted_s: float | None = None  # length of the record with which the structure first fitted badly; None: it fits
-    weighed: Weighed | None = field(default=None, repr=False)  # which model of the bank the person is like
 
     def to_dict(self) -> dict:
         """Plain values, for the test's document and the page."""
@@ -91,7 +80,6 @@ class Decision:
             "words": self.words,
             "knowledge": None if self.knowledge is None else self.knowledge.to_dict(),
             "expected_torque_time_nm_s": self.expected_torque_time_nm_s,
-            **({} if self.weighed is None else {"bank": self.weighed.to_dict()}),
         }
 
 
@@ -108,7 +96,6 @@ class Asked:
     largest_us: float  # largest width that may be played
     pulse_rate_hz: float = 40.0
     earlier: Earlier | None = None  # what is known of this person from earlier sessions
-    bank: Bank | None = None  # models that the person may be like; then `earlier` does not count
 
     def __post_init__(self) -> None:
         for name in ("left_s", "left_nm_s", "largest_us", "pulse_rate_hz"):
@@ -143,65 +130,39 @@ def decide(
     try:
         grid, raw = prepare(record)
         with np.errstate(all="ignore"):
-            weighed, last = None, asked.earlier
-            if asked.bank is not None and asked.bank.candidates:
-                weighed = weigh(grid, asked.bank, before.weighed if before else None)
-                last = weighed.last[weighed.likely]
-            short, wrong = _fitted(grid, raw, last, before.short if before else None, weighed)
+            short, wrong = _fitted(grid, raw, asked.earlier, before.short if before else None)
     except (np.linalg.LinAlgError, IdentifyError) as error:
         return Decision("misfit", words=f"No model can be fitted ({error}). The rest of the fixed test is played.")
-    found = _judged(short, wrong, played_us, asked, before, weighed)
-    if weighed is not None and found.kind != "misfit":
-        found = replace(found, words=f"{found.words} {weighed.words()}")
-    return replace(found, weighed=weighed)
-
-
-def _judged(
-    short: Short,
-    wrong: str | None,
-    played_us: np.ndarray | Sequence[float],
-    asked: Asked,
-    before: Decision | None,
-    weighed: Weighed | None,
-) -> Decision:
     known, played = knowledge(short), np.asarray(played_us, float)
-    alike = weighed is not None and not weighed.is_unlike
     if wrong:
         long_s = short.grid.size * short.grid.step_s
         since_s = long_s if before is None or before.doubted_s is None else before.doubted_s
         if long_s - since_s >= CONFIRMED_S or not _finite(short):
             words = f"{wrong} The rest of the fixed test is played."
             return Decision("misfit", words=words, knowledge=known, short=short)
-        return replace(_next(short, known, played, asked, alike), doubted_s=since_s)
+        return replace(_next(short, known, played, asked), doubted_s=since_s)
     if known.reaches(asked.target) and _settled(short):
         return Decision("enough", words=f"Enough is known. {_state(known)}", knowledge=known, short=short)
-    return _next(short, known, played, asked, alike)
+    return _next(short, known, played, asked)
 
 
 def _opening(asked: Asked) -> Decision:
     rate = asked.pulse_rate_hz
-    earlier = [asked.earlier] if asked.bank is None else [one.earlier for one in asked.bank.candidates]
-    parts_s = (REST_S, RISE_S, TOP_S, FALL_S) if asked.bank is None else BANK_OPENING_S
-    before, up, top, after = (round(seconds * rate) for seconds in parts_s)
+    before, up, top, after = (round(seconds * rate) for seconds in (REST_S, RISE_S, TOP_S, FALL_S))
     rise = asked.largest_us * np.arange(1, up + 1) / up
     widths = np.r_[np.zeros(before), rise, np.full(top, asked.largest_us), np.zeros(after)]
-    doses = [float(np.sum(np.abs(one.model.recruitment(widths))) / rate) for one in earlier if one is not None]
-    dose = max(doses, default=0.0)
+    earlier = asked.earlier
+    dose = 0.0 if earlier is None else float(np.sum(np.abs(earlier.model.recruitment(widths))) / rate)
     if widths.size / rate > asked.left_s or dose > asked.left_nm_s:
         return Decision("spent", words="The torque-time or the time that is left does not allow a first piece.")
     return Decision("next", (Piece("opening", widths).segment(1),), "A first look at the whole range.", None, dose)
 
 
-def _fitted(
-    grid: Grid, raw: Raw, last: Earlier | None, before: Short | None, weighed: Weighed | None = None
-) -> tuple[Short, str | None]:
+def _fitted(grid: Grid, raw: Raw, last: Earlier | None, before: Short | None) -> tuple[Short, str | None]:
     """The fit, and why it does not describe the record; with more knots where the usual number leaves a residual, then
     without what no pulse causes."""
     fine = before is not None and before.basis.knots_us.size > KNOTS
-    if weighed is not None:
-        fine, short = False, weighed.mixed
-    else:
-        short = fit_short(grid, grid.fitted, last=last, before=before, fine=fine)
+    short = fit_short(grid, grid.fitted, last=last, before=before, fine=fine)
     wrong = _misfit(short)
     if wrong and not fine:
         short = fit_short(grid, grid.fitted, last=last, before=short, fine=True)
@@ -243,12 +204,11 @@ def _settled(short: Short) -> bool:
     return short.grid.size * short.grid.step_s >= SETTLED_S
 
 
-def _next(short: Short, known: Knowledge, played: np.ndarray, asked: Asked, alike: bool) -> Decision:
+def _next(short: Short, known: Knowledge, played: np.ndarray, asked: Asked) -> Decision:
     rate = 1.0 / short.grid.step_s
     foresight = Foresight.of(short, played, asked.target)
     levels = _levels(short, known, asked.largest_us)
-    patient = alike and played.size / rate < PATIENT_S
-    candidates = pieces(levels, rate) + (bursts(levels, rate) if alike else [])
+    candidates = pieces(levels, rate)
     after, dose = foresight.after(candidates)
     seconds = np.array([piece.pulse_width_us.size for piece in candidates]) / rate
     allowed = (dose <= asked.left_nm_s) & (seconds <= asked.left_s + 1e-9)
@@ -256,7 +216,7 @@ def _next(short: Short, known: Knowledge, played: np.ndarray, asked: Asked, alik
         return Decision(
             "spent", words=f"The torque-time or the time is used up. {_state(known)}", knowledge=known, short=short
         )
-    cost = dose / max(known.plateau_nm, 1e-9) + (ALIKE_SECOND_COST if patient else SECOND_COST) * seconds
+    cost = dose / max(known.plateau_nm, 1e-9) + SECOND_COST * seconds
     score = np.where(allowed, np.log(np.maximum(foresight.now / after, 1.0)) / cost, -1.0)
     best = int(np.argmax(score))
     number = sum(1 for _ in short.grid.record.segment_names) + 1

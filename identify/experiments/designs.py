@@ -210,17 +210,3 @@ def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:
         if first > second:
             found.append(Piece("prbs", np.repeat(np.where(CHIPS, first, second), chip)))
     return found
-
-
-BURSTS_S, PAIRS_S = (0.1, 0.2, 0.4), (0.075, 0.15)
-"""Seconds of a burst, and of each level of one with two."""
-
-
-def bursts(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:
-    """Short bursts, each with silence after it to the end of a second: they cost little torque-time."""
-    levels = np.unique(np.round(np.floor(10.0 * levels_us) / 10.0, 1))
-    size = max(round(PIECE_S * pulse_rate_hz), 2)
-    heads = [np.full(max(round(s * pulse_rate_hz), 1), level) for level in levels if level > 0.0 for s in BURSTS_S]
-    for pair in permutations(levels[levels > 0.0], 2):
-        heads += [np.repeat(pair, max(round(s * pulse_rate_hz), 1)) for s in PAIRS_S]
-    return [Piece("burst", np.r_[head, np.zeros(max(size - head.size, 0))]) for head in heads]

@@ -18,7 +18,7 @@ from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.pulses import above_rest
 from stimrig.identify.summary import Sheet, quantity
 
-__all__ = ["Inversion", "Reference", "best_fit", "invert", "reasons_of", "stretches_of"]
+__all__ = ["Inversion", "Reference", "invert"]
 
 TURNS = 10
 """Corrections on the model's own prediction, at most: each is a trial that the model plays."""
@@ -32,18 +32,9 @@ TOLERANCE = 0.02
 """A torque that is missed by less of the largest one that the widest pulse gives counts as reached."""
 JOINED = 3
 """Stretches of one reason with fewer pulses between them are one."""
-REASONS = (
-    "above-plateau",
-    "below-zero",
-    "rises-too-fast",
-    "falls-too-fast",
-    "under-threshold",
-    "not-followed",
-    "beyond-dose",
-)
+REASONS = ("above-plateau", "below-zero", "rises-too-fast", "falls-too-fast", "under-threshold", "not-followed")
 """Too high for the largest width; the wrong sign, a muscle only pulls; faster than the muscle, or than the rise limit
-allows; a pulse there gives too little or too much; the rest, for example an effect that cannot be undone; of several
-muscles, where the dose of one of them is limited."""
+allows; a pulse there gives too little or too much; the rest, for example an effect that cannot be undone."""
 
 
 @dataclass(frozen=True)
@@ -206,34 +197,20 @@ def _judged(
     wanted = plant.sign * reference.torque_nm
     error_nm, tolerance_nm = np.abs(wanted - got_nm), TOLERANCE * plant.largest_nm
     missed = error_nm > tolerance_nm
-    reasons = reasons_of(plant, needed_nm, demand_nm, missed, wanted > got_nm, tolerance_nm)
+    reasons = _reasons(plant, needed_nm, demand_nm, missed, wanted > got_nm, tolerance_nm)
     return Inversion(
         reference=reference,
         pulse_width_us=widths_us,
         predicted_nm=plant.sign * got_nm,
-        unreachable=stretches_of(reasons, error_nm, reference.pulse_rate_hz),
-        fit_percent=best_fit(wanted[~missed], got_nm[~missed]),
-        whole_fit_percent=best_fit(wanted, got_nm),
+        unreachable=_stretches(reasons, error_nm, reference.pulse_rate_hz),
+        fit_percent=_best_fit(wanted[~missed], got_nm[~missed]),
+        whole_fit_percent=_best_fit(wanted, got_nm),
         tolerance_nm=tolerance_nm,
     )
 
 
-def stretches_of(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float) -> tuple[Stretch, ...]:
-    """Where it is not reached, in order of time; `reasons`: what `reasons_of` gives, `error_nm`: positive.
-
-    Parameters
-    ----------
-    reasons : ndarray
-        Of each pulse.
-    error_nm : ndarray
-        Of each pulse, N·m.
-    pulse_rate_hz : float
-        Pulses a second, Hz.
-
-    Returns
-    -------
-    tuple[Stretch, ...]
-    """
+def _stretches(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float) -> tuple[Stretch, ...]:
+    """The stretches that are not reached, in order of time, by the reason and the error of each pulse."""
     stretches = [
         Stretch(float(run.start / pulse_rate_hz), float(run.stop / pulse_rate_hz), reason, float(np.max(error_nm[run])))
         for index, reason in enumerate(REASONS)
@@ -242,20 +219,8 @@ def stretches_of(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float
     return tuple(sorted(stretches, key=lambda one: one.begin_s))
 
 
-def best_fit(wanted: np.ndarray, got: np.ndarray) -> float | None:
-    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper.
-
-    Parameters
-    ----------
-    wanted : ndarray
-        y, shape (K,).
-    got : ndarray
-        ŷ, shape (K,).
-
-    Returns
-    -------
-    float or None
-    """
+def _best_fit(wanted: np.ndarray, got: np.ndarray) -> float | None:
+    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; None where the reference does not change."""
     spread = float(np.linalg.norm(wanted - wanted.mean())) if wanted.size else 0.0
     return None if spread < 1e-9 else 100.0 * (1.0 - float(np.linalg.norm(wanted - got)) / spread)
 
@@ -269,30 +234,10 @@ def _joined(rows: np.ndarray) -> np.ndarray:
     return filled
 
 
-def reasons_of(
+def _reasons(
     plant: Plant, wanted: np.ndarray, demand: np.ndarray, missed: np.ndarray, short: np.ndarray, tolerance_nm: float
 ) -> np.ndarray:
-    """Index into `REASONS` for each pulse, -1 where it is reached; shape (K,).
-
-    Parameters
-    ----------
-    plant : Plant
-        The model with its bounds.
-    wanted : ndarray
-        Torque that is asked for, N·m, shape (K,).
-    demand : ndarray
-        Before the dynamics, N·m, shape (K,).
-    missed : ndarray
-        Where it is missed, bool, shape (K,).
-    short : ndarray
-        Where the narrowest pulse decides, bool, shape (K,).
-    tolerance_nm : float
-        What counts as reached, N·m.
-
-    Returns
-    -------
-    ndarray
-    """
+    """Index into `REASONS` for each pulse, -1 where it is reached; shape (K,)."""
     lasting = np.zeros(wanted.size, bool)
     for run in runs(demand >= (1.0 - NOTHING) * plant.largest_nm):
         lasting[run.start + plant.settled : run.stop] = True  # the muscle gives all that it has by then

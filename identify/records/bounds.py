@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import zlib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 
@@ -50,22 +48,11 @@ PULSE_RATES_HZ = (1.0, 200.0)
 
 def content_of(path: Path) -> bytes:
     """A file's bytes, at most as many as a record can have. Raises BadRecord: it cannot be read, or is larger."""
-    with opened(path) as file:
-        pieces = [file.read(PIECE_BYTES)]
-        while pieces[-1] and len(pieces) * PIECE_BYTES <= LARGEST_FILE_BYTES:
-            pieces.append(file.read(PIECE_BYTES))
-    if sum(map(len, pieces)) > LARGEST_FILE_BYTES:
-        fix = "Cut the record, or give the sealed recording."
-        raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), fix=fix)
-    return b"".join(pieces)
-
-
-@contextlib.contextmanager
-def opened(path: Path) -> Iterator[BinaryIO]:
-    """A file to read from. Raises BadRecord: it cannot be read."""
     try:
         with path.open("rb") as file:
-            yield file
+            pieces = [file.read(PIECE_BYTES)]
+            while pieces[-1] and len(pieces) * PIECE_BYTES <= LARGEST_FILE_BYTES:
+                pieces.append(file.read(PIECE_BYTES))
     except FileNotFoundError as error:
         raise BadRecord("no such file", place=str(path), fix="Check the path.") from error
     except IsADirectoryError as error:
@@ -75,6 +62,10 @@ def opened(path: Path) -> Iterator[BinaryIO]:
         raise BadRecord(f"can't be read ({reason})", place=str(path), fix="Check its rights.") from error
     except ValueError as error:  # a NUL in the name
         raise BadRecord("no such file", place=repr(str(path)), fix="Check the path.") from error
+    if sum(map(len, pieces)) > LARGEST_FILE_BYTES:
+        fix = "Cut the record, or give the sealed recording."
+        raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), fix=fix)
+    return b"".join(pieces)
 
 
 class BadPiece(Exception):

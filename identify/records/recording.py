@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.json_text import BadJson, parse
 from stimrig.identify.records import bounds
 from stimrig.identify.records.hdf5 import FIX, StrictFile
 from stimrig.identify.records.pulse_times import Sent, in_force, locate_pulses
@@ -23,52 +22,12 @@ MOST_UNKNOWN = 0.5
 GROUP = "/angle"
 
 
-def read_pulses(
-    file: StrictFile, time_s: np.ndarray, pulse_rate_hz: float, channel: int | None = None
-) -> tuple[Pulses, np.ndarray]:
-    """As `locate_pulses`. Raises BadRecord: columns of different lengths, no widths, or out of order.
-
-    Of one `channel` of a train only its own pulses are returned, on slots that begin with those of the first channel;
-    all are found together, since the sync line does not say whose an edge is.
-    """
+def read_pulses(file: StrictFile, time_s: np.ndarray, pulse_rate_hz: float) -> tuple[Pulses, np.ndarray]:
+    """As `locate_pulses`. Raises BadRecord: columns of different lengths, no widths, or out of order."""
     sync = file.numbers("/torque/sync") if file.has("/torque/sync") else np.full(time_s.size, 255.0)
     if sync.size != time_s.size:
         raise file.bad("columns of different lengths", "/torque/sync")
-    channels = _channels(file)
-    sent = _sent(file, 1.0 / pulse_rate_hz / max(len(channels), 1))
-    pulses, doubts = locate_pulses(sent, time_s, sync)
-    if channel is None:
-        return pulses, doubts
-    whose = file.numbers("/pulses/channel")
-    if whose.size != sent.planned_s.size:
-        raise file.bad("columns of different lengths", "/pulses/channel")
-    own, offset_s = whose == channel, float(channels[channel]["offset_s"])
-    return Pulses(pulses.time_s[own] - offset_s, pulses.width_us[own], pulses.late_s[own], pulses.lost[own]), doubts
-
-
-def channels_of(content: bytes, path: Path) -> list[dict[str, Any]]:
-    """The channels of a sealed recording, as its attribute tells them; empty where it has one channel.
-
-    Raises BadRecord: unreadable, or no sealed recording.
-    """
-    file = StrictFile(content, str(path))
-    _check_format(file)
-    return _channels(file)
-
-
-def _channels(file: StrictFile) -> list[dict[str, Any]]:
-    if file.number("format_version", 0) == 1:
-        return []
-    try:
-        told = parse(file.text("channels"))
-        assert isinstance(told, list)
-        return [{"name": str(one["name"]), "offset_s": float(one["offset_s"]), **_words_of(one)} for one in told]
-    except (BadJson, AssertionError, KeyError, TypeError, ValueError):
-        raise file.bad("channels that are no list of names and offsets", "attribute channels") from None
-
-
-def _words_of(channel: dict[str, Any]) -> dict[str, str]:
-    return {name: str(channel.get(name) or "") for name in ("muscle", "side", "electrode")}
+    return locate_pulses(_sent(file, 1.0 / pulse_rate_hz), time_s, sync)
 
 
 def _sent(file: StrictFile, interval_s: float) -> Sent:
@@ -97,10 +56,8 @@ def attributes(path: Path, names: Sequence[str]) -> dict[str, str]:
     return {name: file.text(name) for name in names}
 
 
-def read_recording(
-    content: bytes, path: Path, pulse_rate_hz: float | None = None, channel: int | None = None
-) -> Record:
-    """A sealed recording from its bytes; `path` is how it is called. Of several channels, one by its index.
+def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = None) -> Record:
+    """A sealed recording from its bytes; `path` is how it is called.
 
     The width in force at a sample is that of the last pulse due before it, and how late that was felt stands beside
     it; a pulse that was dropped or refused counts as none. Samples outside every segment are left out. An angle
@@ -109,13 +66,6 @@ def read_recording(
     """
     file = StrictFile(content, str(path))
     _check_format(file)
-    several = _channels(file)
-    if len(several) == 1:  # of a channel that has a name
-        channel = 0
-    if several and channel is None:
-        names = ", ".join(one["name"] for one in several)
-        message = f"it holds the pulses of several channels ({names})"
-        raise BadRecord(message, place=file.name, fix="Give it to fit, predict, compare, diagnose or improve.")
     rate = file.number("pulse_rate_hz", 40.0) if pulse_rate_hz is None else pulse_rate_hz
     bounds.check_rate(rate, f"{file.name}, attribute pulse_rate_hz")
     time_s, torque = _samples(file)
@@ -126,7 +76,7 @@ def read_recording(
     if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= bounds.LARGEST["torque_nm"]))).size:
         what = "is not finite" if not np.isfinite(torque[bad[0]]) else f"{torque[bad[0]]:g} N·m is no measurement"
         raise BadRecord(f"torque {what}", place=f"{file.name}, /torque/torque_nm, sample {bad[0]}", fix=FIX)
-    pulses, doubts = read_pulses(file, time_s, rate, channel)
+    pulses, doubts = read_pulses(file, time_s, rate)
     width, late = in_force(pulses, time_s, rate)
     angles, unknown, note = _read_angle(file, time_s, inside)
     doubts = doubts | unknown
@@ -157,8 +107,8 @@ def _check_format(file: StrictFile) -> None:
     if file.text("format", "") != FORMAT:
         raise file.bad("HDF5, but no stimrig recording")
     version = file.number("format_version", 0)
-    if version not in (1, 2):
-        message = f"format version {version:g}, this software reads 1 and 2"
+    if version != 1:
+        message = f"format version {version:g}, this software reads 1"
         raise BadRecord(message, place=file.name, fix="Update the software.")
 
 

@@ -150,7 +150,6 @@ def problem_of(
     model: Muscle,
     grid: Grid,
     further: Sequence[tuple[Form, Sequence[float]]] = (),
-    settings: Mapping[str, Any] | None = None,
 ) -> tuple[Problem, np.ndarray]:
     """The model as a `Problem` on a record, and its parameters there; on another record than its own without effects
     that cannot be foreseen.
@@ -164,8 +163,6 @@ def problem_of(
     further : sequence of (Form, sequence of float)
         Forms that act beside the model's effects, next to the curve (a gain before all others, what changes the widths
         after them), and the values of their parameters.
-    settings : Mapping, optional
-        The scale, sign and zero of the fitted record; by default as the model's effects say.
 
     Raises
     ------
@@ -174,7 +171,7 @@ def problem_of(
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
-    told: Mapping[str, Any] = settings or (model.effects[0].get("settings", {}) if model.effects else {})
+    settings = model.effects[0].get("settings", {}) if model.effects else {}
     own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     setup = Setup(
         grid=grid,
@@ -182,14 +179,14 @@ def problem_of(
         fitted=grid.fitted,
         basis=model.recruitment.basis,
         roughness=np.zeros((model.recruitment.basis.size,) * 2),
-        scale_nm=float(told.get("scale_nm", 1.0)),
-        noise_sd_nm=float(told.get("noise_sd_nm", 0.0)),
+        scale_nm=float(settings.get("scale_nm", 1.0)),
+        noise_sd_nm=float(settings.get("noise_sd_nm", 0.0)),
         delay_bounds_s=(-math.inf, math.inf),
-        zero_nm=float(told.get("zero_nm", 0.0)),
-        sign=float(told.get("sign", 1.0)),
-        reference_s=float(told.get("reference_s", 0.0)),
-        angle_late_s=float(told.get("angle_late_s", 0.0)),
-        **_own_angles(model, own_record, told),
+        zero_nm=float(settings.get("zero_nm", 0.0)),
+        sign=float(settings.get("sign", 1.0)),
+        reference_s=float(settings.get("reference_s", 0.0)),
+        angle_late_s=float(settings.get("angle_late_s", 0.0)),
+        **_own_angles(model, own_record, settings),
         states={} if own_record else states_of(model),
     )
     acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]

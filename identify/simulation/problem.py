@@ -72,8 +72,6 @@ class Problem:
         for number in ["", *(f"_{state}" for state in range(2, states + 1))]:
             table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))
             table.append(Parameter(f"initial_rate{number}_nm_s", "N·m/s", -10 * span, 10 * span))
-        self.cores = np.arange(2)
-        """Where the time constant and the damping stand."""
         self.delay = range(2, 3)
         self.baselines = range(3, 3 + parts)
         self.initials = range(3 + parts, 3 + parts + 2 * states)
@@ -89,10 +87,6 @@ class Problem:
         self.log = np.array([p.scale == "log" for p in table])
         self.lower = self.from_physical(np.array([p.lower for p in table]))
         self.upper = self.from_physical(np.array([p.upper for p in table]))
-
-    def fitted_on(self, rows: np.ndarray) -> Problem:
-        """The same, of which only these intervals are fitted, bool, shape (K,)."""
-        return Problem(self.setup.with_(fitted=rows), [(one.effect, one.form) for one in self.chosen])
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -123,8 +117,7 @@ class Problem:
         scale = self.setup.scale_nm
         at = slice(self.baselines.start, self.baselines.stop)
         mean[at], sd[at] = self.setup.rests_nm or (0.0, 0.5 * scale)
-        wide = 1e-6 if self.setup.at_rest else 1.0
-        sd[list(self.initials)] = np.tile([wide * scale, 5.0 * wide * scale], self.setup.grid.starts.size)
+        sd[list(self.initials)] = np.tile([scale, 5.0 * scale], self.setup.grid.starts.size)
         mean[self.coefficients] = self.setup.curve_nm
         precision = np.diag(1.0 / sd**2)
         precision[self.coefficients, self.coefficients] = self.setup.penalty

@@ -49,7 +49,6 @@ class Setup:
     """By effect id, where its slow state begins; 0 (rested) where there is none."""
     angle_late_s: float = 0.0  # by how much later than it was the sensor tells the angle, s
     motion: JointMotion | None = None  # in place of the record's own
-    at_rest: bool = False  # whether the muscle is known to be at rest wherever its state is not known otherwise
 
     @cached_property
     def stretches(self) -> tuple[np.ndarray, np.ndarray]:

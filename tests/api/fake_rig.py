@@ -16,7 +16,6 @@ import sys
 import threading
 import time
 import traceback
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,46 +60,6 @@ def default_widths() -> tuple[list[float], list[dict[str, Any]]]:
 PATIENT = Patient(gain=6.9, a2=1 / 25, a3=float(np.exp(6)))
 
 
-def rate(plan: m.TestPlan) -> float:
-    """Slots a second."""
-    return PULSE_RATE_HZ * len(plan.channels or [0])
-
-
-def of_channels(plan: m.TestPlan, rig: list[str]) -> tuple[list[float], list[dict[str, Any]]]:
-    """As the real rig lays them: a round has one slot of each channel."""
-    from stimrig.rig.channels import RigChannel
-    from stimrig.rig.limits import HARD_LIMITS, SUM_LIMITS, for_plan
-    from stimrig.rig.plan import build
-
-    channels = [RigChannel(name, "", "", "") for name in rig]
-    built = build(plan, for_plan({**HARD_LIMITS, **SUM_LIMITS}, plan), channels)
-    told = [
-        {"name": s.name, "start_s": s.start / rate(plan), "end_s": s.end / rate(plan)} for s in built.segments
-    ]  # fmt: skip
-    return built.pulse_width_us.tolist(), told
-
-
-def by_channel(plan: m.TestPlan, widths: list[float]) -> dict[str, m.ChannelPreview] | None:
-    count = len(plan.channels or [])
-    return {
-        one.name: m.ChannelPreview(
-            charge_uc=sum(widths[k::count]) * one.profile.current_ma / 1000, pulse_width_us=widths[k::count],
-            pulse_time_s=[(k + count * i) / rate(plan) for i in range(len(widths[k::count]))],
-        )
-        for k, one in enumerate(plan.channels or [])
-    } or None  # fmt: skip
-
-
-def joint_torque(count: int, widths: list[float], rate_hz: float) -> list[float]:
-    """Of two muscles against each other: the second one weaker and the other way."""
-    parts = [
-        sign * PATIENT.torque(np.array(widths[k::count]), rate_hz, PULSE_RATE_HZ)
-        for k, sign in zip(range(count), (1.0, -0.6), strict=False)
-    ]
-    torque = np.sum([part[: min(map(len, parts))] for part in parts], axis=0)
-    return (torque + 0.04 * np.random.default_rng(12345).standard_normal(torque.size)).tolist()
-
-
 def trial_widths(plan: list[m.SegmentPlan]) -> tuple[list[float], list[dict[str, Any]]]:
     """Rests and lists of widths, as a controller plans them."""
     widths: list[float] = []
@@ -127,9 +86,6 @@ class FakeRig:
         self.state, self.reason = "ready", ""
         self.stops = 0
         self.shortest_us = 20.0
-        self.channels: list[str] = []
-        """Names of several channels; empty: it has one without a name."""
-        """Of a rig whose first channel has one."""
         self.calibrated: m.Calibrated | None = None
         self.withdrawn: list[rig_requests.WithdrawRequest] = []
         self.plan: m.TestPlan | None = None
@@ -180,17 +136,13 @@ class FakeRig:
             test_id=self.plan.test_id if self.plan else None,
             participant=self.plan.participant if self.plan else None, segment=self.segment,
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
-            stimulator={"device": "fake P24", "firmware": "1.0", "shortest_us": self.shortest_us, **self._named()},
+            stimulator={"device": "fake P24", "firmware": "1.0", "shortest_us": self.shortest_us},
             load_cell={"device": "fake cell", "rate_hz": 400.0},
             torque_age_s=self.torque_age_s, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
             limits=self.limits, require_calibration=self.require_calibration,
             finished=self.finished, angle=self.arm.status(self.elapsed_s),
         )  # fmt: skip
-
-    def _named(self) -> dict[str, Any]:
-        told = [{"name": name, "muscle": "", "side": "", "electrode": ""} for name in self.channels]
-        return {"channels": told} if told else {}
 
     async def serve(self) -> None:
         self.path.unlink(missing_ok=True)
@@ -254,14 +206,12 @@ class FakeRig:
 
     def _widths(self, plan: m.TestPlan) -> tuple[list[float], list[dict[str, Any]]]:
         for segment in plan.segments or []:
-            if plan.channels is None and segment.sequence not in {"prbs", "ramp", "rest", "widths"}:
+            if segment.sequence not in {"prbs", "ramp", "rest", "widths"}:
                 raise m_refusal(
                     "bad-plan", "No such sequence", f"{segment.sequence!r}; there are prbs, ramp, rest, widths."
                 )
         if plan.kind in ("sequence", "held") and plan.segments:
             return trial_widths(plan.segments)
-        if plan.adaptive is None and plan.channels:
-            return of_channels(plan, self.channels)
         if plan.adaptive is None:
             return default_widths()
         score = FakeScore(plan, [], [])
@@ -272,8 +222,8 @@ class FakeRig:
         widths, segments = self._widths(request.plan)
         charge = sum(widths) * request.plan.profile.current_ma / 1000
         return m.Preview(
-            duration_s=len(widths) / rate(request.plan), charge_uc=charge, torque_time_nms=None, pulse_width_us=widths,
-            segments=segments, channels=by_channel(request.plan, widths),
+            duration_s=len(widths) / PULSE_RATE_HZ, charge_uc=charge, torque_time_nms=None, pulse_width_us=widths,
+            segments=segments,
         )  # fmt: skip
 
     async def _on_sequences(self, request: Any, writer: Any) -> Any:
@@ -330,37 +280,11 @@ class FakeRig:
             current_ma=request.current_ma, step_us=request.step_us, train_s=request.train_s,
             max_torque_nm=request.max_torque_nm, pulse_width_us=0.0, ceiling_us=45.0, ceiling_owner="hard limit",
             missing=["sensory", "motor", "comfort"],
-            channels=[
-                m.ChannelCalibration(
-                    name=one.name, current_ma=one.current_ma, step_us=request.step_us, pulse_width_us=0.0,
-                    ceiling_us=45.0, ceiling_owner="hard limit", missing=["sensory", "motor", "comfort"],
-                ) for one in request.channels
-            ] if request.channels else None,
         )  # fmt: skip
-
-    def _one(self, name: str, **changes: Any) -> Any:
-        """A channel of an open calibration, changed."""
-        known = self.calibration
-        assert known is not None and known.channels
-        if name not in [one.name for one in known.channels]:
-            raise m_refusal("bad-plan", "No such channel", f"channel {name!r}")
-        changed = [one.model_copy(update=changes) if one.name == name else one for one in known.channels]
-        self.calibration = known.model_copy(update={"channels": changed})
-        return next(one for one in changed if one.name == name)
 
     async def _on_calibrate_step(self, request: Any, writer: Any) -> Any:
         known = self.calibration
         assert known is not None
-        if known.channels:
-            one = self._one(request.channel)
-            width_us = (
-                one.pulse_width_us + {"up": 1, "fine": 0.5, "down": -1, "repeat": 0}[request.direction] * one.step_us
-            )
-            self._one(request.channel, pulse_width_us=width_us)
-            train = m.CalibrationTrain(number=len(known.trains) + 1, pulse_width_us=width_us, pulses=40,
-                                       torque_rise_nm=0.1, channel=request.channel)  # fmt: skip
-            self.calibration = self.calibration.model_copy(update={"trains": [*known.trains, train]})
-            return
         steps = {"up": 1, "fine": 0.5, "down": -1, "repeat": 0}
         width_us = known.pulse_width_us + steps[request.direction] * known.step_us
         if request.shown_us not in (None, width_us):
@@ -375,12 +299,6 @@ class FakeRig:
         assert known is not None
         if not known.trains:
             raise m_refusal("bad-plan", "Nothing was played yet", "Step up first, then mark.")
-        if known.channels:
-            one = self._one(request.channel)
-            marks = {**one.marks_us, request.threshold: one.pulse_width_us}
-            missing = [name for name in one.missing if name not in marks]
-            self._one(request.channel, marks_us=marks, missing=missing)
-            return
         marks = {**known.marks_us, request.threshold: known.pulse_width_us}
         missing = [name for name in known.missing if name not in marks]
         self.calibration = known.model_copy(update={"marks_us": marks, "missing": missing})
@@ -392,22 +310,12 @@ class FakeRig:
                 self.calibrated = None
             return m.CalibrationResult() if request.discard else kept.result
         assert known is not None
-        if known.channels and not request.discard:
-            profiles = {one.name: self._found(known, one) for one in known.channels}
-            result = m.CalibrationResult(
-                profile=next(iter(profiles.values())), profiles=profiles, recordings=["C1.001"]
-            )
-            self.state, self.calibration = "ready", None
-            self.calibrated = m.Calibrated(
-                calibration_id=known.calibration_id, participant=known.participant, by=known.by, result=result
-            )
-            return result
         if known.missing and not request.discard:
             raise m_refusal("bad-plan", "Not marked yet", f"not marked yet: {', '.join(known.missing)}")
         self.state, self.calibration = "ready", None
         if request.discard:
             return m.CalibrationResult()
-        profile = self._found(known, known)
+        profile = self._found(known)
         result = m.CalibrationResult(profile=profile, recordings=["C1.001"])
         self.calibrated = m.Calibrated(
             calibration_id=known.calibration_id, participant=known.participant, by=known.by, result=result
@@ -415,10 +323,10 @@ class FakeRig:
         return result
 
     @staticmethod
-    def _found(known: m.CalibrationStatus, of: Any) -> m.Profile:
-        marks = of.marks_us
+    def _found(known: m.CalibrationStatus) -> m.Profile:
+        marks = known.marks_us
         return m.Profile(
-            current_ma=of.current_ma, max_pulse_width_us=marks["comfort"], max_torque_nm=known.max_torque_nm,
+            current_ma=known.current_ma, max_pulse_width_us=marks["comfort"], max_torque_nm=known.max_torque_nm,
             sensory_pulse_width_us=marks["sensory"], motor_pulse_width_us=marks["motor"],
             set_at_utc="2026-01-01T08:00:00Z", expires_at_utc="2999-01-02T00:00:00Z",
         )  # fmt: skip
@@ -486,8 +394,7 @@ class FakeRig:
 
     async def _played(self, plan: m.TestPlan) -> None:
         self.score = score = FakeScore(plan, *(self._widths(plan) if plan.adaptive is None else default_widths()))
-        torque_of = muscle if plan.channels is None else partial(joint_torque, len(plan.channels))
-        torque = torque_of(score.widths, self.rate_hz)
+        torque = muscle(score.widths, self.rate_hz)
         self.duration_s = plan.adaptive.max_duration_s if plan.adaptive else score.end_s
         self._send(m.StateEvent(status=self.status()))
         began, sent = time.monotonic(), 0.0
@@ -496,12 +403,12 @@ class FakeRig:
             now_s = (time.monotonic() - began) * self.speed
             score.go_on(now_s)
             if len(torque) != round(score.end_s * self.rate_hz):
-                torque = torque_of(score.widths, self.rate_hz)
+                torque = muscle(score.widths, self.rate_hz)
             until = min(score.end_s, now_s)
             self._frame(plan, score, torque, sent, until)
             sent = until
         self.last_segments = score.segments
-        widths = score.widths[: round(sent * score.slots_hz)]
+        widths = score.widths[: round(sent * PULSE_RATE_HZ)]
         await self._end(plan, widths, torque[: round(sent * self.rate_hz)], score)
 
     def _frame(self, plan: m.TestPlan, score: FakeScore, torque: Any, start: float, end: float) -> None:
@@ -510,19 +417,18 @@ class FakeRig:
         self.segment = next((s["name"] for s in segments if s["start_s"] <= end < s["end_s"]), None)
         bins = [start + (end - start) * k / 4 for k in range(5)]
         pieces = [torque[round(a * self.rate_hz) : round(b * self.rate_hz)] or [0.0] for a, b in zip(bins, bins[1:])]  # noqa: B905, RUF007
-        hz = score.slots_hz
-        first, last = round(start * hz), round(end * hz)
+        first, last = round(start * PULSE_RATE_HZ), round(end * PULSE_RATE_HZ)
         self._send(
             m.LiveEvent(
                 test_id=plan.test_id, segment=self.segment, elapsed_s=end, duration_s=self.duration_s, time_s=bins[:-1],
                 torque_min_nm=[min(p) for p in pieces], torque_max_nm=[max(p) for p in pieces],
-                pulse_time_s=[k / hz for k in range(first, last)], pulse_width_us=widths[first:last],
+                pulse_time_s=[k / PULSE_RATE_HZ for k in range(first, last)], pulse_width_us=widths[first:last],
                 torque_age_s=0.004, lost_samples=0, dropped_pulses=0,
                 sent_pulses=sum(1 for width in widths[:last] if width),
                 charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
                 torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
                 samples=self._samples(torque, start, end), outcomes=_outcomes(widths[:last], first),
-                channels=_live_channels(plan, widths, first, last), pauses=self.pauses, **self.arm.live(start, end),
+                pauses=self.pauses, **self.arm.live(start, end),
             )
         )  # fmt: skip
 
@@ -552,39 +458,17 @@ class FakeRig:
                 test_id=plan.test_id, outcome=outcome, reason=self.reason, recording_path=str(path),
                 recording_id=path.stem, file_sha256=digest, last_sample_unix_s=time.time(),
                 summary={
-                    "duration_s": len(widths) / score.slots_hz, "samples": len(torque), "lost_samples": 0,
+                    "duration_s": len(widths) / PULSE_RATE_HZ, "samples": len(torque), "lost_samples": 0,
                     "pulses": sum(1 for w in widths if w), "dropped_pulses": 0,
                     "lateness_ms": {"median": 0.08, "p99": 0.12, "max": 0.3}, "charge_uc": sum(widths) * 20 / 1000,
                     "alignment": {"method": "sync", "error_ms": 0.02}, "sample_rate_hz": self.rate_hz,
                     "torque_peak_nm": max(torque, default=0.0), "cpu_percent": 3.0, "warnings": self.warnings,
                     "notes": [STOPPED] * len(self.pauses[:1]),
-                    "ended_by": "stopped" if stopped else score.ended_by, **_by_name(plan, widths),
+                    "ended_by": "stopped" if stopped else score.ended_by,
                     **self.more_summary,
                 },
             )
         )  # fmt: skip
-
-
-def _live_channels(plan: m.TestPlan, widths: list[float], first: int, last: int) -> list[m.ChannelPulses] | None:
-    count = len(plan.channels or [])
-    found = []
-    for k, one in enumerate(plan.channels or []):
-        own = [i for i in range(first, last) if i % count == k]
-        found.append(m.ChannelPulses(
-            name=one.name, pulse_time_s=[i / rate(plan) for i in own], pulse_width_us=[widths[i] for i in own],
-            sent_pulses=sum(1 for w in widths[k:last:count] if w), dropped_pulses=0,
-            charge_uc=sum(widths[k:last:count]) * one.profile.current_ma / 1000,
-        ))  # fmt: skip
-    return found or None
-
-
-def _by_name(plan: m.TestPlan, widths: list[float]) -> dict[str, Any]:
-    told = by_channel(plan, widths) or {}
-    counts = {
-        name: {"charge_uc": one.charge_uc, "pulses": sum(1 for w in one.pulse_width_us if w), "dropped_pulses": 0}
-        for name, one in told.items()
-    }
-    return {"channels": counts} if counts else {}
 
 
 def _outcomes(widths: list[float], first: int) -> m.PulseOutcomes:
@@ -603,12 +487,6 @@ def told_next(known: m.CalibrationStatus) -> m.CalibrationStatus:
     if known.trains:
         widths |= {"repeat": known.pulse_width_us, "down": known.pulse_width_us - known.step_us}
     found = {name: width for name, width in widths.items() if 1 <= width <= known.ceiling_us}
-    if known.channels:
-        channels = [
-            one.model_copy(update={"next_us": {"up": one.pulse_width_us + one.step_us, "repeat": one.pulse_width_us}})
-            for one in known.channels
-        ]
-        known = known.model_copy(update={"channels": channels})
     return m.CalibrationStatus.model_validate({**known.model_dump(), "next_us": found})
 
 
@@ -625,8 +503,8 @@ def write_recording(folder: Path, plan: m.TestPlan, widths: list[float], torque:
     folder.mkdir(parents=True, exist_ok=True)
     path = folder / f"R-{plan.test_id}.h5"
     count, pulses = len(torque), len(widths)
-    time_s, due = np.arange(count) / rate_hz, np.arange(pulses) / rate(plan)
-    end = pulses / rate(plan)
+    time_s, due = np.arange(count) / rate_hz, np.arange(pulses) / PULSE_RATE_HZ
+    end = pulses / PULSE_RATE_HZ
     kept = [s for s in segments if s["start_s"] < end]
     sent = np.asarray(widths, float)
     sets: dict[str, tuple[Any, str]] = {
@@ -640,10 +518,6 @@ def write_recording(folder: Path, plan: m.TestPlan, widths: list[float], torque:
         "segments/start_s": (np.array([s["start_s"] for s in kept]), "s"),
         "segments/end_s": (np.array([min(s["end_s"], end) for s in kept]), "s"),
     }  # fmt: skip
-    nowhere = {"muscle": "", "side": "", "electrode": ""}
-    names = [{"name": one.name, **nowhere, "offset_s": k / rate(plan)} for k, one in enumerate(plan.channels or [])]
-    if names:
-        sets["pulses/channel"] = (np.arange(pulses) % len(names)).astype("u1"), "1"
     digest = hashlib.sha256(b"".join(np.ascontiguousarray(value).tobytes() for value, _ in sets.values()))
     with h5py.File(path, "w") as file:
         for name, (value, unit) in sets.items():
@@ -651,14 +525,12 @@ def write_recording(folder: Path, plan: m.TestPlan, widths: list[float], torque:
             data.attrs["unit"], data.attrs["description"] = unit, name
         called = file.create_dataset("segments/name", data=[s["name"] for s in kept], dtype=h5py.string_dtype())
         called.attrs["unit"], called.attrs["description"] = "1", "segments"
-        if names:
-            file.attrs["channels"] = json.dumps(names)
         file.create_group("alignment").attrs.update(
             {"method": "sync", "error_ms": 0.02, "delay_ms": 0.0, "rate_ppm": 0.0}
         )
         file.attrs.update(
             {
-                "format": "stimrig-recording", "format_version": 2 if names else 1, "recording_id": path.stem,
+                "format": "stimrig-recording", "format_version": 1, "recording_id": path.stem,
                 "test_id": plan.test_id,
                 "participant": plan.participant, "kind": plan.kind, "created_utc": "2026-01-01T00:00:00Z",
                 "outcome": outcome, "reason": "", "software": "fake rig", "configuration": "{}",

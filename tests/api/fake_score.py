@@ -14,7 +14,6 @@ class FakeScore:
     """Widths, µs, and segments that are laid; an adaptive plan holds only lists of widths."""
 
     def __init__(self, plan: m.TestPlan, widths: list[float], segments: list[dict[str, Any]]) -> None:
-        self.slots_hz = PULSE_RATE_HZ * len(plan.channels or [0])
         self.adaptive, self.ended_by, self.refuses = plan.adaptive, "" if plan.adaptive else "plan", ""
         self.fixed = (
             [(s.name, list(s.settings["pulse_width_us"])) for s in plan.segments or []] if self.adaptive else []
@@ -25,7 +24,7 @@ class FakeScore:
 
     @property
     def end_s(self) -> float:
-        return len(self.widths) / self.slots_hz
+        return len(self.widths) / PULSE_RATE_HZ
 
     def lay(self, name: str, widths: list[float], by: str) -> None:
         start = self.end_s

@@ -39,82 +39,6 @@ def model(effects: list[str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def is_joint(arguments: dict[str, Any]) -> bool:
-    """Whether a call is about several muscles."""
-    if model_json := arguments.get("model_json"):
-        return json.loads(model_json).get("kind") == "joint"
-    if not Path(arguments["data"]).is_file():
-        return False
-    head = Path(arguments["data"]).read_bytes()[:200]
-    if head.startswith(b"\x89HDF"):
-        import h5py
-
-        with h5py.File(arguments["data"]) as file:
-            return "channels" in file.attrs
-    return b"triceps_pulse_width_us" in head
-
-
-def joint_model(effects: list[str]) -> dict[str, Any]:
-    """Biceps and triceps; the second one pulls the other way."""
-    whole, channels = model([]), []
-    for number, name in enumerate(("biceps", "triceps")):
-        own = model([effect.partition(".")[2] for effect in effects if effect.startswith(f"{name}.")])
-        own["recruitment"]["torque_nm"] = [(1.0, -0.6)[number] * y for y in own["recruitment"]["torque_nm"]]
-        place = {"muscle": f"{name} brachii", "side": "left", "electrode": "", "offset_s": number / 80}
-        channels.append({"name": name, **place, "model": own})
-    between = []
-    for effect in effects:
-        known, _colon, ends = effect.partition(":")
-        if "." not in effect:
-            named = dict(zip(("from", "to"), ends.split(">"), strict=True)) if ends else {}
-            between.append({"id": known, **named, "form": "made-up", "parameters": {}})
-    alone = {"biceps": {"held_out_rms_nm": 0.051}, "triceps": {"held_out_rms_nm": 0.052}}
-    fit = {**whole["fit"], "alone": alone, "both": {"held_out_rms_nm": 0.077}}
-    kept = {name: whole[name] for name in ("schema_version", "model_id", "created", "quality", "data", "software")}
-    return {**kept, "kind": "joint", "pulse_rate_hz": 40.0, "channels": channels, "interplay": between, "fit": fit}
-
-
-def joint_curves() -> dict[str, Any]:
-    found = curves()
-    own = {
-        name: {"torque_nm": [sign * y for y in found["torque_nm"]], "pulse_width_us": found["pulse_width_us"],
-               "step_response": found["step_response"]}
-        for name, sign in (("biceps", 1.5), ("triceps", -0.5))
-    }  # fmt: skip
-    return {**found, "muscles": own}
-
-
-CROSS_TALK = "cross_talk:biceps>triceps"
-
-
-def joint_diagnosis(model_json: str | None) -> dict[str, Any]:
-    """Cross-talk first, then co-contraction; fatigue of the biceps is not asked for."""
-    held = [one["id"] for one in json.loads(model_json)["interplay"]] if model_json else []
-    left = [name for name in (CROSS_TALK, "co_contraction") if name.partition(":")[0] not in held]
-    names = {CROSS_TALK: "Cross-talk (biceps → triceps)", "co_contraction": "Co-contraction"}
-    rows = [
-        {"effect": name, "name": names[name], "probability": 0.97, "rms_before_nm": 0.12, "rms_after_nm": 0.05,
-         "held_out_rms_before_nm": 0.2, "held_out_rms_after_nm": 0.06, "parameters": {},
-         "confused_with": ["co_contraction"][: name != left[-1]], "next_experiment": "Pulses to one channel alone.",
-         "plain": "The electrode of one muscle also reaches the other."}
-        for name in left
-    ]  # fmt: skip
-    tried = [{"effect": "biceps.fatigue", "log_evidence_gain": -3.0}]
-    steps, models = [{"added": None, "fit_percent": 97.0, "rms_nm": 0.12}], [joint_model([])]
-    for k, name in enumerate(left, start=1):
-        steps.append({"added": name, "fit_percent": 98.0, "rms_nm": 0.05})
-        models.append(joint_model(left[:k]))
-    empty = {"where": [], "experiment": None, "signatures": {}, "library": {}, "notes": [], "free": []}
-    found = {
-        "structure": held,
-        "verdict": "effect_missing" if left else "nothing_missing",
-        "noise_sd_nm": 0.04,
-        "base": {},
-    }
-    improved = {"verdict": "effect_missing", "noise_sd_nm": 0.04, "steps": steps, "models": models, "refused": []}
-    return {**found, "missing": rows, "candidates": [tried], **empty, "improvement": improved}
-
-
 def curves() -> dict[str, Any]:
     time_s = [k / 10 for k in range(200)]
     torque = [k % 50 / 10 for k in range(200)]
@@ -280,8 +204,6 @@ class Stub:
         self.pause = pause
         self.advice, self.target = 0, 0.0
         """Answers since the test began, and the target that it told."""
-        self.bank: list[str] = []
-        """Names of the models that it may be like."""
 
     def line(self, line: str | bytes, write: Callable[[str], Any]) -> None:
         """Do one call; what it says is written line by line."""
@@ -310,23 +232,19 @@ class Stub:
             while (Path(arguments["data"]).parent / "fitting-slowly").exists():
                 self.pause(0.05)
             document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
-            if is_joint(arguments):
-                document = joint_model([effect.removesuffix(":made-up") for effect in arguments.get("effects", [])])
             return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
         if verb == "carry":
             return carried(Path(arguments["data"]).parent, json.loads(arguments["model_json"]), say, self.pause)
         if verb == "comparison":
             return {"result": comparison()}
         if verb == "curves":
-            return {"result": joint_curves() if is_joint(arguments) else curves()}
+            return {"result": curves()}
         if verb == "diagnosis":
             slow = Path(arguments["data"]).parent / "slow"
             say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="tried fatigue")
             if slow.exists():
                 self.pause(60)
             held = arguments.get("model_json")
-            if is_joint(arguments):
-                return {"result": joint_diagnosis(held)}
             return {"result": {**diagnosis(held), "improvement": improvement(held)}}
         if verb == "adaptive_outlook":
             if arguments["target"]["step_percent"] == 49.0:
@@ -340,20 +258,13 @@ class Stub:
                 words += "6.0 % and the step response within 3.0 %."
             reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
                      "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
-            bank = None if arguments["bank"] is None else len(arguments["bank"])
             known = bool(arguments["models"])
-            return {"result": {"opening_us": OPENING, "reach": reach, "known": known, "bank": bank}}
+            return {"result": {"opening_us": OPENING, "reach": reach, "known": known}}
         if verb == "adaptive_begin":
             self.advice, self.target = 0, arguments["target"]["curve_percent"]
-            self.bank = [name for name, _text in arguments["bank"] or []]
         if verb == "adaptive_advise":
             self.advice += 1
-            found = advised(self.advice, self.target, self.pause)
-            if self.bank:
-                likely = {name: 0.9 * 0.1**place for place, name in enumerate(self.bank)}
-                words = f"{found['words']} Like {self.bank[0]} (90 %)."
-                found |= {"words": words, "bank": {**likely, "unlike all": 1.0 - sum(likely.values())}}
-            return {"result": found}
+            return {"result": advised(self.advice, self.target, self.pause)}
         if verb == "track":
             return {"result": tracked(arguments, self.pause)}
         if verb == "forecast":

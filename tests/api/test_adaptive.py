@@ -250,8 +250,6 @@ def test_what_is_no_target_is_refused_by_its_place(client: httpx.Client, partici
         ({"max_torque_time_nm_s": -3}, "max_torque_time_nm_s"),
         ({"kind": "pre-session", "target": {"curve_percent": 3}}, ""),
         ({"segments": [{"name": "a", "sequence": "rest"}]}, ""),
-        ({"bank": "yes"}, "bank"),
-        *(({"kind": kind, "bank": True}, "") for kind in ("pre-session", "sequence", "passive", "muscles")),
     ]
     for more, place in wrong:
         refused = start(client, **more)
@@ -441,12 +439,6 @@ def test_no_question_is_asked_before_the_record_is_long_enough(monkeypatch: pyte
         world = World([SAID])
         followed(world, rate_hz, monkeypatch)
         assert world.asked[0]["measured_s"] == pytest.approx(least_s, abs=0.03)
-
-
-def test_whom_the_muscle_is_like_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    bank = {"another person 1": 0.8, "unlike all": 0.2}
-    assert followed(World([{**SAID, "bank": bank}]), 40.0, monkeypatch).told.bank == bank
-    assert followed(World([SAID]), 40.0, monkeypatch).told.bank is None
 
 
 def test_a_chooser_that_gives_up_has_the_fixed_plan_play_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

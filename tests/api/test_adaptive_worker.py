@@ -197,50 +197,6 @@ def test_a_model_that_cannot_be_read_here_keeps_nobody_from_a_test() -> None:
     assert verbs.known([readable, "{}"]) is verbs.known(["no JSON"]) is None  # an older one is not the last one
 
 
-def model_of(seed: int) -> str:
-    """A model of a muscle's first look and two levels."""
-    widths = np.array([*OPENING, *[150.0] * 40, *[0.0] * 40, *[110.0] * 40])
-    noise_nm = 0.02 * np.random.default_rng(seed).standard_normal(4000)
-    return identify.fit(
-        recorded(sigmoid(seed), widths, ["opening"] * widths.size, noise_nm), recruitment="near-sigmoid"
-    ).to_json()
-
-
-@pytest.fixture(scope="module")
-def bank() -> list[tuple[str, str]]:
-    """The muscle that is tested among others, and what is of no use."""
-    named = [("own model 1 of 2026-11-20", 74), ("another person 1", 51_008), ("another person 2", 51_005)]
-    return [*((name, model_of(seed)) for name, seed in named), ("another person 3", "{}"), ("another one", "no JSON")]
-
-
-def test_a_test_with_a_bank_decides_and_tells_whom_the_muscle_is_like(bank: list[tuple[str, str]]) -> None:
-    widths = [*verbs.outlook(quiet, **HOW, max_torque_nm=30.0, bank=bank)["opening_us"], *[0.0] * 16]
-    assert len(widths) == 80 + 16, "a glance"
-    told = first_advice(widths, bank)
-    assert told["kind"] == "next" and told["bank"]["own model 1 of 2026-11-20"] > 0.9
-    assert told["words"].endswith(" %).") and " Like own model 1 of 2026-11-20 (" in told["words"]
-    others = first_advice(widths, bank[1:])
-    assert max(others["bank"], key=others["bank"].__getitem__) == "unlike all" and "Like no earlier" in others["words"]
-
-
-def first_advice(widths: list[float], bank: list[tuple[str, str]]) -> dict[str, Any]:
-    verbs.begin(quiet, **HOW, bank=bank)
-    news = {"samples": Cell(sigmoid(74), 5).news(widths, 2.3), "outcomes": felt(widths, 92)}
-    laid = {"laid_us": list(widths), "segments": [("opening", 0, len(widths))]}
-    return verbs.advise(quiet, **news, **laid, torque_time_nm_s=1.0, measured_s=2.3)
-
-
-def test_what_can_be_reached_is_played_with_the_bank(bank: list[tuple[str, str]]) -> None:
-    """By the person's own last model, where there is one; an empty bank is a test as ever."""
-    how = {**HOW, "max_torque_nm": 30.0, "models": [bank[0][1]]}
-    plain, empty, useless, full = (verbs.outlook(quiet, **how, bank=one) for one in (None, [], bank[3:], bank))
-    assert [found["bank"] for found in (plain, empty, useless, full)] == [None, 0, 0, 3]
-    assert plain["reach"] == empty["reach"] == useless["reach"]
-    assert plain["opening_us"] == empty["opening_us"] == useless["opening_us"] and len(plain["opening_us"]) == 92
-    assert full["known"] and full["reach"]["reachable"]
-    assert full["reach"]["torque_time_nm_s"] < 0.8 * plain["reach"]["torque_time_nm_s"]
-
-
 def test_a_worker_that_died_or_a_begin_that_failed_leaves_no_test_to_advise() -> None:
     news = Cell(sigmoid(71), 1).news([0.0] * 80, 2.0)
 

@@ -99,7 +99,6 @@ TEXT = [
     *((f"on-{name}", name) for name in ("primary", "stimulate", "stop", "tag", "running", "unknown", "emulated")),
     *((f"on-{name}", f"{name}-hover") for name in ("primary", "stimulate", "stop")),
     ("ink", "field"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"), ("card", "good"),
-    *((f"muscle-{k}", surface) for surface in SURFACES for k in (1, 2)),
 ]  # fmt: skip
 """Ink and what it stands on."""
 SEEN = [
@@ -113,12 +112,7 @@ CHARTS = {
     "measurement": ("measured", "model", "residual", "width"),
     "recruitment": ("model", "rising", "falling"),
     "live": ("torque", "width", "limit"),
-    "two muscles": ("muscle-1", "muscle-2"),
-    "live, two muscles": ("torque", "muscle-1", "muscle-2", "limit"),
-    "measurement, two muscles": ("measured", "model", "residual", "muscle-1", "muscle-2"),
 }
-BESIDE = (("muscle-1", "muscle-2"), ("torque", "model", "measured", "residual", "limit"))
-"""One of the muscles and one of the others: in a grey print where it stands and its name tell them apart."""
 DASHED = "limit"
 """Drawn as a dashed line with its name beside it: that tells it apart in a grey print."""
 APART = 9.0
@@ -141,8 +135,7 @@ def test_lines_of_a_chart_are_told_apart(mode: str, vision: str) -> None:
     seen = {name: lab(value, vision) for name, value in MODES[mode].items() if value.startswith("#")}
     for names in CHARTS.values():
         for one, other in combinations([name for name in names if (name, vision) != (DASHED, "grey")], 2):
-            if vision != "grey" or not any(one in a and other in b for a, b in (BESIDE, BESIDE[::-1])):
-                assert difference(seen[one], seen[other]) >= APART, (one, other)
+            assert difference(seen[one], seen[other]) >= APART, (one, other)
     least = SERIES_APART_GREY if vision == "grey" else SERIES_APART
     for one, other in combinations([f"series-{k}" for k in range(1, 7)], 2):
         assert difference(seen[one], seen[other]) >= least, (one, other)

@@ -79,12 +79,10 @@ class World:
     @classmethod
     def made(cls, service: Service, code: str) -> World:
         me, colleague = service.client(), service.client(service.token("colleague", "administer"))
-        world = cls(service, me, colleague, code, {"code": code, "channel": "biceps"})
-        service.rig.channels = ["biceps", "triceps"]
+        world = cls(service, me, colleague, code, {"code": code})
         soon(lambda: service.rig.state != "running")
         if service.rig.state != "ready":
             assert me.post("/v1/rearm").is_success
-        soon(lambda: me.get("/v1/rig").json()["stimulator"].get("channels"))
         assert me.post("/v1/participants", json={"code": code}).is_success
         return world
 
@@ -208,7 +206,7 @@ def world(shared: Service, request: pytest.FixtureRequest) -> Iterator[World]:
     made = World.made(shared, f"P{abs(hash(request.node.name)) % 10**9}")
     yield made
     made.me.post(f"/v1/participants/{made.code}/calibration/finish", json={"discard": True})
-    shared.rig.arm.way, shared.rig.channels = None, []
+    shared.rig.arm.way = None
     shared.rig.become(shared.rig.state, shared.rig.reason)
 
 
@@ -275,8 +273,7 @@ def test_what_was_changed_since_is_decided_anew(world: World, door: str) -> None
 UNWRITTEN = {"POST /v1/participants/{code}/notes/{note_id}/strike", "POST /participants/{code}/notes/{note_id}/strike",
              "POST /v1/participants/{code}/unarchive", "POST /participants/{code}/unarchive",
              "POST /v1/participants/{code}/calibration/step", "POST /participants/{code}/calibration/step/{direction}",
-             "POST /participants/{code}/profile", "POST /participants/{code}/tests",
-             "POST /participants/{code}/channels/{channel}/profile"}  # fmt: skip
+             "POST /participants/{code}/profile", "POST /participants/{code}/tests"}  # fmt: skip
 """Done twice it changes nothing; a train is in the calibration's own recording; a jump is asked about first."""
 TWICE = {"POST /v1/rearm", "POST /rearm", "POST /v1/models/{model_id}/reject", "POST /models/{model_id}/reject",
          "POST /v1/participants/{code}/recordings", "POST /participants/{code}/recordings",

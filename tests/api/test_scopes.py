@@ -126,8 +126,6 @@ POST   /models/x/experiment                                run-test       4xx
 POST   /models/x/diagnosis/cancel                          run-test       303
 POST   /jobs/x/cancel                                      run-test       404
 PUT    /v1/participants/x/muscle                           run-test       428
-PUT    /v1/participants/x/channels/x/profile               run-test       428
-PUT    /v1/participants/x/channels/x/muscle                run-test       428
 POST   /v1/participants/x/archive                          run-test       428
 POST   /v1/participants/x/unarchive                        run-test       428
 GET    /v1/participants/x/notes                            run-test       404
@@ -139,8 +137,6 @@ POST   /participants/x/notes/x/strike                      run-test       428
 POST   /participants/x/archive                             run-test       428
 POST   /participants/x/unarchive                           run-test       428
 POST   /participants/x/muscle                              run-test       428
-POST   /participants/x/channels/x/profile                  run-test       428
-POST   /participants/x/channels/x/muscle                   run-test       428
 POST   /tests/x/ran-by                                     run-test       428
 POST   /participants/x/keys/x/revoke                       run-test       404
 POST   /v1/participants/x/keys                             approve-model  428

@@ -249,7 +249,7 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
     paths = []
     for name, rate_hz, minute in (("late", 400, 10), ("early", 1600, 0)):
         torque = [widths[int(index * 40 / rate_hz)] / 40 for index in range(6 * rate_hz)]
-        plan = SimpleNamespace(test_id=name, participant="P017", kind="default", channels=None)
+        plan = SimpleNamespace(test_id=name, participant="P017", kind="default")
         path, _ = write_recording(tmp_path, plan, widths, torque, segments, rate_hz, "completed")  # pyright: ignore[reportArgumentType]
         with h5py.File(path, "r+") as file:
             file.attrs["created_utc"] = f"2026-01-01T00:{minute:02d}:00.250Z"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import h5py
@@ -10,7 +9,6 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.identify import muscles
 from stimrig.identify.records import read
 from tests.harness.patients import Patient, make_record
 
@@ -156,38 +154,6 @@ def test_reads_a_sealed_recording(tmp_path):
     assert model.data["recording_id"] == "rec-1"
 
 
-def with_channels(path: Path, *names: str) -> None:
-    """Make it one of these channels, of which the first has all pulses."""
-    with h5py.File(path, "a") as file:
-        told = [{"name": name, "offset_s": 0.0125 * place} for place, name in enumerate(names)]
-        file.attrs.update(format_version=2, channels=json.dumps(told))
-        file["/pulses/channel"] = np.zeros(file["/pulses/status"].size, np.uint8)
-
-
-def test_a_channel_with_a_name_is_read_as_one_without(tmp_path):
-    seal(tmp_path / "r.h5")
-    expected = read(tmp_path / "r.h5")
-    with_channels(tmp_path / "r.h5", "biceps")
-    found = read(tmp_path / "r.h5")
-    assert np.array_equal(found.pulse_width_us, expected.pulse_width_us)
-    assert not muscles.is_joint(tmp_path / "r.h5")
-
-
-def test_recordings_of_several_channels_say_where_they_are_read(tmp_path):
-    seal(tmp_path / "r.h5")
-    with_channels(tmp_path / "r.h5", "biceps", "triceps")
-    assert muscles.is_joint(tmp_path / "r.h5")
-    with pytest.raises(identify.BadRecord, match=r"several channels \(biceps, triceps\)"):
-        read(tmp_path / "r.h5")
-    found = muscles.read(tmp_path / "r.h5")
-    assert found.names == ("biceps", "triceps") and not found.records[1].pulse_width_us.any()
-    for wrong in ("no list", '{"name": 1}', '[{"name": "a"}]', "[1]"):
-        with h5py.File(tmp_path / "r.h5", "a") as file:
-            file.attrs["channels"] = wrong
-        with pytest.raises(identify.BadRecord, match="no list of names and offsets"):
-            read(tmp_path / "r.h5")
-
-
 def test_held_out_rows_in_another_case_or_with_blanks_are_held_out_and_told(tmp_path):
     seal(tmp_path / "r.h5")
     expected = read(tmp_path / "r.h5")
@@ -239,6 +205,7 @@ def test_gaps_in_the_torque_are_bridged(tmp_path):
     [
         (lambda file: file.attrs.update(format="other"), "no stimrig recording"),
         (lambda file: file.attrs.update(format_version=9), "format version 9"),
+        (lambda file: file.attrs.update(format_version=2), "format version 2"),
         (lambda file: file.__delitem__("/pulses/status"), "incomplete recording"),
         (lambda file: file.__delitem__("/torque"), "incomplete recording"),
         (lambda file: file["/torque/torque_nm"].__setitem__(5000, np.nan), "torque is not finite"),

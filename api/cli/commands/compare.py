@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli import several
 from stimrig.api.cli.result_files import report
 from stimrig.api.cli.terminal import (
     ColumnMap,
@@ -36,9 +35,6 @@ def compare(
 
     The model runs free: it is given the pulse widths alone, never the measured torque.
     """
-    if several.is_joint(data):
-        several.compare(model_json, data, as_json, html=html, map=columns)
-        return
     model = load_model(model_json, "compare MODEL.json DATA")
     record = load_record(data, columns)
     compared = identify.compare(model, record)

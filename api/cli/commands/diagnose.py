@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli import several
 from stimrig.api.cli.terminal import (
     ColumnMap,
     HeldModel,
@@ -38,9 +37,6 @@ def diagnose(
     Takes 5 to 30 s, longer where structure is left or with several recordings. DATA decides: a model given with --model
     lends its structure, not its numbers.
     """
-    if several.is_joint(data):
-        several.diagnose(data, model_json, as_json, html=html, map=columns)
-        return
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
         if html is None:

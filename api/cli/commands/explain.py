@@ -9,8 +9,6 @@ from typing import Annotated, Any
 import typer
 
 from stimrig import identify
-from stimrig.api.cli import several
-from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.result_files import story_page, told
 from stimrig.api.cli.terminal import (
     ColumnMap,
@@ -42,8 +40,6 @@ def explain(
 
     Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o no model is kept.
     """
-    if several.is_joint(data):
-        raise InputError(f"{data[0]}: of several muscles there is no story yet. Use `stimrig improve`.")
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
         explained = identify.explain(record, progress, model)

@@ -8,7 +8,6 @@ from typing import Annotated, Any
 import typer
 
 from stimrig import identify
-from stimrig.api.cli import several
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import (
     ColumnMap,
@@ -61,10 +60,6 @@ def fit(
     as_json: Json = False,
 ) -> None:
     """Identify a model: recruitment curve, linear dynamics, effects. Says how well it fits and whether it is usable."""
-    if several.is_joint(data):
-        asked = method != METHOD and method
-        several.fit(data, names(effects), output, as_json, method=asked, fit_on=fit_on, carry=carry, map=columns)
-        return
     if carry is not None and (method != METHOD or effects or fit_on):
         raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
     earlier = None if carry is None else load_model(carry)

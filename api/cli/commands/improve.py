@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli import several
 from stimrig.api.cli.result_files import story_page, told
 from stimrig.api.cli.terminal import (
     ColumnMap,
@@ -43,9 +42,6 @@ def improve(
 
     Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o nothing is kept.
     """
-    if several.is_joint(data):
-        several.improve(data, model_json, output, as_json, html=html, map=columns)
-        return
     record, model, structure = load_held(model_json, data, columns)
     with progress_bar() as progress:
         if html is None:

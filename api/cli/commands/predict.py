@@ -8,7 +8,6 @@ from typing import Annotated
 import typer
 
 from stimrig import identify
-from stimrig.api.cli import several
 from stimrig.api.cli.terminal import (
     ColumnMap,
     Data,
@@ -24,8 +23,6 @@ from stimrig.api.cli.terminal import (
     writing,
 )
 
-USAGE = "predict MODEL.json DATA -o FILE"
-
 
 def predict(
     model_json: ModelFile,
@@ -39,14 +36,10 @@ def predict(
 
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
 
-    if several.is_joint([data]):
-        record, own = several.predict(model_json, data, USAGE, map=columns)
-    else:
-        model = load_model(model_json, USAGE)
-        record = load_record([data], columns)
-        own = {"predicted_torque_nm": np.asarray(identify.predict(model, record))}
-    predicted = own["predicted_torque_nm"]
-    found = {"time_s": record.time_s, "torque_nm": record.torque_nm, **own}
+    model = load_model(model_json, "predict MODEL.json DATA -o FILE")
+    record = load_record([data], columns)
+    predicted = np.asarray(identify.predict(model, record))
+    found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
     if output.suffix.lower() == ".mat":
         write_mat(output, found)
     else:

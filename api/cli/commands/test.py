@@ -59,9 +59,6 @@ def test(
         ),
     ] = None,
     anyway: Annotated[bool, typer.Option("--anyway", help="play it although the target is out of reach")] = False,
-    bank: Annotated[
-        bool, typer.Option("--bank", help="with --adaptive: start from earlier models, the person's own and others'")
-    ] = False,
     decide: Annotated[
         list[Path] | None,
         typer.Option(
@@ -77,7 +74,7 @@ def test(
 
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
-    asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway, bank) | given(**labels)
+    asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway) | given(**labels)
     if decide and (adaptive or protocol is not None):
         raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
     token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
@@ -146,17 +143,16 @@ def how(
     max_time: float | None,
     max_torque_time: float | None,
     anyway: bool,
-    bank: bool,
 ) -> dict[str, Any]:
     """What the service is asked for beside the participant.
 
     Raises InputError: an option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
     """
     bounds = given(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time)
-    asked = bounds | given(anyway=anyway or None, bank=bank or None)
+    asked = bounds | given(anyway=anyway or None)
     if not adaptive:
         if asked or target:
-            raise InputError("--target, --max-time, --max-torque-time, --anyway and --bank go with --adaptive.")
+            raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
         return {} if protocol is None else {"protocol": protocol}
     if protocol is not None:
         raise InputError("--protocol is for a fixed test; leave it out, or leave out --adaptive.")

@@ -13,22 +13,18 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
-from stimrig.api.sessions import channels, profiles
-from stimrig.api.sessions.channels import Channel
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.requests import CalibratedIn, CalibrationIn, FinishIn, MarkIn, StepIn
+from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.render import done_or_said, page
-from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import calibration, participants
 from stimrig.rig.messages import Status
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/calibration")
-FIRST = ("current_ma", "step_us")
-"""The form's fields on a rig of one channel."""
 DEFAULTS = CalibrationIn.model_validate({})
 MARKS = {
     "sensory": ("It is felt", "the narrowest pulse the participant feels"),
@@ -66,42 +62,22 @@ async def show_page(
     return page(
         request, "calibration.html", status,
         participant=row, found=found, waits=waits, marks=MARKS, last=last(row.profile), problem=problem,
-        texts=texts or usual(context, row), errors=errors or {}, ladders=ladders(context, row, found),
-        channels=channels.of(row, context.rig.status),
+        texts=texts or usual(row), errors=errors or {},
         help={"current_ma": profiles.takes("current_ma", limits), "step_us": f"{low_us:g} to {high_us:g} µs"},
     )  # fmt: skip
 
 
-def usual(context: Context, row: Participant) -> dict[str, str]:
-    """The participant's own current and the usual fine step: what holds where a form has neither.
-
-    Of each further channel its own current, too; one without is left out.
-    """
+def usual(row: Participant) -> dict[str, str]:
+    """The participant's own current and the usual fine step: what holds where a form has neither."""
     first = row.profile["current_ma"]
-    texts = {"current_ma": typed.number_text(first), "step_us": typed.number_text(DEFAULTS.step_us)}
-    for one in channels.of(row, context.rig.status)[1:]:
-        texts[f"current_ma_{one.name}"] = typed.number_text(one.profile.get("current_ma") or first)
-    return texts
+    return {"current_ma": typed.number_text(first), "step_us": typed.number_text(DEFAULTS.step_us)}
 
 
 def last(profile: Mapping[str, Any]) -> dict[str, float]:
-    """Marks of the last calibration of a channel, µs; empty where there is none."""
+    """Marks of the last calibration, µs; empty where there is none."""
     if profile.get("sensory_pulse_width_us") is None:
         return {}
     return {name: profile[field] for name, field in LAST.items()}
-
-
-def ladders(context: Context, row: Participant, found: dict[str, Any] | None) -> list[dict[str, Any]]:
-    """What the page shows of each channel that is calibrated, side by side; of one without a name it is the whole."""
-    known = {one.name: one for one in channels.of(row, context.rig.status)}
-    shown = []
-    for of in (found or {}).get("channels") or ([found] if found else []):
-        name = of.get("name", "")
-        trains = [train for train in (found or {})["trains"] if train.get("channel", "") == name]
-        before = last(known[name].profile if name in known else row.profile)
-        number = known[name].number if name in known else 0
-        shown.append({"of": of, "name": name, "number": number, "trains": trains, "last": before})
-    return shown
 
 
 def fine_range(status: Status | None) -> tuple[float, float]:
@@ -122,30 +98,21 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     """Open one; a current that is far above the participant's is asked about first."""
     row = await asyncio.to_thread(participants.find, context, code)
     sent = await request.form()
-    fields = usual(context, row).items()
-    texts = {name: str(sent.get(name, text if name in FIRST else ""))[:60] for name, text in fields}
-    texts = {name: text for name, text in texts.items() if text.strip() or name in FIRST}
+    texts = {name: str(sent.get(name, text))[:60] for name, text in usual(row).items()}
     values, errors = read(texts, row, context.rig.status)
     if errors:
         return await show_page(request, context, code, texts, errors)
-    playing = channels.of(row, context.rig.status)
-    currents = {one.name: values[_field(one)] for one in playing if _field(one) in values}
-    asked = [CalibratedIn(name=name, current_ma=current_ma) for name, current_ma in currents.items()]
-    several = {"channels": asked} if len(asked) > 1 else {}
-    body = typed.checked(CalibrationIn, **{name: values[name] for name in FIRST}, large_steps=True, **several)
+    body = typed.checked(CalibrationIn, **values, large_steps=True)
 
     async def open_it() -> str:
         await calibration.begin_calibration(context, who, code, Response(), body)
         return address(code)
 
     await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
-    doubts = [
-        words for one in [{"profile": row.profile, "at": "current_ma"}, *_further(playing, values)]
-        for words in profiles.jumps(one["profile"], {**one["profile"], "current_ma": values[one["at"]]})
-    ]  # fmt: skip
+    doubts = profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]})
     if not doubts:
         return await attempt(request, context, code, open_it(), address(code))
-    current = ", ".join(f"{current_ma:g} mA" for current_ma in currents.values() or [values["current_ma"]])
+    current = f"{values['current_ma']:g} mA"
     question = Question(
         participant=code,
         title=f"Calibrate {code} with {current}?",
@@ -161,15 +128,6 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     return RedirectResponse(context.questions.ask(question, who), 303)
 
 
-def _field(one: Channel) -> str:
-    """The form's field of a channel's current."""
-    return f"current_ma_{one.name}" if one.key else "current_ma"
-
-
-def _further(playing: list[Channel], values: Mapping[str, float]) -> list[dict[str, Any]]:
-    return [{"profile": one.profile, "at": _field(one)} for one in playing if one.key and _field(one) in values]
-
-
 def read(
     texts: dict[str, str], row: Participant, status: Status | None
 ) -> tuple[dict[str, float], dict[str, str]]:  # fmt: skip
@@ -179,27 +137,27 @@ def read(
     if "step_us" in values and not (low_us <= values["step_us"] <= high_us):
         errors["step_us"] = f"{texts['step_us']!r} is not {low_us:g} to {high_us:g} µs"
     limits = {name: bound for name, bound in (status.limits if status else {}).items() if name == "current_ma"}
-    for name in values.keys() - {"step_us"}:
-        for words in profiles.outside({"current_ma": values[name]}, row.profile, limits).values():
-            errors[name] = f"{texts[name]!r}: {words}"
+    if "current_ma" in values:
+        for words in profiles.outside({"current_ma": values["current_ma"]}, row.profile, limits).values():
+            errors["current_ma"] = f"{texts['current_ma']!r}: {words}"
     return values, errors
 
 
 @router.post("/step/{direction}")
 async def step(
     request: Request, context: Ctx, who: Tester, code: str, direction: str,
-    shown_us: Annotated[float | None, Form()] = None, channel: Text = "",
+    shown_us: Annotated[float | None, Form()] = None,
 ) -> Response:  # fmt: skip
     """Play one train; the trains that the page knew of and the width on the button say whether both still hold."""
-    body = typed.checked(StepIn, direction=direction, shown_us=shown_us, channel=channel)
+    body = typed.checked(StepIn, direction=direction, shown_us=shown_us)
     done = calibration.play_step(context, who, code, body, Response())
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/mark/{threshold}")
-async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str, channel: Text = "") -> Response:
+async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str) -> Response:
     """Mark the last train's width."""
-    body = typed.checked(MarkIn, threshold=threshold, channel=channel)
+    body = typed.checked(MarkIn, threshold=threshold)
     done = calibration.set_mark(context, who, code, body, Response())
     return await attempt(request, context, code, done, address(code))
 

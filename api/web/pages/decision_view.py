@@ -15,7 +15,6 @@ from starlette.datastructures import FormData
 
 from stimrig.api.errors import ApiError
 from stimrig.api.models import advice, registry, stored_model
-from stimrig.api.models.family import family_of
 from stimrig.api.models.tracking import QUANTITIES, Limits
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx, Version
@@ -83,7 +82,6 @@ async def _question(
         typed=written,
         sent=sent,
         threshold_us=stored_model.threshold_us(row),
-        family=family_of(row),
         what_to_write=registry.WHAT_TO_WRITE,
     )
 

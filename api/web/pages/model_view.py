@@ -9,11 +9,10 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
-from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts, muscle_charts
+from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import advice, carried_structure, explanation, stored_model
-from stimrig.api.models.family import family_of
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.requests import EffectsIn, TestIn
@@ -61,7 +60,6 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
         may_test=who.may(Scope.RUN_TEST),
         may_approve=who.may(Scope.APPROVE_MODEL),
-        family=family_of(row),
         **shown,
     )
 
@@ -80,14 +78,11 @@ async def figures_of(context: Context, row: Model) -> Figures:
 
 async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[str, Any]:
     """What a model's page and its report show alike."""
-    owners = stored_model.muscles_of(document)
     return {
         "document": document,
-        "muscles": muscle_rows(document),
-        "together": [name for name in row.effects if "." not in name],
         "held": explanation.held_free(document),
-        "recruitment": None if owners else stored_model.recruitment(document),
-        "dynamics": None if owners else stored_model.dynamics(document),
+        "recruitment": stored_model.recruitment(document),
+        "dynamics": stored_model.dynamics(document),
         "repetition": stored_model.repetition(document),
         "validity": stored_model.validity(document),
         "warnings": await asyncio.to_thread(context.runner.lifecycle.warnings, row.recording_id),
@@ -95,23 +90,8 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
     }
 
 
-def muscle_rows(document: dict[str, Any]) -> list[dict[str, Any]]:
-    """What is said of each muscle of a model of several; nothing of a model of one."""
-    alone = (document.get("fit") or {}).get("alone") or {}
-    return [
-        {
-            "number": number, "name": name, "recruitment": stored_model.recruitment(own),
-            "dynamics": stored_model.dynamics(own), "error_nm": (alone.get(name) or {}).get("held_out_rms_nm"),
-            "effects": [effect["id"] for effect in own.get("effects") or []],
-        }
-        for number, (name, own) in enumerate(stored_model.muscles_of(document).items(), start=1)
-    ]  # fmt: skip
-
-
 def draw_own(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
     """The model's own figures; the first one low enough for the first screen."""
-    if stored_model.muscles_of(document):
-        return muscle_charts.muscle_figures(document, measured["curves"])
     figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
     first = {"overview": model_charts.overview(figures[model_charts.LARGE])} if model_charts.LARGE in figures else {}
     held = diagnosis_charts.pictures(explanation.held_free(document))

@@ -17,11 +17,11 @@ from stimrig.api.local_time import clock
 from stimrig.api.models.places import site_of
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import channels, controllers, profiles
+from stimrig.api.sessions import controllers, profiles
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
-from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MUSCLES, MuscleIn, NoteIn, TargetIn, TestIn
+from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MuscleIn, NoteIn, TargetIn, TestIn
 from stimrig.api.store import seen
-from stimrig.api.store.tables import Participant, Recording
+from stimrig.api.store.tables import Recording
 from stimrig.api.web.dependencies import Approver, Context, Ctx, Tester
 from stimrig.api.web.guards import local
 from stimrig.api.web.pages import limits_form, next_view, render, starting, typed
@@ -44,9 +44,9 @@ async def participant(request: Request, context: Ctx, who: Tester, code: str) ->
 
 async def show_page(
     request: Request, context: Context, who: Principal, code: str, form: LimitsForm | None = None, status: int = 200,
-    made: dict[str, Any] | None = None, channel: str = "",
+    made: dict[str, Any] | None = None,
 ) -> Response:  # fmt: skip
-    """The page, with the form as it was sent where something was wrong with it: of a further `channel`, or the first.
+    """The page, with the form as it was sent where something was wrong with it.
 
     `made`: a controller's key that was just made, the only time its text is seen.
     """
@@ -60,8 +60,7 @@ async def show_page(
             "notes": context.notes.participant_notes(code),
             "calibrated": starting.calibrated(context, row),
             "step": next_view.step(context, row, who),
-            "form": (None if channel else form) or limits_form.fresh(row.profile, context.rig.status),
-            "channels": channel_cards(context, row, channel, form),
+            "form": form or limits_form.fresh(row.profile, context.rig.status),
             "meanwhile": participants.meanwhile(context, code),
             "fields": limits_form.fields(context.rig.status),
             "tests": tests[:shown],
@@ -75,18 +74,6 @@ async def show_page(
 
     ask_password = not await context.people.is_confirmed(who.session_hash)
     return page(request, "participant.html", status, ask_password=ask_password, **await asyncio.to_thread(gather))
-
-
-def channel_cards(
-    context: Context, row: Participant, of: str = "", sent: LimitsForm | None = None
-) -> list[dict[str, Any]]:
-    """What the page has of each channel of a rig with several, the first one first; `sent`: the form of one of them."""
-    status, found = context.rig.status, []
-    for one in channels.of(row, status):
-        form = sent if sent is not None and one.key == of else limits_form.fresh(one.profile, status)
-        standing = starting.calibrated(context, row, one.key)
-        found.append({"channel": one, "site": channels.held(row, one.key), "form": form, "calibrated": standing})
-    return found
 
 
 def trials_of(context: Context, who: Principal, code: str) -> Markup | None:
@@ -104,29 +91,20 @@ async def set_limits(request: Request, context: Ctx, who: Tester, code: str) -> 
     return await taken(request, context, who, code, start=False)
 
 
-@router.post("/channels/{channel}/profile")
-async def set_channel_limits(request: Request, context: Ctx, who: Tester, code: str, channel: str) -> Response:
-    """The limits of one channel of several."""
-    key = channels.key_of(context.rig.status, channel)
-    return await taken(request, context, who, code, start=False, channel=key)
-
-
 @router.post("/tests")
 async def start_test(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """To the question before the pre-session test; limits that were typed are set on the way, or asked about."""
     return await taken(request, context, who, code, start=True)
 
 
-async def taken(
-    request: Request, context: Context, who: Principal, code: str, start: bool, channel: str = ""
-) -> Response:
+async def taken(request: Request, context: Context, who: Principal, code: str, start: bool) -> Response:
     """Take the form: refuse it, ask about it, or do what it says."""
     row = await asyncio.to_thread(participants.find, context, code)
-    status, profile = context.rig.status, channels.held(row, channel)["profile"]
+    status, profile = context.rig.status, row.profile
     sent = await request.form()
     form = limits_form.read(sent, profile, status)
     if form.errors:
-        return await show_page(request, context, who, code, form, 422, channel=channel)
+        return await show_page(request, context, who, code, form, 422)
     wanted = asked_test(sent, code) if start else None
 
     async def on() -> str:
@@ -142,7 +120,7 @@ async def taken(
     new, voids = profiles.changed(profile, form.asked)
 
     async def save() -> str:
-        _row, place = await participants.change_profile(context, code, form.asked, who.name, bool(voids), channel)
+        _row, place = await participants.change_profile(context, code, form.asked, who.name, bool(voids))
         seen.looked.set(place)  # what is asked next rests on what was just decided
         return await on()
 
@@ -185,15 +163,13 @@ def asked_test(sent: FormData, code: str) -> TestIn:
     Raises ApiError: 422 what was typed is no target, or no label.
     """
     asked: dict[str, Any] = {name: str(sent.get(name) or "").strip() or None for name in LABEL_TITLES}
-    if sent.get("plan") == MUSCLES:
-        asked["kind"] = MUSCLES
     if sent.get("plan") == "adaptive":
         percent = typed.wanted(str(sent.get("target") or ""), no_target)
         if not (LEAST_PERCENT <= percent <= MOST_PERCENT):
             within = f"{percent:g} % is not from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %"
             raise typed.unusable(no_target(within))
         target = TargetIn(curve_percent=percent, step_percent=percent)
-        asked |= {"kind": "adaptive", "target": target, "anyway": True, "bank": "bank" in sent}
+        asked |= {"kind": "adaptive", "target": target, "anyway": True}
     return typed.checked(TestIn, participant=code, **asked)
 
 
@@ -310,33 +286,17 @@ async def set_muscle(
     name: Annotated[str, Form(alias="muscle")] = "", placement: Text = "",
 ) -> Response:  # fmt: skip
     """Say the site; asked about where calibration, approved model or keys would be lost."""
-    return await say_site(context, who, code, side, name, placement)
-
-
-@router.post("/channels/{channel}/muscle")
-async def set_channel_muscle(
-    context: Ctx, who: Tester, code: str, channel: str, side: Text = "",
-    name: Annotated[str, Form(alias="muscle")] = "", placement: Text = "",
-) -> Response:  # fmt: skip
-    """Say the site of one channel of several."""
-    return await say_site(context, who, code, side, name, placement, channels.key_of(context.rig.status, channel))
-
-
-async def say_site(
-    context: Context, who: Principal, code: str, side: str, name: str, placement: str, channel: str = ""
-) -> Response:
-    """Take the form of a site: ask about it, or do what it says."""
     body = typed.checked(MuscleIn, side=side or None, muscle=name.strip() or None, placement=placement.strip() or None)
     row = await asyncio.to_thread(participants.find, context, code)
 
     async def save() -> str:
-        await participants.change_site(context, code, body, who.name, True, channel)
+        await participants.change_site(context, code, body, who.name, True)
         return f"/participants/{code}"
 
     await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
-    before, after = site_words(site_of(row, channel)), site_words(participants.site_in(body))
+    before, after = site_words(site_of(row)), site_words(participants.site_in(body))
     warnings = []
-    if participants.loses_calibration(row, body, channel):
+    if participants.loses_calibration(row, body):
         warnings += [f"The calibration is lost with it: its thresholds were found at {before}."]
     if before != after and await asyncio.to_thread(context.versions.approved, code) is not None:
         warnings += [f"The approved model and its keys are of {before}. Here there is none."]

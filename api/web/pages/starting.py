@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -14,12 +14,11 @@ from stimrig.api.local_time import until, when
 from stimrig.api.models.changes import dose_words
 from stimrig.api.models.places import Site, site_of
 from stimrig.api.people.auth import Principal
-from stimrig.api.sessions import channels, profiles
-from stimrig.api.sessions.channels import Channel
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.joint_plan import HELD, PASSIVE
 from stimrig.api.sessions.playing import other_than, refuse_archived
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.requests import MUSCLES, TestIn
+from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context
@@ -38,9 +37,9 @@ class Calibrated:
     may_start: bool
 
 
-def calibrated(context: Context, row: Participant, channel: str = "") -> Calibrated:
+def calibrated(context: Context, row: Participant) -> Calibrated:
     """Whether a person has found this participant's limits today, who, and whether a test may start without."""
-    profile = channels.held(row, channel)["profile"]
+    profile = row.profile
     state = profiles.calibration(profile, context.clock.utc())
     if state == "none":
         required = bool(context.rig.status and context.rig.status.require_calibration)
@@ -64,10 +63,8 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
     row = await asyncio.to_thread(participants.find, context, body.participant)
     refuse_archived(row)
     context.runner.refuse_second()
-    playing = channels.needed(row, context.rig.status) if body.kind == MUSCLES else []
-    found = [await asyncio.to_thread(calibrated, context, row, key) for key in [one.key for one in playing] or [""]]
-    standing = next((one for one in found if one.state != "valid"), found[0])
-    if not all(one.may_start for one in found):
+    standing = await asyncio.to_thread(calibrated, context, row)
+    if not standing.may_start:
         detail = f"{row.code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
     preview = await context.runner.preview(body)
@@ -76,7 +73,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         test = await context.runner.start(body, who.name, preview, who.token_hash)
         return f"/tests/{test.id}"
 
-    strength = f"{current_words(row, playing)}, {number(widest_us(preview), 0, 'µs')}"
+    strength = f"{current_words(row)}, {number(widest_us(preview), 0, 'µs')}"
     stimulates = widest_us(preview) > 0.0
     joint = preview.get("joint")
     question = Question(
@@ -84,7 +81,7 @@ async def ask(context: Context, who: Principal, body: TestIn, back: str = "") ->
         title=f"Start the {words(body.kind, 'kind')} of {row.code}?",
         button=f"Start now: {strength}" if stimulates else "Start now: no stimulation",
         action=action,
-        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context), playing)
+        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context))
         + [Row(*said) for said in label_rows(vars(body))],
         warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
         stimulates=stimulates,
@@ -107,11 +104,8 @@ def out_of_reach(preview: dict[str, Any]) -> list[str]:
     return [] if reach is None or reach["reachable"] else [reach["words"]]
 
 
-def rows(
-    row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str,
-    playing: Sequence[Channel] = (),
-) -> list[Row]:  # fmt: skip
-    """What a person has to know before saying yes; `playing`: the channels of a test of several."""
+def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str) -> list[Row]:
+    """What a person has to know before saying yes."""
     pulses = sum(width > 0 for width in preview["pulse_width_us"])
     torque_time = preview.get("torque_time_nms")
     charge = dose_words(preview["charge_uc"])
@@ -130,8 +124,6 @@ def rows(
         dose = f"at most {most} of torque"
         more = [Row("Stops once known within", number(preview["target"]["curve_percent"], 1, "%"))]
         more += [Row("Expected", reach["words"])] if reach["reachable"] else []
-        none = "none that can be used: a test as ever"
-        more += [] if reach["bank"] is None else [Row("Earlier models", str(reach["bank"] or none))]
     widest, most = number(widest_us(preview), 0, "µs"), number(row.profile["max_pulse_width_us"], 0, "µs")
     current = [
         Row("Side and muscle", site_words(site_of(row))),
@@ -139,35 +131,17 @@ def rows(
         Row("Widest pulse", f"{widest}, comfort maximum {most}"),
     ]
     stimulates = widest_us(preview) > 0.0
-    if playing:
-        current = [channel_row(one, preview["channels"][one.name]) for one in playing]
-        dose = f"all together: {dose}"
-    stops_nm = min([row.profile["max_torque_nm"], *(one.profile["max_torque_nm"] for one in playing)])
     return [
         Row("Who", row.code),
         *(current if stimulates else []),
         *more,
         Row("How long", long),
         Row("Dose", dose),
-        Row("Stops at", number(stops_nm, 1, "N·m")),
+        Row("Stops at", number(row.profile["max_torque_nm"], 1, "N·m")),
         *([Row("Calibration", standing.words)] if stimulates else []),
         Row("Run by", ran_by),
         Row("Rig", rig),
     ]
-
-
-def channel_row(one: Channel, planned: Mapping[str, Any]) -> Row:
-    """What one of several channels gets: where, its current, its widest pulse, its dose."""
-    said = {
-        "site": site_words(one.site),
-        "current": f"{one.profile['current_ma']:g} mA",
-        "widest": number(max(planned["pulse_width_us"], default=0.0), 0, "µs"),
-        "most": number(one.profile["max_pulse_width_us"], 0, "µs"),
-        "pulses": sum(width > 0 for width in planned["pulse_width_us"]),
-        "charge": dose_words(planned["charge_uc"]),
-    }
-    words = "{site} · {current} · at most {widest} of {most} · {pulses} pulses, {charge}".format(**said)
-    return Row(one.name, words, muscle=one.number)
 
 
 def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
@@ -214,10 +188,8 @@ def site_words(site: Site) -> str:
 environment.globals |= {"site_words": site_words, "site_of": site_of}
 
 
-def current_words(row: Participant, playing: Sequence[Channel] = ()) -> str:
-    """The current of every pulse; of several channels each one's."""
-    if playing:
-        return ", ".join(f"{one.name} {one.profile['current_ma']:g} mA" for one in playing)
+def current_words(row: Participant) -> str:
+    """The current of every pulse."""
     return f"{row.profile['current_ma']:g} mA"
 
 

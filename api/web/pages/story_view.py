@@ -6,12 +6,11 @@ import asyncio
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import RedirectResponse, Response
+from fastapi.responses import Response
 
 from stimrig.api.charts.story_charts import story_figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation, stored_model
-from stimrig.api.models.family import family_of
 from stimrig.api.models.story import story
 from stimrig.api.people.auth import Scope
 from stimrig.api.store.tables import Model
@@ -27,8 +26,6 @@ router = APIRouter(include_in_schema=False)
 @router.get("/models/{model_id}/story")
 async def show_story(request: Request, context: Ctx, who: ModelReader, row: Version, diagnose: int = -1) -> Response:
     """How this model was improved; a diagnosis of it is begun where there is none."""
-    if not family_of(row).can("story"):  # its versions are told on its own page
-        return RedirectResponse(f"/models/{row.id}#versions", 303)
     looked = await looked_at(context, row, who.name, diagnose)
     shown: dict[str, Any] = {"story": {"title": "", "noise_sd_nm": None}, "problem": None}
     try:
@@ -66,7 +63,6 @@ async def story_figure(
 
 async def _told(context: Context, row: Model) -> dict[str, Any]:
     """The story of a version, with what its figures are drawn from. Raises ApiError where it cannot be compared."""
-    family_of(row).require("story")
     path = await asyncio.to_thread(context.versions.ancestry, row)
     before = await _measured(context, path[0])
     after = before if len(path) == 1 else await _measured(context, row)

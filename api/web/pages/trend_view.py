@@ -16,7 +16,6 @@ from stimrig.api.charts.model_charts import MOST
 from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import changes, stored_model
-from stimrig.api.models.family import family_of
 from stimrig.api.models.trend import Session
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader
@@ -88,8 +87,6 @@ async def chosen(context: Context, asked: list[str] | None) -> list[Model]:
     if other is not None:
         detail = f"{rows[0].id} is of {rows[0].participant}, {other.id} of {other.participant}."
         raise ApiError(422, "two-participants", "The models are of different participants", detail)
-    for row in rows:
-        family_of(row).require("compared")
     return sorted(rows, key=lambda row: row.created_utc)
 
 
@@ -163,7 +160,6 @@ async def trend(request: Request, context: Ctx, _who: ModelReader, code: str) ->
         changes=rest.newest(found),
         columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(changes.name_of, COLUMNS)],
         most=MOST,
-        left_out=await rest.left_out(context, code),
     )
 
 

@@ -14,7 +14,7 @@ from stimrig.api.charts.svg import svg
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
-from stimrig.api.sessions.requests import RanByIn, tighter
+from stimrig.api.sessions.requests import RanByIn
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import Context, Ctx, LiveReader, Tester
 from stimrig.api.web.pages import typed
@@ -34,13 +34,13 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     document = await asyncio.to_thread(context.runner.document, row)
     joint, status = document["joint"], context.rig.status
     grows = document["adaptive"] or (joint and joint["coverage"])
-    fixed = [] if grows or row.plan.get("channels") else (row.plan.get("preview") or {}).get("pulse_width_us") or []
+    fixed = [] if grows else (row.plan.get("preview") or {}).get("pulse_width_us") or []
     bounds = limits_of(row, status)
     if told := document["adaptive"]:
         document = {**document, "adaptive": {**told, **{name: told[name] for name in ("words", "problem")}}}
     data = {
         "test": document, "planned_us": fixed, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
-        "sensor": joint is not None or (status is not None and status.angle.present), "channels": channels_of(row),
+        "sensor": joint is not None or (status is not None and status.angle.present),
     }  # fmt: skip
     shown: dict[str, Any] = (
         await draw_ended(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
@@ -86,26 +86,12 @@ def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
     profile = row.plan.get("profile") or {}
     rig = status.limits.get("torque_nm") if status else None
     torque_nm = [profile.get("max_torque_nm"), row.plan.get("max_torque_nm"), rig.hi if rig else None]
-    torque_nm += [one["profile"]["max_torque_nm"] for one in row.plan.get("channels") or []]
     width_us = [profile.get("max_pulse_width_us"), row.plan.get("max_pulse_width_us")]
     return {
         "current_ma": profile.get("current_ma"),
         "torque_nm": min((value for value in torque_nm if value is not None), default=None),
         "pulse_width_us": min((value for value in width_us if value is not None), default=None),
     }
-
-
-def channels_of(row: Test) -> list[dict[str, Any]]:
-    """What the page draws of each channel of a test of several; none of another test."""
-    planned = (row.plan.get("preview") or {}).get("channels") or {}
-    return [
-        {
-            "number": number, "name": one["name"], "current_ma": one["profile"]["current_ma"],
-            "limit_us": tighter(one["profile"]["max_pulse_width_us"], row.plan.get("max_pulse_width_us")),
-            "planned_s": planned[one["name"]]["pulse_time_s"], "planned_us": planned[one["name"]]["pulse_width_us"],
-        }
-        for number, one in enumerate(row.plan.get("channels") or [], start=1) if one["name"] in planned
-    ]  # fmt: skip
 
 
 async def draw_ended(context: Context, row: Test) -> dict[str, Any]:

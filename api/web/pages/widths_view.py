@@ -12,7 +12,6 @@ from stimrig.api.charts.model_charts import inversion
 from stimrig.api.charts.svg import svg
 from stimrig.api.errors import ApiError
 from stimrig.api.models import inverted as words
-from stimrig.api.models.family import family_of
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
 from stimrig.api.web.pages.render import page
@@ -63,7 +62,6 @@ async def render_widths(
     problem: ApiError | None = None,
 ) -> Response:  # fmt: skip
     """The page, with the result where there is one."""
-    family_of(row).require("widths")
     version = await asyncio.to_thread(context.versions.document, row)
     picture, lacking, pulses = None, [], ""
     if found is not None:

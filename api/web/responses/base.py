@@ -70,9 +70,6 @@ class ReachOut(Document):
     torque_time_nm_s: float = Field(description="what it would cost, N·m·s")
     words: str
     known: bool = Field(False, description="whether a model of an earlier session helps")
-    bank: int | None = Field(
-        None, description="earlier models that the test starts from; 0: none can be used; null: they were not asked for"
-    )
 
 
 class Problem(Document):

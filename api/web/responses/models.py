@@ -43,27 +43,6 @@ class CarriedOut(Document):
     effects: list[CarriedEffect]
 
 
-class JointChannelOut(Document):
-    """One muscle of a model of several."""
-
-    name: str = Field(description="of its channel")
-    muscle: str
-    side: str
-    electrode: str
-    offset_s: float = Field(description="by how much later than those of the first channel its pulses come, s")
-    model: dict[str, JsonValue] = Field(description="its MODEL.json")
-
-
-class JointModelOut(Document):
-    """MODEL.json of several muscles at one joint: the torque is the sum of theirs, and of one zero."""
-
-    schema_version: str
-    kind: Literal["joint"]
-    model_id: str
-    channels: list[JointChannelOut]
-    interplay: list[dict[str, JsonValue]] = Field(description="`cross_talk` (`from`, `to`) and `co_contraction`")
-
-
 class TrackingLimits(Document):
     """How far a tracked model may move from the approved one, either way, %; 0: this is not tracked."""
 
@@ -354,9 +333,6 @@ class TrendOut(Document):
     sessions: list[TrendSessionOut]
     changes: ChangesOut | None = Field(
         description="the last session against the last approved one before it; null: there is none"
-    )
-    left_out: str | None = Field(
-        None, description="that models of several muscles are not in it; missing: there are none"
     )
 
 

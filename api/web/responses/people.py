@@ -103,15 +103,6 @@ class ProfileOut(Document):
     angle_set_at_utc: str | None = Field(None, description="of the angle sensor: its calibration when that was said")
 
 
-class ChannelOut(Document):
-    """What a participant has on a further channel of a rig with several."""
-
-    side: Literal["left", "right"] | None
-    muscle: str | None
-    placement: str | None
-    profile: ProfileOut | None = Field(description="its limits; without any field: nobody has set them")
-
-
 class ParticipantOut(fields_of(documents.Participant)):
     """A participant: a code, never a name."""
 
@@ -120,9 +111,6 @@ class ParticipantOut(fields_of(documents.Participant)):
     muscle: str | None = Field(None, description="the muscle that is stimulated")
     placement: str | None = Field(None, description="of the electrodes: with side and muscle the site")
     archived_utc: str | None = Field(None, description="since when it is archived: no test starts, nothing is deleted")
-    channels: dict[str, ChannelOut] | None = Field(
-        None, description="further channels by name; missing: there are none"
-    )
 
 
 class NoteOut(fields_of(documents.Note)):

@@ -26,20 +26,10 @@ class DeviceOut(Document):
     device: str = ""
 
 
-class RigChannelOut(Document):
-    """One output of the stimulator, as the rig file describes it."""
-
-    name: str
-    muscle: str = ""
-    side: str = ""
-    electrode: str = ""
-
-
 class StimulatorOut(DeviceOut):
     """The stimulator."""
 
     shortest_us: float | None = Field(default=None, description="no narrower pulse is sent, µs")
-    channels: list[RigChannelOut] | None = Field(default=None, description="of a rig with several; missing: it has one")
 
 
 class RigHealth(Document):
@@ -114,12 +104,6 @@ class SequencesOut(Document):
     default: list[SegmentOut] = Field(description="the segments of a test that is given none")
 
 
-class ChannelDoseOut(Document):
-    """What one of several channels is to get; of a preview also `pulse_time_s` and `pulse_width_us`."""
-
-    charge_uc: float = Field(description="charge of one phase, summed over its pulses, µC")
-
-
 class PlannedOut(Document):
     """What a test will take."""
 
@@ -127,7 +111,6 @@ class PlannedOut(Document):
     charge_uc: float = Field(0.0, description="charge of one phase, summed over the pulses, µC")
     torque_time_nms: float | None = Field(None, description="estimated torque-time, N·m·s; null without a model")
     segments: list[SegmentSpan] = Field([])
-    channels: dict[str, ChannelDoseOut] | None = Field(None, description="kind `muscles`: each channel by its name")
 
 
 class PreviewOut(PlannedOut):
@@ -219,10 +202,6 @@ class AdaptiveOut(Document):
     problem: str = Field(description="why the fixed plan plays on; empty while segments are chosen")
     knowledge: KnowledgeOut | None = Field(description="both curves with their bands; null before the first fit")
     least_known: dict[str, float] | None = Field(description="`pulse_width_us` and `time_s` where the bands are widest")
-    bank: dict[str, float] | None = Field(
-        None, description="how probable it is that the muscle is like each earlier model, by its name, or `unlike "
-        "all`; null without a bank, and before the first fit"
-    )  # fmt: skip
     ended: str = Field(
         description="`known-enough`, `enough` (a person said so), `torque-time`, `time`, `limit` (of the "
         "charge, say), `fixed-rest` (the fixed plan was played to its end), `stopped` or `fault`; empty while it runs"

@@ -13,12 +13,11 @@ from fastapi import APIRouter, Response
 from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError
-from stimrig.api.sessions import channels, profiles
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.holds import LIMITS_TURN
-from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
@@ -44,7 +43,7 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
 
     Raises ApiError: 422 neither the request nor the participant says one of them.
     """
-    asked = body.model_dump(exclude=set() if body.channels else {"channels"})
+    asked = body.model_dump()
     for name in ("current_ma", "max_torque_nm"):
         asked[name] = profile.get(name) if asked[name] is None else asked[name]
         if asked[name] is None:
@@ -100,13 +99,12 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
             error.detail = "It was finished, and waits to be stored. Finish it again, or discard it, with this ETag."
             error.headers["ETag"] = f'"{waits.calibration_id}.0"'
         raise error
-    marks = [one.marks_us for one in found.channels] if found.channels else found.marks_us
     return {
         **found.model_dump(),
         "rig_state": status.state,
         "playing": status.state != "calibrating",
         "outdated": await asyncio.to_thread(outdated, context, code, found),
-        "version": f"{found.calibration_id}.{len(found.trains)}.{zlib.crc32(repr(marks).encode()):08x}",
+        "version": f"{found.calibration_id}.{len(found.trains)}.{zlib.crc32(repr(found.marks_us).encode()):08x}",
     }
 
 
@@ -152,7 +150,6 @@ def _store(
     """What was found is the profile, if nothing of that was changed since; what a calibration does not look for (the
     rest between tests) stays. Storing it again changes nothing."""
     found = result.profile.model_dump() if result.profile else None
-    keys = {channels.key_of(context.rig.status, name): name for name in result.profiles or {}} or {"": ""}
     with context.store.write() as session:
         if found is not None:
             row = participants.within(session, code)
@@ -162,29 +159,11 @@ def _store(
                 return dict(row.profile)
             if changed:
                 raise seen.overtaken(changed)
-            for key, name in keys.items():
-                new = (result.profiles or {})[name].model_dump() if name else found
-                before = channels.held(row, key)["profile"]
-                profile = new | {k: v for k, v in before.items() if new.get(k) is None}
-                channels.put(row, key, context.rig.status, profile=profile)
-            found = dict(row.profile)
+            found |= {name: value for name, value in row.profile.items() if found.get(name) is None}
+            row.profile = found
         action, said = "finish calibration" if found else "discard calibration", {"calibration": identity}
-        said |= {"channels": list(keys.values())} if result.profiles else {}
         audit.write(session, context.clock.utc(), by, action, code, profile=found, recordings=result.recordings, **said)
     return found
-
-
-def _several(context: Context, row: Participant, body: CalibrationIn) -> list[requests.CalibrateChannel] | None:
-    """The channels of a calibration of several, each with its own current and last marks; None of one of one."""
-    found = []
-    for one in body.channels or ():
-        name, own = one.name, channels.held(row, channels.key_of(context.rig.status, one.name))["profile"]
-        current_ma = own.get("current_ma") if one.current_ma is None else one.current_ma
-        if current_ma is None:
-            raise ApiError(422, "no-limits", "The participant has no limits", f"Send the current of {name}, too.")
-        last = messages.Profile.model_validate(own) if own and body.large_steps else None
-        found.append(requests.CalibrateChannel(name=name, current_ma=current_ma, last=last))
-    return found or None
 
 
 @router.post("", status_code=201, **describe_answer(CalibrationOut, 201, "open; nothing was sent yet"))
@@ -200,12 +179,7 @@ async def begin_calibration(
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
-        channels.refuse_reordered(row, context.rig.status)
-        several = _several(context, row, body)
         asked = settings(body, row.profile)
-        if body.max_torque_nm is None and several:  # one limit holds for all trains: the tightest
-            own = [channels.held(row, channels.key_of(context.rig.status, one.name))["profile"] for one in several]
-            asked["max_torque_nm"] = min(profile.get("max_torque_nm", asked["max_torque_nm"]) for profile in own)
         identity = await asyncio.to_thread(_write_begin, context, who.name, code, asked)
         last = messages.Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
@@ -214,8 +188,7 @@ async def begin_calibration(
                 participant=code,
                 by=who.name,
                 last=last,
-                channels=several,
-                **{name: value for name, value in asked.items() if name != "channels"},
+                **asked,
             )
         )
         return tagged(response, await standing(context, code))
@@ -252,9 +225,7 @@ async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response:
         found = await sound(context, code)
         check_seen(found)
         await context.rig.ask(requests.CalibrateMarkRequest(**body.model_dump()))
-    own = next((one for one in found.get("channels") or () if one["name"] == body.channel), found)
-    action, told = f"mark {body.threshold}", {"pulse_width_us": own["pulse_width_us"]}
-    told |= {"channel": body.channel} if body.channel else {}
+    action, told = f"mark {body.threshold}", {"pulse_width_us": found["pulse_width_us"]}
     await asyncio.to_thread(context.store.note, context.clock, who.name, action, code, **told)
     return tagged(response, await standing(context, code))
 

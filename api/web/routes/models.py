@@ -12,7 +12,6 @@ from pydantic import Field, FiniteFloat, StrictBool, model_validator
 from stimrig.api.clock import unix_of
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
-from stimrig.api.models.family import family_of
 from stimrig.api.models.tracking import Limits
 from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn, tighter
 from stimrig.api.store import seen
@@ -26,9 +25,8 @@ from stimrig.api.web.routes import participants
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 TAG = {"description": "send it as `If-None-Match`", "schema": {"type": "string"}}
 AGE = {"description": "with `tracked`: when it was found", "schema": {"type": "string"}}
-ANY_MODEL = {"anyOf": [{"$ref": f"#/components/schemas/{name}"} for name in ("ModelJson", "JointModelOut")]}
-"""MODEL.json of one muscle, or of several."""
-MODEL_JSON = {"description": "MODEL.json", "content": {"application/json": {"schema": ANY_MODEL}}}
+MODEL = {"$ref": "#/components/schemas/ModelJson"}
+MODEL_JSON = {"description": "MODEL.json", "content": {"application/json": {"schema": MODEL}}}
 APPROVED: dict[int | str, dict[str, Any]] = {
     200: {**MODEL_JSON, "headers": {"ETag": TAG, "Last-Modified": AGE}},
     304: {"description": "it is the one of `If-None-Match`"},
@@ -37,7 +35,7 @@ WITH_MODEL: dict[str, Any] = {
     "description": "the version, and its MODEL.json as `model`",
     "content": {"application/json": {"schema": {"allOf": [
         {"$ref": "#/components/schemas/VersionOut"},
-        {"type": "object", "required": ["model"], "properties": {"model": ANY_MODEL}},
+        {"type": "object", "required": ["model"], "properties": {"model": MODEL}},
     ]}}},
 }  # fmt: skip
 
@@ -88,7 +86,6 @@ def tracking(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     if found is None:
         participants.find(context, code)
         raise none_approved(code)
-    family_of(context.versions.get(found["approved_model_id"])).require("tracking")
     return found
 
 
@@ -183,7 +180,6 @@ async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: Width
     Of a version, or of one that was tracked from it (its `model_id`).
     """
     text = await asyncio.to_thread(context.tracked.text_of, model_id)
-    family_of(await asyncio.to_thread(context.tracked.version_of, model_id)).require("prediction")
     call = context.pool.submit(
         "forecast", urgent=True, model_json=text, pulse_width_us=body.pulse_width_us,
         pulse_rate_hz=body.pulse_rate_hz, angle_rad=body.angle_rad,
@@ -224,7 +220,6 @@ async def invert(
     """
     text = await asyncio.to_thread(context.tracked.text_of, model_id)
     version = await asyncio.to_thread(context.tracked.version_of, model_id)
-    family_of(version).require("widths")
     participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
     largest_us = tighter(width_us, participant.profile.get("max_pulse_width_us"))
     rig = context.rig.status

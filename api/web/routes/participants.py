@@ -18,7 +18,7 @@ from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models.places import Site, in_words, site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.sessions import channels, notes, profiles
+from stimrig.api.sessions import notes, profiles
 from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.seen import Seen
@@ -44,7 +44,7 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
         if session.get(Participant, body.code) is not None:
             raise ApiError(409, "exists", "The code is taken", f"Participant {body.code!r} exists. Take another code.")
         row = Participant(code=body.code, created_utc=now, created_by=by)
-        channels.put(row, channels.FIRST, context.rig.status, profile=profile)
+        row.profile = profile
         row.side, row.muscle, row.placement = body.side, body.muscle, body.placement
         session.add(row)
         session.flush()
@@ -65,11 +65,9 @@ def within(session: Session, code: str) -> Participant:
 
 @in_limits_turn
 def change_profile(
-    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False, channel: str = ""
+    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False
 ) -> tuple[Participant, Seen]:
     """New limits for a participant: those that are asked for, the rest stays; and the place in the trail.
-
-    `channel`: a further one, whose limits they are.
 
     Raises ApiError: 404 no such participant; 422 beyond what the rig takes, or the first ones are not whole; 409
     changed meanwhile, or the calibration would be lost, and that was not allowed.
@@ -78,8 +76,7 @@ def change_profile(
         row = within(session, code)
         poses = [] if asked.get(profiles.RANGE) is None else [seen.poses()]
         seen.check(session, seen.participant(code), *poses)
-        anew = not channel and channels.is_reordered(row, context.rig.status)
-        before = {} if anew else channels.held(row, channel)["profile"]
+        before = row.profile
         check_asked(context, before, asked)
         profile, voids = profiles.changed(before, add_calibration_time(context, asked))
         if voids and not may_void:
@@ -87,11 +84,9 @@ def change_profile(
                 f"{voids[0].upper()}{voids[1:]}. To set it and make the calibration invalid: ?void_calibration=true."
             )
             raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
-        if profile != before or anew:
-            site = {name: None for name in ("side", "muscle", "placement") if anew}
-            channels.put(row, channel, context.rig.status, **site, profile=profile)
-            of = {"channel": channel} if channel else {}
-            audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids, **of)
+        if profile != before:
+            row.profile = profile
+            audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
         shown = seen.shown.get()
         if shown is not None and seen.since(session, shown, seen.decisions(code), seen.poses()):
             return row, shown  # limits are answered, not what was decided on models, nor where the angle's zero is
@@ -193,10 +188,10 @@ def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
     return context.runner.documents(code, context.versions.of(code))
 
 
-def loses_calibration(row: Participant, body: MuscleIn, channel: str = "") -> bool:
+def loses_calibration(row: Participant, body: MuscleIn) -> bool:
     """Whether a calibration is lost: it was found at another site than the new one."""
-    found = any(channels.held(row, channel)["profile"].get(name) is not None for name in profiles.FOUND)
-    pairs = zip(site_of(row, channel), site_in(body), strict=True)
+    found = any(row.profile.get(name) is not None for name in profiles.FOUND)
+    pairs = zip(site_of(row), site_in(body), strict=True)
     return found and any(before is not None and before != after for before, after in pairs)
 
 
@@ -206,9 +201,7 @@ def site_in(body: MuscleIn) -> Site:
 
 
 @in_limits_turn
-def change_site(
-    context: Context, code: str, body: MuscleIn, by: str, voids: bool = False, channel: str = ""
-) -> Participant:
+def change_site(context: Context, code: str, body: MuscleIn, by: str, voids: bool = False) -> Participant:
     """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
     Raises ApiError: 404 no such participant; 409 a test or calibration of it is under way, or the calibration would be
@@ -219,9 +212,7 @@ def change_site(
     with context.store.write() as session:
         row = within(session, code)
         seen.check(session, seen.participant(code))
-        if not channel:
-            channels.refuse_reordered(row, context.rig.status)
-        lost, here = loses_calibration(row, body, channel), site_of(row, channel)
+        lost, here = loses_calibration(row, body), site_of(row)
         if lost and not voids:
             detail = (
                 f"The thresholds of {code} were found at {in_words(here)}. To change it and make the "
@@ -229,12 +220,10 @@ def change_site(
             )
             raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
         if here != site_in(body):
-            profile = channels.held(row, channel)["profile"]
-            profile = {**profile, **dict.fromkeys(profiles.FOUND)} if lost else profile
-            site = body.model_dump(include=set(MuscleIn.model_fields))
-            channels.put(row, channel, context.rig.status, **site, profile=profile)
-            said = {**body.model_dump(), **({"channel": channel} if channel else {})}
-            audit.write(session, now, by, "set muscle", code, **said, voids_calibration=lost)
+            if lost:
+                row.profile = {**row.profile, **dict.fromkeys(profiles.FOUND)}
+            row.side, row.muscle, row.placement = site_in(body)
+            audit.write(session, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
     return row
 
 
@@ -252,27 +241,6 @@ async def set_muscle(
     controller, until it has its own. Tests keep the site that they were begun with.
     """
     return (await change_site(context, code, body, who.name, void_calibration)).as_dict()
-
-
-@router.put("/{code}/channels/{channel}/profile", **describe_answer(ChangedOut))
-async def set_channel_profile(
-    context: Ctx, who: Tester, code: str, channel: str, body: ProfileIn, response: Response,
-    void_calibration: MayVoid = False,
-) -> dict[str, Any]:  # fmt: skip
-    """Change limits on one channel of a rig that has several, as `PUT …/profile`; the first one's are those."""
-    key = channels.key_of(context.rig.status, channel)
-    row, place = await change_profile(context, code, body.sent(), who.name, void_calibration, key)
-    response.headers["ETag"] = place.etag(f"/v1/participants/{code}")
-    return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
-
-
-@router.put("/{code}/channels/{channel}/muscle", **describe_answer(ParticipantOut))
-async def set_channel_muscle(
-    context: Ctx, who: Tester, code: str, channel: str, body: MuscleIn, void_calibration: MayVoid = False
-) -> dict[str, Any]:
-    """Say the site of one channel of a rig that has several, as `PUT …/muscle`."""
-    key = channels.key_of(context.rig.status, channel)
-    return (await change_site(context, code, body, who.name, void_calibration, key)).as_dict()
 
 
 def refuse_busy(context: Context, code: str) -> None:

@@ -9,10 +9,7 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from stimrig.api.models import changes
-from stimrig.api.models.family import SEVERAL_MUSCLES
-from stimrig.api.models.stored_model import JOINT
 from stimrig.api.models.trend import Session
-from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import TrendOut
@@ -38,19 +35,11 @@ async def sessions(context: Context, code: str) -> list[Session]:
     return await context.trend.sessions(code)
 
 
-async def left_out(context: Context, code: str) -> str | None:
-    """That some models of the participant are not in the trend; None where all are."""
-    of = (Model.participant == code, Model.method == JOINT)
-    some = await asyncio.to_thread(context.store.first, Model.id, *of)
-    return None if some is None else SEVERAL_MUSCLES.lacks["trend"]
-
-
 @router.get("/trend", **describe_answer(TrendOut))
 async def trend(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     """Figures with their uncertainty over the sessions, and what changed since the last approved one."""
-    found, lacking = await sessions(context, code), await left_out(context, code)
-    more = {} if lacking is None else {"left_out": lacking}
-    return {"participant": code, "sessions": [one.document() for one in found], "changes": newest(found), **more}
+    found = await sessions(context, code)
+    return {"participant": code, "sessions": [one.document() for one in found], "changes": newest(found)}
 
 
 def newest(found: list[Session]) -> dict[str, Any] | None:

@@ -13,8 +13,6 @@ const state = {
 
 function shown(text) { return String(text).replace("-", "−"); }
 function segmentWords(name) { const [kind, number] = name.split(" "); return words.segments[name] || (words.segments[kind] ? words.segments[kind] + " " + number : name); }
-const playing = data.channels.map((one) => ({ ...one, pulseTime: [], width: [] })); // of a test of several channels
-const ownColour = (one) => colours[one.number > 2 ? "series-" + (one.number - 2) : "muscle-" + one.number];
 const parts = () => state.laid || (state.test.planned || {}).segments || [];
 function say(name, text) { const box = byId(name); if (box.textContent !== text) box.textContent = text; }
 
@@ -22,8 +20,6 @@ function take(message) {
   if (message.type === "history") {
     Object.assign(state, { time: message.time_s, low: message.torque_min_nm, high: message.torque_max_nm, pulseTime: message.pulse_time_s, width: message.pulse_width_us });
     if (message.duration_s) state.duration = message.duration_s;
-    for (const one of playing) Object.assign(one, { pulseTime: [], width: [] });
-    takePulses(message);
     if (data.sensor) takeAngles(message);
   } else if (message.type === "live") {
     state.heard = performance.now();
@@ -43,13 +39,6 @@ function take(message) {
   state.dirty = true;
 }
 
-function takePulses(message) { // of each channel by its name
-  for (const part of message.channels || []) {
-    const one = playing.find((each) => each.name === part.name);
-    if (one) { one.pulseTime.push(...part.pulse_time_s); one.width.push(...part.pulse_width_us); }
-  }
-}
-
 function showEnough(may) { // the button that ends a test well, where it has one
   const form = byId("enough");
   if (form) form.hidden = !may;
@@ -60,7 +49,6 @@ function addFrame(message) {
   if (message.duration_s) state.duration = message.duration_s;
   state.time.push(...message.time_s); state.low.push(...message.torque_min_nm); state.high.push(...message.torque_max_nm);
   state.pulseTime.push(...message.pulse_time_s); state.width.push(...message.pulse_width_us);
-  takePulses(message);
   if (message.pauses.length) {
     say("paused", words.paused.replace("{time}", shown(message.pauses[message.pauses.length - 1].for_s.toFixed(1)))); byId("paused").hidden = false;
   }
@@ -79,8 +67,7 @@ function laidEnd(segments) { // the end of a test replaces a segment that was la
 function showNumbers(message) {
   const last = message.torque_max_nm.length - 1;
   if (last >= 0) say("torque", shown(((message.torque_max_nm[last] + message.torque_min_nm[last]) / 2).toFixed(2)) + " N·m");
-  if (playing.length) say("width", playing.map((one) => (one.width.length ? one.width[one.width.length - 1].toFixed(0) : "–")).join(" · ") + " µs");
-  else if (message.pulse_width_us.length) say("width", message.pulse_width_us[message.pulse_width_us.length - 1].toFixed(0) + " µs");
+  if (message.pulse_width_us.length) say("width", message.pulse_width_us[message.pulse_width_us.length - 1].toFixed(0) + " µs");
   if (message.test_id !== state.test.id) return;
   showSegment(message.segment);
   say("dose", shown((message.charge_uc / 1000).toFixed(2)) + " mC" + " · " + words.pulses.replace("{count}", message.sent_pulses));
@@ -212,22 +199,7 @@ function drawTorque() {
   cursor(pen, x, area);
 }
 
-function drawTrains() { // each channel's pulses in its own colour
-  const drawn = frame(byId("width-chart"), 0, Math.max(...playing.map((one) => one.limit_us)) * 1.08, words.width, "µs");
-  const { pen, x, y, area } = drawn;
-  segments(drawn);
-  for (const one of playing) stairs(pen, x, y, one.planned_s, one.planned_us, colours.plan, 1);
-  for (const one of playing) {
-    pen.setLineDash(one.number % 2 ? [] : [9, 3]);
-    stairs(pen, x, y, one.pulseTime, one.width, ownColour(one), 1.8);
-    pen.setLineDash([]);
-    limitLine(drawn, one.limit_us, one.name + ": " + words.comfort, ownColour(one));
-  }
-  cursor(pen, x, area);
-}
-
 function drawWidth() {
-  if (playing.length) { drawTrains(); return; }
   const limit = data.limits.pulse_width_us;
   let high = limit || 100;
   for (const value of data.planned_us) if (value > high) high = value;
@@ -291,7 +263,7 @@ function connect() {
 
 function readColours() {
   const style = getComputedStyle(document.documentElement);
-  for (const name of ["ink", "dim", "grid", "torque", "torque-band", "width", "plan", "limit", "cursor", "held-out", "zero", "mark", "chart", ...playing.map((one) => (one.number > 2 ? "series-" + (one.number - 2) : "muscle-" + one.number))]) colours[name] = style.getPropertyValue("--" + name).trim();
+  for (const name of ["ink", "dim", "grid", "torque", "torque-band", "width", "plan", "limit", "cursor", "held-out", "zero", "mark", "chart"]) colours[name] = style.getPropertyValue("--" + name).trim();
   state.dirty = true;
 }
 
