@@ -1,13 +1,12 @@
-"""An adaptive test against fixed tests and other choosers, on the same simulated patients.
+"""An adaptive test against fixed tests, on the same simulated patients.
 
     python -m bench.adaptive --patients 40 --seeds 80000 [--kinds sigmoid,shaped] [--hidden 20] [--json FILE]
 
-Each patient has noise of 0.05 N·m at 400 Hz, and every peer sees the same noise. Seeds from 50000 were developed on.
-Peers: the paper's test (PRBS and ramp with their rests, 29.7 s, without the held-out levels of the default test), the
-protocol `short` without its held-out levels, a staircase, pieces of our library taken at random, a chooser as
-`optbayesexpt` (`bench.particles`), ours for a new person, and ours for a person who is known from one earlier session.
-A test whose structure fits badly goes on with the paper's test; its dose and time count. "Unseen" is the best fit to
-the clean torque of random levels.
+Each patient has noise of 0.05 N·m at 400 Hz, the same in every test. Seeds from 50000 were developed on. Tests: the
+paper's (PRBS and ramp with their rests, 29.7 s, without the held-out levels of the default test), the protocol `short`
+without its held-out levels, ours for a new person, and ours for a person who is known from one earlier session. A test
+whose structure fits badly goes on with the paper's test; its dose and time count. "Unseen" is the best fit to the clean
+torque of random levels.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import keep_lines, lines_of, parser, table
-from bench.particles import HOLD, Particles
+from bench.common import keep_lines, parser, table
 from stimrig import identify
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import draw_scenario, rng_of
@@ -31,15 +29,13 @@ from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.estimation.earlier import Earlier
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
-from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.experiments.adaptive import Target
-from stimrig.identify.experiments.designs import pieces
-from stimrig.identify.experiments.knowledge import Knowledge, step_responses, whole_band
+from stimrig.identify.experiments.knowledge import Knowledge
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.rig import protocols
 from stimrig.rig.sequences import build
-from tests.harness.adaptive import Hidden, Muscle, Played, papers, play, recorded, shaped, sigmoid
+from tests.harness.adaptive import Hidden, Muscle, Played, play, recorded, shaped, sigmoid
 
 RATE_HZ, NOISE_NM = 400.0, 0.05
 TARGET = Target()
@@ -60,13 +56,6 @@ def paper_test(top_us: float, protocol: str = "paper", held_out: bool = False) -
         widths.append(own)
         names += [segment.name] * own.size
     return np.concatenate(widths), names
-
-
-def staircase(top_us: float) -> tuple[np.ndarray, list[str]]:
-    """One second of rest and six levels up and down, one second each."""
-    up = np.arange(1, 7) / 6.0
-    widths = np.repeat(np.r_[0.0, up, up[-2::-1], 0.0] * top_us, 40)
-    return widths, ["staircase"] * widths.size
 
 
 def unseen_percent(muscle: Any, predict: Callable[[Record], np.ndarray], seed: int) -> float:
@@ -119,9 +108,9 @@ def fixed(muscle: Muscle, test: tuple[np.ndarray, list[str]], noise: np.ndarray,
 
 
 def adaptive(
-    muscle: Muscle, noise: np.ndarray, seed: int, earlier: Model | None = None, random: bool = False
+    muscle: Muscle, noise: np.ndarray, seed: int, earlier: Model | None = None
 ) -> tuple[dict[str, Any], Model]:
-    """Our test, or its pieces at random; with the model that it leaves."""
+    """Our test, with the model that it leaves."""
     spent: list[float] = []
 
     def timed(call: Callable[[], Any]) -> Any:
@@ -130,16 +119,9 @@ def adaptive(
         spent.append(time.process_time() - began)
         return found
 
-    rng = np.random.default_rng([seed, 9])
-
-    def by_chance(_decision: Any, _widths: np.ndarray) -> np.ndarray:
-        levels = np.r_[0.0, rng.uniform(0.0, muscle.top_us, 4), muscle.top_us]
-        own = pieces(levels, 40.0)
-        return own[int(rng.integers(len(own)))].pulse_width_us
-
     known = {} if earlier is None else {"earlier": Earlier(earlier)}
     limits = {"left_s": LONGEST_S / 2.0, "left_nm_s": float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0}
-    made = play(muscle, noise, TARGET, timed=timed, choose=by_chance if random else None, **limits, **known)
+    made = play(muscle, noise, TARGET, timed=timed, **limits, **known)
     result, model = finished(muscle, made, noise, seed, {} if earlier is None else {"earlier": earlier})
     return result | {"cpu_s": [round(s, 4) for s in spent[2:]]}, model
 
@@ -163,45 +145,6 @@ def finished(
     return row(muscle, widths, covered, unseen, ended=made.decision.kind), model
 
 
-def chosen_by_particles(muscle: Muscle, noise: np.ndarray, seed: int) -> dict[str, Any]:
-    """The stand-in for `optbayesexpt`: it stops at the same target, or with the time of the paper's test."""
-    widths = np.r_[np.zeros(20), np.full(HOLD, muscle.top_us)]
-    cloud, known, size = None, None, 0
-    while widths.size < paper_test(muscle.top_us)[0].size:
-        record = recorded(muscle, widths, ["level"] * widths.size, noise, RATE_HZ)
-        torque = prepare(record)[0].torque_nm
-        if cloud is None:
-            cloud = Particles(muscle.top_us, float(np.max(torque)), NOISE_NM / np.sqrt(10.0), seed)
-        cloud.learn(widths, torque, widths.size - size)
-        size = widths.size
-        known = particle_bands(cloud.drawn(), muscle.top_us)
-        if known.curve.percent <= TARGET.curve_percent and known.step.percent <= TARGET.step_percent:
-            break
-        widths = np.r_[widths, np.full(HOLD, cloud.next_level(widths))]
-    assert cloud is not None and known is not None
-    gain, width, middle, slow, damping, delay = cloud.drawn().mean(axis=0)
-    share = 1.0 / (1.0 + np.exp(-(np.arange(512.0) - middle) / np.exp(width)))
-    model = Muscle(
-        "", gain * (share - share[0]), muscle.top_us, float(np.exp(slow)), float(np.exp(damping)), max(delay, 0.0)
-    )
-
-    def predicted(record: Record) -> np.ndarray:
-        return model.torque(record.pulse_width_us[:: round(RATE_HZ / 40.0)], RATE_HZ)
-
-    return row(muscle, widths, covered_by(known, muscle), unseen_percent(muscle, predicted, seed))
-
-
-def particle_bands(rows: np.ndarray, top_us: float) -> Knowledge:
-    """Bands of a cloud."""
-    u = np.linspace(0.0, top_us, 61)
-    share = 1.0 / (1.0 + np.exp(-(u[None, :] - rows[:, 2:3]) / np.exp(rows[:, 1:2])))
-    curves = rows[:, :1] * (share - share[:, :1])
-    plateau = float(curves[:, -1].mean())
-    time_s = np.linspace(0.0, 3.0, 61)
-    steps = step_responses(np.c_[np.exp(rows[:, 3:5]), rows[:, 5]], time_s)
-    return Knowledge(whole_band(u, curves / plateau), whole_band(time_s, steps), plateau)
-
-
 def one(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
     """The wanted peers on one patient."""
     muscle = KINDS[kind](seed)
@@ -211,9 +154,6 @@ def one(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
     peers: dict[str, Callable[[], dict[str, Any]]] = {
         "paper": lambda: fixed(muscle, paper_test(muscle.top_us), noise, seed),
         "short": lambda: fixed(muscle, paper_test(muscle.top_us, "short"), noise, seed),
-        "staircase": lambda: fixed(muscle, staircase(muscle.top_us), noise, seed),
-        "random pieces": lambda: adaptive(muscle, noise, seed, random=True)[0],
-        "particles": lambda: chosen_by_particles(muscle, noise, seed),
         "ours, new": lambda: adaptive(muscle, noise, seed)[0],
         "ours, known": lambda: adaptive(muscle, noise, seed, earlier=adaptive(day, other, seed)[1])[0],
     }
@@ -277,21 +217,6 @@ def told_of_hidden(rows: list[dict[str, Any]]) -> list[str]:
     return table(heads.split("; "), lines)
 
 
-def of_papers_muscle(trials: int, seed: int) -> list[str]:
-    """The paper's muscle at 40 Hz with noise of 0.10 N·m and a target of 7 %: six times the noise of an interval."""
-    lines = []
-    for trial in range(seed, seed + trials):
-        muscle, rng = papers(), np.random.default_rng([trial, 5])
-        noise = rng.standard_normal(4000) * 0.10
-        limits = {"left_s": 30.0, "left_nm_s": 83.0}
-        made = play(muscle, noise, Target(7.0, 7.0), rate_hz=40.0, **limits)
-        assert made.record is not None
-        model = identify.fit(made.record, recruitment="near-sigmoid")
-        fit = unseen_percent(muscle, model.predict, trial)
-        lines.append(f"{made.decision.kind} {fit:.2f} % at {made.dose_nm_s(muscle):.1f} N·m·s in {made.seconds:.1f} s")
-    return lines
-
-
 def medians(rows: list[dict[str, Any]]) -> list[str]:
     """Medians and counts as lines of a table."""
     heads = "patients; test; n; unseen, %; against the paper's test, points; dose, N·m·s; dose; time, s; time"
@@ -328,15 +253,10 @@ def main() -> None:
     made.add_argument("--patients", type=int, default=150, help="of each kind")
     made.add_argument("--seeds", type=int, default=80_000, help="the first")
     made.add_argument("--kinds", default="sigmoid,shaped")
-    made.add_argument("--peers", default="paper; short; staircase; random pieces; particles; ours, new; ours, known")
+    made.add_argument("--peers", default="paper; short; ours, new; ours, known")
     made.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
-    made.add_argument("--paper", type=int, default=0, help="trials of the paper's muscle")
     made.add_argument("--json", type=Path, help="every row goes here, one a line")
-    made.add_argument("--rows", type=Path, help="print the table of rows that were written before")
     settings = made.parse_args()
-    if settings.rows is not None:
-        print(*medians(lines_of(settings.rows)), sep="\n")
-        return
     warnings.filterwarnings("ignore", category=RuntimeWarning)
     rows: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.patients):
@@ -350,7 +270,6 @@ def main() -> None:
         found.append(hidden(seed))
         print(json.dumps(found[-1]), file=sys.stderr, flush=True)
     print(*(told_of_hidden(found) if found else []), sep="\n")
-    print(*of_papers_muscle(settings.paper, settings.seeds), sep="\n")
 
 
 if __name__ == "__main__":

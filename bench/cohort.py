@@ -5,14 +5,13 @@
 `--records` short recordings (23 s at 100 samples/s) of simulated muscles are fitted by two workers: the memory of the
 workers and of their computing processes over the records. `--pairs` of them are fitted, as many as the rig seals them
 (48 s at 1600 samples/s) fitted, and a tenth as many short ones diagnosed, by one worker and by two, each after a
-warm-up, twice in turn, and by bare processes as a reference. `--costs` recordings as the rig
+warm-up, twice in turn. `--costs` recordings as the rig
 seals them are fitted and diagnosed by one worker: processor time and bytes of one, and from these the plan for two
 million on paper.
 """
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import statistics
 import sys
@@ -25,7 +24,6 @@ import psutil
 import pyarrow.parquet as pq
 
 from bench.common import keep, parser, table, written_by
-from stimrig.api.cohort import record
 from stimrig.api.cohort.cluster import Workers, connected
 from stimrig.api.cohort.computing import Bounds
 from stimrig.api.cohort.results import Results
@@ -46,8 +44,6 @@ CORES = 100
 PACES = {
     "one worker": "one_per_s",
     "two workers": "two_per_s",
-    "reference: one bare process": "plain_one_per_s",
-    "reference: two bare processes": "plain_two_per_s",
 }
 MEMORY = {
     "process that computes, renewed after {renewed_after} records": "computing_mb",
@@ -127,34 +123,13 @@ def throughput(folder: Path, place: Path, verb: str, count: int, **more: Any) ->
     """Records a second with one worker and with two, in turn, so that other work on the machine meets both."""
     here = folder / f"pairs-{len(list(folder.iterdir()))}"
     given, warm = make(here / "records", count, **more), make(here / "warm", 8, **more)
-    paces: dict[int, list[float]] = {1: [], 2: [], -1: [], -2: []}
+    paces: dict[int, list[float]] = {1: [], 2: []}
     for turn in range(2):
         for workers in (1, 2):
             output = place / f"{here.name}-{workers}-{turn}.parquet"
             paces[workers].append(count / run(given, output, verb, workers, 10**6, warm=warm)[1])
-            paces[-workers].append(count / plain(given, warm, verb, workers))
-    found = {"records": count}
-    for words, one, two in (("", 1, 2), ("plain_", -1, -2)):
-        ratio = statistics.median(paces[two]) / statistics.median(paces[one])
-        found |= {f"{words}one_per_s": paces[one], f"{words}two_per_s": paces[two], f"{words}ratio": ratio}
-    return found
-
-
-def plain(folder: Path, warm: Path, verb: str, processes: int) -> float:
-    """The reference, s: the same records computed by bare processes, no Dask, no results written."""
-    document = checked(Task(verb, software=software_version())).document()
-    jobs, first = ([(str(path), document) for path in sorted(place.rglob("*.h5"))] for place in (folder, warm))
-    with multiprocessing.get_context("spawn").Pool(processes, initializer=record.load) as pool:
-        pool.starmap(bare, first, chunksize=1)
-        began_s = time.perf_counter()
-        pool.starmap(bare, jobs, chunksize=1)
-        return time.perf_counter() - began_s
-
-
-def bare(file: str, document: dict[str, Any]) -> None:
-    """One record of the reference."""
-    row = record.compute(print, file, file, {}, document)["row"]
-    assert row["status"] == "ok", row
+    ratio = statistics.median(paces[2]) / statistics.median(paces[1])
+    return {"records": count, "one_per_s": paces[1], "two_per_s": paces[2], "ratio": ratio}
 
 
 def memory(folder: Path, place: Path, count: int, renew: int) -> dict[str, Any]:
@@ -225,7 +200,6 @@ def report(found: dict[str, Any]) -> list[str]:
             [
                 *([words, *(both(one[name]) for one in pace.values())] for words, name in PACES.items()),
                 ["ratio (goal 1.8)", *(format(one["ratio"], ".2f") for one in pace.values())],
-                ["ratio of the reference", *(format(one["plain_ratio"], ".2f") for one in pace.values())],
                 ["recordings a run", *(one["records"] for one in pace.values())],
             ],
         ),

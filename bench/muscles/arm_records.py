@@ -24,7 +24,7 @@ from stimrig.hardware_sim.arm.movers import make_mover
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, levels, make_design, staircase
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
-__all__ = ["KINDS", "arm_patient", "changed", "held_angles_rad", "record"]
+__all__ = ["KINDS", "arm_patient", "changed", "record"]
 
 RATE_HZ, ANGLE_HZ = 400, 200
 VELOCITY_WINDOW_S = 0.060
@@ -56,7 +56,6 @@ class Asked:
     rng: Generator
     mover: str
     angle_rad: float | None = None
-    protocol: str = "prbs"
     duration_s: float | None = None
     parts: Parts | None = None
 
@@ -106,10 +105,6 @@ def _held(asked: Asked, angle_rad: float, parts: Parts) -> ArmDesign:
 
 def _isometric(asked: Asked) -> ArmDesign:
     at_rad = asked.patient.reference_rad if asked.angle_rad is None else asked.angle_rad
-    if asked.protocol == "staircase":
-        return _staircase_at(asked, at_rad)
-    if asked.protocol != "prbs":
-        raise ValueError(f"protocol {asked.protocol!r}: prbs or staircase")
     design = make_design("full", asked.rng, asked.top_us, with_validate=False)
     borders = np.flatnonzero(design.segment[1:] != design.segment[:-1]) + 1
     widths, names = np.split(design.width_us, borders), np.split(design.segment, borders)
@@ -218,8 +213,6 @@ def record(
     seed: int,
     *,
     angle_rad: float | None = None,
-    mover: str | None = None,
-    protocol: str = "prbs",
     duration_s: float | None = None,
     parts: Parts | None = None,
     sensor: AngleSensor = ENCODER,
@@ -229,14 +222,12 @@ def record(
     Parameters
     ----------
     kind
-        `isometric`: at `angle_rad` (90 degrees if None) by `protocol`, `prbs` (the paper's PRBS, then a ramp) or
-        `staircase`. `held`: a short staircase at `angle_rad`, or anywhere in the range. `passive`: no current; sweeps
-        at about 8, 20, 45 and 80 degrees/s. `moving`: steady levels, 3 to 7 s each, while the joint is swept. `unseen`:
-        random levels and another movement, for validation. `reaching`: as `unseen`, by movements of minimum jerk.
+        `isometric`: at `angle_rad` (90 degrees if None), the paper's PRBS, then a ramp. `held`: a short staircase at
+        `angle_rad`, or anywhere in the range. `passive`: no current; sweeps at about 8, 20, 45 and 80 degrees/s.
+        `moving`: steady levels, 3 to 7 s each, while the joint is swept. `unseen`: random levels and another movement,
+        for validation. `reaching`: as `unseen`, by movements of minimum jerk.
     seed
         Decides, together with patient and kind, every random number.
-    mover
-        `hand` or `robot`; drawn if None. `unseen` moves by waves of 0.05 to 0.6 Hz, `reaching` by itself.
     duration_s
         Length of `passive`, `moving`, `unseen` or `reaching`; 66, 60, 30 and 30 if None. Others have their protocol's.
     parts
@@ -255,17 +246,14 @@ def record(
     Raises
     ------
     ValueError
-        No such kind, protocol or mover.
+        No such kind.
     """
     if kind not in KINDS:
         raise ValueError(f"kind {kind!r}: one of {', '.join(KINDS)}")
-    if mover not in (None, "hand", "robot"):
-        raise ValueError(f"mover {mover!r}: hand or robot")
     rng = rng_of(seed, "arm record", str(patient.seed), kind)
-    drawn = str(rng.choice(["hand", "robot"]))
-    chosen = mover or drawn
+    mover = str(rng.choice(["hand", "robot"]))
     sd_nm = float(rng.uniform(0.05, 0.1))
-    design = KINDS[kind](Asked(patient, rng, chosen, angle_rad, protocol, duration_s, parts))
+    design = KINDS[kind](Asked(patient, rng, mover, angle_rad, duration_s, parts))
     clean = _simulated(patient, design)
     every = SIMULATION_HZ // RATE_HZ
     rows = {name: column[::every] for name, column in clean.items()}
@@ -279,16 +267,8 @@ def record(
         "angle_rad": angle,
         "velocity_rad_s": velocity,
         "segment": design.segment[held],
-        "truth": {**rows, "noise_sd_nm": sd_nm, "mover": chosen, "kind": kind, "patient": patient.truth},
+        "truth": {**rows, "noise_sd_nm": sd_nm, "mover": mover, "kind": kind, "patient": patient.truth},
     }
-
-
-def held_angles_rad(patient: ArmPatient, count: int = 4) -> Floats:
-    """Angles for held records: the reference angle and others evenly over the range, a little inside its ends."""
-    low, high = patient.range_rad
-    others = np.linspace(low + 0.05, high - 0.05, count)
-    others[np.argmin(np.abs(others - patient.reference_rad))] = patient.reference_rad
-    return others
 
 
 def changed(

@@ -78,12 +78,6 @@ def shaped(seed: int) -> Muscle:
     return Muscle(name, gain * share / share[largest], float(largest), *dynamics)
 
 
-def papers() -> Muscle:
-    """The paper's muscle."""
-    own = Patient()
-    return Muscle("paper", own.recruitment(np.arange(512.0)), 300.0, own.time_constant_s, own.damping, 0.0)
-
-
 def _dynamics(rng: np.random.Generator) -> tuple[float, float, float]:
     return float(rng.uniform(0.1, 0.6)), float(rng.uniform(0.6, 1.2)), float(rng.uniform(0.0, 0.002))
 
@@ -154,10 +148,9 @@ def play(
     left_nm_s: float,
     rate_hz: float = 400.0,
     timed: Callable[[Callable[[], Decision]], Decision] = lambda call: call(),
-    choose: Callable[[Decision, np.ndarray], np.ndarray | None] | None = None,
     **known: Any,
 ) -> Played:
-    """Play an adaptive test to its end; `choose` may put other widths in the place of the next piece."""
+    """Play an adaptive test to its end."""
     made = Played(Decision("next"), np.zeros(0), [], None)
     while True:
         before = made.decisions[-1] if made.decisions else None
@@ -167,9 +160,8 @@ def play(
         made.decisions.append(made.decision)
         if made.decision.kind != "next":
             return made
-        other = choose(made.decision, made.widths_us) if choose is not None and before is not None else None
         for segment in made.decision.segments:
-            widths = np.array(segment.settings["pulse_width_us"]) if other is None else other
+            widths = np.array(segment.settings["pulse_width_us"])
             made.widths_us = np.r_[made.widths_us, widths]
             made.names += [segment.name] * widths.size
         made.record = recorded(muscle, made.widths_us, made.names, noise_nm, rate_hz)
