@@ -23,7 +23,8 @@ from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.design import UNRECORDED, Design, make_design
 from stimrig.hardware_sim.hidden.kernels import Floats
 from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS
-from stimrig.hardware_sim.hidden.scenario import Scenario, draw_pair, draw_scenario, rng_of
+from stimrig.hardware_sim.hidden.live import Staged
+from stimrig.hardware_sim.hidden.scenario import draw_pair, draw_scenario, rng_of
 
 SLOWEST_SIMULATION_HZ = 1600
 NOISES = ("white", "ar1", "slow")
@@ -157,15 +158,15 @@ def patient_record(seed: int, moving: bool = False) -> dict[str, Any]:
     return sampled(scenario, scenario.design, 400.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
 
 
-def sampled(scenario: Scenario, design: Design, rate_hz: float, noise_nm: Callable[[int], Floats]) -> dict[str, Any]:
-    """The columns of a record of this design, without its unrecorded rows."""
+def sampled(muscle: Staged, design: Design, rate_hz: float, noise_nm: Callable[[int], Floats]) -> dict[str, Any]:
+    """Simulate a record of this design: its columns without the unrecorded rows."""
     every = math.ceil(SLOWEST_SIMULATION_HZ / rate_hz)
     step_s = 1.0 / (rate_hz * every)
     width, _, angle, velocity = design.fine(step_s)
     count = len(range(0, width.size, every))
     fine_noise = np.zeros(width.size)
     fine_noise[::every] = noise_nm(count)
-    torque = simulate(scenario.base, scenario.stages(), design, step_s, fine_noise)[::every]
+    torque = simulate(muscle.base, muscle.stages(), design, step_s, fine_noise)[::every]
     held = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), design.width_us.size - 1)
     columns: dict[str, Any] = {
         "time_s": np.arange(count) / rate_hz,

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.muscles.other_physics import SETS, SIMULATION_HZ, PhysicsMuscle, draw_muscle
-from stimrig.hardware_sim.hidden.chain import simulate
+from bench.muscles.hidden_records import sampled
+from bench.muscles.other_physics import SETS, PhysicsMuscle, draw_muscle
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, Design, levels, make_design
 from stimrig.hardware_sim.hidden.kernels import Floats
 from stimrig.hardware_sim.hidden.scenario import rng_of
@@ -21,7 +21,7 @@ from stimrig.hardware_sim.hidden.scenario import rng_of
 DISTURBED = {"hum": "mains_hum", "slow zero": "baseline_drift", "breath": ""}
 """What may lie over a record, and the library's name of it, where it has one."""
 NOISE_SD_NM = 0.05
-RATE_HZ = 400
+RATE_HZ = 400.0
 UNSEEN_S = 22.0
 AGAIN = 1_000_000
 """Added to the seed of what lies over a further record."""
@@ -57,7 +57,7 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     muscle = draw_muscle(kinds, seed, rng)
     top_us = float(muscle.base.largest_width_us)
     design = make_design("full", rng, top_us)
-    made = _columns(design, muscle)
+    made = sampled(muscle, design, RATE_HZ, np.zeros)
     chance = rng.random(2)
     over = disturbed if disturbed is not None else _which(kinds, seed, chance)
     made["torque_nm"] = made["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, made["torque_nm"].size)
@@ -65,14 +65,14 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
         made["torque_nm"] += disturbance_nm(one, seed, made["time_s"])
     told = _truth(kinds, muscle) | {"seed": seed, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
     told["true"] = sorted({*told["true"], *(DISTURBED[one] for one in over)} - {""})
-    return made | {"unseen": _columns(unseen_design(seed, top_us), muscle), "truth": told}
+    return made | {"unseen": sampled(muscle, unseen_design(seed, top_us), RATE_HZ, np.zeros), "truth": told}
 
 
 def alike_record(kinds: str, seed: int) -> dict[str, Any]:
     """One more PRBS and ramp of the muscle of `record_of_physics`, rested: the columns of its `unseen`."""
     muscle = draw_muscle(kinds, seed)
     rng, top_us = rng_of(seed, "physics", "alike"), float(muscle.base.largest_width_us)
-    return _columns(make_design("full", rng, top_us, with_validate=False), muscle)
+    return sampled(muscle, make_design("full", rng, top_us, with_validate=False), RATE_HZ, np.zeros)
 
 
 def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Floats) -> dict[str, Any]:
@@ -93,7 +93,7 @@ def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Float
         The columns of `record_of_physics`, with noise; its one segment is `further`.
     """
     design = Design(np.round(width_us), np.full(width_us.size, "further", "U12"))
-    made = _columns(design, draw_muscle(kinds, seed))
+    made = sampled(draw_muscle(kinds, seed), design, RATE_HZ, np.zeros)
     rng = rng_of(seed, "physics", "further")
     made["torque_nm"] = made["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, made["torque_nm"].size)
     for one in over:
@@ -122,18 +122,6 @@ def unseen_design(seed: int, top_us: float) -> Design:
     rest = np.zeros(2 * PULSES_PER_S)
     width = np.round(np.concatenate([rest, quick, rest, slow, rest]))
     return Design(width, np.full(width.size, "validate", "U12"))
-
-
-def _columns(design: Design, muscle: PhysicsMuscle) -> dict[str, Any]:
-    """The columns of the muscle's record of this design, without noise."""
-    torque = simulate(muscle.base, muscle.stages(), design, 1.0 / SIMULATION_HZ)[:: SIMULATION_HZ // RATE_HZ]
-    repeated = RATE_HZ // PULSES_PER_S
-    return {
-        "time_s": np.arange(torque.size) / RATE_HZ,
-        "pulse_width_us": np.repeat(design.width_us, repeated),
-        "torque_nm": torque,
-        "segment": np.repeat(design.segment, repeated),
-    }
 
 
 def disturbance_nm(kind: str, seed: int, time_s: Floats) -> Floats:

@@ -200,20 +200,6 @@ def hung_weight(target: Target, torque_nm: float = 5.0) -> Undo:
 
 
 @fault
-def torque_scaled(target: Target, factor: float = 2.0) -> Undo:
-    """The amplifier's gain is another one than its data sheet says."""
-    return hooked(lambda torque_nm, _time_s: factor * torque_nm, target.load_cell.torque_hooks)
-
-
-@fault
-def torque_drift(target: Target, nm_per_s: float = 0.1) -> Undo:
-    """The zero of the reading drifts away from now on."""
-    begun_s = target.timeline.now_s
-    drift = lambda torque_nm, time_s: torque_nm + nm_per_s * (time_s - begun_s)  # noqa: E731
-    return hooked(drift, target.load_cell.torque_hooks)
-
-
-@fault
 def torque_noisy(target: Target, sd_nm: float = 1.0) -> Undo:
     """More noise comes to the reading: a loose shield, mains hum."""
     check_not_negative("torque_noisy", "sd_nm", sd_nm)

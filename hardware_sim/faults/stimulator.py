@@ -110,18 +110,6 @@ def device_reset(target: Target, mid_frame: bool = False) -> Undo:
 
 
 @fault
-def pulse_width_wrong(target: Target, factor: float = 1.5) -> Undo:
-    """Pulses flow wider than they were asked for; no answer of the stimulator tells."""
-    electrodes = target.board.electrodes
-    fire = electrodes.fire
-
-    def wider(time_s: float, points: Sequence[Point], output: Output, source: str) -> bool:
-        return fire(time_s, [(round(factor * width_us), ma) for width_us, ma in points], output, source)
-
-    return replaced(electrodes, "fire", wider)
-
-
-@fault
 def stop_lost(target: Target, within_s: float = 5.0) -> Undo:
     """A stop that comes within so many seconds of a pulse is lost, and nobody answers it."""
     wire, log = target.firmware.wire(), target.board.electrodes.log
