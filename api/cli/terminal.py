@@ -232,7 +232,7 @@ def carried_lines(found: Mapping[str, Any] | None) -> list[str]:
 
 
 def repetition_lines(fit: Mapping[str, Any]) -> list[str]:
-    """What repeats in the record, a line for each sentence; nothing where a model is of an older version."""
+    """What repeats in the record, a line for each sentence."""
     from stimrig.identify.yardstick import repetition_sentences
 
     return [f"{'' if number else 'repetition':15}{line}" for number, line in enumerate(repetition_sentences(fit))]

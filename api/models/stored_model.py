@@ -62,8 +62,6 @@ UNDEFINED = "not defined: the torque is level there"
 """What stands where a model has an error but no best-fit %."""
 VERDICTS = ("usable", "usable with care", "not usable")
 """Best first."""
-FORMER = {"good": "usable", "poor": "not usable"}
-"""What older versions called them; their "usable" stood between the two."""
 DEFAULTS = {
     "usable": "Nothing speaks against it.",
     "usable with care": "Look at where it fails before relying on it.",
@@ -76,7 +74,7 @@ FIT = (
 
 
 def repetition(document: dict[str, Any]) -> dict[str, Any]:
-    """What repeats in the record of a MODEL.json, with `sentences`; None for each where it is of an older version."""
+    """What repeats in the record of a MODEL.json, with `sentences`; None for each where it is not known."""
     fit = document.get("fit") or {}
     found = fit.get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
     return {**found, "sentences": repetition_sentences(fit)}
@@ -91,8 +89,8 @@ def figures(document: dict[str, Any]) -> dict[str, Any]:
 def quality(document: dict[str, Any]) -> dict[str, Any]:
     """identify's verdict on a model, as its MODEL.json stores it: nothing is judged here.
 
-    Older models are read so: a verdict of a former vocabulary by its place in today's; without words, the first reason;
-    whatever is stored, no better than its gates; "unknown" where there is no verdict.
+    A model is no better than its gates, whatever is stored; without words, the first reason; "unknown" without a
+    verdict.
 
     ``verdict`` (usable, usable with care, not usable, unknown), ``words`` (a sentence), ``reasons`` (a list).
     """
@@ -101,7 +99,6 @@ def quality(document: dict[str, Any]) -> dict[str, Any]:
     verdict = stored.get("verdict")
     if verdict == "usable" and not gates:  # only identify writes gates
         verdict = "usable with care"
-    verdict = FORMER.get(str(verdict), verdict)
     if verdict not in VERDICTS:
         return {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
     refused = [gate.get("severity") == "refuse" for gate in gates.values() if not gate.get("passed", True)]

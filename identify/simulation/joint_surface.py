@@ -68,8 +68,7 @@ class Surfaces:
     def of(cls, effects: Sequence[Mapping[str, Any]]) -> Surfaces | None:
         """Those of a model's effects; None if none of them depends on the joint.
 
-        Raises BadModel: an effect or its form is unknown here, or an older version fitted it, without its own
-        angle.
+        Raises BadModel: an effect or its form is unknown here, or the model does not say its reference angle.
         """
         acting = [one for one in map(JointEffect.of, effects) if one.effect.moves_with_joint]
         if not acting:

@@ -160,7 +160,7 @@ class Rest:
     async def _read(self) -> tuple[float | None, bool]:
         """The stored time, if it certainly belongs to this boot; whether any test was ever played with this folder.
 
-        Older versions stored no time of the last pulse.
+        A folder that was restored from a backup has recordings, but no time of the last pulse.
         """
         work, names, boot_id = self._machine.tasks.work, self._machine.disk.names, self._machine.boot_id
         try:

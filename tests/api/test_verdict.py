@@ -131,13 +131,12 @@ def test_level_held_out_torque_has_no_percent(tmp_path: Path, short_dir: Path, c
         ({"verdict": "usable", "gates": {"stable": {"passed": True}}}, "usable", "Nothing speaks against it."),
         ({"verdict": "usable", "words": "Fits well.", "gates": {"a": {"passed": True}}}, "usable", "Fits well."),
         ({"verdict": "usable with care", "reasons": ["it jumps"]}, "usable with care", "It jumps."),
-        ({"verdict": "good"}, "usable", ""),
         ({"verdict": "usable"}, "usable with care", "Look at where it fails"),
-        ({"verdict": "poor"}, "not usable", "Do not rely on it."),
-        ({"verdict": "good", "words": "Fits well.", "gates": {"stable": GATE}}, "not usable", "Do not rely on it."),
+        ({"verdict": "not usable"}, "not usable", "Do not rely on it."),
+        ({"verdict": "usable", "words": "Fits well.", "gates": {"stable": GATE}}, "not usable", "Do not rely on it."),
     ],
 )
-def test_older_models_are_read(stored: dict[str, Any] | None, verdict: str, words: str) -> None:
+def test_a_verdict_is_no_better_than_its_gates(stored: dict[str, Any] | None, verdict: str, words: str) -> None:
     document = {"fit": {}} | ({} if stored is None else {"quality": stored})
     found = stored_model.quality(document)
     assert found["verdict"] == verdict and found["words"].startswith(words)
