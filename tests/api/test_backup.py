@@ -115,9 +115,7 @@ def test_one_folder_for_rig_and_service(machine: Machine, capsys: pytest.Capture
     assert names(machine.back_up(capsys)) > {"api/stimrig.db", "rig/recordings/upload-aa.csv"}
 
 
-def test_a_backup_while_service_and_rig_write_is_one_state(
-    machine: Machine, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_backup_while_it_is_written_to_is_one_state(machine: Machine, capsys: pytest.CaptureFixture[str]) -> None:
     end = threading.Event()
 
     def write() -> None:
