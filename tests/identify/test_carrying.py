@@ -130,6 +130,7 @@ def unchanged() -> Answer:
     return said(second_session(), WEAK, STRONG)
 
 
+@pytest.mark.campaign
 def test_the_order_of_the_effects_in_the_earlier_model_does_not_matter() -> None:
     """The weak one, fitted alone, took what belongs to the strong one; and the best of both was never found."""
     assert unchanged() == said(second_session(), STRONG, WEAK)

@@ -22,9 +22,17 @@ pytestmark = pytest.mark.slow
 
 KEYS = {"effect", "probability", "rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm"}
 KEYS |= {"confused_with", "next_experiment", "parameters"}
-HIDDEN = ("fatigue", "electromechanical_delay", "output_saturation", "voluntary_effort", "mains_hum")
-"""One of each kind: of the gain, the dynamics, the output, the person and the sensor. A campaign takes the others."""
-OTHERS = ("asymmetric_relaxation", "threshold_drift", "tremor", "baseline_drift", "sensor_clipping")
+HIDDEN = ("fatigue", "electromechanical_delay", "mains_hum")
+"""Of the gain, the dynamics and the sensor. A campaign takes the others."""
+OTHERS = (
+    "output_saturation",
+    "voluntary_effort",
+    "asymmetric_relaxation",
+    "threshold_drift",
+    "tremor",
+    "baseline_drift",
+    "sensor_clipping",
+)
 
 
 @pytest.mark.parametrize("hidden", [*HIDDEN, *(pytest.param(name, marks=pytest.mark.campaign) for name in OTHERS)])
@@ -50,7 +58,11 @@ def test_where_nothing_is_hidden_nothing_is_named(seed, ar1):
 
 @pytest.mark.parametrize(
     ("slow_s", "quick_s", "noise_nm", "gaps_s"),
-    [(0.05, 0.002, 0.01, ()), (0.05, 5e-5, 0.04, ()), (0.6, 0.1, 0.02, ((4.2, 5.6), (11.0, 11.6)))],
+    [
+        pytest.param(0.05, 0.002, 0.01, (), marks=pytest.mark.campaign),
+        (0.05, 5e-5, 0.04, ()),
+        (0.6, 0.1, 0.02, ((4.2, 5.6), (11.0, 11.6))),
+    ],
 )
 def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, noise_nm, gaps_s):
     rng = np.random.default_rng(1)
@@ -68,7 +80,7 @@ def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, n
     assert result.verdict == "nothing_missing", result.missing
 
 
-@pytest.mark.parametrize("noise_nm", [5e-5, 5e-4])
+@pytest.mark.parametrize("noise_nm", [5e-5, pytest.param(5e-4, marks=pytest.mark.campaign)])
 def test_a_spline_s_own_error_is_nothing_missing(noise_nm):
     made = generate(None, "middle", 1, noise_sd_nm=noise_nm)
     result = diagnose(as_record(made))

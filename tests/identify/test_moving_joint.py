@@ -152,6 +152,7 @@ def test_what_changes_nothing_changes_nothing(change: dict[str, float]):
     assert other.inertia_nm_s2_per_rad / scale == pytest.approx(surfaces(model()).inertia_nm_s2_per_rad, rel=0.05)
 
 
+@pytest.mark.campaign
 def test_another_order_of_the_recordings_changes_nothing_and_another_zero_of_the_sensor_the_angles_alone():
     moved = identify.fit(
         joined([changed(made, angle_error_rad=0.5) for made in recorded_tests()], order=[5, 2, 0, 4, 1, 3]),

@@ -63,6 +63,7 @@ def test_the_file_is_short() -> None:
     assert most and len(GOOD.splitlines()) < int(most[1])
 
 
+@pytest.mark.campaign
 def test_without_it_the_library_does_not_explain_the_record(place: Path) -> None:
     found = json.loads(run(["diagnose", "record.csv", "--json"], place))
     assert "sensor_gain_swing" not in [entry["effect"] for entry in found["missing"]]

@@ -153,10 +153,13 @@ REST: dict[str, Callable[[Path, Path], Any]] = {
 }
 ELSEWHERE = {"cohort changed": "cohort fit", "cohort figures": "cohort fit", "test": "a_test"}
 """Run by another one of these tests."""
+LONG = ("cohort diagnose", "cohort improve")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("verb", REST)
+@pytest.mark.parametrize(
+    "verb", [pytest.param(verb, marks=[pytest.mark.campaign] if verb in LONG else []) for verb in REST]
+)
 def test_the_function_of_each_other_verb_runs(verb: str, folder: Path, tmp_path: Path) -> None:
     REST[verb](folder, tmp_path)
 
