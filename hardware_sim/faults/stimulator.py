@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any
-
 from stimrig.hardware_sim.errors import FaultError
 from stimrig.hardware_sim.faults import Target, Undo, fault, hooked, replaced, sometimes
-from stimrig.hardware_sim.stimulators.board import Output, Point
 
 OUTPUTS_PER_CONNECTOR = 4
 HALF_A_FRAME = bytes.fromhex("f0815581")
@@ -121,41 +117,6 @@ def stop_lost(target: Target, within_s: float = 5.0) -> Undo:
         return None if log and now_s - log[-1].time_s < within_s else data
 
     return hooked(lose, target.board.incoming)
-
-
-@fault
-def goes_on(target: Target, after_s: float = 0.4, period_s: float = 0.025) -> Undo:
-    """The watchdog is dead: after so long a silence of the host, the last pulse is repeated until a command comes."""
-    electrodes, timeline = target.board.electrodes, target.timeline
-    fire, last, on = electrodes.fire, list[Any](), [True]
-    heard = [0]
-
-    def note(time_s: float, points: Sequence[Point], output: Output, source: str) -> bool:
-        last[:] = [points, output]
-        return fire(time_s, points, output, source)
-
-    def again(count: int) -> None:
-        if on[0] and last and count == heard[0]:
-            fire(timeline.now_s, last[0], last[1], "watchdog")
-            timeline.after(period_s, lambda: again(count))
-
-    def listen(data: bytes) -> bytes:
-        heard[0] += 1
-        count = heard[0]
-        timeline.after(after_s, lambda: again(count))
-        if any(packet.command in STOPS for packet in wire.feed(data, timeline.now_s)):
-            last.clear()
-        return data
-
-    wire = target.firmware.wire()
-    undo = hooked(listen, target.board.incoming), replaced(electrodes, "fire", note)
-
-    def end() -> None:
-        on[0] = False
-        for one in undo:
-            one()
-
-    return end
 
 
 STOPS = 4, 34
