@@ -18,7 +18,7 @@ import numpy as np
 from stimrig.rig.acquire.angle_guard import AngleGuard
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.acquire.evidence import AROUND_S, stop_device, watch_decay
-from stimrig.rig.acquire.health import DEFAULT_WATCH, DiskWatch, Health, Watch
+from stimrig.rig.acquire.health import DiskWatch, Health, Watch
 from stimrig.rig.acquire.pauses import Pauses
 from stimrig.rig.acquire.plausibility import PlausibilityCheck
 from stimrig.rig.acquire.receiver import FRESH_S, Receiver
@@ -118,8 +118,8 @@ class TestRun:
         receiver: Receiver,
         machine: Machine,
         halt: Halt,
-        watch: Watch = DEFAULT_WATCH,
-        angle: AngleReceiver | None = None,
+        watch: Watch,
+        angle: AngleReceiver | None,
     ) -> None:
         self.plan = test.plan
         self.score = Score(test, table, journal, machine.tasks)

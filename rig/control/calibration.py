@@ -437,7 +437,7 @@ def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
     )
 
 
-def check_profiles(plan: TestPlan, unix_s: float, required: bool, duration_s: float = 0.0) -> None:
+def check_profiles(plan: TestPlan, unix_s: float, required: bool, duration_s: float) -> None:
     """Check the profile of each channel that a test plays; see `check_profile`. Raises RefusedError."""
     check_profile(plan.profile, unix_s, required, duration_s)
     for channel in plan.channels or ():

@@ -118,7 +118,7 @@ class Rig:
             return "the torque receiver has ended"
         return None
 
-    def take_live(self, samples: bool = False) -> Taken | None:
+    def take_live(self, samples: bool) -> Taken | None:
         """Torque and pulses since the last call, every sample if asked for; None if there is no new torque.
 
         It only reads, and takes what waits to be shown: it may be called from another thread than the tasks'.
