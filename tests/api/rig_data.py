@@ -45,6 +45,9 @@ class Rig:
         self.store = Store(Settings(data_dir=folder).database)
         self.number = 0
 
+    def close(self) -> None:
+        self.store.close()
+
     @property
     def now(self) -> str:
         return self.clock.utc()
@@ -109,4 +112,4 @@ class Rig:
 def rig(tmp_path: Path) -> Iterator[Rig]:
     made = Rig(tmp_path)
     yield made
-    made.store.close()
+    made.close()
