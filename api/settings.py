@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ipaddress
 import re
-import socket
 from pathlib import Path
 from typing import Annotated, Any
 from zoneinfo import available_timezones
@@ -44,9 +43,6 @@ class Settings(BaseSettings):
     rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
     rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
     emulated: bool = Field(default=False, description="True: no person is connected, an emulator stands in for the rig")
-    rig_name: str | None = Field(
-        default=None, description="services of one rig on one database give it one name; default: machine and folder"
-    )
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
@@ -85,11 +81,6 @@ class Settings(BaseSettings):
     def database(self) -> str:
         """The database's SQLAlchemy URL."""
         return self.database_url or f"sqlite:///{self.data_dir.absolute() / 'stimrig.db'}"
-
-    @property
-    def rig(self) -> str:
-        """What the services of one rig call it."""
-        return self.rig_name or f"{socket.gethostname()}:{self.data_dir.absolute()}"
 
     @property
     def exports_dir(self) -> Path:

@@ -15,15 +15,11 @@ settings.register_profile("shared-machine", deadline=None, suppress_health_check
 settings.load_profile("shared-machine")
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--postgresql", action="store_true", help="services keep their data in PostgreSQL, not in SQLite")
-
-
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect `campaign` unless the expression of markers names it, and what is SQLite's own on PostgreSQL."""
-    without = [] if "campaign" in config.option.markexpr else ["campaign"]
-    without += ["sqlite"] if config.getoption("--postgresql") else []
-    deselected = {item for item in items if any(item.get_closest_marker(name) for name in without)}
+    """Deselect `campaign` unless the expression of markers names it."""
+    if "campaign" in config.option.markexpr:
+        return
+    deselected = {item for item in items if item.get_closest_marker("campaign")}
     if deselected:
         config.hook.pytest_deselected(items=list(deselected))
         items[:] = [item for item in items if item not in deselected]

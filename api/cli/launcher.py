@@ -22,7 +22,7 @@ from stimrig.api import owner_only
 from stimrig.api.cli.child import ENDINGS, Child
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.settings import Settings
-from stimrig.api.store.holds import HeldError, refuse_if_held
+from stimrig.api.store.service_lock import HeldError, refuse_if_held
 
 SEAL_S = 35.0
 """The rig may still have a test to seal."""

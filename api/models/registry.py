@@ -74,8 +74,8 @@ class Served:
 class Versions:
     """The models of all participants.
 
-    Which approval holds is asked of the database each time, since another service may have changed it. The bytes that
-    it stands for never change, and are kept in memory.
+    Which approval holds is read from the database each time. The bytes that it stands for never change, and are kept in
+    memory.
     """
 
     def __init__(self, store: Store, clock: Clock) -> None:

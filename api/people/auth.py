@@ -21,7 +21,6 @@ from stimrig.api.errors import ApiError
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.audit import digest
-from stimrig.api.store.holds import shared_secret
 from stimrig.api.store.tables import Confirmation, PageSession, Token
 
 LOCKED = ("locked", "This page is locked")
@@ -91,7 +90,7 @@ class Auth:
     ) -> None:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
         self.idle = idle
-        self.cookie_name = f"stimrig_session_{shared_secret(store, 'session-cookie').hex()[:8]}"
+        self.cookie_name = f"stimrig_session_{store.secret('session-cookie').hex()[:8]}"
         """Browsers tell hosts apart, not ports: another service on this host has another name."""
         self._seen: OrderedDict[str, str] = OrderedDict()
         self._remembering = threading.Lock()

@@ -20,7 +20,6 @@ from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store import Store, seen
 from stimrig.api.store.audit import digest
-from stimrig.api.store.holds import Turn
 from stimrig.api.store.tables import Participant, Test, Token
 
 LONGEST_S = 300.0
@@ -58,7 +57,7 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
     return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
 
 
-async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: TestIn) -> Test:
+async def start(runner: Runner, lock: asyncio.Lock, store: Store, who: Principal, body: TestIn) -> Test:
     """Start a test; where a controller's key asks for it, within its plan.
 
     Raises ApiError: 403 outside the key or its plan, and by how much; 409 no model of its participant is approved; else
@@ -69,7 +68,7 @@ async def start(runner: Runner, turn: Turn, store: Store, who: Principal, body: 
             raise seen.another_document(f"/v1/participants/{body.participant}")
         return await runner.start(body, who.name, holder=who.token_hash)
     seen.shown.set(await asyncio.to_thread(store.seen, runner.clock))
-    async with turn:  # no two trials share the last one that is left
+    async with lock:  # no two trials share the last one that is left
         try:
             _refuse_kind(who, body)
             body = await _within_plan(runner, store, who, body)

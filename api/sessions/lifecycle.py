@@ -8,9 +8,6 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import ColumnElement, or_
-from sqlalchemy.exc import SQLAlchemyError
-
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.models import together
@@ -19,7 +16,6 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.kinds import Kinds
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store, audit
-from stimrig.api.store.holds import Holds, Turn
 from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
 from stimrig.api.workers.pool import Call, Pool, Tasks
 from stimrig.rig.messages import LABEL_TITLES, FinishedEvent
@@ -31,10 +27,6 @@ ROW = (
 """What a test's document has of its row as it is."""
 
 
-class LeftError(Exception):
-    """Another service follows the test now: this one was thought dead."""
-
-
 class Lifecycle:
     """Takes over what a test leaves behind.
 
@@ -43,12 +35,12 @@ class Lifecycle:
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions,
-        analyses: Analyses, kinds: Kinds, recordings_dir: Path, follower: Follower,
+        analyses: Analyses, kinds: Kinds, recordings_dir: Path,
         on_progress: Callable[[str], None],
     ) -> None:  # fmt: skip
         self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
-        self.kinds, self.follower = kinds, follower
+        self.kinds = kinds
         self.calls: dict[str, Call] = {}
         self._ahead = Tasks(log)
 
@@ -110,10 +102,10 @@ class Lifecycle:
             self.update(test_id, state="failed", reason=" ".join(str(error).split()) or type(error).__name__)
 
     def take_recording(self, event: FinishedEvent) -> Test | None:
-        """Write down how a test ended and where its recording lies; None where that is done, or another service's."""
+        """Write down how a test ended and where its recording lies; None where that is done."""
         with self.store.write() as session:
             row = session.get(Test, event.test_id)
-            if row is None or row.recording_id is not None or not self.follower.mine(row):
+            if row is None or row.recording_id is not None:
                 return None
             if event.recording_path and event.recording_id:
                 session.add(
@@ -152,9 +144,6 @@ class Lifecycle:
         try:
             model = await self._first_version(row, recording, parent, take, dict(how))
             model = await self.analyses.carried_structure.carry(model, recording.path, take, **how)
-        except LeftError:
-            log.warning("left to the service that took it up", extra={"test_id": test_id})
-            return
         except ApiError as error:
             reason = f"identification: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
@@ -175,8 +164,6 @@ class Lifecycle:
             return await asyncio.to_thread(self.versions.get, row.model_id)
         how |= await asyncio.to_thread(self.kinds[row.kind].fit_options, row)
         found, warning = await self.analyses.carried_structure.fit(row.participant, recording.path, take, **how)
-        if not self.follower.mine(await asyncio.to_thread(self.store.get, Test, row.id)):
-            raise LeftError  # one recording, one model
         by = f"test {row.id}"
         model = await asyncio.to_thread(self.versions.add, found["json"], row.participant, recording.id, by, parent)
         summary = dict(row.summary)
@@ -226,74 +213,3 @@ class Lifecycle:
         except ApiError as error:
             log.warning("looking for the recording of %s: %s", test_id, error)
             return {}
-
-
-PLAYED_STATES = OPEN_STATES[:3]
-LOOK_S = 3.0
-"""How often it is looked for what a service that died has left."""
-
-
-class Follower:
-    """This service as a follower of tests.
-
-    Who began a test follows it to its end; when that service is dead, another one of the same rig does.
-
-    `holds`: says which services live; `rig`: what the services of this rig call it.
-    """
-
-    def __init__(self, store: Store, holds: Holds, rig: str) -> None:
-        self.store, self.holds, self.rig = store, holds, rig
-
-    def mark(self, row: Test) -> None:
-        """This service begins this test."""
-        row.followed_by, row.rig = self.holds.me, self.rig
-
-    def mine(self, row: Test) -> bool:
-        """Whether this service follows the test; one from before it was written down is anybody's."""
-        return row.followed_by in (None, self.holds.me)
-
-    def rig_turn(self) -> Turn:
-        """Around the start of a test: of all services of this rig one starts."""
-        return self.holds.turn(f"rig {self.rig}")
-
-    def played_by_another(self) -> Test | None:
-        """The test that another service of this rig plays, or has begun to."""
-        if not self.store.several:
-            return None
-        of_others = (Test.state.in_(PLAYED_STATES), Test.rig == self.rig, Test.followed_by != self.holds.me)
-        return self.store.first(Test, *of_others)
-
-    def left(self) -> list[Test]:
-        """Open tests of this rig that nobody follows any more; from now on this service does."""
-        dead = self.holds.dead({name for name in self.store.all(Test.followed_by, *self._open()) if name})
-        with self.store.write() as session:
-            rows = [row for row in session.query(Test).filter(*self._open()) if row.followed_by in {None, *dead}]
-            for row in rows:
-                self.mark(row)
-        return rows
-
-    def _open(self) -> list[ColumnElement[bool]]:
-        of_others = [] if not self.store.several else [or_(Test.rig == self.rig, Test.rig.is_(None))]
-        return [Test.state.in_(OPEN_STATES), *of_others]
-
-    async def watch(self, take_up: Callable[[list[Test]], None], look_again: Callable[[], None]) -> None:
-        """Show that this service lives, and take up what others leave; `look_again` is called where there is some."""
-        if not self.store.several:
-            return
-        while True:
-            await asyncio.sleep(LOOK_S)
-            try:
-                await asyncio.to_thread(self.holds.keep)
-                left = await asyncio.to_thread(self._left_by_others)
-            except SQLAlchemyError:
-                log.exception("what other services left could not be read")
-                continue
-            if left:
-                log.warning("taken up from a service that ended: %s", ", ".join(row.id for row in left))
-                take_up(left)
-                look_again()
-
-    def _left_by_others(self) -> list[Test]:
-        """`left`, without a transaction that writes where there is nothing."""
-        followers = {name for name in self.store.all(Test.followed_by, *self._open()) if name}
-        return self.left() if self.holds.dead(followers) else []

@@ -20,7 +20,7 @@ log = logging.getLogger("stimrig.trials")
 ENDING_S = 2.0
 """So long a start waits for a test whose end has been heard."""
 LOOK_AGAIN_S = 0.25
-"""How often it is looked whether a test may still be played: another service's changes are seen so late at most."""
+"""Interval at which it is checked whether a test may still be played: a right may end by time."""
 
 
 @dataclass
@@ -122,7 +122,7 @@ class Playing:
                 current.over |= over
 
     async def look_again_and_again(self, current: Current) -> None:
-        """Other services change things, too."""
+        """Check at intervals whether it may still be played: a right ends by time, too, and no request says so."""
         while self.current is current and not current.ending:
             await asyncio.sleep(LOOK_AGAIN_S)
             try:

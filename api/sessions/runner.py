@@ -24,16 +24,15 @@ from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
-from stimrig.api.sessions.lifecycle import Follower, Lifecycle
+from stimrig.api.sessions.lifecycle import Lifecycle
 from stimrig.api.sessions.live import Hub
-from stimrig.api.sessions.playing import Current, Playing, busy, other_than, refuse_archived, rests_of, right_ended
+from stimrig.api.sessions.playing import Current, Playing, other_than, refuse_archived, rests_of, right_ended
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
 from stimrig.api.sessions.stop_counter import StopCounter
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
-from stimrig.api.store.holds import LIMITS_TURN
-from stimrig.api.store.tables import Participant, Test, Token
+from stimrig.api.store.tables import OPEN_STATES, Participant, Test, Token
 from stimrig.api.workers.pool import Adviser, Pool, Tasks
 from stimrig.rig import messages, requests
 
@@ -64,16 +63,18 @@ class Runner(Playing):
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
-        adviser: Adviser, trials: Trials, recordings_dir: Path, follower: Follower,
+        adviser: Adviser, trials: Trials, recordings_dir: Path, limits_lock: asyncio.Lock,
     ) -> None:  # fmt: skip
         super().__init__(store, clock, rig)
-        self.versions, self.pool, self.trials, self.follower = versions, pool, trials, follower
+        self.versions, self.pool, self.trials, self.limits_lock = versions, pool, trials, limits_lock
+        self.start_lock = asyncio.Lock()
+        """Of several starts one is prepared at a time."""
         self.hub, self.counted = Hub(clock), StopCounter()
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
         self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint)
         self.lifecycle = Lifecycle(
-            store, clock, rig, pool, versions, analyses, self.kinds, recordings_dir, follower, self.announce
+            store, clock, rig, pool, versions, analyses, self.kinds, recordings_dir, self.announce
         )
         self._halted_s = -math.inf
         self._notes = ThreadPoolExecutor(2, "notes-of-stops")
@@ -112,10 +113,8 @@ class Runner(Playing):
         self.refuse_second()
         if body.kind == ADAPTIVE:  # what it can reach is computed now, and not while others wait, and then remembered
             await self._planned(body, await self._participant(body))
-        async with self.follower.rig_turn():
+        async with self.start_lock:
             self.refuse_second()
-            if (row := await asyncio.to_thread(self.follower.played_by_another)) is not None:
-                raise busy(Current(row.id, row.participant, row.requested_by))
             participant = await self._participant(body)
             return await self._start(body, participant, by, confirmed, tokens)
 
@@ -162,7 +161,7 @@ class Runner(Playing):
     async def _command(self, planned: Planned, current: Current) -> None:
         plan = planned.plan
         try:
-            async with self.follower.holds.turn(LIMITS_TURN):
+            async with self.limits_lock:
                 if changed := current.overtaken or await asyncio.to_thread(self.overtaking, current):
                     raise seen.overtaken(changed)
                 if self.is_over(current):
@@ -251,7 +250,6 @@ class Runner(Playing):
         }
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
-        self.follower.mark(row)
         dose = {name: preview.get(name) for name in ("duration_s", "charge_uc", "torque_time_nms")}
         with self.store.write() as session:
             seen.check(session, *rests_of(plan.participant, plan.kind))
@@ -331,8 +329,6 @@ class Runner(Playing):
 
     def _on_event(self, event: AnyEvent) -> None:
         if isinstance(event, messages.LiveEvent):
-            if self.current is None and event.test_id not in (None, self.hub.test_id):
-                self.hub.begin(event.test_id)  # another service began it
             self.hub.live(event)
         elif isinstance(event, messages.FinishedEvent):
             self._follow(event.test_id, self._finish(event))
@@ -412,13 +408,9 @@ class Runner(Playing):
     # ---- after a restart ------------------------------------------------------------------------------------
 
     async def resume(self) -> None:
-        """Take up what a restart of the service left open, and from now on what another service leaves."""
+        """Take up the tests that a restart of the service left open."""
         self.trials.resume()
-        self._take_up(await asyncio.to_thread(self.follower.left))
-        self._tasks.begin(self.follower.watch(self._take_up, self.trials.resume))
-
-    def _take_up(self, left: list[Test]) -> None:
-        for row in left:
+        for row in await asyncio.to_thread(self.store.all, Test, Test.state.in_(OPEN_STATES)):
             status = self.rig.status
             if (
                 status is not None

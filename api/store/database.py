@@ -1,10 +1,11 @@
-"""One door to the database: SQLite by default, or PostgreSQL.
+"""The database: SQLite by default, or PostgreSQL.
 
-Who writes has the database alone, whichever process it is in: what a transaction reads holds until it is committed.
+One transaction writes at a time, so what it has read stays true until it is committed.
 """
 
 from __future__ import annotations
 
+import secrets
 import threading
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -23,6 +24,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.store import audit, migrations
 from stimrig.api.store.migrations import WRITES
 from stimrig.api.store.seen import About, Seen, check, newest
+from stimrig.api.store.tables import Secret
 
 
 class Store:
@@ -41,9 +43,7 @@ class Store:
         except migrations.SchemaError as error:
             raise ApiError(503, "database", "The database has another version", str(error)) from error
         except (ArgumentError, SQLAlchemyError, ImportError, OSError) as error:
-            raise ApiError(503, "database", "The database cannot be opened", _why(error, shown)) from error
-        self.several = parsed.get_backend_name() != "sqlite"
-        """Whether other services may use it at the same time."""
+            raise ApiError(503, "database", "The database cannot be opened", why_not_opened(error, shown)) from error
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
         self._writing = sessionmaker(self.engine.execution_options(**WRITES), expire_on_commit=False)
         self._write_lock = threading.Lock()
@@ -56,7 +56,7 @@ class Store:
 
     @contextmanager
     def write(self) -> Iterator[Session]:
-        """A transaction: committed at the end, rolled back at an error. One writer at a time, of all processes."""
+        """A transaction: committed at the end, rolled back at an error. One at a time."""
         with self._write_lock, self._writing.begin() as session:
             session.connection()  # begins it now: before anything is read
             yield session
@@ -106,13 +106,22 @@ class Store:
                 for statement in ("VACUUM", "PRAGMA wal_checkpoint(TRUNCATE)"):
                     connection.cursor().execute(statement)
 
+    def secret(self, name: str) -> bytes:
+        """The secret of this name: 32 bytes, drawn once, so that pages stay good over a restart."""
+        with self.write() as session:
+            row = session.get(Secret, name)
+            if row is None:
+                row = Secret(name=name, value=secrets.token_bytes(32))
+                session.add(row)
+        return row.value
+
     def close(self) -> None:
         """Let the connections go."""
         self.engine.dispose()
 
 
-def _why(error: Exception, shown: str) -> str:
-    """What is wrong with the database, and the fix, in one line."""
+def why_not_opened(error: Exception, shown: str) -> str:
+    """Say in one line what is wrong with the database, and the fix."""
     first = str(error).splitlines()[0]
     if shown.startswith("postgresql"):
         return f"{shown}: {first}; see that it runs and that STIMRIG_DATABASE_URL names it (docs/install.md)"
@@ -122,8 +131,6 @@ def _why(error: Exception, shown: str) -> str:
     return f"{first}; {fix}"
 
 
-WRITER_KEY = 0x5354494D52494701
-"""PostgreSQL's advisory lock of whoever writes: "STIMRIG" and 1."""
 CONNECT_S, POOL_S = 3, 5
 OTHER_WRITER_MS = 10_000
 """How long one waits for another writer."""
@@ -173,7 +180,6 @@ def _postgresql(url: URL) -> Engine:
         )  # fmt: skip
     except ImportError as error:
         raise ImportError("PostgreSQL needs psycopg: pip install 'stimrig[postgresql]'") from error
-    event.listen(engine, "begin", _begin_postgresql)
     return engine
 
 
@@ -186,19 +192,9 @@ def _durable_sqlite(connection: Any, _record: Any) -> None:
     cursor.close()
 
 
-def writes(connection: Connection) -> bool:
-    """Whether a transaction of this connection writes."""
-    return WRITES.items() <= connection.get_execution_options().items()
-
-
 def _begin_sqlite(connection: Connection) -> None:
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes(connection) else "BEGIN")
-
-
-def _begin_postgresql(connection: Connection) -> None:
-    """Each statement after it sees what the writer before has committed (read committed)."""
-    if writes(connection):
-        connection.exec_driver_sql(f"SELECT pg_advisory_xact_lock({WRITER_KEY})")
+    writes = WRITES.items() <= connection.get_execution_options().items()
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 
 def sqlite_file(url: URL) -> Path | None:

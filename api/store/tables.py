@@ -51,10 +51,6 @@ class Test(Table):
     finished_utc: Mapped[str | None] = mapped_column(String, default=None)
     ran_by: Mapped[str | None] = mapped_column(String, default=None)
     """Who ran it at the rig, if that was somebody else than `requested_by`."""
-    followed_by: Mapped[str | None] = mapped_column(String, default=None)
-    """The service that follows it to its end (`stimrig.api.store.holds`)."""
-    rig: Mapped[str | None] = mapped_column(String, default=None)
-    """The rig that plays it, as its services call it (`Settings.rig_name`)."""
 
 
 class Note(Table):
@@ -234,7 +230,7 @@ class Confirmation(Table):
 
 
 class Secret(Table):
-    """What all services on a database share and nobody else knows."""
+    """A secret of the service that outlives a restart (`Store.secret`)."""
 
     __tablename__ = "secrets"
     name: Mapped[str] = mapped_column(String, primary_key=True)

@@ -16,7 +16,7 @@ from starlette.types import ASGIApp
 
 from stimrig.api.clock import Clock
 from stimrig.api.settings import Settings
-from stimrig.api.store.holds import ServiceLock
+from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.version import software_version
 from stimrig.api.web import openapi, pages, problems, routes
 from stimrig.api.web.dependencies import build

@@ -25,7 +25,6 @@ from stimrig.api.models.trend import Trend
 from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock, Principal, Scope
 from stimrig.api.people.pace import Guesses
-from stimrig.api.sessions.lifecycle import Follower
 from stimrig.api.sessions.notes import Notes
 from stimrig.api.sessions.questions import Questions
 from stimrig.api.sessions.rig_client import RigClient
@@ -33,8 +32,8 @@ from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.stops import StopLog, StopRights
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, holds, uploads
-from stimrig.api.store.holds import LIMITS_TURN, ServiceLock, shared_secret
+from stimrig.api.store import Store, uploads
+from stimrig.api.store.service_lock import KEEP_S, ServiceLock
 from stimrig.api.store.tables import Model, Recording
 from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, require
 from stimrig.api.web.openapi import problem
@@ -76,19 +75,23 @@ class Context:
         pool = self.pool = Pool(settings.workers, worker, places(settings, store))
         self.analyses = Analyses(store, clock, pool, self.versions, settings)
         self.tracked = TrackedVersions(store, clock, self.versions)
-        self.holds = holds.open_holds(store)
+        self.limits_lock = asyncio.Lock()
+        """Held by a change of limits, and by a calibration or test while it is sent by them: once a change is answered,
+        nothing begins with the limits of before."""
+        self.keys_lock = asyncio.Lock()
+        """Trials of controllers' keys are counted and begun one after the other."""
         # workers of their own: a folder that the pool learns ends no test
         adviser, tracker = (Adviser(worker, places(settings, store)) for _ in range(2))
         trials = Trials(rig, store, clock, self.tracked, tracker)
         self.runner = Runner(
             store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
-            Follower(store, self.holds, settings.rig),
+            self.limits_lock,
         )  # fmt: skip
         self.trend, self.jobs = Trend(store, clock, pool), Jobs(pool)
         self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
-        stop_key = shared_secret(store, "stop-right")
+        stop_key = store.secret("stop-right")
         self.stop_rights = StopRights(stop_key, clock)
-        self._flushing: asyncio.Task[None] | None = None
+        self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self) -> None:
         """Connect, warm the workers, take up what a restart left open; begin the regular work."""
@@ -100,15 +103,15 @@ class Context:
                 break
             await asyncio.sleep(0.05)
         await self.runner.resume()
-        self._flushing = asyncio.create_task(_repeat(FLUSH_S, self.auth.idle.flush))
+        regular = ((FLUSH_S, self.auth.idle.flush), (KEEP_S, self.lock.keep))
+        self._tasks = [asyncio.create_task(_repeat(every_s, work)) for every_s, work in regular]
 
     async def close(self) -> None:
         """Let everything go."""
         for part in (self.runner, self.jobs, self.pool, self.rig):
             await part.close()
-        self.holds.close()
-        if self._flushing is not None:
-            self._flushing.cancel()
+        for task in self._tasks:
+            task.cancel()
         with contextlib.suppress(SQLAlchemyError):
             await asyncio.to_thread(self.auth.idle.flush)
         self.people.close()
@@ -158,14 +161,14 @@ def places(settings: Settings, store: Store) -> Places:
     return Places(reads, [settings.exports_dir])
 
 
-def in_limits_turn(
+def under_limits_lock(
     change: Callable[Concatenate[Context, P], T],
 ) -> Callable[Concatenate[Context, P], Coroutine[Any, Any, T]]:
-    """Do a change in a thread, in turn with all else that changes limits or lets something begin by them."""
+    """Do a change in a thread, under the lock of the limits."""
 
     @functools.wraps(change)
     async def changed(context: Context, /, *given: P.args, **more: P.kwargs) -> T:
-        async with context.holds.turn(LIMITS_TURN):
+        async with context.limits_lock:
             return await asyncio.to_thread(change, context, *given, **more)
 
     return changed

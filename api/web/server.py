@@ -24,7 +24,7 @@ from stimrig.api import logs
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.models import carried_structure
 from stimrig.api.settings import Settings, loopback
-from stimrig.api.store.holds import ServiceLock
+from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.web.app import create_app
 
 

@@ -34,7 +34,6 @@ from stimrig.api.web.server import configuration
 from tests.api import thread_process
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness.looks_first import LooksFirst
-from tests.harness.postgres import Cluster, programs, running
 
 TOKEN = "administrator-token-of-the-tests"
 HTML = {"Accept": "text/html,application/xhtml+xml"}
@@ -99,42 +98,6 @@ def databases_that_need_not_last() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "_durable_sqlite", quick)
         yield
-
-
-@pytest.fixture(scope="session")
-def cluster() -> Iterator[Cluster]:
-    """PostgreSQL, of this test process's own."""
-    place = programs()
-    if place is None:
-        pytest.skip("PostgreSQL is not installed: as root, apt-get install postgresql")
-    with running(place) as cluster:
-        yield cluster
-
-
-@pytest.fixture(scope="session", autouse=True)
-def kept_in_postgresql(request: pytest.FixtureRequest) -> Iterator[Cluster | None]:
-    """With `--postgresql`: what a data folder's database is without it, one in the cluster is for the same folder."""
-    if not request.config.getoption("--postgresql"):
-        yield None
-        return
-    cluster: Cluster = request.getfixturevalue("cluster")
-
-    def database(settings: Settings) -> str:
-        return settings.database_url or cluster.database(str(settings.data_dir.absolute()))
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Settings, "database", property(database))
-        yield cluster
-
-
-@pytest.fixture(autouse=True)
-def processes_keep_it_there_too(
-    kept_in_postgresql: Cluster | None, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Services that a test starts as processes read their database from the environment."""
-    if kept_in_postgresql is not None and "tmp_path" in request.fixturenames:
-        address = kept_in_postgresql.database(str(request.getfixturevalue("tmp_path")))
-        monkeypatch.setenv("STIMRIG_DATABASE_URL", address)
 
 
 @pytest.fixture(scope="session", autouse=True)

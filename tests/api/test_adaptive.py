@@ -110,7 +110,7 @@ def test_another_start_does_not_wait_until_it_is_known_what_a_test_can_reach(
 
     async def watched(body: TestIn, who: Any) -> Any:
         found = await planned(body, who)
-        looked.append(context.holds._turns[f"rig {context.runner.follower.rig}"].locked())
+        looked.append(context.runner.start_lock.locked())
         return found
 
     context.runner._planned = watched

@@ -12,7 +12,6 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api.store.holds import LIMITS_TURN
 from tests.api.conftest import Service, csrf, signed_in, soon, wait_done
 from tests.api.test_problems import problem
 from tests.api.test_profiles import mark_all
@@ -265,7 +264,7 @@ def trains(service: Service) -> int:
 def at_once(service: Service, press: Any, count: int = 2) -> list[httpx.Response]:
     """Press so often; all requests stand at the turn before the first of them gets it."""
     context = service.context
-    turn, loop = context.holds._turns[LIMITS_TURN], context.rig._task.get_loop()
+    turn, loop = context.limits_lock, context.rig._task.get_loop()
     service.run(turn.acquire())
     answers: list[httpx.Response] = []
     pressing = [threading.Thread(target=lambda: answers.append(press())) for _ in range(count)]

@@ -145,7 +145,7 @@ def test_restart_goes_on_after_the_plain_version(
     test = run_test(client, participant)
     plain, _ = versions(client, participant, test)
     context = service.context
-    context.runner.lifecycle.update(test["id"], state="identifying", model_id=plain["id"], followed_by="dead")
+    context.runner.lifecycle.update(test["id"], state="identifying", model_id=plain["id"])
     service.run(context.runner.resume())
     test = wait_done(client, test["id"])
     rows = versions(client, participant, test)

@@ -18,7 +18,6 @@ from stimrig.api.errors import ApiError
 from stimrig.api.store import Store, copies, migrations
 from stimrig.api.store.tables import Participant, Table
 
-pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
 NEWER = "UPDATE alembic_version SET version_num = '0900'"
 NEXT = """

@@ -8,7 +8,6 @@ import logging
 import threading
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -16,12 +15,7 @@ import pytest
 
 from stimrig.api.clock import Clock
 from stimrig.api.sessions import playing
-from stimrig.api.sessions.kinds import Kind, Kinds
-from stimrig.api.sessions.lifecycle import Follower, Lifecycle
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.store import Store
-from stimrig.api.store.holds import Holds
-from stimrig.api.store.tables import Model, Participant, Recording, Test
 from stimrig.rig.messages import Reply, StateEvent, Status
 from stimrig.rig.requests import StartRequest
 from tests.api.conftest import Service, let_go, run_test, soon, wait_done
@@ -34,7 +28,7 @@ def fails(*_args: Any, **_more: Any) -> Any:
 def reopened(service: Service, ended: dict[str, Any], **fields: Any) -> Any:
     """What a restarted service finds: the test is open; gives the function that takes it up."""
     context = service.context
-    context.runner.lifecycle.update(ended["id"], state="identifying", model_id=None, followed_by="dead", **fields)
+    context.runner.lifecycle.update(ended["id"], state="identifying", model_id=None, **fields)
 
     def resume() -> None:
         service.run(context.runner.resume())
@@ -132,63 +126,6 @@ def test_a_start_that_fails_unexpectedly_is_stopped_and_leaves_nothing_open(
         assert test["state"] == "failed" and test["reason"] == "something unexpected"
         assert service.rig.stopped_by == "service", "the rig may have heard the start all the same"
         assert client.get("/v1/rig").json()["holder"] is None
-
-
-def store_with_a_test(folder: Path, followed_by: str) -> Store:
-    store, now = Store(f"sqlite:///{folder / 'stimrig.db'}"), "2026-11-23T08:00:00.000Z"
-    rows: list[Any] = [
-        Participant(code="P1", profile={}, created_utc=now, created_by="Ada"),
-        Test(
-            id="T1", participant="P1", kind="identification", state="identifying", plan={}, summary={}, reason="",
-            requested_by="Ada", requested_utc=now, followed_by=followed_by,
-        ),
-        Recording(id="R1", participant="P1", test_id="T1", path="r.h5", file_sha256="", origin="rig", created_utc=now),
-    ]  # fmt: skip
-    with store.write() as session:
-        for row in rows:
-            session.add(row)
-            session.flush()
-        rows[1].recording_id = "R1"
-    return store
-
-
-@pytest.mark.parametrize("taken_up", [False, True])
-def test_a_test_that_was_taken_up_during_the_fit_is_left_to_who_did(tmp_path: Path, taken_up: bool) -> None:
-    holds, added = Holds(), []
-    store = store_with_a_test(tmp_path, holds.me)
-
-    async def fit(*_given: Any, **_how: Any) -> tuple[dict[str, str], str]:
-        if taken_up:
-            with store.write() as session:
-                session.get_one(Test, "T1").followed_by = "another"
-        return {"json": "{}"}, ""
-
-    async def carry(model: Model, *_given: Any, **_how: Any) -> Model:
-        return model
-
-    def add(_json: str, participant: str, recording_id: str, by: str, _parent: str | None) -> Model:
-        row = Model(id=f"M{len(added)}", participant=participant, recording_id=recording_id, method="ml")
-        row.document, row.etag = b"{}", "0" * 64
-        row.effects, row.fit, row.created_utc, row.created_by = [], {}, "2026-11-23T08:00:00.000Z", by
-        with store.write() as session:
-            session.add(row)
-        added.append(row)
-        return row
-
-    async def diagnose_ahead(_model: Model) -> None: ...
-
-    carried = SimpleNamespace(fit=fit, carry=carry)
-    analyses: Any = SimpleNamespace(carried_structure=carried, diagnose_ahead=diagnose_ahead)
-    nothing: Any = SimpleNamespace(add=add)
-    kinds = Kinds(Kind(nothing))
-    follower = Follower(store, holds, "rig")
-    lifecycle = Lifecycle(
-        store, Clock(), nothing, nothing, nothing, analyses, kinds, tmp_path, follower, lambda _test_id: None
-    )
-    asyncio.run(lifecycle.identify("T1"))
-    row = store.get(Test, "T1")
-    assert (len(added), row.state) == ((0, "identifying") if taken_up else (1, "completed"))
-    store.close()
 
 
 def test_an_end_that_was_never_told_is_found_by_asking(client: httpx.Client, service: Service, participant: str):

@@ -21,12 +21,11 @@ from stimrig.api.cli import main
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.launcher import Services
 from stimrig.api.settings import Settings
-from stimrig.api.store import Store, holds
-from stimrig.api.store.holds import HeldError, ServiceLock
+from stimrig.api.store import Store
+from stimrig.api.store.service_lock import HeldError, ServiceLock, refuse_if_held
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 from tests.harness.looks_first import LooksFirst
 
-pytestmark = pytest.mark.sqlite
 ROOT = Path(__file__).parents[2]
 
 
@@ -103,7 +102,9 @@ def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
     os.link(tmp_path / "stimrig.db", tmp_path / "again.db")
     with pytest.raises(HeldError, match="2 names"):
         held(data_dir=tmp_path)
-    held(data_dir=tmp_path / "b", database_url="postgresql://ann:secret@db.example/stimrig").release()
+    with pytest.raises(HeldError, match=r"127\.0\.0\.1:1/stimrig: .*STIMRIG_DATABASE_URL") as caught:
+        held(data_dir=tmp_path / "b", database_url="postgresql://ann:secret@127.0.0.1:1/stimrig")
+    assert "secret" not in str(caught.value) and "\n" not in str(caught.value)
     (tmp_path / "c").mkdir()
     (tmp_path / "c" / "service.lock").mkdir()
     with pytest.raises(HeldError, match="this user may write"):
@@ -188,6 +189,6 @@ def test_the_message_names_nobody_who_is_gone(tmp_path: Path) -> None:
     first.release()
     second = held(data_dir=tmp_path)
     with pytest.raises(HeldError) as caught:
-        holds.refuse_if_held(Settings(data_dir=tmp_path))
+        refuse_if_held(Settings(data_dir=tmp_path))
     assert "1234" not in str(caught.value)
     second.release()

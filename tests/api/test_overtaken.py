@@ -186,10 +186,10 @@ def test_a_trial_that_was_planned_with_another_model_is_not_played(
     assert approved != another
 
 
-def test_another_service_that_changes_something_is_heard_within_the_bound(
+def test_a_change_that_no_request_made_is_noticed_within_the_bound(
     service: Service, client: httpx.Client, participant: str, approved: str
 ) -> None:
-    """As a service beside this one writes it: nothing here was asked, and so nothing is answered."""
+    """As the end of a right by time: nothing here was asked, and so nothing is answered."""
     key, controller = key_of(service, client, participant)
     service.rig.speed = 0.1
     assert controller.post("/v1/tests", json={"participant": participant, **TRIAL}).status_code == 202
@@ -201,14 +201,13 @@ def test_another_service_that_changes_something_is_heard_within_the_bound(
 def test_a_trial_that_outlives_its_service_ends_with_the_right_that_was_revoked_meanwhile(
     service: Service, client: httpx.Client, participant: str, approved: str
 ) -> None:
-    """The service is killed in a trial, and its key is revoked by another one before it is there again."""
+    """The service is killed in a trial, and its key is revoked before it is there again."""
     key, controller = key_of(service, client, participant)
     service.rig.speed = 0.1
     test = controller.post("/v1/tests", json={"participant": participant, **TRIAL}).json()
     context = service.context
     soon(lambda: context.rig.status.test_id == test["id"])
     context.runner.current = None
-    context.runner.lifecycle.update(test["id"], followed_by="dead")
     assert context.auth.revoke(key, "somebody elsewhere")
     service.run(context.runner.resume())
     told = soon(lambda: service.rig.withdrawn)

@@ -208,7 +208,6 @@ def test_audit_is_verified_and_exported_by_a_command(
     assert "broken at entry 2" in capsys.readouterr().out
 
 
-@pytest.mark.sqlite
 def test_an_audit_of_no_database_is_told(tmp_path: Path) -> None:
     assert main.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2
 
@@ -371,7 +370,6 @@ def urls(tmp_path: Path, short_dir: Path) -> Iterator[list[str]]:
             yield [one.url, other.url]
 
 
-@pytest.mark.sqlite  # two services of one folder, each with a database of its own
 def test_one_browser_stays_signed_in_at_every_service_of_a_host(urls: list[str]) -> None:
     for url in urls:
         answer = httpx.post(

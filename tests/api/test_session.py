@@ -155,7 +155,6 @@ def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(client: httpx.Clie
     assert not broken["whole"] and broken["first_broken"] == 3
 
 
-@pytest.mark.sqlite
 def test_database_is_durable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "_durable_sqlite", DURABLE)
     store = Store(f"sqlite:///{tmp_path}/durable.db")

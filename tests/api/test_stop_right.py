@@ -18,7 +18,6 @@ from sqlalchemy.exc import OperationalError
 from stimrig.api.clock import Clock
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.stops import RIGHT_S, StopRights
-from stimrig.api.store import holds
 from tests.api.conftest import HTML, TOKEN, Service, SetClock, soon
 from tests.api.conftest import csrf as csrf_of
 from tests.api.test_people import standing_still
@@ -214,7 +213,7 @@ def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
 def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Service) -> None:
     context = service.context
     right = context.stop_rights.give("Ada", None)
-    assert StopRights(holds.shared_secret(context.store, "stop-right"), Clock()).holder(right) == "Ada"
+    assert StopRights(context.store.secret("stop-right"), Clock()).holder(right) == "Ada"
 
 
 def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Service, client: httpx.Client) -> None:

@@ -309,7 +309,7 @@ def test_a_models_version_is_a_controllers_only(
 def test_a_trial_that_plays_ends_with(
     service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    """With the day of its key, its right, or what another service does to the participant."""
+    """With the day of its key, its right, or a change of the participant that no request made."""
     playing(service, client, participant)
     context = service.context
     if how == "its day":
@@ -358,7 +358,7 @@ def test_a_key_that_ends_between_its_intent_and_its_command_plays_nothing(
 def test_a_key_that_is_revoked_before_its_intent_plays_nothing(
     service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It was good at the door; another service revokes it while the plan is looked at."""
+    """It was good at the door; it is revoked while the plan is looked at."""
     key, controller = key_of(service, client, participant)
     context, starts = service.context, service.rig.starts
     look = context.runner._previewed

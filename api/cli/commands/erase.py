@@ -20,7 +20,7 @@ from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import Json, say, say_json
 from stimrig.api.clock import Clock
 from stimrig.api.store import Store, audit, migrations
-from stimrig.api.store.holds import HeldError, ServiceLock
+from stimrig.api.store.service_lock import HeldError, ServiceLock
 from stimrig.api.store.tables import OPEN_STATES, Approval, Participant, Recording, Table, Test, Token
 from stimrig.api.whole_file import to_disk
 

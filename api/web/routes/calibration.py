@@ -17,7 +17,6 @@ from stimrig.api.sessions import profiles
 from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
 from stimrig.api.store import audit, seen
-from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
@@ -175,7 +174,7 @@ async def begin_calibration(
     # the place in the audit trail at which it began ends its id, and so is kept by the rig, which may outlive this
     # service.
     body = body or CalibrationIn.model_validate({})
-    async with context.holds.turn(LIMITS_TURN):
+    async with context.limits_lock:
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
@@ -212,7 +211,7 @@ async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, respons
 
     It is over when `playing` is false again.
     """
-    async with context.holds.turn(LIMITS_TURN):  # of two presses on the same sight one plays
+    async with context.limits_lock:  # of two presses on the same sight one plays
         check_seen(await sound(context, code))
         await context.rig.ask(requests.CalibrateStepRequest(**body.model_dump()))
     return tagged(response, await standing(context, code))
@@ -221,7 +220,7 @@ async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, respons
 @router.post("/mark", **describe_answer(CalibrationOut))
 async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response: Response) -> dict[str, Any]:
     """Mark the last train's width as a threshold; marking again replaces."""
-    async with context.holds.turn(LIMITS_TURN):  # no train comes between looking and marking
+    async with context.limits_lock:  # no train comes between looking and marking
         found = await sound(context, code)
         check_seen(found)
         await context.rig.ask(requests.CalibrateMarkRequest(**body.model_dump()))
@@ -235,7 +234,7 @@ async def finish_calibration(context: Ctx, who: Tester, code: str, body: FinishI
     """Close it: the profile holds until the end of the day; `discard` leaves the old one."""
     # The rig keeps what was found until it is stored here: where that fails, finishing again stores it.
     discard = bool(body and body.discard)
-    async with context.holds.turn(LIMITS_TURN):
+    async with context.limits_lock:
         waits = await _waiting(context, code)
         if waits is None:
             found = await (standing if discard else sound)(context, code)

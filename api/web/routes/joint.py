@@ -15,7 +15,6 @@ from stimrig.api.sessions import profiles
 from stimrig.api.sessions.kinds import no_sensor
 from stimrig.api.sessions.requests import AngleRad, Body
 from stimrig.api.store import audit, seen
-from stimrig.api.store.holds import LIMITS_TURN
 from stimrig.api.store.seen import Seen
 from stimrig.api.store.tables import Model, Participant
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
@@ -111,7 +110,7 @@ async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
             return seen.newest(session, local_day(now))
 
     taken = {"angle_rad": round(body.angle_rad, 4)}
-    async with context.holds.turn(LIMITS_TURN):  # no other pose comes between looking and taking it
+    async with context.limits_lock:  # no other pose comes between looking and taking it
         before = context.rig.status.angle.calibration if context.rig.status else None
         # before the rig is told: of one whose answer is lost nobody knows whether it was taken
         await asyncio.to_thread(write, seen.POSES[0], seen.poses(), **taken)

@@ -23,7 +23,7 @@ from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, Profi
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.seen import Seen
 from stimrig.api.store.tables import Approval, Model, Participant, Test
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester, in_limits_turn
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester, under_limits_lock
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 from stimrig.api.web.responses.rig import TestOut
@@ -63,7 +63,7 @@ def within(session: Session, code: str) -> Participant:
     return require_found(session.get(Participant, code), "participant", code)
 
 
-@in_limits_turn
+@under_limits_lock
 def change_profile(
     context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False
 ) -> tuple[Participant, Seen]:
@@ -200,7 +200,7 @@ def site_in(body: MuscleIn) -> Site:
     return body.side, body.muscle, body.placement
 
 
-@in_limits_turn
+@under_limits_lock
 def change_site(context: Context, code: str, body: MuscleIn, by: str, voids: bool = False) -> Participant:
     """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
@@ -255,7 +255,7 @@ def refuse_busy(context: Context, code: str) -> None:
         raise ApiError(409, "participant-busy", "A calibration of this participant is open", detail)
 
 
-@in_limits_turn
+@under_limits_lock
 def put_archived(context: Context, code: str, archived: bool, by: str) -> Participant:
     """Put a participant into the archive, or take it out; doing it again changes nothing. Raises as `change_site`."""
     if archived:

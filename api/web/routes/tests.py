@@ -17,7 +17,6 @@ from stimrig.api.sessions import controllers
 from stimrig.api.sessions.playing import other_than
 from stimrig.api.sessions.requests import RanByIn, TestIn
 from stimrig.api.store import audit, seen
-from stimrig.api.store.holds import KEY_TURN
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, context_of
 from stimrig.api.web.guards import refuse_outside, same_origin
@@ -42,7 +41,7 @@ def find(context: Context, test_id: str) -> Test:
 @router.post("", status_code=202, **describe_answer(TestOut, 202, "begun; see `Location`"))
 async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
-    row = await controllers.start(context.runner, context.holds.turn(KEY_TURN), context.store, who, body)
+    row = await controllers.start(context.runner, context.keys_lock, context.store, who, body)
     response.headers["Location"] = f"/v1/tests/{row.id}"
     return context.runner.document(row)
 

@@ -1,0 +1,171 @@
+"""The lock of the one service of a data folder and a database: a second start is refused with one clear line.
+
+The data folder, and a SQLite database outside of it, are locked by `flock` on a file: the kernel releases it when the
+process ends. A PostgreSQL database is locked by an advisory lock that a connection of its own holds: the server
+releases it when the connection ends.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import json
+import logging
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO
+
+from sqlalchemy import Connection
+from sqlalchemy.engine import URL, make_url
+from sqlalchemy.exc import ArgumentError, SQLAlchemyError
+
+from stimrig.api import owner_only
+from stimrig.api.clock import Clock
+from stimrig.api.settings import Settings
+from stimrig.api.store.database import open_engine, sqlite_file, why_not_opened
+
+log = logging.getLogger("stimrig.store")
+SERVICE_KEY = 0x5354494D52494702
+"""PostgreSQL's advisory lock of the service: "STIMRIG" and 2."""
+KEEP_S = 5.0
+"""Interval at which the service checks that it still holds the advisory lock."""
+OTHER_DATABASE = "stop it, or take another database: STIMRIG_DATABASE_URL"
+
+
+class HeldError(OSError):
+    """The data folder or the database is locked by another service, or cannot be locked; one line with the fix."""
+
+
+class ServiceLock:
+    """Locks the data folder and the database of the settings.
+
+    Raises HeldError: another service holds one of them, or it cannot be locked.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self._files: list[IO[str]] = []
+        self._database: DatabaseLock | None = None
+        self._since_utc = Clock().utc()
+        try:
+            for place, shown, fix in _lock_places(settings):
+                self._files.append(_take_file(place, shown, fix))
+            if settings.database.startswith("postgresql"):
+                self._database = DatabaseLock(make_url(settings.database))
+        except BaseException:
+            self.release()
+            raise
+        self.tell("an address not known yet")
+
+    def tell(self, address: str) -> None:
+        """Write down who holds it, for whoever comes second."""
+        words = {"pid": os.getpid(), "host": socket.gethostname(), "since_utc": self._since_utc, "address": address}
+        for file in self._files:
+            file.seek(0)
+            file.truncate()
+            file.write(json.dumps(words) + "\n")
+            file.flush()
+
+    def keep(self) -> None:
+        """Take the lock of a PostgreSQL database again after its connection was lost; to be called every `KEEP_S`.
+
+        Where another service has taken it meanwhile, this process is told to end.
+        """
+        if self._database is None:
+            return
+        try:
+            self._database.take()
+        except SQLAlchemyError as error:
+            log.warning("the database does not answer: %s", error)
+        except HeldError as error:
+            log.critical("this service ends: %s", error)
+            os.kill(os.getpid(), signal.SIGTERM)
+
+    def release(self) -> None:
+        """Let go."""
+        while self._files:
+            self._files.pop().close()
+        if self._database is not None:
+            self._database.release()
+
+
+class DatabaseLock:
+    """The advisory lock of a PostgreSQL database. Raises HeldError: another service has it, or no connection."""
+
+    def __init__(self, url: URL) -> None:
+        self._shown = url.render_as_string(hide_password=True)
+        self._connection: Connection | None = None
+        try:
+            self._engine = open_engine(url).execution_options(isolation_level="AUTOCOMMIT")
+            self.take()
+        except (SQLAlchemyError, ImportError) as error:
+            raise HeldError(why_not_opened(error, self._shown)) from error
+
+    def take(self) -> None:
+        """Take it unless this connection has it. Raises HeldError, SQLAlchemyError."""
+        if self._connection is not None:
+            try:
+                self._connection.exec_driver_sql("SELECT 1")
+                return
+            except SQLAlchemyError:
+                self.release()
+        self._connection = self._engine.connect()
+        if not self._connection.exec_driver_sql(f"SELECT pg_try_advisory_lock({SERVICE_KEY})").scalar():
+            self.release()
+            raise HeldError(f"{self._shown}: another service runs on it; {OTHER_DATABASE}")
+
+    def release(self) -> None:
+        """End the connection, which releases the lock."""
+        if self._connection is not None:
+            self._connection.invalidate()
+            self._connection.close()
+            self._connection = None
+
+
+def refuse_if_held(settings: Settings) -> None:
+    """Say at once, before devices are started, that another service holds the place. Raises HeldError."""
+    ServiceLock(settings).release()
+
+
+def _lock_places(settings: Settings) -> Iterator[tuple[Path, Path, str]]:
+    folder = owner_only.folder(settings.data_dir)
+    yield folder / "service.lock", folder, "stop it, or take another folder: --data, STIMRIG_DATA_DIR"
+    try:
+        url = make_url(settings.database)
+    except ArgumentError:
+        return  # the store says what is wrong with it
+    database = sqlite_file(url)
+    if database is None:  # in memory, or PostgreSQL
+        return
+    real = database.resolve()
+    if real.exists() and real.stat().st_nlink > 1:
+        raise HeldError(f"{real}: the file has {real.stat().st_nlink} names (hard links), SQLite needs one; keep one")
+    owner_only.folder(real.parent)
+    yield real.with_name(f"{real.name}.lock"), database, OTHER_DATABASE
+
+
+def _take_file(place: Path, shown: Path, fix: str) -> IO[str]:
+    try:
+        file = os.fdopen(os.open(place, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "r+", encoding="utf-8")
+    except OSError as error:
+        raise HeldError(f"{place}: {error.strerror}; set STIMRIG_DATA_DIR to a folder this user may write") from error
+    owner_only.close(place, 0o600)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        with file:
+            raise HeldError(f"{shown}: another service runs on it: {_holder(file)}; {fix}") from None
+    except OSError as error:
+        file.close()
+        raise HeldError(f"{place}: cannot be locked ({error.strerror}); take a folder on a local disk") from error
+    file.truncate(0)
+    return file
+
+
+def _holder(file: IO[str]) -> str:
+    with contextlib.suppress(ValueError, KeyError, TypeError):
+        said = json.loads(file.read())
+        return f"process {said['pid']} on {said['host']}, since {said['since_utc']}, at {said['address']}"
+    return "it starts just now"

@@ -1,0 +1,138 @@
+"""The service on PostgreSQL: the lock of its database, and tests of other files run again with their data there."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from sqlalchemy import inspect
+
+from stimrig.api.errors import ApiError
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store
+from stimrig.api.store.service_lock import HeldError, ServiceLock
+from tests.api.conftest import STUB, serving, soon, wait_done
+from tests.api.test_idle_lock import test_a_lock_holds_over_a_restart as test_a_lock_holds_over_a_restart
+from tests.api.test_people import clinician as clinician
+from tests.api.test_people import (
+    test_changed_password_and_removal_end_sessions as test_changed_password_and_removal_end_sessions,
+)
+from tests.api.test_people import (
+    test_wrong_revoked_and_expired_tokens_are_refused as test_wrong_revoked_and_expired_tokens_are_refused,
+)
+from tests.api.test_session import test_whole_path_to_the_controller as test_whole_path_to_the_controller
+from tests.api.test_tracked import test_a_restart_goes_on_where_it_was as test_a_restart_goes_on_where_it_was
+from tests.api.test_what_was_seen import (
+    test_a_program_is_held_to_what_it_read as test_a_program_is_held_to_what_it_read,
+)
+from tests.harness.postgres import Cluster, programs, running
+
+pytestmark = [pytest.mark.postgresql, pytest.mark.slow]
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Cluster]:
+    place = programs()
+    if place is None:
+        pytest.skip("PostgreSQL is not installed: as root, apt-get install postgresql")
+    with running(place) as cluster:
+        yield cluster
+
+
+@pytest.fixture(scope="module", autouse=True)
+def data_in_postgresql(cluster: Cluster) -> Iterator[None]:
+    """Each data folder has a database of its own in the cluster."""
+
+    def database(settings: Settings) -> str:
+        return settings.database_url or cluster.database(str(settings.data_dir.absolute()))
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Settings, "database", property(database))
+        yield
+
+
+def lock(cluster: Cluster, folder: Path) -> ServiceLock:
+    return ServiceLock(Settings(data_dir=folder, database_url=cluster.database("locked")))
+
+
+def test_a_second_service_is_refused_until_the_first_has_ended(cluster: Cluster, tmp_path: Path) -> None:
+    first = lock(cluster, tmp_path / "a")
+    with pytest.raises(HeldError, match="another service runs on it; stop it") as caught:
+        lock(cluster, tmp_path / "b")
+    assert "\n" not in str(caught.value)
+    cluster.restart()
+    first.keep()
+    with pytest.raises(HeldError, match="another service runs on it"):
+        lock(cluster, tmp_path / "b")
+    first.release()
+    lock(cluster, tmp_path / "b").release()
+
+
+def test_a_service_whose_lock_another_one_took_ends(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed: list[tuple[int, int]] = []
+    monkeypatch.setattr(os, "kill", lambda *given: killed.append(given))
+    first = lock(cluster, tmp_path / "a")
+    store = Store(cluster.database("locked"))
+    with store.engine.connect() as connection:  # as a network that is cut
+        connection.exec_driver_sql("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory'")
+    second = lock(cluster, tmp_path / "b")
+    first.keep()
+    assert killed == [(os.getpid(), signal.SIGTERM)]
+    second.keep()
+    assert len(killed) == 1
+    for one in (first, second, store):
+        one.close() if isinstance(one, Store) else one.release()
+
+
+def test_no_column_limits_the_length_of_a_text(cluster: Cluster) -> None:
+    """SQLite does not either: what fits into the one fits into the other."""
+    store = Store(cluster.database("columns"))
+    inspected = inspect(store.engine)
+    limited = [
+        (table, column["name"])
+        for table in inspected.get_table_names()
+        for column in inspected.get_columns(table)
+        if getattr(column["type"], "length", None) and table != "alembic_version"
+    ]
+    store.close()
+    assert limited == []
+
+
+def test_a_database_that_is_not_there_or_newer_is_refused_in_one_line(cluster: Cluster) -> None:
+    with pytest.raises(ApiError) as caught:
+        Store("postgresql://ann:secret@127.0.0.1:1/stimrig")
+    line = str(caught.value)
+    assert "127.0.0.1" in line and "secret" not in line and "\n" not in line and "STIMRIG_DATABASE_URL" in line
+    newer = cluster.empty("newer")
+    store = Store(newer)
+    with store.write() as session:
+        session.connection().exec_driver_sql("UPDATE alembic_version SET version_num = '0900'")
+    store.close()
+    with pytest.raises(ApiError, match="it is of version 0900"):
+        Store(newer)
+    with pytest.raises(ApiError, match="neither sqlite nor postgresql"):
+        Store("mysql://ann@127.0.0.1/stimrig")
+
+
+def test_a_stop_is_answered_while_the_database_is_frozen(cluster: Cluster, tmp_path: Path, short_dir: Path) -> None:
+    with serving(tmp_path, short_dir, STUB, speed=2.0) as (service, client):
+        client.post("/v1/participants", json={"code": "P1"})
+        test_id = client.post("/v1/tests", json={"participant": "P1"}).json()["id"]
+        cluster.freeze()
+        try:
+            answer = client.post("/v1/stop", json={"reason": "frozen"})
+            assert answer.status_code == 200, answer.text
+            assert service.rig.status().state != "playing"
+        finally:
+            cluster.thaw()
+        assert wait_done(client, test_id)["state"] in ("stopped", "aborted", "fault")
+        cluster.restart()
+        assert soon(lambda: client.get("/v1/audit").status_code == 200)
+        assert client.get("/v1/audit").json()["whole"]
+        assert soon(lambda: "frozen" in json.dumps(client.get("/v1/audit").json()))
