@@ -43,11 +43,11 @@ class JsonLines(logging.Formatter):
         return json.dumps(line, ensure_ascii=False)
 
 
-def configure(process: str = "service", level: int = logging.INFO) -> None:
+def configure(process: str = "service") -> None:
     """Send every logger's lines to standard error; also warnings, and the error that ends a process or a thread."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLines(process))
-    logging.basicConfig(level=level, handlers=[handler], force=True)
+    logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
     logging.captureWarnings(True)
     sys.excepthook = lambda kind, error, trace: log.critical("ended by an error", exc_info=(kind, error, trace))
     threading.excepthook = lambda told: log.critical("a thread ended by an error", exc_info=told.exc_value)

@@ -6,7 +6,7 @@ import os
 
 INTERRUPTED = 130
 PAGE = frozenset({
-    "alembic", "argon2", "can", "cantools", "cryptography", "fastapi", "fastapi_offline",
+    "alembic", "argon2", "can", "cantools", "fastapi", "fastapi_offline",
     "multipart", "prometheus_client", "pydantic_settings", "serial", "sqlalchemy", "starlette", "uvicorn",
 })  # fmt: skip
 """Modules that the extra `page` brings: identification works without them."""
