@@ -22,8 +22,6 @@ from stimrig.rig.control.memory import LatchFile
 from tests.api.test_schemas import unmet
 from tests.simulator.virtual_time import VirtualMachine
 
-pytestmark = pytest.mark.sqlite
-
 
 class Machine:
     """The data folders of rig and service on an installed machine."""
