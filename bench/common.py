@@ -8,13 +8,11 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
-
-import numpy as np
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "docs" / "results"
@@ -68,11 +66,6 @@ def keep_lines(path: Path | None, rows: Iterable[Any]) -> None:
         path.write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
-def lines_of(path: Path | None) -> list[dict[str, Any]]:
-    """Rows that were kept so; none where there is no file."""
-    return [json.loads(line) for line in path.read_text().splitlines()] if path and path.exists() else []
-
-
 def table(heads: Sequence[str], rows: Iterable[Iterable[object]]) -> list[str]:
     """Lines of a Markdown table."""
     return [line(heads), "|---" * len(heads) + "|", *map(line, rows)]
@@ -81,12 +74,6 @@ def table(heads: Sequence[str], rows: Iterable[Iterable[object]]) -> list[str]:
 def line(cells: Iterable[object]) -> str:
     """One line of it."""
     return f"| {' | '.join(map(str, cells))} |"
-
-
-def spread(values: Iterable[float], scale: float = 1e3) -> dict[str, float]:
-    """Median, 99th percentile and maximum; of seconds in ms."""
-    found = np.asarray([*values]) * scale
-    return {"median": float(np.median(found)), "p99": float(np.percentile(found, 99)), "max": float(np.max(found))}
 
 
 @contextmanager
@@ -100,21 +87,6 @@ def services(*emulator: str) -> Iterator[Any]:
         settings = Settings(data_dir=Path(folder), port=0)  # pyright: ignore[reportCallIssue]
         with Services(settings, list(emulator), TOKEN) as running, Client(running.url, TOKEN, timeout_s=600) as client:
             yield running, client
-
-
-@contextmanager
-def emulated_rig(*emulator: str, busy: int = 0, speed: float = 1.0) -> Iterator[tuple[Any, Any]]:
-    """An emulator with a rig on it, and its client; so many busy processes beside."""
-    from tests.harness.processes import Bench, busy_process
-
-    with TemporaryDirectory(prefix="rig-bench-") as folder, ExitStack() as stack:
-        bench = Bench(Path(folder), *emulator, speed=speed)
-        stack.callback(bench.close)
-        client = bench.start_rig()
-        client.ask("subscribe")
-        for _ in range(busy):
-            stack.enter_context(busy_process())
-        yield bench, client
 
 
 def reveal(seed: int, *more: str) -> dict[str, Any]:
