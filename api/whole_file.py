@@ -12,31 +12,18 @@ from typing import IO
 
 
 @contextlib.contextmanager
-def whole_file(
-    path: Path, aside: Path | None = None, mode: int = 0o666, must_last: bool = False
-) -> Iterator[IO[bytes]]:
-    """Write a file; who reads has the one before, or this one, whole.
-
-    Parameters
-    ----------
-    aside : Path, optional
-        Where it is written, on the same disk; default: a hidden name beside it. What is there is written over.
-    mode : int
-        Of the file, the process's mask aside.
-    must_last : bool
-        Whether to raise OSError where the folder's list of files is not brought to the disk; not every file system
-        does this.
-    """
-    part = aside or path.with_name(f".{path.name}.new")
+def whole_file(path: Path) -> Iterator[IO[bytes]]:
+    """Write a file beside its place and rename it once it is on the disk: a reader has the earlier one or this one."""
+    part = path.with_name(f".{path.name}.new")
     try:
-        with os.fdopen(os.open(part, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, mode), "wb") as file:
+        with part.open("wb") as file:
             yield file
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-    with contextlib.nullcontext() if must_last else contextlib.suppress(OSError):
+    with contextlib.suppress(OSError):  # not every file system brings a folder's list of files to the disk
         to_disk(path.parent)
 
 

@@ -15,8 +15,9 @@ from typing import Any, Protocol
 
 from stimrig.api.cohort.tasks import CohortError
 
-SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat", ".parquet")
-"""What counts as a record in a folder. A file that is named itself is taken whatever its name."""
+SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
+"""What counts as a record in a folder: no Parquet file, which may be results. A file that is named itself is taken
+whatever its name."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ It is read for the options it was made with, its rows, and which rows of many pa
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
@@ -38,8 +38,7 @@ REFUSED = pa.struct([("effect", pa.string()), ("log_evidence_gain", pa.float64()
 INSTANT = pa.timestamp("us", tz="UTC")
 
 TYPES: dict[str, pa.DataType] = {
-    "text": pa.string(), "day": pa.date32(), "number": pa.float64(), "integer": pa.int64(), "bytes": pa.int64(),
-    "true or false": pa.bool_(), "time": INSTANT,
+    "text": pa.string(), "day": pa.date32(), "number": pa.float64(), "bytes": pa.int64(),
 }  # fmt: skip
 
 
@@ -92,14 +91,10 @@ COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
 MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
 
 
-def schema_of(columns: Iterable[tuple[str, pa.DataType, str, str]]) -> pa.Schema:
-    """An Arrow schema; unit and meaning stand in each field's metadata."""
-    return pa.schema([
-        pa.field(name, kind, metadata={"unit": unit, "description": says}) for name, kind, unit, says in columns
-    ])  # fmt: skip
-
-
-SCHEMA = schema_of(COLUMNS)
+SCHEMA = pa.schema([
+    pa.field(name, kind, metadata={"unit": unit, "description": says}) for name, kind, unit, says in COLUMNS
+])  # fmt: skip
+"""Unit and meaning of a column stand in its field's metadata."""
 ROWS_A_GROUP = 5000
 ROWS_AT_ONCE = 1000
 """Rows held in memory while tables are read."""
@@ -107,10 +102,10 @@ KEYS = ("sha256", "address", "stamp", "bytes", "status", "error_kind")
 """Columns that tell which record a row is of."""
 
 
-def table_of(rows: Sequence[dict[str, Any]], schema: pa.Schema = SCHEMA) -> pa.Table:
-    """Rows as a table; keys that are no column are dropped."""
-    arrays = [_array([_cell(row.get(field.name), field.type) for row in rows], field.type) for field in schema]
-    return pa.Table.from_arrays(arrays, schema=schema)
+def table_of(rows: Sequence[dict[str, Any]]) -> pa.Table:
+    """Make a table of rows; keys that are no column are dropped."""
+    arrays = [_array([_cell(row.get(field.name), field.type) for row in rows], field.type) for field in SCHEMA]
+    return pa.Table.from_arrays(arrays, schema=SCHEMA)
 
 
 def _array(values: list[Any], kind: pa.DataType) -> pa.Array:

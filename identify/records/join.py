@@ -26,8 +26,8 @@ LONGEST_TEXT = 300
 FIX = "Join the recordings again."
 
 
-def write_joined(record: Record, path: Path, comment: str = "") -> None:
-    """Write a record with its parts as CSV (docs/recording.md); `comment` is a line before the header.
+def write_joined(record: Record, path: Path) -> None:
+    """Write a record with its parts as CSV (docs/recording.md).
 
     Raises BadRecord: the file would be larger than what can be read.
     """
@@ -41,7 +41,7 @@ def write_joined(record: Record, path: Path, comment: str = "") -> None:
     described = {part.first: "," + cells for part, cells in zip(record.parts, _descriptions(record), strict=True)}
     size = 0
     with path.open("w", encoding="utf-8", newline="") as file:
-        file.write((f"# {comment}\n" if comment else "") + ",".join(header) + "\n")
+        file.write(",".join(header) + "\n")
         for index, row in enumerate(zip(*columns, strict=True)):
             size += file.write(",".join(row) + described.get(index, empty) + "\n")
             if size > bounds.LARGEST_FILE_BYTES:

@@ -286,9 +286,7 @@ def run_lines(found: dict[str, Any]) -> list[str]:
     ]
     lines += passed_over(found, "counted")
     if not found["records"] + found["left_out"]:
-        lines.append(
-            "Nothing was found. A folder is searched for .h5, .hdf5, .csv, .tsv, .txt, .mat and .parquet files."
-        )
+        lines.append("Nothing was found. A folder is searched for .h5, .hdf5, .csv, .tsv, .txt and .mat files.")
     return [*lines, f"written to     {found['output']}"]
 
 
