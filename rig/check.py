@@ -16,7 +16,7 @@ import os
 import signal
 import sys
 import tempfile
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable
 from concurrent.futures import wait
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -41,7 +41,6 @@ CURRENT_MA, WIDTH_US, RATE_HZ = 16.0, 100.0, 40.0
 calibration."""
 MOST_TORQUE_NM = 2.0
 """Above rest, at which the test pulse's test is stopped: nothing pulls where only a dummy load is connected."""
-EMULATED_TORQUE_NM = 30.0
 LISTEN_S, REST_S, AFTER_PULSE_S = 3.0, 0.4, 1.5
 MOST_LOST, MOST_RATE_OFF = 0.002, 0.02
 EMULATED_SLACK = 10
@@ -52,8 +51,7 @@ CLOSED_WITHIN_S = 45.0
 """Real seconds for the stop, its evidence and the sealing of a test that was interrupted."""
 INTERRUPTED = 130
 ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-POLL_S = 0.1
-"""A signal that another thread of this process has taken is noticed after so long."""
+POLL_S = 0.1  # a signal that another thread has taken is noticed after so long
 TTY, NET = Path("/sys/class/tty"), Path("/sys/class/net")
 
 Ask = Callable[[str], bool]
@@ -103,7 +101,7 @@ FAULTS = {
     "angle_silent": ("the angle sensor gives no angle", "check its plug, its supply and angle_sensor.bus"),
     "angle_sign": ("the angle falls when the joint is bent", "change the sign of angle_sensor.direction"),
     "angle_unmoved": ("the angle does not follow the joint", "fasten the sensor's shaft"),
-    "refused": ("the rig refuses it", "the message says what to change"),
+    "refused": ("the rig refused or ended the test of the pulse", "the message says what to look at"),
     "stop": ("the stimulator does not obey the stop", "connect nobody, and change its cable; else it needs its maker"),
     "open_circuit": ("the circuit is open: no load, a broken cable, or the emergency stop is pressed",
                      "put the load on both cables of this output, try another cable, release the emergency stop"),
@@ -111,7 +109,6 @@ FAULTS = {
     "torque_follows": ("torque follows the pulse: somebody is connected instead of the dummy load",
                        "take every electrode off the person, and put the dummy load on"),
     "sync": ("the sync line does not rise with the pulse", 'wire it to the cell, or write sync = "" in the rig file'),
-    "ended": ("the rig ended the test of the pulse", "the reason says what to look at"),
 }  # fmt: skip
 """What may be wrong, with its remedy."""
 ENDINGS = {
@@ -124,12 +121,11 @@ ENDINGS = {
 class RigCheck:
     """The steps of a check on one rig.
 
-    `ask`: asks the person, in a thread of its own; `folder`: of the pulse's journal, never the rig's own data folder;
-    `emulated`: whether the devices are emulated, with a muscle that may pull.
+    `ask`: asks the person, in a thread of its own; `folder`: of the pulse's journal, never the rig's own data folder.
     """
 
     def __init__(self, config: RigConfig, machine: Machine, ask: Ask, folder: Path, emulated: bool) -> None:
-        self.config, self.machine, self.ask, self.emulated = config, machine, ask, emulated
+        self.config, self.machine, self.ask = config, machine, ask
         self.tasks = machine.tasks
         limits = config.limits.model_copy(update={"rest_between_tests_s": None})  # a resistor does not tire
         own = {"data_dir": folder, "require_calibration": False, "limits": limits}
@@ -278,7 +274,7 @@ class RigCheck:
         edges, reason = int(np.sum((sync[1:] == 1) & (sync[:-1] != 1))), rig.finished.reason
         figure = f"{channel or 'one pulse'}: {reason or f'{edges} edges of the sync line'}"
         if rig.finished.outcome != "completed":
-            raise Fault(next((fault for words, fault in ENDINGS.items() if words in reason), "ended"), figure)
+            raise Fault(next((fault for words, fault in ENDINGS.items() if words in reason), "refused"), figure)
         if [one.status for one in pulses] != [PulseStatus.ACKNOWLEDGED]:
             raise Fault("unanswered", f"{figure}; {', '.join(one.status.name for one in pulses)}")
         if self.config.load_cell.model_dump().get("sync") and edges != 1:
@@ -288,11 +284,9 @@ class RigCheck:
     def plan(self, channel: str) -> TestPlan:
         """One pulse between two rests."""
         table, rate_hz = self.rig.table, min(RATE_HZ, self.rig.table["pulse_rate_hz"].hi)
-        width_us = min(WIDTH_US, table["pulse_width_us"].hi)
-        most_nm = EMULATED_TORQUE_NM if self.emulated else MOST_TORQUE_NM + abs(self.rest_nm)
-        profile = Profile(
-            current_ma=min(CURRENT_MA, table["current_ma"].hi), max_pulse_width_us=width_us, max_torque_nm=most_nm
-        )  # fmt: skip
+        width_us, current_ma = min(WIDTH_US, table["pulse_width_us"].hi), min(CURRENT_MA, table["current_ma"].hi)
+        most_nm = MOST_TORQUE_NM + abs(self.rest_nm)
+        profile = Profile(current_ma=current_ma, max_pulse_width_us=width_us, max_torque_nm=most_nm)
         on = {"max_pulse_width_us": width_us, "on_s": 1 / rate_hz, "off_s": 0.0, "repeats": 1}
         segments = [
             SegmentPlan(name="rest", sequence="rest", settings={"duration_s": REST_S}),
@@ -410,22 +404,16 @@ def check(config: RigConfig, ask: Ask, emulated: bool) -> dict[str, Any]:
             machine.driver.end()
 
 
-@contextlib.contextmanager
-def exclusive(folder: Path) -> Iterator[None]:
+def exclusive(folder: Path) -> contextlib.AbstractContextManager[object]:
     """Lock the data folder as a rig does. Raises BusyError: a rig uses it; ConfigError: it is another user's."""
     if not folder.exists():  # no rig has used it yet
-        yield
-        return
+        return contextlib.nullcontext()
     if os.geteuid() == 0 and folder.stat().st_uid != 0:
-        raise ConfigError(
-            f"data_dir {folder}: it is another user's; check as that user (sudo -u USER stimrig rig check)"
-        )
+        raise ConfigError(f"data_dir {folder}: another user's; check as that user (sudo -u USER stimrig rig check)")
     try:
-        lock = Files().lock(folder)
+        return Files().lock(folder)
     except OSError as error:
         raise ConfigError(f"data_dir {folder}: {error.strerror}; check as the user of the rig") from None
-    with lock:
-        yield
 
 
 def ask_at_terminal(question: str) -> bool:
@@ -435,9 +423,8 @@ def ask_at_terminal(question: str) -> bool:
 
 
 def print_step(step: Step) -> None:
-    mark = {"passed": "ok", "failed": "FAULT", "not done": "--"}[step.outcome]
     bound = f"  (must be: {step.bound})" if step.bound else ""
-    print(f"{mark:6} {step.name}: {step.figure}{bound}", file=sys.stderr, flush=True)
+    print(f"{step.outcome:8} {step.name}: {step.figure}{bound}", file=sys.stderr, flush=True)
 
 
 def _end(*_: object) -> None:

@@ -239,7 +239,7 @@ def test_a_missing_port_is_told_with_its_remedy(tmp_path: Path, capfd: pytest.Ca
     asked = ["rig", "check", "--rig", str(rig_file(tmp_path)), "--no-questions"]
     assert stimrig.run(asked) == 1
     out, err = capfd.readouterr()
-    assert out.startswith("faults\n") and FAULTS["port_missing"][1] in out and "FAULT" in err
+    assert out.startswith("faults\n") and FAULTS["port_missing"][1] in out and "failed" in err
     assert stimrig.run([*asked, "--json"]) == 1
     report = json.loads(capfd.readouterr().out)
     assert unmet("rig", report) == [] and report["verdict"] == "faults"

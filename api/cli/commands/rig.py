@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 
 from stimrig.api.cli.child import die_with_parent
-from stimrig.api.cli.errors import INTERRUPTED, InputError, LaunchError
+from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import Json, say, say_json
 
 
@@ -48,10 +48,8 @@ def check(
         )  # fmt: skip
     finally:
         signal.signal(signal.SIGINT, before)
-    if ended.returncode in (2, INTERRUPTED):
-        raise typer.Exit(ended.returncode)  # it has said why
-    if not ended.stdout:
-        raise LaunchError("check: it ended without a result", 1)
+    if not ended.stdout:  # it has said why
+        raise typer.Exit(max(ended.returncode, 1))
     found = json.loads(ended.stdout)
     say_json(found) if as_json else say(*summary(found))
     raise typer.Exit(ended.returncode)
