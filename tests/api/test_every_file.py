@@ -18,6 +18,8 @@ from stimrig.identify.errors import BadRecord
 from tests.frozen.rig_records import KINDS, of_kind
 from tests.harness import few_effects
 
+pytestmark = pytest.mark.slow
+
 TOO_LITTLE = {
     "calibration": "a handful of pulses of one width",
     "passive": "no pulse at all",

@@ -15,6 +15,8 @@ from stimrig.identify.records.record import Record
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
+pytestmark = pytest.mark.slow
+
 SD_NM = 0.08
 Change = Callable[[np.ndarray, np.random.Generator], np.ndarray]
 
