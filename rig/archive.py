@@ -61,22 +61,13 @@ ANGLE_COLUMNS: tuple[tuple[str, str, str], ...] = (
 )
 """The same, after the others, of a rig with an angle sensor: all of them, or none."""
 
-CHANNEL_COLUMN = (
-    "pulses/channel",
-    "1",
-    "place of the pulse's channel in the attribute `channels`; the pulses of a test of several stand in the order in "
-    "which they were due",
-)
-"""After the others, before those of the angle, of a recording of version 2."""
-
 MOST_BYTES = 10**9
 """Of a recording's values; three hours at 1600 Hz have as many. A damaged file that declares more is not read."""
 
 
 def layout(columns: Collection[str]) -> tuple[tuple[str, str, str], ...]:
     """The datasets of a recording that has these paths."""
-    found = (*COLUMNS, CHANNEL_COLUMN) if CHANNEL_COLUMN[0] in columns else COLUMNS
-    return found + ANGLE_COLUMNS if any(path.startswith("angle/") for path in columns) else found
+    return COLUMNS + ANGLE_COLUMNS if any(path.startswith("angle/") for path in columns) else COLUMNS
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +159,7 @@ def verify(path: Path, file: io.BytesIO | None = None) -> str:
     """
     try:
         with h5py.File(file or path, "r") as opened:
-            found = layout([path for path in ("angle/", CHANNEL_COLUMN[0]) if path.rstrip("/") in opened])
+            found = layout(["angle/"] if "angle" in opened else [])
             datasets = {p: _numbers(opened[p]) for p, _, _ in found}
             if sum(dataset.nbytes for dataset in datasets.values()) > MOST_BYTES:
                 raise ValueError(f"it has more than {MOST_BYTES:.0e} bytes of values; no test is so long")

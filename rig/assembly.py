@@ -21,14 +21,12 @@ from stimrig.rig import align, align_angle, journal
 from stimrig.rig.align_angle import Reference
 from stimrig.rig.clock import utc_text
 from stimrig.rig.errors import RecordingError
-from stimrig.rig.journal import Intent, JournalContents, Kind, LaidBlock
+from stimrig.rig.journal import JournalContents, Kind, LaidBlock
 from stimrig.rig.messages import Labels
 from stimrig.rig.signals import SAMPLE, PulseStatus, Segment
-from stimrig.rig.train import Train, train_of
 
 FORMAT = "stimrig-recording"
-FORMAT_VERSION, OF_CHANNELS = 1, 2
-"""The second where the test names its channels."""
+FORMAT_VERSION = 1
 EVIDENCE = (Kind.START, Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED, Kind.TORQUE, Kind.ANGLE)
 """Blocks that show that the test had begun."""
 LIKELY_RATE_HZ = 40.0
@@ -73,32 +71,25 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     header = contents.first_json(Kind.HEADER) or _header_of_blocks(contents, notes)
     planned, segments = planned_pulses(contents, header, notes)
     rate_hz = float(header["plan"]["pulse_rate_hz"])
-    channels = header["plan"].get("channels")
-    train = train_of_plan(header["plan"])
-    begun, t0_s, unix_s = _start(contents, header, train)
+    begun, t0_s, unix_s = _start(contents, header, rate_hz)
     end = contents.first_json(Kind.END) or {"outcome": outcome, "reason": reason, "time_s": _last_time(contents)}
     end_s = float(end["time_s"]) - t0_s
     played_s = min(end_s, float(end.get("stimulation_end_s", end["time_s"])) - t0_s) if begun else 0.0
-    planned = np.concatenate([planned, np.zeros(train.whole(len(planned)) - len(planned))])
-    current_ma = [one["profile"]["current_ma"] for one in channels] if channels else [float(header["current_ma"])]
-    pulses = _Pulses(planned, np.resize(current_ma, len(planned)), t0_s)
+    pulses = _Pulses(planned, float(header["current_ma"]), t0_s)
     pulses.take(contents)
-    columns = pulses.columns(train, played_s, contents.blocks_missing > 0, notes)
-    if channels:
-        columns["pulses/channel"] = train.channel(np.arange(len(columns["pulses/status"]))).astype(np.uint8)
+    columns = pulses.columns(rate_hz, played_s, contents.blocks_missing > 0, notes)
     written_s = columns["pulses/written_time_s"]
     pulse_times = np.sort(written_s[np.isfinite(written_s)])
     reference, alignment, measured_hz = _aligned(contents, t0_s, pulse_times, float(header["sample_rate_hz"]))
     columns.update(_torque(reference, end_s))
     of_angle, angle = align_angle.read_angles(contents, header, reference, end_s)
     columns.update(of_angle)
-    segments = [s for s in segments if train.length_s(s.start) < played_s]
-    columns["segments/start_s"] = np.array([train.length_s(s.start) for s in segments])
-    columns["segments/end_s"] = np.minimum([train.length_s(s.end) for s in segments], max(played_s, 0.0))
+    segments = [s for s in segments if s.start / rate_hz < played_s]
+    columns["segments/start_s"] = np.array([s.start / rate_hz for s in segments])
+    columns["segments/end_s"] = np.minimum([s.end / rate_hz for s in segments], max(played_s, 0.0))
     attributes = {
         "format": FORMAT,
-        "format_version": OF_CHANNELS if channels else FORMAT_VERSION,
-        **({"channels": json.dumps(_described(header, train))} if channels else {}),
+        "format_version": FORMAT_VERSION,
         "recording_id": header["recording_id"],
         "test_id": header["plan"]["test_id"],
         **Labels.model_validate(header["plan"]).model_dump(exclude_none=True),
@@ -122,22 +113,6 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     return Recording(columns, [s.name for s in segments], attributes, alignment, events, angle)
 
 
-def train_of_plan(plan: dict[str, Any]) -> Train:
-    """The train of a plan as a header has it."""
-    channels = plan.get("channels") or [{"offset_s": 0.0}]
-    return train_of(float(plan["pulse_rate_hz"]), [one.get("offset_s") for one in channels])
-
-
-def _described(header: dict[str, Any], train: Train) -> list[dict[str, Any]]:
-    """What a recording says of each channel."""
-    known = {one["name"]: one for one in header.get("channels", [])}
-    blank = {"muscle": "", "side": "", "electrode": ""}
-    return [
-        {**blank, **known.get(one["name"], {}), "name": one["name"], "offset_s": offset_s}
-        for one, offset_s in zip(header["plan"]["channels"], train.offsets_s, strict=True)
-    ]
-
-
 def _refuse_empty(contents: JournalContents) -> None:
     """Raise RecordingError if neither header and plan nor any block shows that something was played."""
     kinds = {kind for kind, _ in contents.blocks}
@@ -157,10 +132,8 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
     torque = [np.frombuffer(p, SAMPLE) for k, p in contents.blocks if k == Kind.TORQUE and len(p)]
     first_s = [float(samples["host_time_s"][0]) for samples in torque[:1]]
     rate_hz = LIKELY_RATE_HZ
-    of_one = [i for i in intents if i.channel == intents[0].channel]
-    if len(of_one) > 1 and of_one[-1].slot > of_one[0].slot:
-        pulses = (of_one[-1].slot - of_one[0].slot) / of_one[0].channels
-        rate_hz = round(pulses / (of_one[-1].due_s - of_one[0].due_s), 6)
+    if len(intents) > 1 and intents[-1][0] > intents[0][0]:
+        rate_hz = round((intents[-1][0] - intents[0][0]) / (intents[-1][2] - intents[0][2]), 6)
     else:
         notes.append(f"the pulse rate is unknown, {rate_hz:g} pulses/s were assumed")
     notes.append(
@@ -174,7 +147,6 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
             "participant": "unknown",
             "kind": "recovered",
             "pulse_rate_hz": rate_hz,
-            **_channels_of(contents, intents, rate_hz),
         },
         "segments": [],
         "current_ma": max((intent[4] for intent in intents), default=0.0),
@@ -186,28 +158,7 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
     }
 
 
-def _channels_of(contents: JournalContents, intents: list[Intent], rate_hz: float) -> dict[str, Any]:
-    """The channels of a plan, inferred from the intents; nothing where the test named none."""
-    named = any(kind == Kind.INTENT and len(payload) == journal.INTENT_OF.size for kind, payload in contents.blocks)
-    if not named:
-        return {}
-    found, of_first_s = list[dict[str, Any]](), None
-    for place in range(intents[0].channels):
-        own = [intent for intent in intents if intent.channel == place]
-        started_s = [intent.due_s - intent.slot // intent.channels / rate_hz for intent in own]
-        offset_s = float(np.median(started_s)) if own else None
-        of_first_s = offset_s if place == 0 else of_first_s
-        found.append(
-            {
-                "name": f"output-{own[0].output + 1}" if own else f"unknown-{place + 1}",
-                "profile": {"current_ma": max((intent.current_ma for intent in own), default=0.0)},
-                "offset_s": None if offset_s is None or of_first_s is None else round(offset_s - of_first_s, 6),
-            }
-        )
-    return {"channels": found}
-
-
-def _start(contents: JournalContents, header: dict[str, Any], train: Train) -> tuple[bool, float, float]:
+def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) -> tuple[bool, float, float]:
     """Whether the test began; start of the test's clock on the rig's clock, s; the same time as UTC."""
     started = contents.first_json(Kind.START)
     if started is not None:
@@ -215,7 +166,7 @@ def _start(contents: JournalContents, header: dict[str, Any], train: Train) -> t
     intents = read_intents(contents)
     t0_s = float(header["time_s"])
     if intents:
-        t0_s = float(np.median([intent.due_s - train.due_s(intent.slot) for intent in intents]))
+        t0_s = float(np.median([due_s - index / rate_hz for index, _, due_s, _, _ in intents]))
     return bool(intents), t0_s, float(header["unix_s"]) + t0_s - float(header["time_s"])
 
 
@@ -234,9 +185,9 @@ def _last_time(contents: JournalContents) -> float:
 
 
 class _Pulses:
-    """What became of each planned pulse; of each slot, where there are several channels."""
+    """What became of each planned pulse."""
 
-    def __init__(self, planned: NDArray[Any], current_ma: NDArray[np.float64], t0_s: float) -> None:
+    def __init__(self, planned: NDArray[Any], current_ma: float, t0_s: float) -> None:
         n = len(planned)
         self._planned, self._current_ma, self._t0_s = planned, current_ma, t0_s
         self._sent_us, self._current = np.full(n, np.nan), np.zeros(n)
@@ -253,8 +204,7 @@ class _Pulses:
                 continue
             self._mentioned[i] = True
             if kind == Kind.INTENT:
-                intent = Intent.from_bytes(payload)
-                self._sent_us[i], self._current[i] = intent.pulse_width_us, intent.current_ma
+                _, _, _, self._sent_us[i], self._current[i] = journal.INTENT.unpack(payload)
                 self._intended[i], self._status[i] = True, PulseStatus.UNACKNOWLEDGED
             elif kind == Kind.WRITTEN:
                 self._written_s[i] = journal.WRITTEN.unpack(payload)[2] - self._t0_s
@@ -265,9 +215,11 @@ class _Pulses:
                 failed = len(payload) > journal.ACKED.size
                 self._status[i] = PulseStatus.DEVICE_ERROR if failed else PulseStatus.ACKNOWLEDGED
 
-    def columns(self, train: Train, played_s: float, blocks_missing: bool, notes: list[str]) -> dict[str, NDArray[Any]]:
-        due_s = train.due_times_s(len(self._planned))
-        reached = int(np.searchsorted(due_s, played_s - 1e-6 / train.slots_per_s))
+    def columns(
+        self, rate_hz: float, played_s: float, blocks_missing: bool, notes: list[str]
+    ) -> dict[str, NDArray[Any]]:
+        n = len(self._planned)
+        reached = int(np.clip(np.ceil(played_s * rate_hz - 1e-6), 0, n))
         self._without_intent(notes)
         if blocks_missing:
             self._without_trace(reached, notes)
@@ -277,7 +229,7 @@ class _Pulses:
         acked_s = np.where(np.isfinite(self._written_s), self._acked_s, np.nan)
         self._sent_us[self._status == PulseStatus.REST] = 0.0
         found: dict[str, NDArray[Any]] = {
-            "pulses/planned_time_s": due_s,
+            "pulses/planned_time_s": np.arange(n) / rate_hz,
             "pulses/pulse_width_us": self._planned.astype(np.float64),
             "pulses/sent_pulse_width_us": self._sent_us,
             "pulses/current_ma": self._current,
@@ -318,7 +270,7 @@ class _Pulses:
     def _as_planned(self, which: NDArray[np.bool_]) -> None:
         known = which & (self._planned > 0)
         self._sent_us[known] = np.floor(self._planned[known])
-        self._current[known] = self._current_ma[known]
+        self._current[known] = self._current_ma
 
 
 def _aligned(
@@ -352,10 +304,12 @@ def _torque(of: Reference, end_s: float) -> dict[str, NDArray[Any]]:
 
 
 Floats = NDArray[np.float64]
+Intent = tuple[int, float, float, float, float]
 
 
 def read_intents(contents: JournalContents) -> list[Intent]:
-    return [Intent.from_bytes(payload) for kind, payload in contents.blocks if kind == Kind.INTENT]
+    """Index, time, due time, width and current of each pulse that was to be sent."""
+    return [journal.INTENT.unpack(payload) for kind, payload in contents.blocks if kind == Kind.INTENT]
 
 
 def laid_blocks(contents: JournalContents) -> list[LaidBlock]:
@@ -415,6 +369,6 @@ def _sent(contents: JournalContents) -> Floats:
     asked = read_intents(contents)
     known += [intent[0] for intent in asked]
     widths_us = np.zeros(max(known, default=-1) + 1)
-    for intent in asked:
-        widths_us[intent.slot] = intent.pulse_width_us
+    for index, _, _, width_us, _ in asked:
+        widths_us[index] = width_us
     return widths_us

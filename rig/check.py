@@ -33,7 +33,7 @@ from stimrig.rig.control.memory import LatchFile
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import ConfigError, RigError
 from stimrig.rig.machine import Machine
-from stimrig.rig.messages import ChannelPlan, Profile, SegmentPlan, TestPlan
+from stimrig.rig.messages import Profile, SegmentPlan, TestPlan
 from stimrig.rig.signals import SAMPLE, PulseStatus
 
 CURRENT_MA, WIDTH_US, RATE_HZ = 16.0, 100.0, 40.0
@@ -252,19 +252,14 @@ class RigCheck:
     # -- one pulse, through the rig's own gate and limits
 
     async def check_pulse(self) -> Step:
-        figures = [await self.send_pulse(name) for name in [one.name for one in self.config.channels()] or [""]]
-        return passed("; ".join(figures), "acknowledged, without an error")
-
-    async def send_pulse(self, channel: str) -> str:
-        """Send one pulse on a channel and return what became of it. Raises Fault, NotDone, RigError."""
-        of = f"of the channel {channel} " if channel else ""
+        """Send one pulse and tell what became of it."""
         await self.confirm(
-            f"Connect nobody to the stimulator, and put a resistor of 500 Ω to 1 kΩ (2 W) on the cables {of}alone. One "
+            "Connect nobody to the stimulator, and put a resistor of 500 Ω to 1 kΩ (2 W) on the cables alone. One "
             "pulse follows. Is nobody connected, and the resistor in place?"
         )
         rig, receiver = self.rig, self.receiver
         receiver.live.clear()
-        await rig.start(self.plan(channel))
+        await rig.start(self.plan())
         gate, playing = rig.pair.gate, rig.player.playing
         if playing is not None:
             await self.tasks.wait(math.inf, playing.done)
@@ -272,16 +267,17 @@ class RigCheck:
         pulses = [one for one in gate.done if one.status != PulseStatus.REST]
         sync = np.concatenate([np.empty(0, "u1"), *(block["sync"] for block in receiver.live)])
         edges, reason = int(np.sum((sync[1:] == 1) & (sync[:-1] != 1))), rig.finished.reason
-        figure = f"{channel or 'one pulse'}: {reason or f'{edges} edges of the sync line'}"
+        figure = f"one pulse: {reason or f'{edges} edges of the sync line'}"
         if rig.finished.outcome != "completed":
             raise Fault(next((fault for words, fault in ENDINGS.items() if words in reason), "refused"), figure)
         if [one.status for one in pulses] != [PulseStatus.ACKNOWLEDGED]:
             raise Fault("unanswered", f"{figure}; {', '.join(one.status.name for one in pulses)}")
         if self.config.load_cell.model_dump().get("sync") and edges != 1:
             raise Fault("sync", figure, "1 edge")
-        return f"{figure}, acknowledged after {1e3 * (pulses[0].acknowledged_s - pulses[0].written_s):.1f} ms"
+        after_ms = 1e3 * (pulses[0].acknowledged_s - pulses[0].written_s)
+        return passed(f"{figure}, acknowledged after {after_ms:.1f} ms", "acknowledged, without an error")
 
-    def plan(self, channel: str) -> TestPlan:
+    def plan(self) -> TestPlan:
         """One pulse between two rests."""
         table, rate_hz = self.rig.table, min(RATE_HZ, self.rig.table["pulse_rate_hz"].hi)
         width_us, current_ma = min(WIDTH_US, table["pulse_width_us"].hi), min(CURRENT_MA, table["current_ma"].hi)
@@ -293,10 +289,9 @@ class RigCheck:
             SegmentPlan(name="pulse", sequence="steps", settings=on),
             SegmentPlan(name="rest", sequence="rest", settings={"duration_s": AFTER_PULSE_S}),
         ]
-        channels = [ChannelPlan(name=channel, profile=profile)] if channel else None
         return TestPlan(
-            test_id=f"check-{channel or 'pulse'}", participant="rig-check", kind="rig-check", profile=profile,
-            segments=segments, pulse_rate_hz=rate_hz, channels=channels,
+            test_id="check-pulse", participant="rig-check", kind="rig-check", profile=profile,
+            segments=segments, pulse_rate_hz=rate_hz,
         )  # fmt: skip
 
 

@@ -16,7 +16,6 @@ from pydantic import BaseModel, ConfigDict, Field, StrictBool, ValidationError
 
 from stimrig.rig import devices, limits
 from stimrig.rig.acquire.health import DEFAULT_WATCH, Watch
-from stimrig.rig.channels import RigChannel
 from stimrig.rig.devices import DeviceSettings, Kind
 from stimrig.rig.errors import ConfigError, RefusedError
 from stimrig.rig.limits import Limit
@@ -85,28 +84,7 @@ class RigConfig(_Table):
     def devices(self) -> dict[Kind, DeviceSettings]:
         """The settings of each device that this rig has, in the order in which they are opened."""
         found: dict[Kind, DeviceSettings] = {"stimulator": self.stimulator, "load_cell": self.load_cell}
-        if self.angle_sensor is not None:
-            found["angle_sensor"] = self.angle_sensor
-        return found
-
-    def channels(self) -> tuple[RigChannel, ...]:
-        """The channels that have names; none where the rig has one without."""
-        return tuple(
-            RigChannel(
-                **{name: one[name] for name in ("name", "muscle", "side", "electrode")},
-                limits={name: value for name, value in one["limits"].items() if value is not None},
-            )
-            for one in self.stimulator.model_dump().get("channels", [])
-        )
-
-    def table(self) -> dict[str, Limit]:
-        """The hard limits, narrowed by the rig file. Raises RefusedError."""
-        table, channels = self.limits.table(), self.channels()
-        if channels:
-            table = {**table, **limits.SUM_LIMITS}
-        for channel in channels:
-            limits.narrowed(table, channel.limits, f"{channel.name}")
-        return table
+        return found if self.angle_sensor is None else {**found, "angle_sensor": self.angle_sensor}
 
 
 EMULATOR_ONLY = "clock_speed"
@@ -179,7 +157,7 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         "clock_speed": line.get("speed", 1.0),
         "require_calibration": False,  # no person is connected to an emulator
         "watch": line.get("watch", EMULATOR_WATCH),
-        "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator, **_emulated_channels(line)},
+        "stimulator": {"device": line.get("stimulator_device", "p24"), "port": stimulator},
         "load_cell": {
             "device": "can_load_cell",
             "bus": can,
@@ -190,22 +168,6 @@ def for_emulator(ready: str, **overrides: Any) -> RigConfig:
         "angle_sensor": sensor,
     }
     return check(content, "--emulator-json", **overrides)
-
-
-EMULATED = ("biceps", "m. biceps brachii"), ("triceps", "m. triceps brachii")
-
-
-def _emulated_channels(line: dict[str, Any]) -> dict[str, Any]:
-    """The rig-file settings of an emulator's outputs, where it has several."""
-    of_p24 = line.get("stimulator_device", "p24") == "p24"
-    channels = []
-    for place, (connector, channel) in enumerate(line.get("outputs", [])):
-        name, muscle = EMULATED[place] if place < len(EMULATED) else (f"muscle-{place + 1}", f"muscle {place + 1}")
-        plug = (
-            {"channel": channel + 1, "connector": connector + 1} if of_p24 else {"channel": 4 * connector + channel + 1}
-        )
-        channels.append({"name": name, "muscle": muscle, "side": "right", "electrode": "emulated", **plug})
-    return {"channels": channels} if channels else {}
 
 
 def _emulated_sensor(line: dict[str, Any]) -> dict[str, Any]:
@@ -244,7 +206,7 @@ def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
         content["angle_sensor"] = _device("angle_sensor", content["angle_sensor"], place).beside(content["load_cell"])
     try:
         config = RigConfig.model_validate(content)
-        config.table()
+        config.limits.table()
     except ValidationError as error:
         raise ConfigError(f"{place}: {_first(error, RigConfig)}") from None
     except RefusedError as error:
@@ -270,8 +232,6 @@ def _first(error: ValidationError, model: type[BaseModel]) -> str:
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         return f"{key}: unknown key (known here: {', '.join(model.model_fields)})"
-    if first["type"] == "value_error":
-        return first["msg"].removeprefix("Value error, ")
     if first["type"] == "missing":
         return f"{key}: missing; see docs/rig-file.md"
     return f"{key}: {first['msg']}, not {first['input']!r}"

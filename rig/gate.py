@@ -1,11 +1,9 @@
 """The only way to a stimulator: open only during a test, limits first, intent on disk before the command.
 
-At most one pulse, whatever its channel, is unacknowledged at any time. Each pulse that comes due before the
-acknowledgement (ack) is dropped, and the drop is recorded. So a stalled line can hold one pulse, never several. The
-moment at which that pulse is felt is unknown until its ack is read. Intervals, rates and charge per second are
-therefore counted from the ack, so that they hold at the electrode.
-
-Each channel has limits of its own; what holds for all together is checked beside them.
+At most one pulse is unacknowledged at any time. Each pulse that comes due before the acknowledgement (ack) is dropped,
+and the drop is recorded. So a stalled line can hold one pulse, never several. The moment at which that pulse is felt is
+unknown until its ack is read. Intervals, rates and charge per second are therefore counted from the ack, so that they
+hold at the electrode.
 
 After `shut` has returned, no pulse is written to the line.
 """
@@ -15,16 +13,15 @@ from __future__ import annotations
 import contextlib
 import math
 from collections import deque
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 from stimrig.rig import journal as jn
-from stimrig.rig.channels import Channel, named
 from stimrig.rig.clock import Clock
 from stimrig.rig.devices import Stimulator
 from stimrig.rig.errors import DeviceError, JournalError
 from stimrig.rig.journal import Journal, Kind
-from stimrig.rig.limits import LONGEST_PULSE_S, Admitted, Limit, Refusal, admit, check
+from stimrig.rig.limits import Admitted, Limit, Refusal, admit, check
 from stimrig.rig.signals import Ack, LateError, Pulse, PulseStatus
 
 LATE_ACK_S = 0.015
@@ -40,30 +37,11 @@ class OnItsWay:
     number: int
     pulse_width_us: float
     written_s: float
-    channel: int = 0  # of the test
-    output: int = 0  # of the rig
-
-
-@dataclass(slots=True)
-class Lane:
-    """What one channel has had in a test."""
-
-    recent: deque[tuple[float, float]] = field(default_factory=deque)
-    """Of the pulses of the last second: when each was felt at the latest (s), and its charge (µC)."""
-    charge_uc: float = 0.0
-    sent: int = 0
-    dropped: int = 0
-
-    def recent_uc(self, now_s: float) -> float:
-        """Charge of the last second."""
-        while self.recent and self.recent[0][0] <= now_s - 1.0:
-            self.recent.popleft()
-        return sum(charge_uc for _, charge_uc in self.recent)
 
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What became of a pulse: its index (slot), the width that was sent (0: none was), when it was written
+    """What became of a pulse: its index, the width that was sent (0: none was), when it was written
     and acknowledged (rig clock, s; NaN: not)."""
 
     index: int
@@ -101,14 +79,13 @@ class Gate:
         """Whether a test may send pulses now."""
         self._table: dict[str, Limit] = {}
         self.on_its_way: OnItsWay | None = None
-        self._channels: tuple[Channel, ...] = ()
-        self.lanes: list[Lane] = [Lane()]
-        """One for each channel of the test."""
-        self._last_ma = 0.0
+        self._recent: deque[tuple[float, float]] = deque()
         self.last_pulse_s: float | None = None
         """Latest time at which the last pulse can have been felt, s; None before the first pulse."""
         self.lateness_s: list[float] = []
         self.ack_delay_s: list[float] = []
+        self.charge_uc = 0.0
+        self.dropped = 0
         self.done: list[Done] = []
         """In this order it became known; only appended to. A pulse that is on its way is not in it."""
         self._state_as_armed = ""
@@ -122,38 +99,21 @@ class Gate:
         """(True if the device says that it cannot stimulate, its state in words). Raises DeviceError."""
         return await self._stimulator.state()
 
-    @property
-    def charge_uc(self) -> float:
-        """Of what was sent in this test, one phase, µC."""
-        return sum(lane.charge_uc for lane in self.lanes)
+    def reset(self) -> None:
+        """Clear the counts of the previous test."""
+        self.last_pulse_s, self.lateness_s, self.ack_delay_s = None, [], []
+        self.charge_uc, self.dropped, self.done = 0.0, 0, []
+        self._recent.clear()
 
-    @property
-    def dropped(self) -> int:
-        return sum(lane.dropped for lane in self.lanes)
-
-    def reset(self, channels: int = 1) -> None:
-        """Clear the counts of the previous test, and begin those of so many channels."""
-        self.last_pulse_s, self.lateness_s, self.ack_delay_s, self.done = None, [], [], []
-        self.lanes = [Lane() for _ in range(channels)]
-
-    async def open(
-        self,
-        journal: Journal,
-        table: dict[str, Limit],
-        halted: Callable[[], bool],
-        channels: Sequence[Channel] = (),
-    ) -> None:
+    async def open(self, journal: Journal, table: dict[str, Limit], halted: Callable[[], bool]) -> None:
         """Arm the device for one test. It stays shut if the test is `halted` by the time that the device answers.
-
-        `table` holds for the whole test; `channels`: those of the test, none where it has one without a name.
 
         Raises DeviceError, JournalError: the gate stays shut.
         """
         journal.append_json(Kind.EVENT, {"event": "arm", "time_s": self._clock.now_s()})
         await self._stimulator.arm()
         _, self._state_as_armed = await self._stimulator.state()
-        self._table, self._channels = table, tuple(channels) or (Channel("", 0, math.nan, math.nan, table),)
-        assert len(self.lanes) == len(self._channels)
+        self._table = table
         self.on_its_way = None  # the device has answered since, so the line is empty
         self._journal = journal
         self.is_open = not halted()
@@ -164,7 +124,7 @@ class Gate:
         Parameters
         ----------
         index
-            Its slot in the test, which says its channel.
+            Its number in the test.
         due_s, latest_s
             When it is due, and the time after which it is dropped instead of sent.
 
@@ -179,8 +139,7 @@ class Gate:
         if pulse.pulse_width_us == 0:
             self._note(index, PulseStatus.REST)
             return PulseStatus.REST
-        channel = self._channels[index % len(self._channels)]
-        verdict = admit(pulse, channel.table, self._stimulator.steps, channel.output)
+        verdict = admit(pulse, self._table, self._stimulator.steps)
         if isinstance(verdict, Refusal):
             return self._skip(journal, index, PulseStatus.REFUSED, str(verdict))
         if verdict.pulse_width_us == 0 or verdict.current_ma == 0:
@@ -188,10 +147,10 @@ class Gate:
         now_s = self._clock.now_s()
         if not (now_s <= latest_s):
             return self._skip(journal, index, PulseStatus.DROPPED)
-        held = self._too_close(now_s, index)
+        held = self._too_close(now_s)
         if held:
             return self._skip(journal, index, PulseStatus.DROPPED, held)
-        refusal = self._too_much(now_s, index, verdict) or self._too_much_in_all(now_s, verdict)
+        refusal = self._too_much(now_s, verdict.charge_uc)
         if refusal is not None:
             return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))
         return self._send(journal, index, verdict, now_s, due_s, latest_s)
@@ -237,7 +196,7 @@ class Gate:
         if pulse is None:
             return ""
         age_ms = 1e3 * (self._clock.now_s() - pulse.written_s) / self._clock.speed
-        return f"{self._named(pulse.index)} was sent {age_ms:.0f} ms ago and not acknowledged: it may still be felt"
+        return f"pulse {pulse.index + 1} was sent {age_ms:.0f} ms ago and not acknowledged: it may still be felt"
 
     async def disconnect(self) -> None:
         """Try to stop, then close the line; never raises."""
@@ -249,21 +208,17 @@ class Gate:
         self, journal: Journal, index: int, pulse: Admitted, now_s: float, due_s: float, latest_s: float
     ) -> PulseStatus:
         """Intent to the journal, pulse to the line, then the counts."""
-        channels, lane = len(self._channels), self.lanes[index % len(self._channels)]
-        intent = jn.Intent(
-            index, now_s, due_s, pulse.pulse_width_us, pulse.current_ma, index % channels, channels, pulse.output
-        )
-        journal.append(Kind.INTENT, intent.to_bytes(named=bool(self._channels[0].name)))
+        journal.append(Kind.INTENT, jn.INTENT.pack(index, now_s, due_s, pulse.pulse_width_us, pulse.current_ma))
         try:
             number = self._stimulator.send(pulse, latest_s)  # checks the clock as its last step before the write
         except LateError:  # the disk or the line was slow
             return self._skip(journal, index, PulseStatus.DROPPED)
         written_s = self._clock.now_s()
-        self.on_its_way = OnItsWay(index, number, pulse.pulse_width_us, written_s, index % channels, pulse.output)
-        lane.recent.append((written_s, pulse.charge_uc))
-        lane.charge_uc, lane.sent = lane.charge_uc + pulse.charge_uc, lane.sent + 1
-        self.last_pulse_s, self._last_ma = written_s, pulse.current_ma
+        self.on_its_way = OnItsWay(index, number, pulse.pulse_width_us, written_s)
+        self._recent.append((written_s, pulse.charge_uc))
+        self.last_pulse_s = written_s
         self.lateness_s.append(written_s - due_s)
+        self.charge_uc += pulse.charge_uc
         journal.append(Kind.WRITTEN, jn.WRITTEN.pack(index, number, written_s))
         return PulseStatus.UNACKNOWLEDGED
 
@@ -272,7 +227,7 @@ class Gate:
         journal.append(Kind.SKIPPED, jn.SKIPPED.pack(index, status, now_s))
         self._note(index, status)
         if status == PulseStatus.DROPPED:
-            self.lanes[index % len(self.lanes)].dropped += 1
+            self.dropped += 1
         if reason:
             event = status.name.lower()
             journal.append_json(Kind.EVENT, {"event": event, "index": index, "reason": reason, "time_s": now_s})
@@ -282,74 +237,42 @@ class Gate:
         """Of a pulse that was not sent."""
         self.done.append(Done(index, 0.0, math.nan, math.nan, status))
 
-    def _named(self, index: int) -> str:
-        """A pulse in words."""
-        count = len(self._channels)
-        return f"pulse {index // count + 1}{named(self._channels, index % count)}"
-
-    def _too_close(self, now_s: float, index: int) -> str:
+    def _too_close(self, now_s: float) -> str:
         """Why too little time has certainly passed since the previous pulse; empty if enough has."""
         if self.on_its_way is not None:
-            return f"{self._named(self.on_its_way.index)} is not acknowledged yet"
-        recent, refusal = self.lanes[index % len(self.lanes)].recent, None
-        if recent:
-            refusal = check(self._table["pulse_interval_s"], now_s - recent[-1][0])
-        if refusal is None and len(self.lanes) > 1 and self.last_pulse_s is not None:
-            refusal = check(self._table["channel_gap_s"], now_s - self.last_pulse_s)
+            return f"pulse {self.on_its_way.index + 1} is not acknowledged yet"
+        if not self._recent:
+            return ""
+        refusal = check(self._table["pulse_interval_s"], now_s - self._recent[-1][0])
         return "" if refusal is None else str(refusal)
 
-    def _too_much(self, now_s: float, index: int, pulse: Admitted) -> Refusal | None:
-        """Of one channel by itself."""
-        lane, table = self.lanes[index % len(self.lanes)], self._channels[index % len(self.lanes)].table
-        recent_uc = lane.recent_uc(now_s)
-        if lane.recent:
+    def _too_much(self, now_s: float, charge_uc: float) -> Refusal | None:
+        while self._recent and self._recent[0][0] <= now_s - 1.0:
+            self._recent.popleft()
+        if self._recent:
             # pulses of the last second: a window that ends with a pulse may also begin with one
-            refusal = check(table["pulse_rate_hz"], len(lane.recent))
+            refusal = check(self._table["pulse_rate_hz"], len(self._recent))
             if refusal is not None:
                 return refusal
-        return check(table["charge_per_second_uc"], pulse.charge_uc + recent_uc) or check(
-            table["charge_per_test_uc"], lane.charge_uc + pulse.charge_uc
+        return check(self._table["charge_per_second_uc"], charge_uc + sum(c for _, c in self._recent)) or check(
+            self._table["charge_per_test_uc"], self.charge_uc + charge_uc
         )
-
-    def _too_much_in_all(self, now_s: float, pulse: Admitted) -> Refusal | None:
-        """Of all channels together."""
-        if len(self.lanes) == 1:
-            return None
-        flows = self.last_pulse_s is not None and not (now_s - self.last_pulse_s >= LONGEST_PULSE_S)
-        for row, value in (
-            ("simultaneous_current_ma", pulse.current_ma + (self._last_ma if flows else 0.0)),
-            ("all_charge_per_second_uc", pulse.charge_uc + sum(lane.recent_uc(now_s) for lane in self.lanes)),
-            ("all_charge_per_test_uc", pulse.charge_uc + self.charge_uc),
-        ):
-            refusal = check(self._table[row], value)
-            if refusal is not None:
-                return refusal
-        return None
 
     def _acknowledged(self, ack: Ack) -> None:
         pulse, index = self.on_its_way, -1
         unasked = ack.number >= 0 and ack.error is None and self.is_open
         if pulse is not None and pulse.number == ack.number:
             index, unasked = pulse.index, False
-            if ack.error is None and ack.output not in (None, pulse.output):
-                other = self._of_output(ack.output) or " of an output that is not in use"
-                ack = replace(ack, error=f"it acknowledged a pulse{other} instead")
             self._settle(pulse, ack)
         failure = self._write_ack(index, ack, unasked)
-        place = f" at {self._named(index)}" if index >= 0 else ""
-        other = f"it acknowledged a pulse{self._of_output(ack.output)} that it was not sent; is the line disturbed?"
+        place = f" at pulse {index + 1}" if index >= 0 else ""
         for reason in (
             failure,
             f"stimulator: {ack.error}{place}" if ack.error is not None else "",
-            f"stimulator: {other}" if unasked else "",
+            "stimulator: it acknowledged a pulse that it was not sent; is the line disturbed?" if unasked else "",
         ):
             if reason:
                 self._on_fault(reason)
-
-    def _of_output(self, output: int | None) -> str:
-        """Which channel that is, in words; empty where it has no name, or is none of this test's."""
-        place = next((place for place, one in enumerate(self._channels) if one.output == output), -1)
-        return named(self._channels, place)
 
     def _settle(self, pulse: OnItsWay, ack: Ack) -> None:
         """The ack came: the pulse was felt at some time between its write and its ack."""
@@ -358,9 +281,8 @@ class Gate:
         self.ack_delay_s.append(self.last_pulse_s - pulse.written_s)
         status = PulseStatus.ACKNOWLEDGED if ack.error is None else PulseStatus.DEVICE_ERROR
         self.done.append(Done(pulse.index, pulse.pulse_width_us, pulse.written_s, ack.time_s, status))
-        recent = self.lanes[pulse.channel].recent if pulse.channel < len(self.lanes) else None
-        if recent:
-            recent[-1] = self.last_pulse_s, recent[-1][1]
+        if self._recent:
+            self._recent[-1] = self.last_pulse_s, self._recent[-1][1]
 
     def _write_ack(self, index: int, ack: Ack, unasked: bool) -> str:
         try:

@@ -17,7 +17,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,12 +35,7 @@ _CRC_AT = 12
 MAX_PAYLOAD = 64 * 1024 * 1024
 
 INTENT = struct.Struct("<idddd")
-"""Pulse index (of several channels its slot, see `rig.train`), time_s, due_s, width µs, current mA: written before the
-command goes out."""
-INTENT_OF = struct.Struct("<iddddBBB")
-"""The same with the pulse's channel: its place in the test, how many channels the test has, its place in the rig file.
-Written where a test names its channels, so that without header and plan it is still known what stimulated which muscle.
-"""
+"""Pulse index, time_s, due_s, width µs, current mA: written before the command goes out."""
 WRITTEN = struct.Struct("<iBd")
 """Pulse index, packet number, time_s when the last byte was written to the line."""
 SKIPPED = struct.Struct("<iBd")
@@ -51,27 +46,6 @@ ACKED = struct.Struct("<id")
 
 APART_BYTES = 8192
 """Between the two copies of header and plan: no damaged sector, 4096 bytes at most, reaches both."""
-
-
-class Intent(NamedTuple):
-    """A pulse that was to be sent."""
-
-    slot: int
-    time_s: float
-    due_s: float
-    pulse_width_us: float
-    current_ma: float
-    channel: int = 0
-    channels: int = 1
-    output: int = 0
-
-    def to_bytes(self, named: bool) -> bytes:
-        """`named`: whether the test names its channels."""
-        return INTENT_OF.pack(*self) if named else INTENT.pack(*self[:5])
-
-    @staticmethod
-    def from_bytes(payload: bytes) -> Intent:
-        return Intent(*(INTENT if len(payload) == INTENT.size else INTENT_OF).unpack(payload))
 
 
 class Kind(IntEnum):

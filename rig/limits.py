@@ -7,7 +7,6 @@ steps. The tightest of table, rig file, participant's profile and request applie
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from stimrig.rig.errors import RefusedError
@@ -136,36 +135,6 @@ HARD_LIMITS: dict[str, Limit] = {
     )
 }  # fmt: skip
 
-LONGEST_PULSE_S = 0.0011
-"""Two phases of 500 µs, and 100 µs between them."""
-
-SUM_LIMITS: dict[str, Limit] = {
-    row.name: row
-    for row in (
-        Limit(
-            "channel_gap_s", 0.002, math.inf, "s",
-            "a pulse lasts up to 1.1 ms: so those of two channels never overlap at the electrodes",
-            "own rule: 2 x 500 µs + 100 µs, and nearly as much again",
-        ),
-        Limit(
-            "simultaneous_current_ma", 0.0, 100.0, "mA",
-            "currents that may flow at the same time, added: no more than through one pair of electrodes",
-            "own rule: current_ma",
-        ),
-        Limit(
-            "all_charge_per_second_uc", 0.0, 3200.0, "µC/s",
-            "all channels together: what two may have; more of them share it",
-            "own rule: charge_per_second_uc × 2",
-        ),
-        Limit(
-            "all_charge_per_test_uc", 0.0, 100_000.0, "µC",
-            "all channels together: what two may have; more of them share it",
-            "own rule: charge_per_test_uc × 2",
-        ),
-    )
-}  # fmt: skip
-"""Further rows of a rig with several channels; each row above holds for each channel, or for the joint."""
-
 
 @dataclass(frozen=True, slots=True)
 class Steps:
@@ -218,7 +187,6 @@ class Admitted:
 
     pulse_width_us: int
     current_ma: float
-    output: int = 0  # place of its channel among the rig's
 
     @property
     def charge_uc(self) -> float:
@@ -279,23 +247,8 @@ def for_profile(table: dict[str, Limit], profile: Profile, owner: str = "partici
 
     Raises RefusedError: the profile holds a number that makes no sense (negative, NaN).
     """
-    return for_joint(for_pulses(table, profile, owner), profile, owner)
-
-
-def narrowed(table: dict[str, Limit], most: Mapping[str, float], owner: str) -> dict[str, Limit]:
-    """The table with upper bounds narrowed, by the names of their rows. Raises RefusedError."""
-    for name, hi in most.items():
-        table = tightened(table, name, hi, owner)
-    return table
-
-
-def for_pulses(table: dict[str, Limit], profile: Profile, owner: str) -> dict[str, Limit]:
-    """What a profile says of one channel's pulses. Raises RefusedError."""
-    return narrowed(table, {"pulse_width_us": profile.max_pulse_width_us, "current_ma": profile.current_ma}, owner)
-
-
-def for_joint(table: dict[str, Limit], profile: Profile, owner: str) -> dict[str, Limit]:
-    """What a profile says of the joint and of the rest, whichever channel it is of. Raises RefusedError."""
+    table = tightened(table, "pulse_width_us", profile.max_pulse_width_us, owner)
+    table = tightened(table, "current_ma", profile.current_ma, owner)
     table = _for_torque(table, profile.max_torque_nm, owner)
     if profile.angle_range_rad is not None:
         lo_rad, hi_rad = profile.angle_range_rad
@@ -314,14 +267,9 @@ def _for_torque(table: dict[str, Limit], max_torque_nm: float, owner: str) -> di
 def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
     """The table as profile and request narrow it: of hard limit, rig file, profile and request the tightest wins.
 
-    Of a test of several channels it holds for the joint and the sum.
-
     Raises RefusedError: a bound that makes no sense.
     """
-    if request.channels is None:
-        table = for_profile(table, request.profile)
-    for channel in request.channels or ():  # their widths and currents: see `channels.played`
-        table = for_joint(table, channel.profile, f"profile of {channel.name}")
+    table = for_profile(table, request.profile)
     owner = "request"
     if request.max_pulse_width_us is not None:
         table = tightened(table, "pulse_width_us", request.max_pulse_width_us, owner)
@@ -337,7 +285,7 @@ def for_plan(table: dict[str, Limit], request: TestPlan) -> dict[str, Limit]:
     return table
 
 
-def admit(pulse: Pulse, table: dict[str, Limit], steps: Steps = FINEST, output: int = 0) -> Admitted | Refusal:
+def admit(pulse: Pulse, table: dict[str, Limit], steps: Steps = FINEST) -> Admitted | Refusal:
     """Admit one pulse or say why not. Pure.
 
     Parameters
@@ -348,8 +296,6 @@ def admit(pulse: Pulse, table: dict[str, Limit], steps: Steps = FINEST, output: 
         `HARD_LIMITS`, narrowed by `tightened` and `for_profile`.
     steps
         The stimulator's.
-    output
-        Place of its channel among the rig's.
 
     Returns
     -------
@@ -366,4 +312,4 @@ def admit(pulse: Pulse, table: dict[str, Limit], steps: Steps = FINEST, output: 
         refusal = check(table[name], value)
         if refusal is not None:
             return refusal
-    return Admitted(steps.width_us(pulse.pulse_width_us), steps.current(pulse.current_ma), output)
+    return Admitted(steps.width_us(pulse.pulse_width_us), steps.current(pulse.current_ma))

@@ -37,13 +37,6 @@ SAFE_END_S = 1.0
 AHEAD = 2
 """Pulse periods before the end of what is laid of an adaptive test: then the fixed plan's next segment is laid, and a
 client is late."""
-
-
-MOST_CHANNELS = 8
-CHANNEL_NAME = r"^[a-z][a-z0-9_-]{0,31}$"
-RESERVED_NAMES = ("joint", "predicted")
-"""Words of files of several channels, which no channel may have for a name."""
-
 PULSE_RATES_HZ = (1.0, 60.0)
 """Least and most that any rig plays (`stimrig.rig.limits` says why)."""
 
@@ -51,6 +44,14 @@ PULSE_RATES_HZ = (1.0, 60.0)
 def stop_socket(path: Path) -> Path:
     """Path of the stop socket of a rig that listens at `path`."""
     return path.with_name(f"{path.name}.stop")
+
+
+T = TypeVar("T")
+
+
+def several(default: T, description: str, **more: Any) -> T:
+    """Make a field that is left out of the JSON while it has its default."""
+    return Field(default, description=description, exclude_if=lambda value: value == default, **more)
 
 
 class Message(BaseModel):
@@ -62,32 +63,12 @@ class Message(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-T = TypeVar("T")
-
-
-def several(default: T, description: str, **more: Any) -> T:
-    """A field that is written only where it is set: who has one channel never sees it."""
-    return Field(default, description=description, exclude_if=lambda value: value == default, **more)
-
-
-class ChannelSequence(Message):
-    """What one channel plays in a segment."""
-
-    sequence: str = Field(description="id of a sequence in rig.sequences")
-    settings: dict[str, Any] = Field(default_factory=dict)
-
-
 class SegmentPlan(Message):
     """One segment of a test: a sequence of the library by name, with its settings."""
 
     name: str = Field(description="segment's name in the recording: rest, prbs, ramp, validate, or the user's own")
     sequence: str = Field(description="id of a sequence in rig.sequences, e.g. prbs")
     settings: dict[str, Any] = Field(default_factory=dict)
-    channels: dict[str, ChannelSequence] | None = several(
-        None,
-        "of a test of several channels: what each named channel plays; one that is not named rests, but for the first, "
-        "which plays the segment's own sequence. All last as long as the longest, padded with rest",
-    )
 
 
 class Profile(Message):
@@ -163,19 +144,6 @@ LABEL_TITLES = {name: field.title for name, field in Labels.model_fields.items()
 """Labels that a person types and reads."""
 
 
-class ChannelPlan(Message):
-    """One channel of a test of several: which, and what its participant's profile allows on it."""
-
-    name: str = Field(pattern=CHANNEL_NAME, description="as the rig file names it")
-    profile: Profile
-    max_pulse_width_us: float | None = Field(default=None, description="for this test only, if tighter, µs")
-    offset_s: float | None = Field(
-        default=None,
-        description="of each of its pulses after the first channel's, s; rises from channel to channel, 0 for the "
-        "first. None: the channels share the pulse period evenly",
-    )
-
-
 class TestPlan(Labels, Message):
     """A whole pre-session test.
 
@@ -195,13 +163,6 @@ class TestPlan(Labels, Message):
     max_torque_nm: float | None = Field(default=None, description="for this test only, if tighter, N·m")
     adaptive: AdaptivePlan | None = Field(default=None, description="the test may be extended while it plays")
     angle: AnglePlan | None = Field(default=None, description="what it asks of the joint's angle")
-    channels: list[ChannelPlan] | None = several(
-        None,
-        "channels of the rig file that it plays, in the order of their pulses; `profile` is that of the first. None: "
-        "the rig's first channel alone",
-        min_length=1,
-        max_length=MOST_CHANNELS,
-    )
 
     @property
     def largest_us(self) -> float:
@@ -251,22 +212,6 @@ class CalibrationTrain(Message):
     pulse_width_us: float
     pulses: int = Field(description="pulses that were sent")
     torque_rise_nm: float | None = Field(None, description="largest change of torque from rest, N·m")
-    channel: str = several("", "which it stimulated; of a calibration of several channels")
-
-
-class ChannelCalibration(Message):
-    """Progress of one channel in a calibration of several; see `CalibrationStatus`."""
-
-    name: str
-    current_ma: float
-    step_us: float
-    last_us: dict[Threshold, float] = Field(default_factory=dict)
-    pulse_width_us: float
-    ceiling_us: float
-    ceiling_owner: str
-    next_us: dict[Direction, float] = Field(default_factory=dict)
-    marks_us: dict[Threshold, float] = Field(default_factory=dict)
-    missing: list[Threshold] = Field(default_factory=list)
 
 
 class CalibrationStatus(Message):
@@ -292,17 +237,11 @@ class CalibrationStatus(Message):
     marks_us: dict[Threshold, float] = Field(default_factory=dict, description="marked widths, µs")
     missing: list[Threshold] = Field(default_factory=list, description="thresholds still to be marked")
     trains: list[CalibrationTrain] = Field(default_factory=list)
-    channels: list[ChannelCalibration] | None = several(
-        None, "of several channels: each; the fields above are those of the channel that played last"
-    )
 
 
 class CalibrationResult(Message):
     profile: Profile | None = Field(None, description="valid until the end of the day; None: discarded")
     recordings: list[str] = Field(default_factory=list, description="one sealed recording per train")
-    profiles: dict[str, Profile] | None = several(
-        None, "of several channels: by their names; `profile` is that of the first"
-    )
 
 
 class Calibrated(Message):
@@ -367,9 +306,7 @@ class Status(Message):
     elapsed_s: float = 0.0
     duration_s: float = 0.0
     stimulator: dict[str, Any] = Field(
-        default_factory=dict,
-        description="device, id, firmware, port, shortest_us (no narrower pulse is sent), and of a rig with several "
-        "channels: channels, each with name, muscle, side and electrode",
+        default_factory=dict, description="device, id, firmware, port, shortest_us (no narrower pulse is sent)"
     )
     load_cell: dict[str, Any] = Field(default_factory=dict, description="device, measured sample rate, bus")
     torque_age_s: float | None = Field(None, description="age of the newest torque sample; None: there was none")
@@ -410,23 +347,12 @@ class Sequences(Message):
     default: list[SegmentPlan] = Field(description="segments of the default pre-session test")
 
 
-class ChannelPreview(Message):
-    """What a plan plays on one channel."""
-
-    charge_uc: float
-    pulse_time_s: list[float] = Field(description="when each is due, test's clock")
-    pulse_width_us: list[float]
-
-
 class Preview(Message):
     duration_s: float
     charge_uc: float = Field(description="sum over pulses of width × current, one phase, µC")
     torque_time_nms: float | None = Field(None, description="estimated torque-time, N·m·s; None: there is no model")
     pulse_width_us: list[float]
     segments: list[dict[str, Any]] = Field(description="each with name, start_s, end_s")
-    channels: dict[str, ChannelPreview] | None = several(
-        None, "of several channels: by their names; `pulse_width_us` has all pulses in the order in which they are due"
-    )
 
 
 class StopEvidence(Message):
@@ -460,9 +386,7 @@ class Extended(Message):
     """What is laid of an adaptive test, and what its bounds leave."""
 
     test_id: str
-    laid: int = Field(
-        description="pulses of all channels that are laid, those of width 0 included, without rest for a late client"
-    )
+    laid: int = Field(description="pulses that are laid, those of width 0 included, without rest for a late client")
     boundary_s: float = Field(description="where they end on the test's clock, s")
     ended_by: str = Field(description="why nothing will follow: plan, enough, limit, torque_time; empty: more may")
     duration_left_s: float
@@ -495,18 +419,6 @@ class PulseOutcomes(Message):
     written_time_s: list[float | None]
     acknowledged_time_s: list[float | None]
     status: list[int] = Field(description="as `/pulses/status` of a recording")
-    channel: list[int] | None = several(None, "of several channels: place of each pulse's channel in the plan's list")
-
-
-class ChannelPulses(Message):
-    """One channel's part of a live event of a test of several channels."""
-
-    name: str
-    pulse_time_s: list[float]
-    pulse_width_us: list[float]
-    sent_pulses: int
-    dropped_pulses: int
-    charge_uc: float
 
 
 class Pause(Message):
@@ -546,9 +458,6 @@ class LiveEvent(Message):
     laid_segments: list[LaidSegment] = Field(default_factory=list, description="all that are laid; adaptive tests only")
     pauses: list[Pause] = Field(default_factory=list, description="all of the test so far")
     outcomes: PulseOutcomes | None = Field(None, description="for who subscribed with `samples`")
-    channels: list[ChannelPulses] | None = several(
-        None, "of a test of several channels: each; the fields beside are of all pulses together"
-    )
     angle_rad: float | None = Field(None, description="the newest; None without a sensor, or where it gives nothing")
     velocity_rad_s: float | None = Field(None, description="of the last 50 ms, so 25 ms late")
     samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
@@ -574,8 +483,7 @@ class FinishedEvent(Message):
         "ack_delay_ms {median, p99, max}, pauses (each as `Pause`), charge_uc, torque_time_nms, ended_by, "
         "alignment {method, error_ms}, "
         "sample_rate_hz, torque_peak_nm, angle (with a sensor: samples, lost_samples, range_rad, error_ms), "
-        "cpu_percent, channels (of a test of several: by name, each with charge_uc, pulses, dropped_pulses), of a test "
-        "whose process died dose_is_bound (true: charge_uc, duration_s and pulses may be too "
+        "cpu_percent, of a test whose process died dose_is_bound (true: charge_uc, duration_s and pulses may be too "
         "high, never too low) and doubtful_pulses, warnings (sentences for people about possible errors), "
         "notes (sentences about what happened and leaves nothing in doubt)",
     )

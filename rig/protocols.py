@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import inspect
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 from stimrig.rig.errors import PlanError
-from stimrig.rig.messages import ChannelSequence, SegmentPlan
+from stimrig.rig.messages import SegmentPlan
 
 LOWER = 0.75
 
@@ -57,40 +57,6 @@ def short(max_pulse_width_us: float) -> list[SegmentPlan]:
     ]
 
 
-def several(names: Sequence[str]) -> list[SegmentPlan]:
-    """Random levels of all channels, a ramp of each alone, of all together, and held-out levels alone and together.
-
-    58.0 s at 40 pulses/s with two channels: 1.5 times the paper's test. The widths are each channel's largest by
-    themselves. The channels' levels are drawn apart, so that they are not correlated; the last ramps overlap by a half,
-    so that every channel also moves while another one holds much or little.
-    """
-    turns, last = list(enumerate(names)), max(len(names) - 1, 1)
-    alone = [[(name, "ramp", {"up_s": 3.3, "down_s": 3.3})] for name in names]
-    together = [
-        (name, "ramp", {"up_s": 2.0 + 1.4 * turn / last, "down_s": 3.2 - 1.2 * turn / last}) for turn, name in turns
-    ]
-    both = [(name, "multilevel", {"duration_s": 6.0, "seed": 20 + 7 * turn}) for turn, name in turns]
-    own = [[(name, "multilevel", {"duration_s": 2.4, "seed": 3 + turn, "zero_share": 0.0})] for turn, name in turns]
-    random = [(name, "prbs", {"seed": 1 + 41 * turn, "chips": 108}) for turn, name in turns]
-    levels = [(name, "multilevel", {"duration_s": 5.0, "seed": 50 + 9 * turn}) for turn, name in turns]
-    found = [_rest(2.0), _played("prbs", random), _rest(1.8)]
-    for parts in alone:
-        found += [_played("ramp", parts), _rest(1.2)]
-    found += [_played("ramp", together), _rest(1.2), _played("levels", levels), _rest(1.4)]
-    found.append(_played("validate", both))
-    for parts in own:
-        found += [_rest(0.9, "validate"), _played("validate", parts)]
-    return [*found, _rest(2.0)]
-
-
-def _played(name: str, parts: Sequence[tuple[str, str, dict[str, Any]]]) -> SegmentPlan:
-    """A segment of several channels; one that is not among them rests."""
-    own = {channel: ChannelSequence(sequence=sequence, settings=settings) for channel, sequence, settings in parts}
-    return SegmentPlan(name=name, sequence="rest", settings={"duration_s": REST_OF_OTHERS_S}, channels=own)
-
-
-REST_OF_OTHERS_S = 0.1
-"""What the first channel plays where it is not named: padded to the segment's length."""
 DEFAULT = "paper"
 LIBRARY: dict[str, Callable[[float], list[SegmentPlan]]] = {"paper": paper, "short": short}
 """By their ids, the default first."""
@@ -115,5 +81,5 @@ def _segment(name: str, sequence: str = "", /, **settings: Any) -> SegmentPlan:
     return SegmentPlan(name=name, sequence=sequence or name, settings=settings)
 
 
-def _rest(duration_s: float, name: str = "rest") -> SegmentPlan:
-    return _segment(name, "rest", duration_s=duration_s)
+def _rest(duration_s: float) -> SegmentPlan:
+    return _segment("rest", duration_s=duration_s)

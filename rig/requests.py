@@ -12,9 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from stimrig.rig.messages import (
-    CHANNEL_NAME,
     LONGEST_NAME,
-    MOST_CHANNELS,
     Direction,
     Message,
     Profile,
@@ -22,7 +20,6 @@ from stimrig.rig.messages import (
     SegmentPlan,
     TestPlan,
     Threshold,
-    several,
 )
 
 LONGEST_LINE = 1_900_000
@@ -120,15 +117,6 @@ class RearmRequest(Message):
     latch: str = Field(description="`Status.latch` that the person was shown")
 
 
-class CalibrateChannel(Message):
-    """One channel of a calibration of several; what is left out is as the request says for all."""
-
-    name: str = Field(pattern=CHANNEL_NAME, description="as the rig file names it")
-    current_ma: float | None = None
-    max_pulse_width_us: float | None = None
-    last: Profile | None = Field(None, description="what the last calibration found for it; with large_steps")
-
-
 class CalibrateStartRequest(Message):
     """Open a guided calibration; nothing is sent yet. Reply: `Status` with `calibration`."""
 
@@ -147,13 +135,6 @@ class CalibrateStartRequest(Message):
     pulse_rate_hz: float = 40.0
     max_pulse_width_us: float | None = Field(None, description="widest pulse allowed, µs; None: the hard limits")
     max_torque_nm: float = Field(30.0, description="torque at which a train stops, N·m")
-    channels: list[CalibrateChannel] | None = several(
-        None,
-        "several channels in one calibration, each with its own trains, marks and profile. None: the rig's first "
-        "channel alone",
-        min_length=1,
-        max_length=MOST_CHANNELS,
-    )
 
 
 class CalibrateStepRequest(Message):
@@ -168,7 +149,6 @@ class CalibrateStepRequest(Message):
     shown_us: float | None = Field(
         None, description="width that a person was shown; refused if another one would be sent. None: not shown"
     )
-    channel: str = several("", "name of the channel; of a calibration of several it must be given")
 
 
 class CalibrateMarkRequest(Message):
@@ -177,7 +157,6 @@ class CalibrateMarkRequest(Message):
     kind: Literal["calibrate-mark"] = "calibrate-mark"
     id: int = 0
     threshold: Threshold
-    channel: str = several("", "name of the channel; of a calibration of several it must be given")
 
 
 class CalibrateFinishRequest(Message):

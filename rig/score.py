@@ -38,8 +38,7 @@ WAIT_S = 0.25
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Everything that is laid, whole rounds of slots: widths in µs and whether each may jump there, shape (n,), and the
-    segments."""
+    """Everything that is laid: widths in µs and whether each may jump there, shape (n,), and the segments."""
 
     pulse_width_us: NDArray[np.float64]
     jumps: NDArray[np.bool_]
@@ -57,7 +56,7 @@ class Layout:
         added = Segment(piece.of.name, len(self), end, by)
         return Layout(
             np.concatenate([self.pulse_width_us, piece.pulse_width_us]),
-            np.concatenate([self.jumps, np.resize(piece.jumps, len(piece.pulse_width_us))]),
+            np.concatenate([self.jumps, np.full(len(piece.pulse_width_us), piece.jumps)]),
             (*self.segments, added),
         )
 
@@ -71,7 +70,6 @@ class Score:
 
     def __init__(self, test: PlannedTest, table: dict[str, Limit], journal: Journal, tasks: Tasks) -> None:
         self.plan, self.adaptive, self.longest_s = test.plan, test.plan.adaptive, test.longest_s
-        self.channels, self.train = test.channels, test.train
         self.ended_by = "" if self.adaptive else "plan"
         """Why nothing more will be laid; empty: more may be."""
         self._table, self._journal = table, journal
@@ -84,7 +82,7 @@ class Score:
         for piece in at_start:
             self.laid = self.laid.add_piece(piece, "plan")
         self.decided = len(self.laid)
-        """Slots that are laid, without the rest behind them that only waits for a client."""
+        """Pulses that are laid, without the rest behind them that only waits for a client."""
         self._reached = -1
         self._end_at: int | None = None
         self._checked = 0
@@ -92,15 +90,15 @@ class Score:
 
     @property
     def duration_s(self) -> float:
-        return self.train.length_s(len(self.laid))
+        return len(self.laid) / self.plan.pulse_rate_hz
 
     def segment_at(self, time_s: float) -> str | None:
         """Name of the segment at a time on the test's clock, None outside."""
-        index = int(np.floor(time_s * self.train.slots_per_s + 1e-9))
+        index = int(np.floor(time_s * self.plan.pulse_rate_hz + 1e-9))
         return next((s.name for s in self.laid.segments if s.start <= index < s.end), None)
 
     def pulse(self, index: int, torque_time_nms: float) -> float | None:
-        """Width of the next slot, µs; None after the last. Only the sender asks, in order.
+        """Width of the next pulse, µs; None after the last. Only the sender asks, in order.
 
         `index`: one more than the last time; `torque_time_nms`: measured until now. Raises JournalError: what was to be
         laid could not be written.
@@ -109,7 +107,7 @@ class Score:
             bound_nms = self.adaptive.max_torque_time_nms
             if not (torque_time_nms < bound_nms):
                 self._end("torque_time", f"torque-time {torque_time_nms:.1f} of {bound_nms:g} N·m·s", cut=index)
-            elif index + AHEAD * self.train.channels > len(self.laid) and not self.ended_by:
+            elif index + AHEAD > len(self.laid) and not self.ended_by:
                 self._go_on()
         self._reached = index
         return float(self.laid.pulse_width_us[index]) if index < len(self.laid) else None
@@ -173,18 +171,15 @@ class Score:
     def left(self, torque_time_nms: float) -> Extended:
         """What is laid, and what the bounds leave of an adaptive test."""
         assert self.adaptive is not None
-        laid, train = self.laid, self.train
-        doses_uc = plan.dose_uc(laid.pulse_width_us, self.channels)
-        left_uc = [c.table["charge_per_test_uc"].hi - uc for c, uc in zip(self.channels, doses_uc, strict=True)]
-        if train.channels > 1:
-            left_uc.append(self._table["all_charge_per_test_uc"].hi - sum(doses_uc))
+        laid, rate_hz = self.laid, self.plan.pulse_rate_hz
+        charge_uc = float(np.sum(laid.pulse_width_us)) * self.plan.profile.current_ma * 1e-3
         return Extended(
             test_id=self.plan.test_id,
             laid=self.decided,
-            boundary_s=train.length_s(self.decided),
+            boundary_s=self.decided / rate_hz,
             ended_by=self.ended_by,
-            duration_left_s=max(0.0, self.longest_s - train.length_s(len(laid))),
-            charge_left_uc=max(0.0, min(left_uc)),
+            duration_left_s=max(0.0, self.longest_s - len(laid) / rate_hz),
+            charge_left_uc=max(0.0, self._table["charge_per_test_uc"].hi - charge_uc),
             torque_time_left_nms=max(0.0, self.adaptive.max_torque_time_nms - torque_time_nms),
         )
 
@@ -208,25 +203,26 @@ class Score:
         for number, segment in enumerate(chosen, start=1):
             if not (1 <= len(segment.name) <= MAX_NAME and segment.name.isprintable()):
                 raise PlanError(f"extend.segments: name {number} must have 1 to {MAX_NAME} printable characters")
-        longest_s = self.train.length_s(before) + MAX_EXTENSION_S
+        longest_s = before / self.plan.pulse_rate_hz + MAX_EXTENSION_S
         table = tightened(self._table, "duration_s", longest_s, f"at most {MAX_EXTENSION_S:g} s an extension")
-        built = plan.build_pieces(chosen, self.channels, self.train, table["duration_s"], before)
+        built = plan.build_pieces(chosen, self.plan, table["duration_s"], before)
         self._check(laid, built)
         return built
 
     def _check(self, laid: Layout, added: Sequence[Piece]) -> None:
         """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
         before_us = laid.pulse_width_us
-        plan.check_pieces(added, self.channels, self.train, self._table, before_us)
+        plan.check_pieces(added, self.plan, self._table, before_us)
         whole_us = np.concatenate([before_us, *(piece.pulse_width_us for piece in added)])
-        whole = len(whole_us) + plan.safe_end(whole_us, self.train)
-        refuse(self._table["duration_s"], self.train.length_s(whole), "plan, with its safe end")
+        rate_hz = self.plan.pulse_rate_hz
+        whole_s = (len(whole_us) + plan.safe_end(whole_us, rate_hz)) / rate_hz
+        refuse(self._table["duration_s"], whole_s, "plan, with its safe end")
 
     def _go_on(self) -> None:
         """Lay a rest where a client may still choose, else the fixed plan's next segment, or end."""
         if self._patience_s > 0:
-            piece = Piece(WAIT, np.zeros(max(self.train.channels, self.train.slots(WAIT_S))), jumps=False)
-            self._patience_s -= self.train.length_s(len(piece.pulse_width_us))
+            piece = Piece(WAIT, np.zeros(max(1, round(WAIT_S * self.plan.pulse_rate_hz))), jumps=False)
+            self._patience_s -= len(piece.pulse_width_us) / self.plan.pulse_rate_hz
             with contextlib.suppress(RefusedError):  # no room for it: nor, perhaps, for the fixed plan's next segment
                 self._check(self.laid, [piece])
                 self._lay(piece, "wait")
@@ -249,13 +245,9 @@ class Score:
         event = {"event": "ended", "by": by, "reason": reason, "index": cut, "time_s": self._clock.now_s()}
         self._journal.append_json(Kind.EVENT, event)
         kept = self.laid.cut(cut)
-        missing = plan.safe_end(kept.pulse_width_us, self.train)
+        missing = plan.safe_end(kept.pulse_width_us, self.plan.pulse_rate_hz)
         if missing or len(kept) < len(self.laid):
-            # what is laid are whole rounds: of one that has begun the slots that are played are laid once more
-            begun = len(kept) % self.train.channels
-            whole = kept.cut(len(kept) - begun)
-            widths_us = np.concatenate([kept.pulse_width_us[len(whole) :], np.zeros(missing)])
-            self._lay(Piece(SAFE_END, widths_us, jumps=begun > 0), "end", whole)
+            self._lay(Piece(SAFE_END, np.zeros(missing), jumps=False), "end", kept)
         self.ended_by, self._end_at = by, len(kept)
 
     def _lay(self, piece: Piece, by: LaidBy, before: Layout | None = None) -> None:

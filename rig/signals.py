@@ -38,7 +38,7 @@ LaidBy = Literal["plan", "extension", "wait", "end"]
 
 
 class Segment(NamedTuple):
-    """A segment as indices of its slots (`rig.train`), end exclusive, and who laid it."""
+    """A segment as indices of its pulses, end exclusive, and who laid it."""
 
     name: str
     start: int
@@ -52,15 +52,11 @@ class LateError(Exception):
 
 @dataclass(frozen=True, slots=True)
 class Ack:
-    """A stimulator's answer to one pulse: `error` is None when it was delivered, `number` -1 if it names no pulse.
-
-    `output`: place among the rig's channels of the one that it names; -1: of none, None: it does not say.
-    """
+    """A stimulator's answer to one pulse: `error` is None when it was delivered, `number` -1 if it names no pulse."""
 
     number: int
     time_s: float
     error: str | None = None
-    output: int | None = None
 
 
 SAMPLE = np.dtype(

@@ -150,7 +150,7 @@ class TestRun:
     async def execute(self) -> RunResult:
         """Play the test to its end or its halt; never raises for a fault, the result says it."""
         cpu_s, began_s = self._machine.cpu_s(), self._clock.now_s()
-        self.gate.reset(self.score.train.channels)
+        self.gate.reset()
         torque = self._table["torque_nm"]
         self._plausibility = PlausibilityCheck(
             self._table["torque_jump_nm"].hi,
@@ -188,13 +188,6 @@ class TestRun:
     @property
     def sent(self) -> int:
         return len(self.gate.lateness_s)
-
-    def by_channel(self) -> dict[str, dict[str, float]]:
-        """What each channel has had, by its name."""
-        return {
-            channel.name: {"charge_uc": lane.charge_uc, "pulses": lane.sent, "dropped_pulses": lane.dropped}
-            for channel, lane in zip(self.score.channels, self.gate.lanes, strict=True)
-        }
 
     @property
     def begun(self) -> bool:
@@ -240,22 +233,21 @@ class TestRun:
         self._plausibility.rate.begin()
         self._angle.begin()
         self._rest_nm = self._receiver.torque_around(0.1 * self._clock.speed)
-        await self.gate.open(self.journal, self._table, self.halt.signal.is_set, self.score.channels)
+        await self.gate.open(self.journal, self._table, self.halt.signal.is_set)
         return self.gate.is_open
 
     async def _play(self, pauses: Pauses) -> None:
-        clock, train, channels = self._clock, self.score.train, self.score.channels
+        clock, current_ma = self._clock, self.plan.profile.current_ma
+        period_s = 1 / self.plan.pulse_rate_hz
         t0_s = clock.now_s() + LEAD_S * clock.speed
         self.journal.append_json(Kind.START, {"t0_s": t0_s, "unix_s": clock.unix_s() + LEAD_S})
         self.t0_s = t0_s
         self._angle.started()
         self.started.set()
-        late_s = [self._late_s(place) for place in range(train.channels)]
-        rises = [Rise(channel.table["width_rise_us"].hi, train.pulse_rate_hz) for channel in channels]
-        index, resting = 0, True
+        late_s = self._watch.late_pulse_periods * period_s
+        index, resting, rise = 0, True, Rise(self._table["width_rise_us"].hi, self.plan.pulse_rate_hz)
         while (width_us := self.score.pulse(index, self.torque_time_nms)) is not None:
-            due_s, place = t0_s + train.due_s(index), train.channel(index)
-            rise = rises[place]
+            due_s = t0_s + index * period_s
             first = resting and width_us > 0
             if first:
                 resting = False
@@ -271,19 +263,10 @@ class TestRun:
             asked_us = rise.limited(width_us, bool(self.score.laid.jumps[index]))
             self.gate.feed()
             self._machine.hold_until(due_s)
-            pulse = Pulse(asked_us, channels[place].current_ma)
-            status = self.gate.fire(index, pulse, due_s, due_s + late_s[place])
+            status = self.gate.fire(index, Pulse(asked_us, current_ma), due_s, due_s + late_s)
             rise.take(status, asked_us, width_us)
             index += 1
-        await self._tasks.wait(t0_s + train.length_s(index), self.halt.signal)
-
-    def _late_s(self, place: int) -> float:
-        """How late a channel's pulse may be: never so late that it would come too close to the next of another, s."""
-        train = self.score.train
-        late_s = self._watch.late_pulse_periods / train.pulse_rate_hz
-        if train.channels == 1:
-            return late_s
-        return min(late_s, train.gap_s(place) - self._table["channel_gap_s"].lo)
+        await self._tasks.wait(t0_s + index * period_s, self.halt.signal)
 
     def _at_rest(self) -> None:
         """Right before the first pulse: what torque is rest, and no range or torque-time yet."""
@@ -356,7 +339,6 @@ class TestRun:
             "torque_peak_nm": self._receiver.peak_nm,
             "ended_by": self.ended_by,
             "cpu_percent": round(cpu_percent, 2),
-            **({"channels": self.by_channel()} if self.plan.channels else {}),
             "stop": found.model_dump(),
         }
         if angle is not None:

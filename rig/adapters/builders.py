@@ -13,10 +13,8 @@ import logging
 import os
 import pickle
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict
 
-from stimrig.rig.channels import RigChannel
 from stimrig.rig.control.live import Taken
 from stimrig.rig.errors import BusyError, PlanError
 from stimrig.rig.limits import Limit
@@ -95,10 +93,9 @@ class Builder:
 class Previews(Builder):
     """Sends requests for previews to their builder."""
 
-    def __init__(self, table: dict[str, Limit], speed: float, channels: Sequence[RigChannel] = ()) -> None:
+    def __init__(self, table: dict[str, Limit], speed: float) -> None:
         rows = {name: asdict(row) for name, row in table.items()}
-        first = {"table": rows, "speed": speed, "channels": [asdict(channel) for channel in channels]}
-        super().__init__("previews", json.dumps(first).encode() + b"\n")
+        super().__init__("previews", json.dumps({"table": rows, "speed": speed}).encode() + b"\n")
         self._waiting = 0
 
     async def reply(self, line: bytes, angle_set_at_utc: str | None = None) -> bytes:

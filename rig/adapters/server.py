@@ -67,7 +67,7 @@ class Server:
         """
         self._loop = asyncio.get_running_loop()
         self.rig, self._ask = rig, ask
-        self._previews = Previews(rig.table, rig.speed, rig.channels)
+        self._previews = Previews(rig.table, rig.speed)
         if await _is_listening(path):
             raise ConfigError(f"socket: {path}: another rig is listening there; stop it or use another path")
         try:

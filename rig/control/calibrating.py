@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 from stimrig.rig import plan
-from stimrig.rig.channels import RigChannel
 from stimrig.rig.control.angle_calibration import Joint
-from stimrig.rig.control.calibration import CalibrationOfChannels
+from stimrig.rig.control.calibration import Calibration
 from stimrig.rig.control.memory import Result
 from stimrig.rig.control.playing import Player, check_names
 from stimrig.rig.errors import BusyError, PlanError
@@ -28,10 +27,8 @@ class Calibrations:
     """Opens, plays step by step, marks and closes a calibration. Every answer but that of `finish` is the status."""
 
     def __init__(
-        self, player: Player, joint: Joint, result: Result, table: dict[str, Limit], rig: Sequence[RigChannel],
-        publish: Callable[[], None],
-    ) -> None:  # fmt: skip
-        self._rig = rig
+        self, player: Player, joint: Joint, result: Result, table: dict[str, Limit], publish: Callable[[], None]
+    ) -> None:
         self._player, self._joint, self._result, self._table, self._publish = player, joint, result, table, publish
         self._state, self._pair, self._rest = player.state, player.pair, player.rest
         self._store, self._tasks = player.store, player.tasks
@@ -48,8 +45,7 @@ class Calibrations:
             state.refuse_unseen(latch)
             self._result.refuse_waiting()
             check_names("calibration", calibration_id=request.calibration_id, participant=request.participant)
-            now_s = self._tasks.clock.unix_s()
-            calibration = CalibrationOfChannels(request, self._table, now_s, self._pair.steps, self._rig)
+            calibration = Calibration(request, self._table, self._tasks.clock.unix_s(), self._pair.steps)
             await self._tasks.work(self._store.check_room, f"{request.calibration_id}.001")
             state.phase.may_start()  # a stop may have come meanwhile
             state.calibration = calibration
@@ -62,11 +58,11 @@ class Calibrations:
         playing; above a limit or the marked comfort maximum; its day is over.
         """
         async with self._state.in_turn():
-            calibration = self._open(today=True).channel(request.channel)
+            calibration = self._open(today=True)
             width_us = calibration.next_width_us(request.direction)
             calibration.check_shown(width_us, request.shown_us)
             train = calibration.train(width_us)
-            test = plan.build(train, calibration.table, self._rig)
+            test = plan.build(train, calibration.table)
             self._rest.check(test, calibration.rest)
             await self._tasks.work(self._store.check_room, train.test_id)
             self._open()  # a stop may have come meanwhile
@@ -76,7 +72,7 @@ class Calibrations:
     async def mark(self, request: CalibrateMarkRequest) -> None:
         """Mark the last train's width as a threshold. Raises PlanError, BusyError, RefusedError (its day is over)."""
         async with self._state.in_turn():
-            self._open(today=True).channel(request.channel).mark(request.threshold)
+            self._open(today=True).mark(request.threshold)
             self._publish()
 
     async def finish(self, request: CalibrateFinishRequest) -> CalibrationResult:
@@ -90,7 +86,7 @@ class Calibrations:
                 result = kept.result
                 if request.discard:
                     await self._result.let_go(kept.calibration_id)
-                    result = result.model_copy(update={"profile": None, "profiles": None})
+                    result = result.model_copy(update={"profile": None})
             else:
                 result = await self._close(self._open(request.calibration_id), request.discard)
             log.info("calibration %s", "discarded" if request.discard else "done")
@@ -103,11 +99,10 @@ class Calibrations:
             await self._result.let_go(calibration_id)
             self._publish()
 
-    async def _close(self, calibration: CalibrationOfChannels, discard: bool) -> CalibrationResult:
+    async def _close(self, calibration: Calibration, discard: bool) -> CalibrationResult:
         of = calibration.request
-        result = CalibrationResult(profile=None, recordings=calibration.recordings)
-        if not discard:
-            result = calibration.result(self._tasks.clock.unix_s())
+        profile = None if discard else calibration.profile(self._tasks.clock.unix_s())
+        result = CalibrationResult(profile=profile, recordings=calibration.recordings)
         if not discard:
             found = {"calibration_id": of.calibration_id, "participant": of.participant, "by": of.by, "result": result}
             await self._result.keep(Calibrated.model_validate(found))
@@ -115,7 +110,7 @@ class Calibrations:
             self._state.change(self._state.phase.calibrated())
         return result
 
-    def _open(self, calibration_id: str = "", today: bool = False) -> CalibrationOfChannels:
+    def _open(self, calibration_id: str = "", today: bool = False) -> Calibration:
         """The open calibration between two trains; `today`: if its day is not over."""
         calibration, phase = self._state.calibration, self._state.phase
         if calibration is None:

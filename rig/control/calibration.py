@@ -11,22 +11,16 @@ and the calendar never ends a train in its middle. Nothing that has begun uses t
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 
 from stimrig.rig import limits
-from stimrig.rig.channels import RigChannel, played
 from stimrig.rig.clock import utc_text
 from stimrig.rig.control.calibration_steps import rule_of
 from stimrig.rig.errors import PlanError, RefusedError
 from stimrig.rig.limits import FINEST, Limit, Steps
 from stimrig.rig.messages import (
-    CalibrationResult,
     CalibrationStatus,
     CalibrationTrain,
-    ChannelCalibration,
-    ChannelPlan,
     Direction,
     FinishedEvent,
     Profile,
@@ -34,7 +28,7 @@ from stimrig.rig.messages import (
     TestPlan,
     Threshold,
 )
-from stimrig.rig.requests import CalibrateChannel, CalibrateStartRequest
+from stimrig.rig.requests import CalibrateStartRequest
 
 ORDER: tuple[Threshold, ...] = ("sensory", "motor", "comfort")
 STEPS: tuple[Direction, ...] = ("up", "fine", "repeat", "down")
@@ -50,17 +44,8 @@ MOST_MISSED = 0.1
 """Share of a train's pulses that may be missing: one with more feels weaker than its width."""
 
 
-@dataclass(slots=True)
-class Played:
-    """What an open calibration has played, on all its channels."""
-
-    trains: list[CalibrationTrain] = field(default_factory=list)
-    recordings: list[str] = field(default_factory=list)
-    charge_uc: float = 0.0
-
-
 class Calibration:
-    """An open calibration of one channel.
+    """An open calibration.
 
     Parameters
     ----------
@@ -72,8 +57,6 @@ class Calibration:
         Time now; its day is the day of the calibration.
     steps
         The stimulator's resolution.
-    channel, played
-        Of a calibration of several channels: which it is, and what all have played.
 
     Raises
     ------
@@ -83,10 +66,9 @@ class Calibration:
     """
 
     def __init__(
-        self, request: CalibrateStartRequest, table: dict[str, Limit], unix_s: float, steps: Steps = FINEST,
-        channel: CalibrateChannel | None = None, played: Played | None = None,
-    ) -> None:  # fmt: skip
-        self.request, self._channel, self._played = request, channel, played or Played()
+        self, request: CalibrateStartRequest, table: dict[str, Limit], unix_s: float, steps: Steps = FINEST
+    ) -> None:
+        self.request = request
         self._steps = steps
         self._ends_s = end_of_day_s(unix_s)
         for name, value in (
@@ -116,20 +98,9 @@ class Calibration:
         self._whole = True
         """Whether the last train was felt as it was planned."""
         self._marks_us: dict[Threshold, float] = {}
+        self._trains: list[CalibrationTrain] = []
         self._charge_uc = 0.0
-
-    @property
-    def recordings(self) -> list[str]:
-        return self._played.recordings
-
-    @property
-    def _name(self) -> str:
-        return self._channel.name if self._channel else ""
-
-    @property
-    def _trains(self) -> list[CalibrationTrain]:
-        """Of this channel."""
-        return [train for train in self._played.trains if train.channel == self._name]
+        self.recordings: list[str] = []
 
     def _check_shortest(self) -> None:
         """Raise RefusedError where already the stimulator's shortest pulse is more than the first train may be."""
@@ -198,7 +169,7 @@ class Calibration:
     @property
     def rest(self) -> Limit:
         """Rest that the next train needs: before the first train as much as between two tests."""
-        return self.table["rest_between_trains_s" if self._played.trains else "rest_between_tests_s"]
+        return self.table["rest_between_trains_s" if self._trains else "rest_between_tests_s"]
 
     def _pulses(self) -> int:
         return round(self.request.train_s * self.request.pulse_rate_hz)
@@ -206,23 +177,17 @@ class Calibration:
     def train(self, width_us: float) -> TestPlan:
         """Plan of one train of that width. Raises RefusedError if the calibration's total charge would be too high."""
         request = self.request
-        train_uc = self._pulses() * width_us * request.current_ma * 1e-3
-        limits.refuse(self.table["charge_per_test_uc"], self._charge_uc + train_uc, "calibration, all trains together")
-        if self._channel is not None:
-            in_all = self.table["all_charge_per_test_uc"]
-            limits.refuse(in_all, self._played.charge_uc + train_uc, "calibration, all channels together")
+        dose_uc = self._charge_uc + self._pulses() * width_us * request.current_ma * 1e-3
+        limits.refuse(self.table["charge_per_test_uc"], dose_uc, "calibration, all trains together")
         rest = SegmentPlan(name="rest", sequence="rest", settings={"duration_s": REST_S})
         steps = {"max_pulse_width_us": width_us, "on_s": request.train_s, "off_s": 0.0, "repeats": 1}
-        profile = Profile(
-            current_ma=request.current_ma, max_pulse_width_us=width_us, max_torque_nm=request.max_torque_nm
-        )
-        of = self._channel
         return TestPlan(
-            test_id=f"{request.calibration_id}.{len(self._played.trains) + 1:03d}",
+            test_id=f"{request.calibration_id}.{len(self._trains) + 1:03d}",
             participant=request.participant,
             kind="calibration",
-            profile=profile,
-            channels=[ChannelPlan(name=of.name, profile=profile)] if of else None,
+            profile=Profile(
+                current_ma=request.current_ma, max_pulse_width_us=width_us, max_torque_nm=request.max_torque_nm
+            ),
             segments=[rest, SegmentPlan(name="train", sequence="steps", settings=steps), rest],
             pulse_rate_hz=request.pulse_rate_hz,
         )
@@ -239,13 +204,13 @@ class Calibration:
             if width_us < self._width_us:
                 self._left_us.add(self._width_us)
             self._width_us = width_us
-        charge_uc, played = float(finished.summary.get("charge_uc", 0.0)), self._played
-        self._charge_uc += charge_uc
-        played.charge_uc += charge_uc
-        train = {"pulse_width_us": width_us, "pulses": pulses, "torque_rise_nm": torque_rise_nm, "channel": self._name}
-        played.trains.append(CalibrationTrain(number=len(played.trains) + 1, **train))
+        self._charge_uc += float(finished.summary.get("charge_uc", 0.0))
+        number = len(self._trains) + 1
+        self._trains.append(
+            CalibrationTrain(number=number, pulse_width_us=width_us, pulses=pulses, torque_rise_nm=torque_rise_nm)
+        )
         if finished.recording_path is not None:
-            played.recordings.append(finished.recording_path)
+            self.recordings.append(finished.recording_path)
 
     def mark(self, threshold: Threshold) -> None:
         """Mark the last train's width as that threshold.
@@ -303,7 +268,7 @@ class Calibration:
             next_us={step: width_us for step in STEPS if (width_us := self._would_send_us(step)) is not None},
             marks_us=dict(self._marks_us),
             missing=self._missing(),
-            trains=list(self._played.trains),
+            trains=list(self._trains),
         )
 
     def _would_send_us(self, direction: Direction) -> float | None:
@@ -330,88 +295,6 @@ class Calibration:
         return Limit(width.name, 0.0, most_us, width.unit, width.reason, width.source, owner)
 
 
-class CalibrationOfChannels:
-    """An open calibration: of one channel that nobody names, or of several, each with its own trains and marks.
-
-    `rig`: the rig's channels. Everything else as of `Calibration`; raises PlanError, RefusedError also for a channel
-    that the rig does not have.
-    """
-
-    def __init__(
-        self, request: CalibrateStartRequest, table: dict[str, Limit], unix_s: float, steps: Steps = FINEST,
-        rig: Sequence[RigChannel] = (),
-    ) -> None:  # fmt: skip
-        self.request, self._playing = request, ""
-        if request.channels is None:
-            table = limits.narrowed(table, rig[0].limits, f"rig file, {rig[0].name}") if rig else table
-            self._of = {"": Calibration(request, table, unix_s, steps)}
-            return
-        self._check(request.channels, table, rig)
-        own = {one.name: limits.narrowed(table, one.limits, f"rig file, {one.name}") for one in rig}
-        played = Played()
-        self._of = {
-            one.name: Calibration(_request_for(one, request), own[one.name], unix_s, steps, one, played)
-            for one in request.channels
-        }
-        self._playing = request.channels[0].name
-
-    @property
-    def recordings(self) -> list[str]:
-        return self._of[self._playing].recordings
-
-    def check_day(self, unix_s: float) -> None:
-        self._of[self._playing].check_day(unix_s)
-
-    def channel(self, name: str) -> Calibration:
-        """That channel's. Raises PlanError: it is none of this calibration's, or not named."""
-        if name not in self._of:
-            known = ", ".join(filter(None, self._of)) or "leave it out: there is one"
-            raise PlanError(f"calibration: channel {name!r} is not calibrated ({known})")
-        return self._of[name]
-
-    def played(self, plan: TestPlan, torque_rise_nm: float | None, finished: FinishedEvent) -> None:
-        """See `Calibration.played`; `plan`: of the train."""
-        self._playing = plan.channels[0].name if plan.channels else ""
-        self._of[self._playing].played(plan.profile.max_pulse_width_us, torque_rise_nm, finished)
-
-    def result(self, unix_s: float) -> CalibrationResult:
-        """With a profile for each channel. Raises PlanError (a threshold is not marked: names the channel)."""
-        if self.request.channels is None:
-            return CalibrationResult(profile=self._of[self._playing].profile(unix_s), recordings=self.recordings)
-        profiles = dict[str, Profile]()
-        for name, one in self._of.items():
-            try:
-                profiles[name] = one.profile(unix_s)
-            except PlanError as error:
-                raise PlanError(f"channel {name}: {error}") from None
-        first = profiles[self.request.channels[0].name]
-        return CalibrationResult(profile=first, recordings=self.recordings, profiles=profiles)
-
-    def status(self) -> CalibrationStatus:
-        status = self._of[self._playing].status()
-        if self.request.channels is None:
-            return status
-        shown = set(ChannelCalibration.model_fields) - {"name"}
-        each = [
-            ChannelCalibration(name=name, **one.status().model_dump(include=shown)) for name, one in self._of.items()
-        ]
-        return status.model_copy(update={"channels": each})
-
-    @staticmethod
-    def _check(channels: Sequence[CalibrateChannel], table: dict[str, Limit], rig: Sequence[RigChannel]) -> None:
-        """As for a test: the rig's channels, each once."""
-        profile = Profile(current_ma=0.0, max_pulse_width_us=0.0, max_torque_nm=1.0)
-        plans = [ChannelPlan(name=one.name, profile=profile) for one in channels]
-        played(TestPlan(test_id="", participant="", profile=profile, segments=None, channels=plans), table, rig)
-
-
-def _request_for(channel: CalibrateChannel, request: CalibrateStartRequest) -> CalibrateStartRequest:
-    """The request as it would be for that channel alone."""
-    own = {"current_ma": channel.current_ma, "max_pulse_width_us": channel.max_pulse_width_us}
-    given = {name: value for name, value in own.items() if value is not None}
-    return request.model_copy(update={**given, "last": channel.last, "channels": None})
-
-
 def end_of_day_s(unix_s: float) -> float:
     """Next midnight in the rig's time zone, s since 1970."""
     here = datetime.fromtimestamp(unix_s, UTC).astimezone()
@@ -424,9 +307,8 @@ def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
 
     `angle_set_at_utc` is of the angle sensor's present calibration; None: it has none.
     """
-    profiles = [plan.profile, *(channel.profile for channel in plan.channels or ())]
-    said = {profile.angle_set_at_utc for profile in profiles if profile.angle_range_rad is not None}
-    if plan.angle is None or said <= {angle_set_at_utc}:
+    profile = plan.profile
+    if plan.angle is None or profile.angle_range_rad is None or profile.angle_set_at_utc == angle_set_at_utc:
         return
     if angle_set_at_utc is None:
         raise RefusedError(
@@ -435,16 +317,6 @@ def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
     raise RefusedError(
         f"profile.angle_range_rad: the angle sensor was calibrated anew at {angle_set_at_utc}; say the range again"
     )
-
-
-def check_profiles(plan: TestPlan, unix_s: float, required: bool, duration_s: float) -> None:
-    """Check the profile of each channel that a test plays; see `check_profile`. Raises RefusedError."""
-    check_profile(plan.profile, unix_s, required, duration_s)
-    for channel in plan.channels or ():
-        try:
-            check_profile(channel.profile, unix_s, required, duration_s)
-        except RefusedError as error:
-            raise RefusedError(f"channel {channel.name}: {error}") from None
 
 
 def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: float = 0.0) -> None:

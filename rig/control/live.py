@@ -19,8 +19,7 @@ from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.run import TestRun
 from stimrig.rig.control.replies import to_line
 from stimrig.rig.gate import Done
-from stimrig.rig.messages import ChannelPulses, LaidSegment, LiveEvent, PulseOutcomes, TorqueSamples
-from stimrig.rig.train import Train
+from stimrig.rig.messages import LaidSegment, LiveEvent, PulseOutcomes, TorqueSamples
 
 log = logging.getLogger("rig.live")
 
@@ -38,9 +37,7 @@ class Taken(NamedTuple):
     angles: list[NDArray[Any]] | None  # None: the rig has no angle sensor
     done: list[Done]  # pulses of which it is known what became of them
     segments: tuple[tuple[Any, ...], ...] = ()  # of the test; of one that is not adaptive none
-    train: Train = Train(1.0)
-    channels: tuple[tuple[str, dict[str, float]], ...] = ()
-    """Name and counts of each, where the test names its channels."""
+    pulse_rate_hz: float = 1.0
 
 
 def take(
@@ -71,9 +68,7 @@ def take(
     done = run.gate.done[run.told_pulses :]
     run.told_pulses += len(done)
     segments = run.score.laid.segments if run.score.adaptive else ()  # they hold every pulse before
-    channels = tuple(run.by_channel().items()) if run.plan.channels else ()
-    fields |= _of_run(run)
-    return Taken(fields, origin_s, samples, blocks, angles, done, segments, run.score.train, channels)
+    return Taken({**fields, **_of_run(run)}, origin_s, samples, blocks, angles, done, segments, run.plan.pulse_rate_hz)
 
 
 def _emptied(queue: Any) -> list[NDArray[Any]]:
@@ -94,7 +89,7 @@ def _of_run(run: TestRun) -> dict[str, Any]:
         "charge_uc": run.gate.charge_uc,
         "torque_time_nms": float(np.nan_to_num(run.torque_time_nms)),
         "laid": run.score.decided,
-        "boundary_s": run.score.train.length_s(run.score.decided),
+        "boundary_s": run.score.decided / run.plan.pulse_rate_hz,
         "ended_by": run.ended_by,
         "pauses": run.pauses.all if run.pauses else [],
     }
@@ -102,7 +97,7 @@ def _of_run(run: TestRun) -> dict[str, Any]:
 
 def live_event(taken: Taken) -> LiveEvent:
     """The newest torque as minimum and maximum of bins of 10 ms, and the pulses."""
-    found, train = np.concatenate(taken.blocks), taken.train
+    found, rate_hz = np.concatenate(taken.blocks), taken.pulse_rate_hz
     bins = np.floor((found["host_time_s"] - taken.origin_s) / BIN_S)
     starts = np.concatenate([[0], np.flatnonzero(np.diff(bins) > 0) + 1])
     return LiveEvent(
@@ -110,15 +105,14 @@ def live_event(taken: Taken) -> LiveEvent:
         time_s=np.round(bins[starts] * BIN_S, 4).tolist(),
         torque_min_nm=_finite(np.fmin.reduceat(found["torque_nm"], starts)),
         torque_max_nm=_finite(np.fmax.reduceat(found["torque_nm"], starts)),
-        pulse_time_s=[train.due_s(pulse.index) for pulse in taken.done],
+        pulse_time_s=[pulse.index / rate_hz for pulse in taken.done],
         pulse_width_us=[pulse.pulse_width_us for pulse in taken.done],
         laid_segments=[
-            LaidSegment(name=name, start_s=train.length_s(start), end_s=train.length_s(end), by=by)
+            LaidSegment(name=name, start_s=start / rate_hz, end_s=end / rate_hz, by=by)
             for name, start, end, by in taken.segments
         ],
         samples=_samples(found, taken.origin_s) if taken.samples else None,
-        outcomes=_outcomes(taken) if taken.samples else None,
-        channels=[_channel(taken, place) for place in range(len(taken.channels))] or None,
+        outcomes=_outcomes(taken.done, taken.origin_s) if taken.samples else None,
         angle=_rows(taken.angles, taken.origin_s) if taken.samples and taken.angles is not None else None,
     )
 
@@ -157,22 +151,7 @@ def _samples(found: NDArray[Any], origin_s: float) -> TorqueSamples:
     )
 
 
-def _channel(taken: Taken, place: int) -> ChannelPulses:
-    name, counts = taken.channels[place]
-    own = [pulse for pulse in taken.done if taken.train.channel(pulse.index) == place]
-    return ChannelPulses(
-        name=name,
-        pulse_time_s=[taken.train.due_s(pulse.index) for pulse in own],
-        pulse_width_us=[pulse.pulse_width_us for pulse in own],
-        sent_pulses=int(counts["pulses"]),
-        dropped_pulses=int(counts["dropped_pulses"]),
-        charge_uc=counts["charge_uc"],
-    )
-
-
-def _outcomes(taken: Taken) -> PulseOutcomes:
-    done, origin_s = taken.done, taken.origin_s
-
+def _outcomes(done: list[Done], origin_s: float) -> PulseOutcomes:
     def times(name: str) -> list[float | None]:
         return [finite(round(getattr(pulse, name) - origin_s, 6)) for pulse in done]
 
@@ -182,7 +161,6 @@ def _outcomes(taken: Taken) -> PulseOutcomes:
         written_time_s=times("written_s"),
         acknowledged_time_s=times("acknowledged_s"),
         status=[int(pulse.status) for pulse in done],
-        channel=[taken.train.channel(pulse.index) for pulse in done] if taken.channels else None,
     )
 
 

@@ -151,7 +151,7 @@ class Rest:
         first = test.first_pulse
         if self.last_pulse_s is None or first is None:
             return
-        first_s = test.train.due_s(first) + LEAD_S * self._clock.speed
+        first_s = first / test.plan.pulse_rate_hz + LEAD_S * self._clock.speed
         rest_s = self._clock.now_s() + first_s - self.last_pulse_s
         refusal = limits.check(limit, rest_s)
         if refusal is not None:

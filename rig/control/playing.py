@@ -209,7 +209,7 @@ class Player:
         await state.settle()
         self.run = None
         if train and state.calibration is not None:
-            state.calibration.played(run.plan, result.rise_nm, finished)
+            state.calibration.played(run.plan.profile.max_pulse_width_us, result.rise_nm, finished)
         if not train:
             self.finished = finished
         state.change(state.phase.sealed())

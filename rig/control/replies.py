@@ -6,14 +6,12 @@ import contextlib
 import json
 import re
 import time
-from collections.abc import Sequence
 from typing import Any, BinaryIO
 
 from pydantic import BaseModel, ValidationError
 
 from stimrig.rig import limits, plan
-from stimrig.rig.channels import RigChannel
-from stimrig.rig.control.calibration import check_profiles, check_range
+from stimrig.rig.control.calibration import check_profile, check_range
 from stimrig.rig.errors import RigError
 from stimrig.rig.limits import Limit
 from stimrig.rig.messages import Preview, Problem, Reply
@@ -66,22 +64,18 @@ def previewed(
     unix_s: float,
     speed: float = 1.0,
     angle_set_at_utc: str | None = None,
-    rig: Sequence[RigChannel] = (),
 ) -> Preview:
     """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""
     check_range(request.plan, angle_set_at_utc)
-    test = plan.build(request.plan, limits.for_plan(table, request.plan), rig)
-    check_profiles(request.plan, unix_s, required=False, duration_s=test.longest_s / speed)
+    test = plan.build(request.plan, limits.for_plan(table, request.plan))
+    check_profile(request.plan.profile, unix_s, required=False, duration_s=test.longest_s / speed)
     return plan.preview(test, request.recruitment)
 
 
-def answer(
-    line: bytes, table: dict[str, Limit], unix_s: float, speed: float, angle_set_at_utc: str | None,
-    rig: Sequence[RigChannel] = (),
-) -> Reply:  # fmt: skip
+def answer(line: bytes, table: dict[str, Limit], unix_s: float, speed: float, angle_set_at_utc: str | None) -> Reply:
     try:
         request = PreviewRequest.model_validate_json(line)
-        body = previewed(request, table, unix_s, speed, angle_set_at_utc, rig).model_dump(mode="json")
+        body = previewed(request, table, unix_s, speed, angle_set_at_utc).model_dump(mode="json")
         return Reply(id=request.id, ok=True, body=body)
     except ValidationError as error:
         return invalid_request(id_of(line), error)
@@ -101,8 +95,7 @@ def serve(requests: BinaryIO, replies: BinaryIO) -> None:
         return
     settings = json.loads(first)
     table = {name: Limit(**row) for name, row in settings["table"].items()}
-    rig = [RigChannel(**channel) for channel in settings["channels"]]
     for of_angle in requests:
-        reply = answer(requests.readline(), table, time.time(), settings["speed"], json.loads(of_angle), rig)
+        reply = answer(requests.readline(), table, time.time(), settings["speed"], json.loads(of_angle))
         replies.write(to_line(reply))
         replies.flush()

@@ -13,7 +13,7 @@ from stimrig.rig import limits, plan
 from stimrig.rig.config import RigConfig
 from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibrating import Calibrations
-from stimrig.rig.control.calibration import check_profiles, check_range
+from stimrig.rig.control.calibration import check_profile, check_range
 from stimrig.rig.control.live import Taken, finite, take
 from stimrig.rig.control.memory import LatchFile, Rest, Result
 from stimrig.rig.control.pair import Pair
@@ -58,8 +58,8 @@ class Rig:
         self._data_dir, self._require_calibration = config.data_dir, config.require_calibration
         self._machine, self._tasks, self._clock = machine, machine.tasks, machine.tasks.clock
         self._publish, self.speed = publish, machine.tasks.clock.speed
-        self.table, self.channels = config.table(), config.channels()
-        """Hard limits, narrowed by the rig file; the channels that have names."""
+        self.table = config.limits.table()
+        """Hard limits, narrowed by the rig file."""
         self._born_s = self._clock.now_s()
         self.state = State(LatchFile(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._tell)
         self.pair = Pair(config, machine, self.fault, self._lost)
@@ -68,7 +68,7 @@ class Rig:
         self.store = RecordingStore(config, machine)
         self._result = Result(config.data_dir, machine)
         self.player = Player(self.state, self.pair, self.rest, self.store, machine, config.watch, publish)
-        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self.channels, self._tell)
+        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self._tell)
 
     @property
     def latch(self) -> str:
@@ -87,7 +87,6 @@ class Rig:
             cell["measured_rate_hz"] = round(measured_hz, 2)
         seen = receiver is not None and receiver.last_s is not None
         stimulator = self.pair.identity["stimulator"]
-        named = {"channels": [channel.described() for channel in self.channels]} if self.channels else {}
         return Status(
             state=phase.state,
             reason=phase.reason_stopped,
@@ -97,7 +96,7 @@ class Rig:
             segment=run.segment() if run else None,
             elapsed_s=run.elapsed_s() if run else 0.0,
             duration_s=run.score.longest_s if run else 0.0,
-            stimulator=stimulator and {**stimulator, "shortest_us": self.pair.steps.shortest_us, **named},
+            stimulator=stimulator and {**stimulator, "shortest_us": self.pair.steps.shortest_us},
             load_cell=cell,
             torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
             torque_nm=finite(receiver.last_torque_nm) if receiver else None,
@@ -201,12 +200,12 @@ class Rig:
                     f"start.key: an adaptive test needs one of at least {MIN_KEY} characters; make a random one"
                 )
             table = limits.for_plan(self.table, request)
-            test = await self._tasks.work(plan.build, request, table, self.channels)
+            test = await self._tasks.work(plan.build, request, table)
             await self._tasks.work(self.store.check_room, request.test_id)
             following = state.phase.start(request.test_id, request.participant)  # a stop may have come meanwhile
             now_s, longest_s = self._clock.unix_s(), test.longest_s / self._clock.speed
             needs_widths = self._require_calibration and request.kind != PASSIVE  # no pulse, so no width to find
-            check_profiles(request, now_s, needs_widths, longest_s)
+            check_profile(request.profile, now_s, needs_widths, longest_s)
             check_range(request, self.joint.set_at_utc)
             plan.check_steps(test, self.pair.steps, table["width_rise_us"])
             self.rest.check(test, table["rest_between_tests_s"])

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import json
 import logging
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -27,7 +26,6 @@ from stimrig.rig.machine import Log, Machine
 from stimrig.rig.messages import FinishedEvent
 from stimrig.rig.plan import PlannedTest
 from stimrig.rig.signals import PulseStatus
-from stimrig.rig.train import train_of
 
 MAY_BE_FELT = PulseStatus.ACKNOWLEDGED, PulseStatus.UNACKNOWLEDGED, PulseStatus.DEVICE_ERROR
 REST_S = 0.1
@@ -51,9 +49,7 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
     `lost_s`: rig seconds before the test's end of which nothing may stand in the journal, as the computer lost its
     power: what was planned for so long counts, too.
     """
-    columns, attributes = recording.columns, recording.attributes
-    channels = json.loads(attributes.get("channels", "[{}]"))
-    train = train_of(attributes["pulse_rate_hz"], [one.get("offset_s", 0.0) for one in channels])
+    columns, rate_hz = recording.columns, recording.attributes["pulse_rate_hz"]
     status, n = columns["pulses/status"], len(columns["pulses/status"])
     felt = np.isin(status, MAY_BE_FELT)
     widths_us, currents_ma = columns["pulses/sent_pulse_width_us"][felt], columns["pulses/current_ma"][felt]
@@ -63,34 +59,17 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
     currents_ma = np.where(currents_ma > 0, currents_ma, highest_ma)
     header = contents.first_json(Kind.HEADER)  # None: it is lost
     planned_us = np.empty(0) if header is None else assembly.planned_pulses(contents, header, [])[0]
-    unseen_us = planned_us[n : n + int(np.ceil(lost_s * train.slots_per_s))]
+    unseen_us = planned_us[n : n + int(np.ceil(lost_s * rate_hz))]
     doubtful = int(np.sum(status == PulseStatus.UNACKNOWLEDGED)) + int(np.sum(unseen_us > 0))
-    played_s = max([train.length_s(n) if felt.any() else 0.0, *columns["segments/end_s"].tolist()])
+    played_s = max([n / rate_hz if felt.any() else 0.0, *columns["segments/end_s"].tolist()])
     return {
-        "duration_s": played_s + train.length_s(len(unseen_us)),
+        "duration_s": played_s + len(unseen_us) / rate_hz,
         "pulses": int(felt.sum()) + int(np.sum(unseen_us > 0)),
         "dropped_pulses": int(np.sum(status == PulseStatus.DROPPED)),
         "charge_uc": float(np.sum(widths_us * currents_ma) + np.sum(unseen_us) * highest_ma) * 1e-3,
         **_torque_dose(columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][felt]),
-        **({"channels": _by_channel(recording, channels, widths_us * currents_ma)} if "channels" in attributes else {}),
         "dose_is_bound": doubtful > 0,
         "doubtful_pulses": doubtful,
-    }
-
-
-def _by_channel(
-    recording: Recording, channels: list[dict[str, Any]], felt_nc: NDArray[Any]
-) -> dict[str, dict[str, float]]:
-    """What each channel has had. `felt_nc`: charge of each pulse that may be felt, nC."""
-    status, of = recording.columns["pulses/status"], recording.columns["pulses/channel"]
-    felt_on = of[np.isin(status, MAY_BE_FELT)]
-    return {
-        one["name"]: {
-            "charge_uc": float(np.sum(felt_nc[felt_on == place])) * 1e-3,
-            "pulses": int(np.sum(felt_on == place)),
-            "dropped_pulses": int(np.sum((status == PulseStatus.DROPPED) & (of == place))),
-        }
-        for place, one in enumerate(channels)
     }
 
 
@@ -318,7 +297,6 @@ class RecordingStore:
             "time_s": self._clock.now_s(),
             "unix_s": self._clock.unix_s(),
             **({} if angle is None else {"angle": angle}),
-            **({} if test.plan.channels is None else {"channels": self._channels(test)}),
         }
         try:
             book.begin(header, test.pulse_width_us[: certain[-1].end].astype("<f8").tobytes())
@@ -328,11 +306,6 @@ class RecordingStore:
                 self._disk.remove(book.path)
             raise
         return book
-
-    def _channels(self, test: PlannedTest) -> list[dict[str, Any]]:
-        """What the rig file says of the test's channels."""
-        known = self._config.channels()
-        return [known[channel.output].described() for channel in test.channels]
 
     def _create(self, path: Path) -> Log:
         try:

@@ -7,7 +7,7 @@ import logging
 import math
 from collections.abc import AsyncIterator, Callable
 
-from stimrig.rig.control.calibration import CalibrationOfChannels
+from stimrig.rig.control.calibration import Calibration
 from stimrig.rig.control.memory import LatchFile
 from stimrig.rig.errors import BusyError, LatchChangedError, RigError
 from stimrig.rig.phase import STOPPED, Phase
@@ -33,7 +33,7 @@ class State:
     def __init__(self, file: LatchFile, tasks: Tasks, instance: str, publish: Callable[[], None]) -> None:
         self.phase = Phase()
         self.file = file
-        self.calibration: CalibrationOfChannels | None = None
+        self.calibration: Calibration | None = None
         """The one that is open: a stop, a fault or a lost device closes it."""
         self.closing = False
         """Whether the rig shuts down: from now on nothing begins."""

@@ -1,8 +1,8 @@
 """Devices behind three small Protocols; each device is one file here, found by its id (the file's name).
 
-A device module has `KIND` ("stimulator", "load_cell" or "angle_sensor"), `Settings` (a pydantic model, the
-device's part of the rig file) and `create(settings, machine)`: the device, not yet opened; it raises ConfigError where
-a DBC file lacks the message or signal. To add a device, add a file.
+A device module has `KIND` ("stimulator", "load_cell" or "angle_sensor"), `Settings` (a pydantic model, the device's
+part of the rig file) and `create(settings, machine)`: the device, not yet opened; it raises ConfigError where a DBC
+file lacks the message or signal. To add a device, add a file.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ class Stimulator(Protocol):
         ...
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
-        """Write one pulse to the line, for the output of its channel, and return its number; waits for no ack.
+        """Write one pulse to the line and return its number; does not wait for the ack.
 
         Raises LateError if the clock has passed `latest_s` right before the write, and DeviceError.
         """

@@ -11,14 +11,11 @@ import struct
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar
-
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from typing import Any, ClassVar, Generic, TypeVar
 
 from stimrig.rig.devices import DeviceSettings
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.machine import Machine, Port
-from stimrig.rig.messages import CHANNEL_NAME, LONGEST_NAME, MOST_CHANNELS, RESERVED_NAMES, several
 from stimrig.rig.signals import Ack, LateError
 from stimrig.rig.tasks import Signal
 
@@ -324,69 +321,15 @@ class PacketLine:
             answered.set()
 
 
-Most = Annotated[float | None, Field(ge=0, strict=True)]
-
-
-class ChannelLimits(BaseModel):
-    """Tighter limits for one channel."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-    pulse_width_us: Most = None
-    current_ma: Most = None
-    charge_per_phase_uc: Most = None
-    charge_per_second_uc: Most = None
-
-
-class ChannelSettings(BaseModel):
-    """A named channel; a driver adds which of the device's outputs it is."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
-
-    name: str = Field(pattern=CHANNEL_NAME)
-    muscle: str = Field(min_length=1, max_length=LONGEST_NAME)
-    side: Literal["left", "right"]
-    electrode: str = Field("", max_length=LONGEST_NAME)
-    limits: ChannelLimits = ChannelLimits()
-    channel: int
-
-    @property
-    def output(self) -> tuple[int, ...]:
-        """What tells the device's outputs apart."""
-        return (self.channel,)
-
-
-C = TypeVar("C", bound=ChannelSettings)
-
-
-class LineSettings(DeviceSettings, Generic[C]):
+class LineSettings(DeviceSettings):
     """What the settings of every driver on a serial line have."""
 
     port: str
     channel: int
     reply_timeout_s: float
-    channels: list[C] = several(
-        [], "each with its name and its output; without them there is one", max_length=MOST_CHANNELS
-    )
-
-    @model_validator(mode="after")
-    def _differ(self) -> LineSettings[C]:
-        if self.channels and self.model_fields_set & {"channel", "connector"}:
-            raise ValueError("with [[stimulator.channels]] each of them names its output: remove it from [stimulator]")
-        for place, channel in enumerate(self.channels):
-            if channel.name in RESERVED_NAMES:
-                why = "stands for something else in files of several channels; give another name"
-                raise ValueError(f"channels.{place}.name: {channel.name!r} {why}")
-        for what, values in (
-            ("names", [channel.name for channel in self.channels]),
-            ("outputs", [channel.output for channel in self.channels]),
-        ):
-            if len(set(values)) < len(values):
-                raise ValueError(f"channels: their {what} must differ: {', '.join(map(str, values))}")
-        return self
 
 
-S = TypeVar("S", bound=LineSettings[Any])
+S = TypeVar("S", bound=LineSettings)
 
 
 class LineStimulator(Generic[S]):
@@ -416,7 +359,7 @@ class LineStimulator(Generic[S]):
             "id": serial_number,
             "firmware": firmware,
             "port": settings.port,
-            **({} if settings.channels else {"channel": settings.channel}),
+            "channel": settings.channel,
             "state": state,
         }
 

@@ -10,17 +10,9 @@ from enum import IntEnum
 
 from pydantic import Field
 
-from stimrig.rig.devices._line import (
-    SCIENCEMODE_4,
-    ChannelSettings,
-    LineSettings,
-    LineStimulator,
-    Packet,
-    in_words,
-)
+from stimrig.rig.devices._line import SCIENCEMODE_4, LineSettings, LineStimulator, Packet, in_words
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
-from stimrig.rig.machine import Machine
 from stimrig.rig.signals import Ack
 
 KIND = "stimulator"
@@ -113,16 +105,7 @@ def parse_version(data: bytes) -> str:
     return f"{data[1]}.{data[2]}.{data[3]} (ScienceMode {data[4]}.{data[5]}.{data[6]})"
 
 
-class Channel(ChannelSettings):
-    channel: int = Field(ge=1, le=4, description="1 red, 2 blue, 3 black, 4 white")
-    connector: int = Field(1, ge=1, le=2, description="1 yellow, 2 green")
-
-    @property
-    def output(self) -> tuple[int, ...]:
-        return self.connector, self.channel
-
-
-class Settings(LineSettings[Channel]):
+class Settings(LineSettings):
     port: str = Field(description="serial port, e.g. /dev/serial/by-id/usb-HASOMED_P24-if00")
     channel: int = Field(1, ge=1, le=4, description="1 red, 2 blue, 3 black, 4 white")
     connector: int = Field(1, ge=1, le=2, description="1 yellow, 2 green")
@@ -138,11 +121,6 @@ class P24(LineStimulator[Settings]):
     framing = SCIENCEMODE_4
     serial = {"baudrate": 3_000_000, "stopbits": 2, "rtscts": True}  # noqa: RUF012
 
-    def __init__(self, settings: Settings, machine: Machine) -> None:
-        super().__init__(settings, machine)
-        outputs = settings.channels or [settings]
-        self._outputs = [(one.channel - 1, one.connector - 1) for one in outputs]
-
     async def _identity(self) -> tuple[str, str]:
         serial_number = parse_device_id((await self._ask(Command.DEVICE_ID)).data)
         return serial_number, parse_version((await self._ask(Command.EXTENDED_VERSION)).data)
@@ -151,7 +129,7 @@ class P24(LineStimulator[Settings]):
         await self._ask(Command.LL_INIT, bytes((0,)))
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
-        channel, connector = self._outputs[pulse.output]
+        channel, connector = self._settings.channel - 1, self._settings.connector - 1
         return self._line.tell(
             lambda number: ll_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma, connector), latest_s
         )
@@ -180,19 +158,19 @@ class P24(LineStimulator[Settings]):
     def _take(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.LL_CHANNEL_CONFIG + 1:
             result = packet.data[0] if packet.data else 1
-            words = result_text(result) if result else None
-            self._line.on_ack(Ack(packet.number, time_s, words, self._output(packet.data)))
+            words = result_text(result) if result else self._of_another_output(packet.data)
+            self._line.on_ack(Ack(packet.number, time_s, words))
         elif packet.command in (Command.GENERAL_ERROR, Command.UNKNOWN_COMMAND):
             result = packet.data[0] if packet.data else 0
             words = result_text(result) if result else "unknown command"
             self._line.on_ack(Ack(packet.number, time_s, words))
 
-    def _output(self, data: bytes) -> int | None:
-        """Which of the rig's channels an ack names."""
-        if len(data) < 2:
+    def _of_another_output(self, data: bytes) -> str | None:
+        """Return the error of an ack that names another output than the rig file's; None where it is that one."""
+        settings = self._settings
+        if len(data) < 2 or (data[1] & 0xF, data[1] >> 4) == (settings.channel - 1, settings.connector - 1):
             return None
-        place = data[1] & 0xF, data[1] >> 4
-        return self._outputs.index(place) if place in self._outputs else -1
+        return "it acknowledged a pulse of an output that is not in use instead"
 
 
 create = P24

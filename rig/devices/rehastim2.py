@@ -14,7 +14,7 @@ from typing import Any
 
 from pydantic import Field
 
-from stimrig.rig.devices._line import SCIENCEMODE_2, ChannelSettings, LineSettings, LineStimulator, Packet
+from stimrig.rig.devices._line import SCIENCEMODE_2, LineSettings, LineStimulator, Packet
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted, Steps
 from stimrig.rig.machine import Machine
@@ -98,11 +98,7 @@ def single_pulse(number: int, channel: int, pulse_width_us: int, current_ma: flo
     return SCIENCEMODE_2.encode(Packet(number, Command.SINGLE_PULSE, data))
 
 
-class Channel(ChannelSettings):
-    channel: int = Field(ge=1, le=8, description="1 to 4 on side A, 5 to 8 on side B")
-
-
-class Settings(LineSettings[Channel]):
+class Settings(LineSettings):
     port: str = Field(description="serial port, e.g. /dev/serial/by-id/usb-FTDI_RehaStim2-if00-port0")
     channel: int = Field(1, ge=1, le=8, description="1 to 4 on side A, 5 to 8 on side B")
     reply_timeout_s: float = Field(0.3, gt=0, le=5, description="for commands other than pulses, real seconds")
@@ -118,7 +114,6 @@ class RehaStim2(LineStimulator[Settings]):
     def __init__(self, settings: Settings, machine: Machine) -> None:
         super().__init__(settings, machine)
         self._tasks, self._clock = machine.tasks, machine.tasks.clock
-        self._outputs = [one.channel - 1 for one in settings.channels or [settings]]
         self._armed = False
         self._offered = Signal()
         self._offer: Packet | None = None
@@ -139,7 +134,7 @@ class RehaStim2(LineStimulator[Settings]):
         self._armed = True
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
-        channel = self._outputs[pulse.output]
+        channel = self._settings.channel - 1
         return self._line.tell(
             lambda number: single_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma), latest_s
         )

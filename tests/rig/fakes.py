@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +16,11 @@ from stimrig.rig.acquire.health import DEFAULT_WATCH, Watch
 from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.run import Halt, RunResult, TestRun
 from stimrig.rig.adapters.files import Files
-from stimrig.rig.channels import RigChannel
 from stimrig.rig.errors import DeviceError, RigError
 from stimrig.rig.gate import Gate
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.limits import Admitted, Steps
-from stimrig.rig.messages import AdaptivePlan, AnglePlan, ChannelPlan, Profile, SegmentPlan, TestPlan
+from stimrig.rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
 from stimrig.rig.signals import ANGLE_SAMPLE, SAMPLE, Ack, AngleScale, Block, LateError
 from stimrig.rig.tasks import Outcome
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
@@ -55,9 +54,7 @@ class FakeStimulator:
         self.send_error: str | None = None
         self.silent = False
         self.on_send: Callable[[int], None] = lambda _: None
-        self.says_output: Callable[[int], int | None] = lambda output: output
         self._number = 0
-        self._outputs: dict[int, int] = {}
 
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
         self.on_ack, self.on_lost = on_ack, on_lost
@@ -84,13 +81,12 @@ class FakeStimulator:
         self.on_send(len(self.sent))
         if self.ack_delay_s is not None:
             at = self.clock.now_s() + self.ack_delay_s
-            self._outputs[number] = pulse.output
             self.clock.call_at(at, lambda: self._acknowledge(number, error))
         return number
 
     def _acknowledge(self, number: int, error: str | None) -> None:
         self.acked_s.append(self.clock.now_s())
-        self.on_ack(Ack(number, self.clock.now_s(), error, self.says_output(self._outputs[number])))
+        self.on_ack(Ack(number, self.clock.now_s(), error))
 
     async def stop(self) -> None:
         self.stops += 1
@@ -201,8 +197,6 @@ class VirtualRig:
         kind: str = "pre-session",
         angle: AnglePlan | None = None,
         has_sensor: bool = False,
-        channels: list[ChannelPlan] | None = None,
-        rig: Sequence[RigChannel] = (),
         **profile: Any,
     ) -> None:
         self.machine = VirtualMachine()
@@ -223,22 +217,18 @@ class VirtualRig:
             SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 1.0, "down_s": 1.0}),
             rest(0.5),
         ]
-        own = channels[0].profile if channels else Profile(**profile)
         self.plan = TestPlan(
-            test_id="t", participant="P", kind=kind, profile=own, segments=segments, adaptive=adaptive,
-            angle=angle, channels=channels,
+            test_id="t", participant="P", kind=kind, profile=Profile(**profile), segments=segments, adaptive=adaptive,
+            angle=angle,
         )  # fmt: skip
         self.table = limits.for_plan(base, self.plan)
-        self.test = plan.build(self.plan, self.table, rig)
+        self.test = plan.build(self.plan, self.table)
         self.path = folder / "t.journal"
         self.journal = journal_at(self.path)
         self.run = TestRun(
             self.test, self.table, self.journal, self.gate, self.receiver, self.machine, self.halt, watch, self.angle
         )
-        named = {"channels": [rig[channel.output].described() for channel in self.test.channels]} if channels else {}
-        self.journal.append_json(
-            Kind.HEADER, header(self.run, self.clock) | ({} if self.angle is None else OF_ANGLE) | named
-        )
+        self.journal.append_json(Kind.HEADER, header(self.run, self.clock) | ({} if self.angle is None else OF_ANGLE))
         self.journal.append(Kind.PLAN, self.run.score.laid.pulse_width_us.astype("<f8").tobytes())
 
     def at(self, time_s: float, action: Callable[[], object]) -> None:

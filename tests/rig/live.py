@@ -14,7 +14,6 @@ from stimrig.rig import config
 from stimrig.rig.control import pair
 from stimrig.rig.control.live import live_event
 from stimrig.rig.control.rig import Rig
-from stimrig.rig.devices import find
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Disk
 from stimrig.rig.messages import (
@@ -142,8 +141,6 @@ class LiveRig:
     ----------
     clock
         Of a rig that was closed: time goes on where that one ended.
-    channels
-        Of the rig file, with their names.
     changes
         To its configuration.
     """
@@ -155,7 +152,6 @@ class LiveRig:
         armed: bool = False,
         clock: VirtualClock | None = None,
         disk: Disk | None = None,
-        channels: list[dict[str, Any]] | None = None,
         **changes: Any,
     ) -> None:
         self.clock = clock or VirtualClock()
@@ -168,9 +164,6 @@ class LiveRig:
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _machine: made[kind]))
         monkeypatch.setattr(pair, "devices", found)
         self.config = config.for_emulator(json.dumps(LINE), data_dir=folder, socket=folder / "s")
-        if channels:
-            stimulator = {"device": "p24", "port": LINE["stimulator"], "channels": channels}
-            changes["stimulator"] = find("stimulator", "p24").Settings.model_validate(stimulator)
         self.config = self.config.model_copy(update=changes)
         self.events: list[Event] = []
         self.rig = Rig(self.config, self.machine, self.events.append)
@@ -211,11 +204,11 @@ class LiveRig:
     def rearm(self, by: str = "nurse") -> Status:
         return self.ask(self.rig.rearm(by, self.rig.latch))
 
-    def step(self, direction: Direction = "up", channel: str = "") -> None:
-        self.ask(self.rig.calibrations.step(CalibrateStepRequest(direction=direction, channel=channel)))
+    def step(self, direction: Direction = "up") -> None:
+        self.ask(self.rig.calibrations.step(CalibrateStepRequest(direction=direction)))
 
-    def mark(self, threshold: Threshold, channel: str = "") -> None:
-        self.ask(self.rig.calibrations.mark(CalibrateMarkRequest(threshold=threshold, channel=channel)))
+    def mark(self, threshold: Threshold) -> None:
+        self.ask(self.rig.calibrations.mark(CalibrateMarkRequest(threshold=threshold)))
 
     def stored(self, calibration_id: str) -> Status:
         self.ask(self.rig.calibrations.stored(calibration_id))

@@ -11,7 +11,7 @@ import pytest
 from stimrig.hardware_sim.load_cells import CELLS
 from stimrig.hardware_sim.load_cells.frames import Sample
 from stimrig.hardware_sim.stimulators import STIMULATORS
-from stimrig.rig import config, limits
+from stimrig.rig import config
 from stimrig.rig.devices import find, library
 from stimrig.rig.errors import ConfigError
 from stimrig.rig.machine import Frame
@@ -213,101 +213,3 @@ def test_every_emulated_device_has_its_description(tmp_path: Path, stimulator: s
     assert frame.can_id == device._frame.message.frame_id
     read = device.decode([Frame(frame.can_id, frame.data, 1.0, 1.0)])
     assert read.samples["torque_nm"] == pytest.approx([sample.torque_nm for sample in samples], abs=2e-3)
-
-
-TWO = """
-[[stimulator.channels]]
-name = "biceps"
-muscle = "m. biceps brachii"
-side = "right"
-electrode = "5 x 5 cm"
-channel = 1
-[[stimulator.channels]]
-name = "triceps"
-muscle = "m. triceps brachii"
-side = "right"
-channel = 2
-connector = 2
-[stimulator.channels.limits]
-pulse_width_us = 250
-charge_per_phase_uc = 9
-"""
-
-
-def of_channels(tmp_path: Path, more: str = TWO, **replaced: str) -> config.RigConfig:
-    for old, new in replaced.items():
-        more = more.replace(old.replace("_eq_", " = "), new)
-    head, load_cell = GOOD.split("[load_cell]")
-    return load(tmp_path, f"{head}{more}\n[load_cell]{load_cell}")
-
-
-def test_several_channels(tmp_path: Path):
-    loaded = of_channels(tmp_path)
-    biceps, triceps = loaded.channels()
-    assert biceps.described() == {
-        "name": "biceps", "muscle": "m. biceps brachii", "side": "right", "electrode": "5 x 5 cm",
-    }  # fmt: skip
-    assert biceps.limits == {}
-    assert triceps.limits == {"pulse_width_us": 250.0, "charge_per_phase_uc": 9.0}
-    table = loaded.table()
-    assert set(table) == {*limits.HARD_LIMITS, *limits.SUM_LIMITS}
-    assert table["pulse_width_us"].hi == 400, "of the rig, not of one channel"
-    assert loaded.public()["stimulator"]["channels"][1]["connector"] == 2
-
-
-def test_one_channel_sees_nothing_of_it(tmp_path: Path):
-    loaded = load(tmp_path, GOOD)
-    assert loaded.channels() == ()
-    assert loaded.table() == loaded.limits.table()
-    assert set(loaded.table()) == set(limits.HARD_LIMITS)
-    assert "channels" not in loaded.public()["stimulator"]
-
-
-@pytest.mark.parametrize(
-    ("replaced", "words"),
-    [
-        ({"triceps": "biceps"}, "their names must differ: biceps, biceps"),
-        ({"connector = 2": "connector = 1", "channel = 2": "channel = 1"}, "their outputs must differ"),
-        ({'"triceps"': '"Triceps!"'}, "stimulator.channels.1.name"),
-        ({'"triceps"': '"joint"'}, "stimulator.channels.1.name"),
-        ({'side = "right"': 'side = "up"'}, "stimulator.channels.0.side"),
-        ({"channel = 2": "channel = 5"}, "stimulator.channels.1.channel"),
-        ({"channel = 2\n": ""}, "stimulator.channels.1.channel: missing"),
-        ({"pulse_width_us = 250": "pulse_width_us = nan"}, "stimulator.channels.1.limits.pulse_width_us"),
-        ({"pulse_width_us = 250": "pulse_width_us = true"}, "stimulator.channels.1.limits.pulse_width_us"),
-        ({"pulse_width_us = 250": "torque_nm = 2"}, "torque_nm"),
-        ({"[[stimulator.channels]]\nname = \"biceps\"": "channel = 3\n[[stimulator.channels]]\nname = \"biceps\""},
-         "each of them names its output"),
-    ],
-)  # fmt: skip
-def test_a_wrong_channel_is_one_line(tmp_path: Path, replaced: dict[str, str], words: str):
-    with pytest.raises(ConfigError) as told:
-        of_channels(tmp_path, **replaced)
-    assert words in str(told.value)
-    assert "\n" not in str(told.value)
-    assert len(str(told.value)) < 400
-
-
-def test_a_rehastim_2_has_channels(tmp_path: Path):
-    more = TWO.replace("connector = 2", "").replace("channel = 2", "channel = 8")
-    head, load_cell = GOOD.replace('"p24"', '"rehastim2"').split("[load_cell]")
-    loaded = load(tmp_path, f"{head}{more}\n[load_cell]{load_cell}")
-    assert [one["channel"] for one in loaded.stimulator.model_dump()["channels"]] == [1, 8]
-
-
-@pytest.mark.parametrize(
-    ("device", "plugs"),
-    [
-        ("p24", [{"channel": 1, "connector": 1}, {"channel": 2, "connector": 2}]),
-        ("rehastim2", [{"channel": 1}, {"channel": 6}]),
-    ],
-)
-def test_an_emulator_tells_its_outputs(device: str, plugs: list[dict[str, int]]):
-    line = {"stimulator": "/dev/pts/gone", "can": {"interface": "virtual"}, "stimulator_device": device}
-    loaded = config.for_emulator(
-        json.dumps({**line, "outputs": [[0, 0], [1, 1]]}), data_dir=Path("d"), socket=Path("s")
-    )
-    assert [one.name for one in loaded.channels()] == ["biceps", "triceps"]
-    told = loaded.stimulator.model_dump()["channels"]
-    assert [{name: one[name] for name in plug} for one, plug in zip(told, plugs, strict=True)] == plugs
-    assert config.for_emulator(json.dumps(line), data_dir=Path("d"), socket=Path("s")).channels() == ()

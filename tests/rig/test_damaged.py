@@ -25,7 +25,6 @@ from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.errors import JournalError, RecordingError
 from stimrig.rig.journal import JournalContents, Kind
 from stimrig.rig.messages import SegmentPlan
-from stimrig.rig.train import Train
 from tests.rig.fakes import VirtualRig, header, journal_at
 from tests.rig.live import ACK_S, SPEED, LiveRig
 from tests.simulator.disk import SimulatedDisk
@@ -235,9 +234,9 @@ def test_a_sender_that_lost_the_processor_wrote_before_the_ack() -> None:
         blocks.append((Kind.WRITTEN, journal.WRITTEN.pack(index, index, written_s)))
         if acked_s is not None:
             blocks.append((Kind.ACKED, journal.ACKED.pack(index, acked_s)))
-    pulses = _Pulses(np.full(3, 120.0), np.full(3, 20.0), 10.0)
+    pulses = _Pulses(np.full(3, 120.0), 20.0, 10.0)
     pulses.take(JournalContents(Path("j"), blocks, 0, 0))
-    columns = pulses.columns(Train(40.0), 0.075, blocks_missing=False, notes=[])
+    columns = pulses.columns(40.0, 0.075, blocks_missing=False, notes=[])
     expected_s = [0.0013, 0.0251, 0.0503]
     np.testing.assert_allclose(columns["pulses/written_time_s"], expected_s, atol=1e-9)
 

@@ -375,49 +375,42 @@ class Line:
     def close(self) -> None: ...
 
 
-CHANNELS = [
-    {"name": "biceps", "muscle": "b", "side": "right", "channel": 1},
-    {"name": "triceps", "muscle": "t", "side": "right", "channel": 4},
-]
-
-
-def driver(device: str, channels: list[dict[str, Any]]) -> tuple[Any, Line, list[Ack]]:
+def driver(device: str, **settings: int) -> tuple[Any, Line, list[Ack]]:
     machine, line, acks = VirtualMachine(VirtualClock()), Line(), list[Ack]()
     machine.port = lambda *_, **__: line  # type: ignore[method-assign]
     module = library("stimulator")[device]
-    made = module.create(module.Settings(device=device, port="/dev/x", channels=channels), machine)
+    made = module.create(module.Settings(device=device, port="/dev/x", **settings), machine)
     made.listen(acks.append, lambda _: None)
     machine.run(made._line.open())
     return made, line, acks
 
 
-def test_a_p24_sends_to_the_output_of_the_pulses_channel():
-    channels = [CHANNELS[0], {**CHANNELS[1], "connector": 2}, {**CHANNELS[0], "name": "brachialis", "connector": 2}]
-    made, line, _ = driver("p24", channels)
-    for output in range(3):
-        made.send(Admitted(250, 20.0, output), 1e9)
-    heads = [SCIENCEMODE_4.decode(frame).data[0] for frame in line.written]
-    assert [(head >> 7, head >> 5 & 3, head >> 4 & 1) for head in heads] == [(1, 0, 0), (1, 3, 1), (1, 0, 1)]
+def test_a_p24_sends_to_the_output_of_the_rig_file():
+    made, line, _ = driver("p24", channel=4, connector=2)
+    made.send(Admitted(250, 20.0), 1e9)
+    (head,) = [SCIENCEMODE_4.decode(frame).data[0] for frame in line.written]
+    assert (head >> 7, head >> 5 & 3, head >> 4 & 1) == (1, 3, 1)
 
 
-@pytest.mark.parametrize(("place", "output"), [(0x00, 0), (0x13, 1), (0x10, -1), (0x03, -1)])
-def test_a_p24s_ack_names_its_output(place: int, output: int):
-    made, line, acks = driver("p24", [CHANNELS[0], {**CHANNELS[1], "connector": 2}])
-    number = made.send(Admitted(250, 20.0, 1), 1e9)
+@pytest.mark.parametrize(("place", "ours"), [(0x00, False), (0x13, True), (0x10, False), (0x03, False)])
+def test_a_p24s_ack_of_another_output_is_an_error(place: int, ours: bool):
+    made, line, acks = driver("p24", channel=4, connector=2)
+    number = made.send(Admitted(250, 20.0), 1e9)
     line.take(SCIENCEMODE_4.encode(RigsPacket(number, 3, bytes((0, place, 0)))), 0.0)
-    assert [(ack.number, ack.error, ack.output) for ack in acks] == [(number, None, output)]
+    (ack,) = acks
+    assert ack.number == number
+    assert ack.error == (None if ours else "it acknowledged a pulse of an output that is not in use instead")
 
 
 def test_the_vendors_acks_are_of_the_first_output():
-    made, line, acks = driver("p24", [])
+    made, line, acks = driver("p24")
     for number in range(1, 6):
         assert made.send(Admitted(250, 20.0), 1e9) == number
     line.take(bytes.fromhex("f0 81 55 81 5a 81 43 81 d5 14 03 00 00 00 0f"), 0.0)
-    assert [(ack.number, ack.error, ack.output) for ack in acks] == [(5, None, 0)]
+    assert [(ack.number, ack.error) for ack in acks] == [(5, None)]
 
 
-def test_a_rehastim_2_sends_to_the_output_of_the_pulses_channel():
-    made, line, _ = driver("rehastim2", [{**CHANNELS[0], "channel": 2}, {**CHANNELS[1], "channel": 8}])
-    for output in (0, 1):
-        made.send(Admitted(250, 20.0, output), 1e9)
-    assert [SCIENCEMODE_2.decode(frame).data[0] for frame in line.written] == [1, 7]
+def test_a_rehastim_2_sends_to_the_output_of_the_rig_file():
+    made, line, _ = driver("rehastim2", channel=8)
+    made.send(Admitted(250, 20.0), 1e9)
+    assert [SCIENCEMODE_2.decode(frame).data[0] for frame in line.written] == [7]

@@ -11,7 +11,7 @@ from pydantic import ValidationError
 
 from stimrig.rig.control.replies import id_of, invalid_request, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
-from stimrig.rig.messages import ChannelSequence, Event, FinishedEvent, Reply, SegmentPlan, StateEvent, TestPlan
+from stimrig.rig.messages import Event, FinishedEvent, Reply, SegmentPlan, StateEvent, TestPlan
 from stimrig.rig.requests import EnoughRequest, ExtendRequest, RearmRequest, StartRequest, StopRequest, WithdrawRequest
 from tests.simulator.host import Process
 from tests.simulator.world import World
@@ -155,10 +155,6 @@ class Clinic:
     def extend(self, test_id: str, key: str, after: int) -> Asked:
         """Lay one more segment, as a client that chooses them."""
         more = SegmentPlan(name="more", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1})
-        run = None if self.rig is None else self.rig.player.run
-        if run is not None and len(run.plan.channels or ()) > 1:
-            other = ChannelSequence(sequence="steps", settings={"on_s": 0.25, "off_s": 0.25, "repeats": 1})
-            more = more.model_copy(update={"channels": {"triceps": other}})
         return self.ask(ExtendRequest(id=1, test_id=test_id, key=key, after=after, segments=[more]), test_id)
 
     def enough(self, test_id: str) -> Asked:

@@ -9,7 +9,6 @@ line's; after them the rig must stop like after any fault.
 from __future__ import annotations
 
 import io
-import json
 from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Iterator
 from functools import lru_cache
@@ -30,8 +29,6 @@ from tests.simulator.life import FOLDER, Felt, Life
 ON_ITS_WAY_S = 0.06
 """A command that nothing holds is felt within this time: the line's transit, and what the stimulator does before it."""
 CLOSEST_S = 0.008
-LONGEST_PULSE_S = 0.0011
-"""Two phases of 500 µs, and 100 µs between them."""
 MOST_PULSES_A_SECOND = 60
 MOST_UC_A_SECOND = 1600.0
 MOST_UC_A_PULSE = 40.0
@@ -71,17 +68,17 @@ ANSWERED_S = 8.0
 """A stop waits up to 6 s for what the torque shows."""
 WRITTEN_S = 0.05
 """A latch is on a disk that works within this time."""
+OUTPUT = 0, 0
+"""Of the rig file: connector and channel, from 0."""
 STATES = {"ready", "latched", "uncertain", "disconnected", "calibrating"}
 
 
 def every_pulse_is_within_the_limits(life: Life) -> Iterator[str]:
     """Width, current, charge, balance: of every pulse, whatever the line did to its command."""
-    profiles = [channel.profile for channel in life.channels] or [life.profile]
+    widest_us, most_ma = life.profile.max_pulse_width_us, life.profile.current_ma
     for pulse in life.felt:
-        if pulse.output < 0:
-            yield f"{pulse.time_s:.4f} s: at an output that is no channel"
-            continue
-        widest_us, most_ma = profiles[pulse.output].max_pulse_width_us, profiles[pulse.output].current_ma
+        if pulse.output != OUTPUT:
+            yield f"{pulse.time_s:.4f} s: at an output that is not the rig file's"
         if not (0 < pulse.width_us <= widest_us and 0 < pulse.current_ma <= most_ma):
             yield f"{pulse.time_s:.4f} s: {pulse.width_us:g} µs, {pulse.current_ma:g} mA"
         if not (pulse.width_us * pulse.current_ma * 1e-3 <= MOST_UC_A_PULSE) or not pulse.balanced:
@@ -89,28 +86,16 @@ def every_pulse_is_within_the_limits(life: Life) -> Iterator[str]:
 
 
 def pulses_are_apart_and_not_too_many(life: Life) -> Iterator[str]:
-    """Interval, rate and charge of each second, of each channel by itself."""
-    for felt in _by_output(_true(life)):
-        for one, other in pairwise(felt):
-            if not (other.time_s - one.time_s >= CLOSEST_S - 1e-6):
-                yield f"{other.time_s:.4f} s: {1e3 * (other.time_s - one.time_s):.2f} ms after the pulse before"
-        for last, pulse in enumerate(felt):
-            second = [p for p in felt[: last + 1] if p.time_s > pulse.time_s - 1.0]
-            charge_uc = _charge_uc(second)
-            if not (len(second) <= MOST_PULSES_A_SECOND and charge_uc <= MOST_UC_A_SECOND + 1e-6):
-                yield f"{pulse.time_s:.4f} s: {len(second)} pulses, {charge_uc:.1f} µC within a second"
-
-
-def channels_never_flow_together_nor_too_much(life: Life) -> Iterator[str]:
-    """No pulse of a channel begins before one of another has certainly ended, and all channels share a charge."""
-    felt = sorted(_true(life), key=lambda pulse: pulse.time_s)
+    """Interval, rate and charge of each second."""
+    felt = _true(life)
     for one, other in pairwise(felt):
-        if one.output != other.output and not (other.time_s - one.time_s >= LONGEST_PULSE_S):
-            yield f"{other.time_s:.4f} s: {1e3 * (other.time_s - one.time_s):.2f} ms after one of another channel"
+        if not (other.time_s - one.time_s >= CLOSEST_S - 1e-6):
+            yield f"{other.time_s:.4f} s: {1e3 * (other.time_s - one.time_s):.2f} ms after the pulse before"
     for last, pulse in enumerate(felt):
-        charge_uc = _charge_uc([p for p in felt[: last + 1] if p.time_s > pulse.time_s - 1.0])
-        if not (charge_uc <= 2 * MOST_UC_A_SECOND + 1e-6):
-            yield f"{pulse.time_s:.4f} s: {charge_uc:.1f} µC of all channels within a second"
+        second = [p for p in felt[: last + 1] if p.time_s > pulse.time_s - 1.0]
+        charge_uc = sum(p.width_us * p.current_ma * 1e-3 for p in second)
+        if not (len(second) <= MOST_PULSES_A_SECOND and charge_uc <= MOST_UC_A_SECOND + 1e-6):
+            yield f"{pulse.time_s:.4f} s: {len(second)} pulses, {charge_uc:.1f} µC within a second"
 
 
 def a_test_is_no_longer_and_no_more_than_asked(life: Life) -> Iterator[str]:
@@ -118,14 +103,13 @@ def a_test_is_no_longer_and_no_more_than_asked(life: Life) -> Iterator[str]:
     for name, felt in _by_test(life).items():
         if not (felt[-1].time_s - felt[0].time_s <= LONGEST_TEST_S):
             yield f"{name}: felt for {felt[-1].time_s - felt[0].time_s:.2f} s"
-        each = [_charge_uc(of_one) for of_one in _by_output(felt)]
-        if not (max(each) <= MOST_UC_A_TEST and sum(each) <= 2 * MOST_UC_A_TEST):
+        if not (sum(p.width_us * p.current_ma * 1e-3 for p in felt) <= MOST_UC_A_TEST):
             yield f"{name}: too much charge"
 
 
 def pulses_keep_their_pace(life: Life) -> Iterator[str]:
     """Each is decided within a share of the period after it was due: a late one is left out, never sent in a burst."""
-    for name, felt in ((name, felt) for name, every in _by_test(life).items() for felt in _by_output(every)):
+    for name, felt in _by_test(life).items():
         period_s = 1 / (TRAIN_RATE_HZ if _calibration(name) else life.rate_hz)
         phases = np.array([life.wires.decided_s[pulse.written_s] / period_s % 1.0 for pulse in felt])
         after = (phases[None, :] - phases[:, None]) % 1.0
@@ -144,15 +128,14 @@ def tests_are_apart(life: Life) -> Iterator[str]:
 
 
 def trains_rise_in_small_steps(life: Life) -> Iterator[str]:
-    """No train of a calibration carries much more charge than those that were felt before it on its channel."""
-    most_uc: dict[tuple[str, int], float] = {}
-    for name, felt in ((name, felt) for name, every in _by_test(life).items() for felt in _by_output(every)):
+    """No train of a calibration carries much more charge than those that were felt before it."""
+    most_uc: dict[str, float] = {}
+    for name, felt in _by_test(life).items():
         if calibration := _calibration(name):
-            of = calibration, felt[0].output
             uc = max(p.width_us * p.current_ma * 1e-3 for p in felt)
-            if not (uc <= most_uc.get(of, 0.0) + MOST_RISE_UC + 1e-9):
-                yield f"{name}: {uc:.2f} µC, {most_uc.get(of, 0.0):.2f} µC before"
-            most_uc[of] = max(uc, most_uc.get(of, 0.0))
+            if not (uc <= most_uc.get(calibration, 0.0) + MOST_RISE_UC + 1e-9):
+                yield f"{name}: {uc:.2f} µC, {most_uc.get(calibration, 0.0):.2f} µC before"
+            most_uc[calibration] = max(uc, most_uc.get(calibration, 0.0))
 
 
 def nothing_is_written_blind(life: Life) -> Iterator[str]:
@@ -316,7 +299,7 @@ def every_pulse_has_its_intent_and_its_record(life: Life) -> Iterator[str]:
 def what_the_files_call_acknowledged_was_felt(life: Life) -> Iterator[str]:
     """No more acknowledged pulses in the files than were felt; a pulse of which a RehaStim 2 reports that it failed is
     acknowledged first, and ends its test or its train: it is told once, however often that is told again."""
-    acknowledged = sum(1 for test in _tests(life).values() for _, _, status, _ in test if status == 0)
+    acknowledged = sum(1 for test in _tests(life).values() for _, _, status in test if status == 0)
     failed = sum(
         told.process is before.process and "stimulator:" in told.reason and "stimulator:" not in before.reason
         for before, told in pairwise(life.clinic.states)
@@ -357,7 +340,7 @@ def recordings_are_whole_and_in_order(life: Life) -> Iterator[str]:
 
 def after_a_pause_the_width_climbs_from_nothing(life: Life) -> Iterator[str]:
     """As at the start of a train, also where the sequence may jump."""
-    for path, columns in _lanes(life):
+    for path, columns in _recordings(life):
         planned_s, planned_us, sent_us = (
             columns[f"pulses/{name}"] for name in ("planned_time_s", "pulse_width_us", "sent_pulse_width_us")
         )
@@ -370,7 +353,7 @@ def after_a_pause_the_width_climbs_from_nothing(life: Life) -> Iterator[str]:
 
 def what_is_left_out_makes_no_steeper_rise(life: Life) -> Iterator[str]:
     """Where the plan rises in small steps, so does what was sent, also over pulses that were left out."""
-    for path, columns in _lanes(life):
+    for path, columns in _recordings(life):
         if path.stem.rpartition("_")[2] in life.people.jumping:
             continue
         planned_us, sent_us = columns["pulses/pulse_width_us"], columns["pulses/sent_pulse_width_us"]
@@ -476,8 +459,8 @@ def _forgotten(life: Life, since_s: float) -> float:
     return np.inf
 
 
-Sent = tuple[float, float, int, int]
-"""A recorded pulse that may have been sent: its width, µs; its current, mA; its status; its channel in the rig file."""
+Sent = tuple[float, float, int]
+"""A recorded pulse that may have been sent: its width, µs; its current, mA; its status."""
 
 
 @lru_cache(maxsize=1)
@@ -530,7 +513,6 @@ def _tests(life: Life) -> dict[str, list[Sent]]:
                 columns["pulses/sent_pulse_width_us"][sent],
                 columns["pulses/current_ma"][sent],
                 columns["pulses/status"][sent],
-                columns["output"][sent],
                 strict=True,
             )
         )
@@ -545,8 +527,8 @@ def _of_journal(path: Any, data: bytes) -> list[Sent]:
         blocks = journal.parse(path, data).blocks
     except RecordingError:
         return []
-    intents = [journal.Intent.from_bytes(payload) for kind, payload in blocks if kind == journal.Kind.INTENT]
-    return [(intent.pulse_width_us, intent.current_ma, 4, intent.output) for intent in intents]
+    intents = [journal.INTENT.unpack(payload) for kind, payload in blocks if kind == journal.Kind.INTENT]
+    return [(width_us, current_ma, 4) for _, _, _, width_us, current_ma in intents]
 
 
 def _name(path: Path) -> str:
@@ -560,33 +542,8 @@ def _recordings(life: Life) -> list[tuple[Path, dict[str, np.ndarray]]]:
     for path, file in life.disk.files.items():
         if path.parent == FOLDER / "recordings":
             with h5py.File(io.BytesIO(bytes(file.data)), "r") as opened:
-                columns = {name: np.asarray(opened[name]) for name in _COLUMNS}
-                names = [one["name"] for one in json.loads(opened.attrs.get("channels", '[{"name": "biceps"}]'))]
-                places = np.array([_OUTPUTS.get(name, -2) for name in names])
-                channel = np.asarray(opened["pulses/channel"]) if "pulses/channel" in opened else 0
-                columns["output"] = places[np.broadcast_to(channel, columns["pulses/status"].shape)]
-                found.append((path, columns))
+                found.append((path, {name: np.asarray(opened[name]) for name in _COLUMNS}))
     return found
-
-
-def _lanes(life: Life) -> Iterator[tuple[Path, dict[str, np.ndarray]]]:
-    """The pulses of each recording, each channel by itself."""
-    for path, columns in _recordings(life):
-        for output in np.unique(columns["output"]):
-            own = columns["output"] == output
-            yield path, {name: column[own] for name, column in columns.items() if name.startswith("pulses/")}
-
-
-def _by_output(felt: list[Felt]) -> list[list[Felt]]:
-    """Each channel's pulses."""
-    return [[pulse for pulse in felt if pulse.output == output] for output in sorted({pulse.output for pulse in felt})]
-
-
-def _charge_uc(felt: list[Felt]) -> float:
-    return sum(pulse.width_us * pulse.current_ma * 1e-3 for pulse in felt)
-
-
-_OUTPUTS = {"biceps": 0, "output-1": 0, "triceps": 1, "output-2": 1}
 
 
 _TIMES = "torque/time_s", "pulses/written_time_s"
@@ -597,8 +554,7 @@ _COLUMNS = (
 
 
 def _same(pulse: Felt, recorded: Sent) -> bool:
-    near = abs(pulse.width_us - recorded[0]) < 1e-6 and abs(pulse.current_ma - recorded[1]) < 1e-6
-    return near and recorded[3] in (pulse.output, -2)  # -2: the channel's name is lost
+    return abs(pulse.width_us - recorded[0]) < 1e-6 and abs(pulse.current_ma - recorded[1]) < 1e-6
 
 
 def _stood(life: Life) -> list[tuple[float, float]]:

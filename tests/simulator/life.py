@@ -15,7 +15,7 @@ from stimrig.hardware_sim.stimulators import STIMULATORS
 from stimrig.rig import config
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import RigError
-from stimrig.rig.messages import ChannelPlan, Profile
+from stimrig.rig.messages import Profile
 from tests.simulator import accidents
 from tests.simulator.clinic import Clinic
 from tests.simulator.disk import SimulatedDisk
@@ -29,10 +29,6 @@ LASTS_S = 8.0
 """How long accidents and people go on."""
 QUIET_S = 20.0
 """The longest that the rig may then need until it has played one more test."""
-SEVERAL = 0.3
-"""Share of the lives whose rig has two channels."""
-NAMES, OUTPUTS = ("biceps", "triceps"), ((0, 0), (0, 1))
-"""Both reach the one muscle of a life."""
 HELD, ROBOT = "held", "robot,from_deg=60,to_deg=110,deg_s=60,pause_s=0.2"
 
 
@@ -46,7 +42,7 @@ class Felt(NamedTuple):
     balanced: bool
     written_s: float
     true: bool
-    output: int = 0  # place of the channel in the rig file; -1: of an output that no channel has
+    output: tuple[int, int]  # connector and channel, from 0
 
 
 class Life:
@@ -68,8 +64,6 @@ class Life:
             max_torque_nm=chance.choice((9.0, 30.0)),
         )  # fmt: skip
         self.rate_hz = chance.choice((20.0, 40.0, 50.0))
-        self.channels = self._channels(random.Random(f"channels {seed}"))
-        """Of a rig that has two; the first has the profile above."""
         self.adaptive = chance.random() < 0.3
         cells = set(CELLS) - {WithAngle.name}  # whose angle would be one more
         settings = Settings(
@@ -85,9 +79,6 @@ class Life:
         self.computer = Computer(world, chance.uniform(-100, 100), 1_764_000_000.0)
         self.disk.access = self.computer.access
         self.felt: list[Felt] = []
-        if self.channels:
-            muscle = self.devices.electrodes.wired[OUTPUTS[0]]
-            self.devices.electrodes.wired = dict.fromkeys(OUTPUTS, muscle)
         self.wires = Wires(world, self.devices, chance.choice((0.01, 0.02, 0.03)), self._note)
         self.clinic = Clinic(world, self.devices.state)
         self.clinic.kill = lambda: self.kill(0.3)
@@ -192,26 +183,11 @@ class Life:
 
     # -- set-up
 
-    def _channels(self, chance: random.Random) -> tuple[ChannelPlan, ...]:
-        if chance.random() >= SEVERAL:
-            return ()
-        other = self.profile.model_copy(
-            update={
-                "current_ma": chance.choice((6.0, 12.0, 30.0)),
-                "max_pulse_width_us": chance.choice((100.0, 250.0, 400.0)),
-            }
-        )
-        first = ChannelPlan(name=NAMES[0], profile=self.profile)
-        return first, ChannelPlan(name=NAMES[1], profile=other, offset_s=chance.choice((None, 0.004, 0.011)))
-
     def _note(self, written_s: float, true: bool) -> None:
         for pulse in self.devices.electrodes.log[len(self.felt) :]:
-            used = OUTPUTS[: max(1, len(self.channels))]
-            output = used.index(pulse.output) if pulse.output in used else -1
-            felt = Felt(pulse.time_s, pulse.width_us, pulse.current_ma, pulse.balanced, written_s, true, output)
-            self.felt.append(felt)
-            deviant = f" output {output}" if self.channels else ""
-            deviant += "" if true else ", of a piece that came changed"
+            how = pulse.time_s, pulse.width_us, pulse.current_ma, pulse.balanced
+            self.felt.append(Felt(*how, written_s, true, pulse.output))
+            deviant = "" if true else ", of a piece that came changed"
             self.world.tell("electrode", f"{pulse.width_us:g} µs {pulse.current_ma:g} mA{deviant}", pulse.time_s)
 
     def _plan_accidents(self, chance: random.Random, only: Collection[int] | None) -> None:
@@ -231,11 +207,9 @@ class Life:
         self.world.tell("accident", f"{number} {self.befallen[-1]}")
 
     def _rig_file(self, settings: Settings) -> config.RigConfig:
-        outputs = [{"name": name, "muscle": name, "side": "right", "channel": n} for n, name in enumerate(NAMES, 1)]
-        named = {"channels": outputs} if self.channels else {}
         content = {
             "require_calibration": False,
-            "stimulator": {"device": settings.stimulator, "port": "/dev/simulated", **named},
+            "stimulator": {"device": settings.stimulator, "port": "/dev/simulated"},
             "load_cell": {
                 "device": "can_load_cell", "bus": {"interface": "simulated"}, "sample_rate_hz": settings.rate_hz,
                 **self.devices.load_cell.cell.rig_keys,

@@ -6,18 +6,8 @@ import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from stimrig.rig.messages import (
-    AdaptivePlan,
-    AnglePlan,
-    CalibrationStatus,
-    ChannelPlan,
-    ChannelSequence,
-    Profile,
-    SegmentPlan,
-    TestPlan,
-)
+from stimrig.rig.messages import AdaptivePlan, AnglePlan, Profile, SegmentPlan, TestPlan
 from stimrig.rig.requests import (
-    CalibrateChannel,
     CalibrateFinishRequest,
     CalibrateMarkRequest,
     CalibrateStartRequest,
@@ -39,12 +29,6 @@ SEGMENTS = [
     SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.75, "down_s": 0.5}),
     SegmentPlan(name="steps", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1}),
 ]
-ON_OTHER = (
-    None,
-    ChannelSequence(sequence="steps", settings={"on_s": 0.25, "off_s": 0.25, "repeats": 2}),
-    ChannelSequence(sequence="ramp", settings={"up_s": 0.5, "down_s": 0.5}),
-)
-"""What the second channel plays in each of them."""
 LONGEST_ADAPTIVE_S = 6.0
 
 
@@ -130,13 +114,10 @@ class People:
             kind = "held" if life.arm == "held" else "moving"
             target_rad, still_s = (math.pi / 2, None) if kind == "held" else (None, 2.0)
             angle = AnglePlan(range_rad=(0.2, 2.4), target_rad=target_rad, still_s=still_s)
-        channels, segments = self._on_channels(profile, segments)
-        if channels:
-            profile = channels[0].profile
         bounds = AdaptivePlan(max_duration_s=LONGEST_ADAPTIVE_S, max_torque_time_nms=50.0)
         plan = TestPlan(
             test_id=test_id, participant="P1", kind=kind, profile=profile, pulse_rate_hz=rate_hz,
-            adaptive=bounds if life.adaptive else None, angle=angle, segments=segments, channels=channels or None,
+            adaptive=bounds if life.adaptive else None, angle=angle, segments=segments,
         )  # fmt: skip
 
         def then(asked: Asked) -> None:
@@ -147,27 +128,6 @@ class People:
         if not quiet and self.chance.random() < 0.1:  # on its way beside the start, or at any time of the test
             delay_s, begun = self.chance.choice((0.0, 0.01, 0.3, 1.0)), self.chance.random() < 0.5
             life.world.after(delay_s, lambda: self._withdraw(test_id, begun))
-
-    def _on_channels(
-        self, profile: Profile, segments: list[SegmentPlan]
-    ) -> tuple[list[ChannelPlan], list[SegmentPlan]]:
-        """Both channels, of a rig that has two, and what they play; or one of them, with or without its name."""
-        life, chance = self.life, self.chance
-        if not life.channels:
-            return [], segments
-        first, other = life.channels[0].model_copy(update={"profile": profile}), life.channels[1]
-        drawn = chance.random()
-        if drawn < 0.2:
-            return [], segments
-        if drawn < 0.4:
-            return [other.model_copy(update={"offset_s": None})], segments
-        if chance.random() < 0.1:
-            other = other.model_copy(update={"offset_s": chance.choice((0.0, 0.001, -0.01, 0.0199, 1.0, math.nan))})
-        played = [
-            one.model_copy(update={"channels": {other.name: part} if part else None})
-            for one, part in zip(segments, ON_OTHER, strict=False)
-        ]
-        return [first, other], played
 
     def _withdraw(self, test_id: str, begun: bool) -> None:
         process = self.clinic.process
@@ -217,14 +177,7 @@ class People:
     def _open_calibration(self) -> None:
         self.clinic.tests += 1
         wild = self.chance.random() < (0.05 if self._calibrates else 0.3)
-        both = [
-            CalibrateChannel(
-                name=one.name, current_ma=one.profile.current_ma, max_pulse_width_us=one.profile.max_pulse_width_us
-            )
-            for one in self.life.channels
-        ]
         request = CalibrateStartRequest(
-            channels=both if both and self.chance.random() < 0.7 else None,
             calibration_id=f"c{self.clinic.tests}", participant="P1", by="nurse",
             train_s=self._nonsense(2.0) if wild else 0.3, step_us=self._nonsense(25.0) if wild else 10.0,
             current_ma=self.life.profile.current_ma, max_pulse_width_us=self.life.profile.max_pulse_width_us,
@@ -243,35 +196,20 @@ class People:
             wanted = CalibrateFinishRequest(by="nurse", calibration_id=calibration_id, discard=True)
             self.clinic.ask(wanted, calibration_id)
 
-    def _channel_of(self, found: CalibrationStatus | None) -> str:
-        """The channel that is calibrated next: the one that was, or one that lacks a threshold, or any."""
-        if found is None or not found.channels:
-            return ""
-        played = found.trains[-1].channel if found.trains else ""
-        if played and self.chance.random() < 0.8:
-            unfinished = [one.name for one in found.channels if one.missing]
-            return played if played in unfinished or not unfinished else unfinished[0]
-        return self.chance.choice(("biceps", "triceps"))
-
     def _calibrate(self) -> None:
         drawn = self.chance.random()
         found = None if self.clinic.rig is None else self.clinic.rig.status().calibration
-        name = self._channel_of(found)
         if found is not None and found.trains and self._calibrates and self.chance.random() < 0.9:
-            missing = next((one.missing for one in found.channels or () if one.name == name), found.missing)
-            wanted = CalibrateMarkRequest(threshold=missing[0], channel=name) if missing else None
+            wanted = CalibrateMarkRequest(threshold=found.missing[0]) if found.missing else None
             self.clinic.ask(wanted or CalibrateFinishRequest(by="nurse"))
         elif self.life.quiet or drawn < 0.05:
             self.clinic.ask(CalibrateFinishRequest(by="nurse", discard=True))
         elif drawn < 0.6:
             direction = self.chance.choice(("up", "up", "up", "fine", "repeat", "down"))
             shown_us = self._nonsense(500.0) if self.chance.random() < 0.1 else None
-            self._repeat(
-                lambda: self.clinic.ask(CalibrateStepRequest(direction=direction, shown_us=shown_us, channel=name))
-            )
+            self._repeat(lambda: self.clinic.ask(CalibrateStepRequest(direction=direction, shown_us=shown_us)))
         elif drawn < 0.8:
-            threshold = self.chance.choice(("sensory", "motor", "comfort"))
-            self.clinic.ask(CalibrateMarkRequest(threshold=threshold, channel=name))
+            self.clinic.ask(CalibrateMarkRequest(threshold=self.chance.choice(("sensory", "motor", "comfort"))))
         elif drawn < 0.85:
             self.clinic.ask(CalibrateFinishRequest(by="nurse"))
         elif drawn < 0.9:

@@ -5,16 +5,12 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from typing import Any
 
 import pytest
 
-from stimrig.rig import gate
 from stimrig.rig.acquire.run import Halt
 from stimrig.rig.gate import Gate
-from stimrig.rig.limits import admit
 from tests.simulator.__main__ import live, shrink
-from tests.simulator.invariants import broken
 from tests.simulator.life import Life
 
 SEEDS = range(500_000, 500_024)
@@ -47,28 +43,3 @@ def test_a_mistake_is_found_and_shrunk(monkeypatch: pytest.MonkeyPatch):
     only = shrink(seed)
     assert live(seed, only)[1]
     assert len(only) < Life(seed).accidents or not only
-
-
-def wrong_output(of: Any, pulse: Any, *more: Any) -> Any:
-    return admit(of, pulse, *more[:-1], 0)
-
-
-def test_a_pulse_on_the_wrong_output_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(gate, "admit", wrong_output)
-    several = [seed for seed in range(1, 80) if Life(seed).channels]
-    assert any("stands in no file" in " ".join(live(seed)[1]) for seed in several)
-
-
-@pytest.mark.parametrize("mistaken", [False, True])
-def test_pulses_that_do_not_wait_for_other_channels_are_found(monkeypatch: pytest.MonkeyPatch, mistaken: bool) -> None:
-    """A line that stands still again and again holds one pulse at most, of whichever channel."""
-    if mistaken:
-        monkeypatch.setattr(Gate, "_too_close", lambda *_: "")
-    wrong: list[str] = []
-    for seed in [seed for seed in range(1, 40) if Life(seed).channels][:4]:
-        life = Life(seed, only=())
-        for tenth in range(80):
-            life.world.at(tenth / 10, lambda life=life: life.wires.to_device.stall(0.05, False))
-        life.live()
-        wrong += broken(life)
-    assert any("channels_never_flow_together" in words for words in wrong) == bool(wrong) == mistaken
