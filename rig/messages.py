@@ -6,7 +6,7 @@ These two are the only modules of `rig` that `api` imports, beside its stop key.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -44,14 +44,6 @@ PULSE_RATES_HZ = (1.0, 60.0)
 def stop_socket(path: Path) -> Path:
     """Path of the stop socket of a rig that listens at `path`."""
     return path.with_name(f"{path.name}.stop")
-
-
-T = TypeVar("T")
-
-
-def several(default: T, description: str, **more: Any) -> T:
-    """Make a field that is left out of the JSON while it has its default."""
-    return Field(default, description=description, exclude_if=lambda value: value == default, **more)
 
 
 class Message(BaseModel):
