@@ -292,6 +292,19 @@ def test_the_charge_of_the_last_second_counts_from_the_ack_and_no_longer_than_a_
     assert setup.gate.charge_uc == pytest.approx(41 * 40.0)
 
 
+def test_no_test_gets_more_charge_than_a_test_may(tmp_path: Path):
+    setup = Setup(tmp_path, is_open=False)
+    setup.table = limits.tightened(setup.table, "charge_per_test_uc", 20.0, "rig file")
+    setup.open()
+    statuses = []
+    for _ in range(4):
+        statuses.append(setup.fire(300, 20.0))
+        setup.wait(2.0)
+    assert statuses == [*[PulseStatus.UNACKNOWLEDGED] * 3, PulseStatus.REFUSED]
+    assert setup.gate.charge_uc == pytest.approx(18.0)
+    assert setup.events()[-1]["reason"].startswith("charge_per_test_uc 24 µC is outside 0 … 20 (rig file")
+
+
 def test_the_journal_says_of_each_pulse_that_was_not_sent_why(tmp_path: Path):
     setup = Setup(tmp_path)
     setup.gate.fire(0, Pulse(100, 20), T0_S, T0_S)
