@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from stimrig.hardware_sim.errors import FaultError
 from stimrig.hardware_sim.faults import Target, Undo, fault, hooked, replaced, sometimes
 
-OUTPUTS_PER_CONNECTOR = 4
 HALF_A_FRAME = bytes.fromhex("f0815581")
 
 
@@ -74,14 +72,9 @@ def corrupt_commands(target: Target, probability: float = 1.0) -> Undo:
 
 
 @fault
-def electrode_error(target: Target, output: float = 0.0) -> Undo:
-    """An electrode has come off: at the output of this number, from 1, or with 0 at all."""
-    electrodes, place = target.board.electrodes, divmod(int(output) - 1, OUTPUTS_PER_CONNECTOR)
-    if output not in range(2 * OUTPUTS_PER_CONNECTOR + 1):
-        raise FaultError(f"setting 'output' of fault 'electrode_error' must be 0 to 8, not {output:g}")
-    if not output:
-        return replaced(electrodes, "attached", False)
-    return replaced(electrodes, "off", electrodes.off | {place})
+def electrode_error(target: Target) -> Undo:
+    """An electrode has come off."""
+    return replaced(target.board.electrodes, "attached", False)
 
 
 @fault

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -18,6 +18,8 @@ Point = tuple[int, float]
 """One piece of a pulse's shape: duration in µs, current in mA."""
 Output = tuple[int, int]
 """Connector and channel, from 0."""
+FIRST: Output = (0, 0)
+"""The output with the pair of electrodes."""
 
 
 @dataclass(frozen=True)
@@ -34,37 +36,33 @@ class FiredPulse:
 
 
 class Electrodes:
-    """Pairs at the stimulator's outputs, each on a muscle; one muscle alone has its pair at the first output.
+    """One pair on one muscle, at the stimulator's first output.
 
     `raise_sync` is called for each pulse that flows. `cut` is the emergency switch: some devices report it, to the
-    others it looks like an open electrode. `off` are outputs whose pair has come off.
+    others it looks like an open electrode.
     """
 
-    def __init__(self, wired: Muscle | Mapping[Output, Muscle], raise_sync: Callable[[], None] = lambda: None) -> None:
+    def __init__(self, muscle: Muscle, raise_sync: Callable[[], None] = lambda: None) -> None:
         self.attached = True
         self.cut = False
-        self.off: set[Output] = set()
-        self.wired = wired if isinstance(wired, Mapping) else {(0, 0): wired}
         self.unbalanced_pulses = 0
         self.delivered_pulses = 0
         self.log: list[FiredPulse] = []
+        self._muscle = muscle
         self._raise_sync = raise_sync
 
     def fire(self, time_s: float, points: Sequence[Point], output: Output, source: str) -> bool:
-        """One pulse of this shape; True if it flowed through a muscle."""
+        """One pulse of this shape; True if it flowed through the muscle."""
         width_us, current_ma, balanced = phase(points)
-        flows = self._reaches(output) and width_us > 0
+        flows = self.attached and not self.cut and output == FIRST and width_us > 0
         self.log.append(FiredPulse(time_s, width_us, current_ma, flows, balanced, source, output))
         if not balanced:
             self.unbalanced_pulses += 1
         if flows:
             self.delivered_pulses += 1
-            self.wired[output].pulse(time_s, width_us, current_ma)
+            self._muscle.pulse(time_s, width_us, current_ma)
             self._raise_sync()
         return flows
-
-    def _reaches(self, output: Output) -> bool:
-        return self.attached and not self.cut and output in self.wired and output not in self.off
 
     def pulses(self, since: int = 0) -> list[dict[str, Any]]:
         """The log from entry `since` on, as plain values."""
