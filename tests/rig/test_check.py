@@ -133,7 +133,7 @@ PLANTED: dict[str, tuple[str, dict[str, Any]]] = {
     "lever not connected": ("torque_unmoved", {"pull_nm": 0.0}),
     "angle sensor turned round": ("angle_sign", {"settings": {"angle_direction": -1}, "arm": "held"}),
     "stop line dead": ("stop", {"faults": {"stop_lost": {}}}),
-    "load not connected": ("open_circuit", {"faults": {"electrode_error": {"output": 1.0}}}),
+    "load not connected": ("open_circuit", {"faults": {"electrode_error": {}}}),
     "sync line not wired": ("sync", {"faults": {"sync_unwired": {}}}),
 }
 

@@ -72,7 +72,7 @@ def test_the_examples_of_the_page_are_complete(tmp_path: Path):
         ("p24", "slcan"),
     ]
     for one in loaded:
-        one.table()
+        one.limits.table()
         find("load_cell", one.load_cell.device).create(one.load_cell, VirtualMachine())
 
 
