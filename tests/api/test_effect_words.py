@@ -49,8 +49,8 @@ def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
     row = {"id": "M-1", "added_effect": "fatigue,threshold_drift"}
     rival = {"effect": "fatigue", "confused_with": ["threshold_drift"]}
     library = {entry["id"]: entry for entry in effects.library()}
-    title = library["threshold_drift"]["name"]
-    assert explanation.label(row) == f"+ {library['fatigue']['name']}, {title}"
+    title = "drift of the recruitment threshold"
+    assert explanation.label(row) == f"+ fatigue, {title}"
     for known in ({}, library):
         assert explanation.card(rival, known, {})["rivals"] == [title]
 
