@@ -14,7 +14,7 @@ from stimrig.api.sessions import controllers
 from stimrig.api.store.tables import Model, Test
 from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.next_view import Situation, Today, next_step
-from tests.api.conftest import Service, csrf, run_test, signed_in, wait_done
+from tests.api.conftest import Service, run_test, signed_in, wait_done
 
 READY, DONE, POOR = Today("M1", "usable"), Today("M1", "usable", decided=True), Today("M1", "not usable")
 RUNS = {"test": "T1", "state": "running", "rig": "running", "holder": "P1"}
@@ -152,14 +152,6 @@ KEYLESS_NOW = ("done", "Today's model is approved until 23:59, but no controller
 DONE_NOW = ("done", "Done. The controller has today's model until 23:59.")
 
 
-def test_the_first_page_leaves_it_to_the_line_what_comes_next(service: Service, pages: httpx.Client) -> None:
-    """To somebody who has made nobody yet, it named the test; the line then named the calibration."""
-    first = pages.get("/").text
-    assert "The line at the top of its page says what comes next." in first
-    buttons = {next_step(Situation("P1", **so)).button for so, *_ in TABLE} - {""}
-    assert not [words for words in (*buttons, "pre-session test", "alibrat") if words in first]
-
-
 def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service, participant: str) -> None:
     assert shown(service)[0] == "calibrate"
     model = run_test(client, participant)["model_id"]
@@ -175,40 +167,6 @@ def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service,
     assert shown(service)[0] == f"look {better}"
     client.post(f"/v1/models/{better}/undo")
     assert shown(service) == DONE_NOW
-
-
-def test_what_is_next_of_a_rejected_model_is_about_it_first(
-    client: httpx.Client, pages: httpx.Client, participant: str
-) -> None:
-    first = run_test(client, participant)["model_id"]
-    client.post(f"/v1/models/{first}/reject", json={"reason": "electrode slipped"})
-    assert (
-        "This model no longer counts. <b data-words>The last model was rejected." in pages.get(f"/models/{first}").text
-    )
-    second = run_test(client, participant)["model_id"]
-    text = pages.get(f"/models/{first}").text
-    assert "This model no longer counts; another one of today waits. <b data-words>" in text and second in text
-
-
-def test_an_undo_is_called_so_and_says_how_to_have_it_back(
-    client: httpx.Client, pages: httpx.Client, participant: str
-) -> None:
-    model = run_test(client, participant)["model_id"]
-    better = client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
-    client.post(f"/v1/models/{better}/approve")
-    assert "was undone" not in pages.get(f"/models/{model}").text
-    client.post(f"/v1/models/{better}/undo", json={"reason": "not plausible"})
-    before, after = (pages.get(f"/models/{each}").text for each in (model, better))
-    assert "The version after this one was undone." in before and f'href="/models/{better}">To have it again' in before
-    assert "This model is approved." in before
-    assert "Undone by" in after and "Approve this one to have it again." in after and "Rejected by" not in after
-    assert ">undone</span>" in after and "not plausible" in after
-    client.post(f"/v1/models/{better}/approve")
-    assert "was undone" not in pages.get(f"/models/{model}").text
-    client.post(f"/v1/models/{better}/reject", json={"reason": "undone: by hand, with a typed reason"})
-    assert "was undone" not in pages.get(f"/models/{model}").text
-    typed = pages.get(f"/models/{better}").text
-    assert "Rejected by" in typed and "undone: by hand, with a typed reason" in typed and "Undone by" not in typed
 
 
 def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Service, participant: str) -> None:
@@ -259,29 +217,3 @@ def test_a_test_that_goes_on_over_midnight_is_still_running(client: httpx.Client
     assert shown(service) == (f"running {test}", "The test is running.")
     client.post("/v1/stop")
     wait_done(client, test)
-
-
-def test_the_button_of_the_line_begins_the_calibration_with_the_current_it_names(
-    client: httpx.Client, service: Service, pages: httpx.Client, participant: str
-) -> None:
-    seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
-    page = pages.get("/participants/P017").text
-    assert "Begin the calibration: 20 mA" in page
-    form = {"csrf": csrf(pages), "seen": seen}
-    assert (
-        pages.post("/participants/P017/calibration", data=form).headers["location"] == "/participants/P017/calibration"
-    )
-    opened = pages.get("/participants/P017/calibration").text
-    assert "20.0 mA · trains of" in opened and "nothing sent yet" in opened and "sends one short train" in opened
-    assert "no step above 45 µs" in opened and "tests go no further than what you mark as comfortable" in opened
-    assert "fine near a mark" not in opened, "without earlier marks no step is fine by itself"
-    assert service.rig.calibration is not None and service.rig.calibration.trains == []
-
-
-def test_the_start_in_the_line_sets_what_was_typed(client: httpx.Client, pages: httpx.Client, participant: str) -> None:
-    """It is a button of the limits' form: one click sets them and asks."""
-    run_test(client, participant)
-    seen = client.get("/v1/participants/P017").headers["etag"].strip('"')
-    form = {"csrf": csrf(pages), "seen": seen, "current_ma": "19", "max_pulse_width_us": "300", "max_torque_nm": "30"}
-    page = pages.get(pages.post("/participants/P017/tests", data=form).headers["location"]).text
-    assert "19 mA" in page and "Start now" in page

@@ -16,7 +16,6 @@ import pytest
 
 from stimrig.api.web import pages
 from tests.api.browser import (
-    NAME,
     NARROW,
     PASSWORD,
     PHONE,
@@ -181,35 +180,14 @@ def blank(browser: Any, service: Service) -> Iterator[Any]:
     yield from open_tab(browser, service, signed_in=False)
 
 
-def test_approval_wants_the_password_a_rejection_a_reason_and_says_what_is_wrong(tab: Any, service: Service) -> None:
-    model = service.play_test("C1")["model_id"]
-    tab.goto(f"{service.url}/models/{model}")
-    tab.get_by_role("button", name="Approve").click()
-    assert tab.url.endswith(model), "the browser asks for the password first"
-    tab.get_by_label("Your password, once more").first.fill("not my password")
-    tab.get_by_role("button", name="Approve").click()
-    tab.get_by_role("heading", name="The password does not match").wait_for()
-    tab.get_by_role("link", name="Back to the model").click()
-    tab.get_by_text("Not approved yet").wait_for()
-    tab.get_by_label("Your password, once more").first.fill(PASSWORD)
-    tab.get_by_role("button", name="Approve").click()
-    tab.get_by_text(f"Approved by {NAME}").wait_for()
-    tab.get_by_text("Withdraw it from the controller").click()
-    tab.get_by_label("Reason").fill("electrode slipped")
-    tab.get_by_label("Your password, once more").first.fill(PASSWORD)
-    tab.get_by_role("button", name="Withdraw", exact=True).click()
-    tab.get_by_text("electrode slipped").wait_for()
-    with service.client() as http:
-        assert http.get("/v1/participants/C1/model").status_code == 404
-        deeds = [(e["who"], e["action"], e["detail"].get("reason")) for e in http.get("/v1/audit").json()["entries"]]
-    assert (NAME, "approve", "") in deeds and (NAME, "reject", "electrode slipped") in deeds
-
-
 def test_a_form_without_a_reason_decides_nothing(service: Service, pages: httpx.Client, client: httpx.Client) -> None:
     model = service.play_test("C2")["model_id"]
     refused = pages.post(f"/models/{model}/reject", data={"csrf": csrf(pages), "reason": "  "})
     assert refused.status_code == 422 and "needs a reason" in refused.text
     assert client.get(f"/v1/models/{model}").json()["decision"] is None
+    given = pages.post(f"/models/{model}/reject", data={"csrf": csrf(pages), "reason": "electrode slipped"})
+    assert given.status_code == 303
+    assert client.get(f"/v1/models/{model}").json()["decision_reason"] == "electrode slipped"
 
 
 def test_every_export_of_a_model_and_a_test_is_there(tab: Any, service: Service) -> None:

@@ -97,16 +97,6 @@ def test_an_odd_form_is_a_problem_in_words(service: Service, known: dict[str, st
     assert tried >= len(posts()) * (len(ODD) + len(BODIES) // apart) > 700
 
 
-@pytest.mark.parametrize("effect", [None, "", "No Effect", "../x", "x" * 65])
-def test_an_effect_that_is_none_is_told_in_one_sentence(service: Service, known: dict[str, str], effect: str | None):
-    token = service.token(f"tester-{effect}"[:20].replace("/", "-"), "run-test", "read-model")
-    with service.client(token, headers=HTML) as client:
-        data = {} if effect is None else {"effect": effect}
-        answer = client.post(f"/models/{known['model_id']}/effects", data=data)
-    assert answer.status_code == 422 and "<h1>This value cannot be used</h1>" in answer.text
-    assert "effect: " in answer.text and "Nothing was changed" in answer.text and "^[a-z" not in answer.text
-
-
 def test_a_form_is_utf_8(service: Service, known: dict[str, str]) -> None:
     with service.client(headers=HTML) as client:
         kind = f"{PARTS}; charset=utf-7"

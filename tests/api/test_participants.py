@@ -10,7 +10,6 @@ import httpx
 import pytest
 from sqlalchemy import event
 
-from stimrig.api import local_time
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
 from tests.api.conftest import Service, csrf, run_test, shared_service, signed_in, soon, wait_done
@@ -233,19 +232,12 @@ def test_letters_are_composed(made: tuple[httpx.Client, dict[str, Any]]) -> None
     assert answer.json()["text"] == "Müde <b>"
 
 
-# ---- Folds stay as a person left them, a note's kind is chosen, an estimate says so, a day ends at 23:59
+# ---- A note's kind is chosen; which fit is shown
 
 
-@pytest.fixture(scope="module")
-def model(service: Service) -> str:
-    with service.client() as http:
-        http.post("/v1/participants", json={"code": "L1"})
-        model: str = run_test(http, "L1")["model_id"]
-        http.get(f"/v1/models/{model}/diagnosis")
-    return model
-
-
-def test_the_kind_of_a_note_is_chosen(pages: httpx.Client, model: str) -> None:
+def test_the_kind_of_a_note_is_chosen(pages: httpx.Client, http: httpx.Client) -> None:
+    make(http, "L1")
+    run_test(http, "L1")
     page = pages.get("/participants/L1").text
     assert 'name="kind" required><option value="">Choose…</option>' in page
     form = {"csrf": csrf(pages), "text": "electrode 2 moved", "kind": ""}
@@ -253,21 +245,6 @@ def test_the_kind_of_a_note_is_chosen(pages: httpx.Client, model: str) -> None:
     assert refused.status_code == 422 and "Choose what the note is about" in refused.text
     assert pages.post("/participants/L1/notes", data={**form, "kind": "electrodes"}).status_code == 303
     assert [note["kind"] for note in pages.get("/v1/participants/L1/notes").json()] == ["electrodes"]
-
-
-def test_what_an_effect_would_leave_is_called_an_estimate(pages: httpx.Client, model: str) -> None:
-    page = pages.get(f"/models/{model}").text
-    assert "0.200 → about <b>0.042 N·m</b>" in page and "it is estimated: adding it fits the model anew" in page
-    assert "with it (estimated)" in page
-
-
-def test_a_day_ends_at_its_last_minute_everywhere(pages: httpx.Client, client: httpx.Client, model: str) -> None:
-    ends = client.post(f"/v1/models/{model}/approve", json={"reason": "follows the measurement well"}).json()
-    end = local_time.until(ends["expires_utc"])
-    assert end.endswith("23:59") and local_time.when(ends["expires_utc"]).endswith("00:00")
-    assert f"until {end}" in pages.get(f"/models/{model}").text
-    assert f"until {end}" in pages.get(f"/models/{model}/report").text
-    assert local_time.until("2026-01-02T09:30:00.000Z") == local_time.when("2026-01-02T09:30:00.000Z")
 
 
 def test_new_pulses_come_first() -> None:

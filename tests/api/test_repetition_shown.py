@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-import pytest
 
 from stimrig import identify
-from stimrig.api.cli.terminal import model_report, repetition_lines
-from stimrig.api.models import stored_model
+from stimrig.api.cli.terminal import model_report
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.api.workers.curves import curves
 from stimrig.identify.json_text import json_value
@@ -15,35 +13,17 @@ from tests.harness.muscle import Patient
 from tests.harness.patients import make_record, ramp
 
 REST = np.zeros(120)
-FOUND = {
-    "found_by": "exact repeats", "repeats": 4.0, "seconds": 6.0, "rms_nm": 0.081, "model_rms_nm": 0.072,
-    "explained_percent": 93.04, "held_out_rms_nm": 0.058, "held_out_model_rms_nm": 0.072,
-}  # fmt: skip
 
 
-@pytest.fixture(scope="module")
-def made():
+def test_a_report_and_the_command_line_have_it():
     widths = np.concatenate([REST, ramp(6), REST, ramp(6), REST])
     names = ["rest"] * 120 + ["ramp"] * 240 + ["rest"] * 120 + ["validate"] * 240 + ["rest"] * 120
     record, _ = make_record(
         Patient(time_constant_s=0.12), np.random.default_rng(1), rate_hz=100, pulses=(widths, names)
     )
-    return record, identify.fit(record)
-
-
-def test_a_report_and_the_command_line_have_it(made):
-    record, model = made
+    model = identify.fit(record)
     document = model.to_dict()
     page = comparison_html(document, json_value(curves(model, record)), "a record")
     assert "Of variance that repeats" in page
     assert "Between 2 repeats of the same pulses the torque differs by" in page
     assert any(line.startswith("repetition     Between 2 repeats") for line in model_report(document))
-
-
-def test_a_model_of_an_older_version_has_none(made):
-    record, model = made
-    document = model.to_dict()
-    del document["fit"]["repetition"]
-    assert stored_model.repetition(document)["sentences"] == []
-    assert repetition_lines(document["fit"]) == []
-    assert "not known" in comparison_html(document, json_value(curves(model, record)), "a record")

@@ -5,10 +5,7 @@ from __future__ import annotations
 import httpx
 import pytest
 
-from stimrig.api.charts.story_charts import side_by_side
-from stimrig.api.models.story import story
 from stimrig.identify.healing import healed_places, place_words
-from tests.api import stub_worker
 from tests.api.conftest import Service, run_test, signed_in
 
 
@@ -53,14 +50,6 @@ def test_the_improvement_that_a_diagnosis_found_is_not_searched_again(
     assert client.post(f"/v1/models/{model}/improve", timeout=30).status_code == 201
 
 
-def test_the_curve_of_a_single_model_is_not_called_the_last_one() -> None:
-    before, after = ({"curves": stub_worker.curves(), "comparison": stub_worker.comparison()} for _ in range(2))
-    names = [[line["name"] for line in side_by_side(before, last, [])["data"]] for last in (before, after)]
-    assert names == [["measured", "model", "residual"],
-                     ["measured", "model at first", "model at last", "left at first", "left at last"]]  # fmt: skip
-    assert side_by_side(before, after, [])["layout"]["yaxis2"]["title"]["text"] == "Residual (N·m)"
-
-
 def test_a_place_is_healed_where_only_noise_is_left_there() -> None:
     times, place = [0.0, 0.5, 1.0, 1.5], {"start_s": 0.0, "end_s": 0.6, "text": "ramp"}
 
@@ -75,16 +64,3 @@ def test_a_place_is_healed_where_only_noise_is_left_there() -> None:
         (found,) = healed_places(first, comparison(left_nm, -left_nm, 9.0, 9.0))
         assert (found["before_nm"], found["after_nm"], found["healed"]) == (1.0, left_nm, healed)
         assert words in place_words(found)
-
-
-def test_an_error_that_does_not_fall_is_not_said_to_fall() -> None:
-    nowhere = {"noise_sd_nm": 0.05}
-
-    def said(*errors_nm: float) -> str:
-        rows = [{"held_out_rms_nm": error_nm} for error_nm in errors_nm]
-        return story(rows, nowhere, nowhere, None, None)["title"]
-
-    assert said(0.05) == "The held-out error is 0.05 N·m"
-    assert said(0.1, 0.05) == "The held-out error fell from 0.1 to 0.05 N·m"
-    for now_nm in (0.0499, 0.06):  # added without evidence
-        assert said(0.05, now_nm) == f"The held-out error did not fall: 0.05, then {now_nm} N·m"

@@ -10,7 +10,6 @@ import pytest
 
 from stimrig.api import local_time
 from stimrig.api.models.tracking import OUTCOMES, sentences
-from stimrig.api.web.pages.decision_view import tracking_words
 from stimrig.api.web.responses.models import TrialOut
 from tests.api.conftest import Service, csrf
 from tests.api.test_tracked import play, say, tracked
@@ -56,29 +55,10 @@ def test_a_trial_that_taught_the_model_nothing_changes_no_sentence() -> None:
         assert sentences([unexplained], SINCE) == []
 
 
-def test_a_model_of_another_day_and_no_trial() -> None:
-    before, weaker = "2026-11-19T11:05:00.000Z", [trial(gain=(0.5, 0.4, 0.6))]
-    time = local_time.clock(before)[:5]
-    assert sentences(weaker, before) == [f"In trial 1 the plateau is 50 % lower than on 19 Nov 2026 at {time}."]
-    unsure = trial(gain=(0.77, 0.5, 1.01))
-    assert sentences([unsure], before) == [f"By trial 1 no change since 19 Nov 2026, {time} is certain."]
-    unknown = {"now": None, "at_utc": "", "outcome": "not-followed", "number": 1, "distance": None}
-    assert sentences([], before) == sentences([unknown], before) == []
-
-
 def test_every_outcome_of_the_service_has_words() -> None:
     told = get_args(TrialOut.model_fields["outcome"].annotation)
     assert set(told) == set(OUTCOMES)
     assert len(set(OUTCOMES.values())) == len(told)
-
-
-def test_limits_are_shown_as_they_were_typed() -> None:
-    said = tracking_words({"gain_percent": 12.5, "threshold_percent": 20.0, "time_scale_percent": 0.4}, 83.37)
-    assert "gain ±12.5\u00a0%, threshold ±20\u00a0% (±16.7\u00a0µs), time scale ±0.4\u00a0%" in said
-    without = tracking_words(None, None)
-    assert "gain ±20\u00a0%, threshold as approved, time scale ±20\u00a0%" in without, "there is no threshold to move"
-    nothing = dict.fromkeys(("gain_percent", "threshold_percent", "time_scale_percent"), "0")
-    assert "does not follow" in tracking_words(nothing, 80.0)
 
 
 def test_the_card_tells_the_trials_without_scripts(service: Service, client: httpx.Client, approved: str):

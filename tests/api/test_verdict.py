@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import inspect
-import itertools
 import json
 import re
 import time
@@ -280,60 +279,6 @@ def test_the_worst_finding_comes_first_and_risks_are_said_once() -> None:
     assert advice.risks({}, []), "never nothing"
 
 
-@pytest.mark.parametrize(
-    ("fit", "words"),
-    [
-        (
-            {"held_out_fit_percent": 96.2, "held_out_ceiling_percent": 96.3, "held_out_by": "validate"},
-            "On held-out pulses (not used for fitting) the fit is 96.2 %; the noise allows about 96.3 %.",
-        ),
-        ({"held_out_fit_percent": 90.0}, "On held-out pulses (not used for fitting) the fit is 90.0 %."),
-        (
-            {"held_out_fit_percent": 90.0, "held_out_by": "cross-validation"},
-            "On parts of the recording that were left out in turn the fit is 90.0 %.",
-        ),
-        (
-            {"fit_percent": 88.0, "ceiling_percent": 89.0, "held_out_rms_nm": 0.1},
-            "On the pulses that it was fitted to the fit is 88.0 %; the noise allows about 89.0 %.",
-        ),
-        (
-            {"held_out_fit_percent": -5.0},
-            "On held-out pulses (not used for fitting) the model does not follow the torque at all.",
-        ),
-        ({}, ""),
-    ],
-)
-def test_fit_and_ceiling_in_one_sentence(fit: dict[str, Any], words: str) -> None:
-    assert advice.fit_sentence(fit) == words
-
-
-def test_segments_in_a_clinicians_words() -> None:
-    from stimrig.api.charts.model_charts import segment_marks
-    from stimrig.api.clinical_words import segment_words
-
-    names = ["rest", "prbs", "ramp", "validate", "my <own>"]
-    assert [segment_words(name) for name in names] == [
-        "Rest", "Random pulses", "Ramp", "Check (not used for fitting)", "my <own>"
-    ]  # fmt: skip
-    runs = [{"name": name, "start_s": 10.0 * at, "end_s": 10.0 * at + 10.0} for at, name in enumerate(names)]
-    marks = segment_marks(runs)[1]
-    assert [mark["text"] for mark in marks] == [
-        "Random pulses", "Ramp", "Check (not used for fitting)", "my ‹own›"
-    ]  # fmt: skip
-
-
-def test_names_of_short_segments_are_not_written_over_one_another() -> None:
-    from stimrig.api.charts.model_charts import LETTER, segment_marks
-
-    ends = [2.7, 3.7, 4.7, 6.7, 8.7, 40.0]
-    names = ["opening", "ramp 2", "ramp 3", "step 4", "prbs", "ramp"]
-    runs = [{"name": n, "start_s": a, "end_s": b} for n, a, b in zip(names, [0.0, *ends[:-1]], ends, strict=True)]
-    shapes, marks = segment_marks(runs)
-    assert len(shapes) == len(runs) and 2 <= len(marks) < len(runs)
-    places = [(mark["x"], 40.0 * LETTER * len(mark["text"]) / 2) for mark in marks]
-    assert all(b - half_b >= a + half_a for (a, half_a), (b, half_b) in itertools.pairwise(places))
-
-
 # ---- What the rig finds doubtful about a recording is said wherever a person looks at the test or its model
 
 
@@ -363,14 +308,6 @@ def test_warnings_are_told_on_every_page_and_in_the_terminal(client: httpx.Clien
         for place, text in shown.items():
             for words in WORDS:
                 assert (words in text) == told, (place, words)
-
-
-def test_a_rig_that_knows_no_warnings_is_no_error(client: httpx.Client, service: Service, participant: str) -> None:
-    """Summaries written before there were any."""
-    done = run_test(client, participant)
-    summary = {key: value for key, value in done["summary"].items() if key != "warnings"}
-    model = json.loads(client.get(f"/v1/models/{done['model_id']}/file").text)
-    assert not [line for line in report_lines({**done, "summary": summary}, model) if line.startswith("in doubt")]
 
 
 # ---- A cell mounted the other way round: a told torque is the record's own, or it says that it is the muscle's

@@ -16,7 +16,6 @@ from bench.muscles import hidden_records
 from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.web.pages.report_file import missing_parts
-from stimrig.identify import effects
 from stimrig.identify.conclusion import conclude, why_ended
 from tests.api.conftest import Service, csrf, run_test, signed_in, soon, wait_done
 from tests.harness import few_effects
@@ -185,18 +184,6 @@ def test_improving_a_version_adds_to_what_it_holds(client: httpx.Client, model: 
     assert rows[-1]["effects"] == ["fatigue", "threshold_drift"]
 
 
-def test_diagnosis_kept_before_structures_were_told_is_read(client: httpx.Client, service: Service, model: str) -> None:
-    """It was made of the plain structure, and kept with the first version."""
-    context = service.context
-    kept = soon(lambda: context.analyses.known(model, "diagnosis"))
-    old = {key: value for key, value in kept.items() if key != "structure"} | {"noise_sd_nm": 0.123}
-    context.analyses._keep(model, "diagnosis", old)
-    assert client.get(f"/v1/models/{model}/diagnosis").json()["noise_sd_nm"] == 0.123
-    with signed_in(service) as browser:
-        assert "Structure of the model: plain" in browser.get(f"/models/{model}").text
-    assert client.get(f"/v1/models/{with_fatigue(client, model)}/diagnosis").json()["noise_sd_nm"] == 0.04
-
-
 def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]], effect: str) -> str | None:
     rounds = [[{"effect": name, "log_evidence_gain": gain} for name, gain in found] for found in gains]
     return explanation.refusal({"missing": missing, "candidates": rounds}, [], effect)
@@ -283,14 +270,6 @@ FATIGUE = {"effect": "fatigue", "name": "Fatigue", "probability": 0.97, "rms_bef
 def shown(verdict: str, missing: list[dict[str, Any]], effects: list[str], times: float) -> dict[str, Any]:
     diagnosis = {"verdict": verdict, "missing": missing, "where": [PLACE], "noise_sd_nm": 0.04}
     return explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04 * times}, effects)
-
-
-def test_verdict_on_this_model_in_words() -> None:
-    assert "evidence" in shown("effect_missing", [FATIGUE], [], 6)["words"]
-    after = shown("effect_missing", [FATIGUE], ["fatigue"], 1.1)
-    assert after["title"] == "Nothing is missing: what is left is noise" and after["missing"] == []
-    strange = shown("unexplained_structure", [], [], 5)
-    assert strange["kind"] == "unexplained" and "Ramp, pulse width falling, 120–180 µs" in strange["words"]
 
 
 @pytest.mark.parametrize(
@@ -417,15 +396,6 @@ def test_a_further_test_is_told_what_it_decided() -> None:
     )
 
 
-def test_a_parameter_is_told_by_the_words_of_its_own_form() -> None:
-    library = {entry["id"]: entry for entry in effects.library()}
-    told = {}
-    for form in ("bumps_1", "spasms_1"):
-        entry = {"effect": "voluntary_effort", "form": form, "parameters": {"centre_0_s": {}}}
-        told[form] = explanation.card(entry, library, {})["parameters"]["centre_0_s"]["label"]
-    assert told == {"bumps_1": "middle", "spasms_1": "start"}
-
-
 def _without_diagnosis(submit: Any, searched: list[Any]) -> Any:
     def submitted(verb: str, **given: Any) -> Any:
         searched.extend([given] if verb == "diagnosis" and "model_json" in given else [])
@@ -466,12 +436,6 @@ def test_only_what_is_likely_missing_is_advised() -> None:
     assert both["likely"] == ["Fatigue"] and both["title"] == "An effect is missing in this model"
     found = shown("effect_missing", [perhaps], [], 6)
     assert found["likely"] == [] and "possibly missing" in found["title"] and len(found["missing"]) == 1
-
-
-def test_place_is_named_without_repeating_its_share() -> None:
-    found = explanation.place(PLACE, 3)
-    assert found["words"] == "Ramp, pulse width falling, 120–180 µs: model too high by 0.4 N·m"
-    assert found["text"].startswith(WORDS) and found["percent"] == 31
 
 
 def test_page_shows_the_diagnosis_adds_by_a_form_and_shows_the_fall(service: Service, model: str) -> None:

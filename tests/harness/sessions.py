@@ -7,7 +7,7 @@ clock that is set back. Everything follows from the seed.
 from __future__ import annotations
 
 import hashlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -65,24 +65,6 @@ class Planned:
     current_ma: float = 20.0
     notes: dict[str, str] = field(default_factory=dict)
     noise_nm: float = 0.04
-
-
-def weeks(count: int) -> list[Planned]:
-    """Sessions two or three days apart, in which a muscle gains torque and the threshold comes down."""
-    rng, muscle = np.random.default_rng(1), Patient()
-    found = []
-    for number in range(count):
-        share = number / max(count - 1, 1)
-        gain = muscle.gain * (1 + 0.35 * share + 0.03 * rng.standard_normal())
-        rise = muscle.a2 * (1 + 0.04 * rng.standard_normal())
-        slower = muscle.time_constant_s * (1 - 0.12 * share + 0.01 * rng.standard_normal())
-        notes = {"electrodes": "new electrodes, 2 cm proximal"} if number % 7 == 4 else {}
-        if number % 9 == 6:
-            notes["spasm"] = "spasm in the ramp; +baclofen since yesterday"
-        now = replace(muscle, gain=gain, a2=rise, time_constant_s=slower)
-        day = 2.0 * number + number // 3 + float(rng.uniform(0.0, 0.2))
-        found.append(Planned(now, day, approved=number % 5 != 3, notes=notes))
-    return found
 
 
 def record(session: Planned, seed: int) -> identify.Record:

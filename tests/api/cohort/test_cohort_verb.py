@@ -18,8 +18,6 @@ import pytest
 
 from stimrig.api.cli import main
 from stimrig.api.cohort import cluster
-from stimrig.api.cohort.select import FIELDS
-from stimrig.rig.messages import LABEL_TITLES
 from tests.api.test_schemas import unmet
 from tests.harness.cohort_records import cohort
 from tests.harness.processes import below, stat
@@ -110,14 +108,6 @@ def test_a_scheduler_without_workers_is_one_line(capsys: pytest.CaptureFixture[s
             "--wait", "0.5",
         )  # fmt: skip
     assert "no worker within 0.5 s" in words
-
-
-def test_the_docs_list_the_fields_that_there_are() -> None:
-    lines = (Path(__file__).parents[3] / "docs" / "cohorts.md").read_text("utf-8").splitlines()
-    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in lines if line.startswith("| `")]
-    written = {row[0].strip("`"): row[1:] for row in rows if len(row) == 3}
-    said = {name: f"{field.says}, {field.unit}" if field.unit else field.says for name, field in FIELDS.items()}
-    assert written == {name: [FIELDS[name].type, says] for name, says in said.items() if name not in LABEL_TITLES}
 
 
 # ---- the real thing: processes that are interrupted and killed

@@ -186,16 +186,6 @@ def test_many_rows_pass_in_groups(output: Path, monkeypatch: pytest.MonkeyPatch)
     assert pq.read_metadata(output).num_row_groups > 2
 
 
-@pytest.mark.parametrize("joined", [False, True])
-def test_a_table_that_is_older_than_a_label_goes_on(output: Path, joined: bool) -> None:
-    """What it was for the records in it is not known."""
-    run(output, made("a"), join=joined)
-    file = output if joined else Results(output, TASK).folder / "00000000.parquet"
-    pq.write_table(pq.read_table(file).drop_columns(["kind"]), file)
-    run(output, made("b", kind="adaptive"))
-    assert {row["name"]: row["kind"] for row in read(output)} == {"a": None, "b": "adaptive"}
-
-
 def test_columns_have_types_and_units(output: Path) -> None:
     row = made(
         "a", day="2026-01-31", begun_utc="2026-01-31T10:00:00+02:00", computed_utc=datetime(2026, 2, 1, tzinfo=UTC),

@@ -16,7 +16,6 @@ import pytest
 from distributed import Client, LocalCluster
 from distributed.scheduler import KilledWorker
 
-from stimrig.api.cli.commands.cohort import duration, words
 from stimrig.api.cohort import computing, run
 from stimrig.api.cohort.cluster import check_versions
 from stimrig.api.cohort.computing import close_all
@@ -263,9 +262,3 @@ def test_a_worker_that_cannot_compute_ends_the_run(
     monkeypatch.setattr(run, "run_parcel", Mock(side_effect=OSError(28, "No space left on device")))
     with pytest.raises(CutOffError, match="No space left"):
         go(client, sources_of([str(folder)]), tmp_path / "r.parquet")
-
-
-def test_words_on_how_far_it_is() -> None:
-    assert words(Tally(before=3), 0.0) == "3"
-    assert words(Tally(total=100, ok=10, error=2, before=8), 10.0) == "20 of 100, 2 failed, 1.2/s, 1 min left"
-    assert [duration(seconds) for seconds in (5, 90, 5000, 7300)] == ["5 s", "2 min", "83 min", "2 h 2 min"]
