@@ -1,4 +1,4 @@
-"""Black boxes in the manner of the well-known toolbox and of recent papers, plain: numpy, scipy and numba alone.
+"""Black boxes in the manner of the well-known toolbox and of recent papers, plain: numpy and scipy alone.
 
 Each fits the rows that may be fitted and predicts all rows in free run, from the inputs and the fitted rows at the
 begin of each part. Their settings are fixed for all tasks; where they choose, they choose on fitted rows.
@@ -9,10 +9,9 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from itertools import pairwise, product
+from itertools import pairwise
 
 import numpy as np
-from numba import njit
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from scipy.optimize import least_squares, minimize
 from scipy.signal import lfilter, lfilter_zi
@@ -125,76 +124,6 @@ def hammerstein_wiener(task: Task) -> Predict:
     return lambda: scaled.back(simulate(best[1:], int(best[0])))
 
 
-# ---- nlarx: a linear part and a sigmoid network of lagged outputs and inputs; one-step error, free run ----
-
-LAGS, UNITS = 3, 8
-
-
-@njit
-def _free_run(w, hidden, outer, inputs, first, begins):
-    y = np.empty(inputs.shape[0])
-    z = np.empty(w.size)
-    units, width = hidden.shape
-    for k in range(y.size):
-        if k - begins[k] < LAGS:
-            y[k] = first[k]
-            continue
-        z[0] = 1.0
-        for j in range(LAGS):
-            z[1 + j] = y[k - 1 - j]
-            z[1 + LAGS + j] = inputs[k, j]
-        value = 0.0
-        for i in range(width):
-            value += w[i] * z[i]
-        for h in range(units):
-            inner = 0.0
-            for i in range(width):
-                inner += hidden[h, i] * z[i]
-            value += outer[h] * np.tanh(inner)
-        y[k] = min(max(value, -6.0), 6.0)
-    return y
-
-
-def nlarx(task: Task) -> Predict:
-    """`nlarx`: trained on the error of one step, as the toolbox does by default; the best free run of six starts."""
-    scaled = Scaled(task)
-    u, y, parts = scaled.u, scaled.y, task.parts
-    inputs = lagged(u, parts, range(1, 1 + LAGS))
-    z = np.c_[np.ones(y.size), lagged(y, parts, range(1, 1 + LAGS)), inputs]
-    begins = np.concatenate([np.full(p.stop - p.start, p.start) for p in parts])
-    usable = np.flatnonzero(task.fitted & (np.arange(y.size) - begins >= LAGS))
-    usable = usable[np.all(task.fitted[usable[:, None] - np.arange(1, 1 + LAGS)], axis=1)]
-    z, target, width = z[usable], y[usable], z.shape[1]
-
-    def split(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        return x[:width], x[width : width * (1 + UNITS)].reshape(UNITS, width), x[-UNITS:]
-
-    def run(x: np.ndarray) -> np.ndarray:
-        return _free_run(*split(x), inputs, y, begins)
-
-    def residual(x: np.ndarray) -> np.ndarray:
-        w, hidden, outer = split(x)
-        return np.r_[z @ w + np.tanh(z @ hidden.T) @ outer - target, 1e-2 * x[width:]]
-
-    def slope(x: np.ndarray) -> np.ndarray:
-        _, hidden, outer = split(x)
-        active = np.tanh(z @ hidden.T)
-        inner = ((1 - active**2) * outer)[:, :, None] * z[:, None, :]
-        rows = np.c_[z, inner.reshape(len(z), -1), active]
-        return np.r_[rows, np.c_[np.zeros((x.size - width, width)), 1e-2 * np.eye(x.size - width)]]
-
-    def fits() -> Iterator[tuple[float, np.ndarray]]:
-        linear = np.linalg.lstsq(z, target, rcond=None)[0]
-        for seed in range(6):
-            rng = np.random.default_rng(seed)
-            start = np.r_[linear, 0.5 * rng.standard_normal(UNITS * width), 0.1 * rng.standard_normal(UNITS)]
-            found = least_squares(residual, start, slope, max_nfev=100).x  # pyright: ignore[reportArgumentType]
-            yield float(np.mean((run(found) - y)[task.fitted] ** 2)), found
-
-    best = several(fits())
-    return lambda: scaled.back(run(best))
-
-
 # ---- Gaussian process on lagged inputs ----
 
 EDGES = np.unique(np.round(np.geomspace(1, 81, 14)).astype(int)) - 1
@@ -235,129 +164,3 @@ def gaussian_process(task: Task) -> Predict:
     inner = rows[:, fitted] @ rows[:, fitted].T + noise * np.eye(kept.size)
     weights = np.linalg.solve(inner, rows[:, fitted] @ y[fitted])
     return lambda: scaled.back(weights @ rows)
-
-
-# ---- a small neural state space, on simulation error ----
-
-STATES, NEURONS = 3, 6
-
-
-@njit
-def _states(x, u, begins, part, derivatives):
-    """Output, and its derivatives by the parameters carried forward; x: A, B, hidden, outer, C, begins."""
-    s, h, d = STATES, NEURONS, x.size
-    width = s + 2
-    at_b = s * s
-    at_h = at_b + 2 * s
-    at_o = at_h + h * width
-    at_c = at_o + s * h
-    at_0 = at_c + s + 1
-    y, slope = np.empty(u.size), np.zeros((u.size if derivatives else 1, d))
-    state, carried = np.zeros(s), np.zeros((s, d))
-    active, z = np.empty(h), np.empty(width)
-    local, gain = np.empty((s, s)), np.empty(s)
-    for k in range(u.size):
-        if begins[k]:
-            carried[:] = 0.0
-            for i in range(s):
-                state[i] = x[at_0 + part[k] * s + i]
-                carried[i, at_0 + part[k] * s + i] = 1.0
-        value = x[at_c + s]
-        for i in range(s):
-            value += x[at_c + i] * state[i]
-        y[k] = value
-        if derivatives:
-            for j in range(d):
-                total = 0.0
-                for i in range(s):
-                    total += x[at_c + i] * carried[i, j]
-                slope[k, j] = total
-            for i in range(s):
-                slope[k, at_c + i] += state[i]
-            slope[k, at_c + s] += 1.0
-        z[:s] = state
-        z[s], z[s + 1] = u[k], 1.0
-        for n in range(h):
-            inner = 0.0
-            for i in range(width):
-                inner += x[at_h + n * width + i] * z[i]
-            active[n] = np.tanh(inner)
-        if derivatives:
-            for i in range(s):
-                for j in range(s):
-                    total = x[i * s + j]
-                    for n in range(h):
-                        total += x[at_o + i * h + n] * (1 - active[n] ** 2) * x[at_h + n * width + j]
-                    local[i, j] = total
-            carried = local @ carried
-            for i in range(s):
-                for j in range(s):
-                    carried[i, i * s + j] += state[j]
-                carried[i, at_b + 2 * i] += u[k]
-                carried[i, at_b + 2 * i + 1] += 1.0
-                for n in range(h):
-                    carried[i, at_o + i * h + n] += active[n]
-                    bent = x[at_o + i * h + n] * (1 - active[n] ** 2)
-                    for j in range(width):
-                        carried[i, at_h + n * width + j] += bent * z[j]
-        for i in range(s):
-            total = x[at_b + 2 * i] * u[k] + x[at_b + 2 * i + 1]
-            for j in range(s):
-                total += x[i * s + j] * state[j]
-            for n in range(h):
-                total += x[at_o + i * h + n] * active[n]
-            gain[i] = total
-        for i in range(s):
-            state[i] = min(max(gain[i], -50.0), 50.0)
-    return y, slope
-
-
-def neural_states(task: Task) -> Predict:
-    """Three states: a linear part beside six neurons. Levenberg-Marquardt on the whole simulated fitted rows.
-
-    SUBNET's kin: no encoder (each part's begin is estimated) and no short sections, since exact derivatives are at
-    hand. The last fifth of the fitted rows, kept aside, chooses among speeds of the start and sizes of the ridge.
-    """
-    scaled = Scaled(task)
-    u, y, parts, fitted = scaled.u, scaled.y, task.parts, np.flatnonzero(task.fitted)
-    begins, part = np.zeros(y.size, bool), np.zeros(y.size, np.int64)
-    for number, rows in enumerate(parts):
-        begins[rows.start], part[rows] = True, number
-    kept = fitted[: int(0.8 * fitted.size)]
-    aside = fitted[kept.size :]
-    plain = STATES * STATES + 2 * STATES + NEURONS * (STATES + 2) + STATES * NEURONS + STATES + 1
-    alike = np.eye(plain + STATES * len(parts))  # later parts begin as the first one, but for a difference
-    for number in range(1, len(parts)):
-        rows = plain + STATES * number
-        alike[rows : rows + STATES, plain : plain + STATES] = np.eye(STATES)
-
-    def run(x: np.ndarray) -> np.ndarray:
-        return _states(alike @ x, u, begins, part, False)[0]
-
-    def fit(start: np.ndarray, rows: np.ndarray, ridge: float) -> np.ndarray:
-        tie = np.full(start.size, ridge)
-        tie[: STATES * STATES], tie[plain:] = 0.0, 0.1
-
-        def residual(x: np.ndarray) -> np.ndarray:
-            return np.r_[(run(x) - y)[rows], tie * x]
-
-        def slope(x: np.ndarray) -> np.ndarray:
-            return np.r_[_states(alike @ x, u, begins, part, True)[1][rows] @ alike, np.diag(tie)]
-
-        found = least_squares(residual, start, slope, x_scale=0.2, max_nfev=60)  # pyright: ignore[reportArgumentType]
-        return found.x
-
-    def fits() -> Iterator[tuple[float, np.ndarray]]:
-        for ridge, (seed, lag) in product((0.01, 0.1, 0.5), enumerate((4.0, 15.0))):
-            rng = np.random.default_rng(seed)
-            linear = np.diag(np.exp(-1.0 / (lag * np.array([1.0, 0.6, 0.3]))))
-            linear[1, 0], linear[2, 1] = 1 - linear[1, 1], 1 - linear[2, 2]
-            drive = np.array([[1 - linear[0, 0], 0.0], [0.0, 0.0], [0.0, 0.0]])
-            net = 0.3 * rng.standard_normal(NEURONS * (STATES + 2)), 0.01 * rng.standard_normal(STATES * NEURONS)
-            start = np.r_[linear.ravel(), drive.ravel(), *net, 0.0, 1.0, 0.0, y.min(), np.zeros(STATES * len(parts))]
-            found = fit(start, kept, ridge)
-            yield float(np.mean((run(found) - y)[aside] ** 2)), np.r_[ridge, found]
-
-    ridge, *start = several(fits())
-    best = fit(np.array(start), fitted, ridge)
-    return lambda: scaled.back(run(best))

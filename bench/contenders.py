@@ -12,7 +12,7 @@ import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
-from bench.black_boxes import gaussian_process, hammerstein_wiener, neural_states, nlarx
+from bench.black_boxes import gaussian_process, hammerstein_wiener
 from bench.tasks import OWN_EFFECTS, Task
 from stimrig import identify
 from tests.harness.muscle import second_order, sigmoid
@@ -189,7 +189,5 @@ CONTENDERS = (
     Contender("jax-sysid", "two states, spline inputs, L-BFGS", jax_sysid, fine=True),
     Contender("SysIdentPy", "FROLS on spline inputs, extended LS", sysidentpy, fine=True),
     Contender("Hammerstein-Wiener", "as nlhw: piecewise linear, order 2 or 3", hammerstein_wiener),
-    Contender("nlarx", "as nlarx: sigmoid network of 3 + 3 lags", nlarx),
     Contender("Gaussian process", "lagged inputs, 2 s of memory, Nyström", gaussian_process),
-    Contender("neural state space", "SUBNET-like: 3 states, 6 neurons", neural_states),
 )

@@ -68,13 +68,6 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     return made | {"unseen": sampled(muscle, unseen_design(seed, top_us), RATE_HZ, np.zeros), "truth": told}
 
 
-def alike_record(kinds: str, seed: int) -> dict[str, Any]:
-    """One more PRBS and ramp of the muscle of `record_of_physics`, rested: the columns of its `unseen`."""
-    muscle = draw_muscle(kinds, seed)
-    rng, top_us = rng_of(seed, "physics", "alike"), float(muscle.base.largest_width_us)
-    return sampled(muscle, make_design("full", rng, top_us, with_validate=False), RATE_HZ, np.zeros)
-
-
 def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Floats) -> dict[str, Any]:
     """One more record of a set's muscle, rested, of pulse widths that somebody chose.
 
