@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import concurrent.futures
 import re
-from collections.abc import Iterator
 from typing import Any
 
 import httpx
@@ -17,15 +16,10 @@ from stimrig.api.store.tables import Participant
 from stimrig.rig import messages as m
 from tests.api.conftest import Service, SetClock, csrf, run_test, signed_in, wait_done
 from tests.api.test_forms import fields
+from tests.api.test_forms import tab as tab
 from tests.api.test_profiles import calibrate
 
 PAGE = "/participants/P017"
-
-
-@pytest.fixture
-def tab(service: Service, participant: str) -> Iterator[httpx.Client]:
-    with signed_in(service) as browser:
-        yield browser
 
 
 def ask(tab: httpx.Client) -> str:

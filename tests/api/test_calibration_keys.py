@@ -13,7 +13,6 @@ from tests.api.browser import expected, open_tab
 from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
-LAPTOP, TABLET = (1366, 768), (820, 1180)
 
 
 service = shared_service()
@@ -165,18 +164,6 @@ def test_another_calibration_that_comes_under_the_hand_is_read_first(page: Any, 
     assert not seen[0][0] and seen[-1][0]
     assert seen[-1][1] - seen[0][1] > 1000, "ms of the 2000: a pause may come before the first is seen"
     assert widths(service) == []
-
-
-def test_everything_to_press_is_on_one_screen(page: Any) -> None:
-    press(page, "ArrowUp", 1)
-    names = ("step-up", "step-fine", "step-repeat", "step-down", "mark-sensory", "mark-comfort", "finish", "discard")
-    for width, height in (LAPTOP, TABLET):
-        page.set_viewport_size({"width": width, "height": height})
-        page.evaluate("scrollTo(0, 0)")
-        for name in names:
-            box = page.locator(f"#{name}").bounding_box()
-            assert box["height"] >= 48 and box["y"] + box["height"] <= height, (name, box)
-        assert page.evaluate("document.documentElement.scrollWidth") <= width
 
 
 def test_last_times_marks_stand_beside_todays(page: Any, service: Service) -> None:

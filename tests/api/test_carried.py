@@ -285,13 +285,6 @@ def test_an_uploads_model_page_says_what_was_left_out_of_its_structure(site: Ser
 
 
 @pytest.mark.slow
-def test_administration_shows_it(site: Service, service: Service) -> None:
-    for place, words in ((site, "<b>fatigue, tremor</b>"), (service, "<b>plain</b>")):
-        with signed_in(place) as browser:
-            assert words in browser.get("/administration").text
-
-
-@pytest.mark.slow
 def test_unknown_effect_is_one_line_before_the_service_starts(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -1,4 +1,4 @@
-"""Charts in a real browser: stills as they are reached, the plot library on demand; nothing covers anything."""
+"""Charts in a real browser: stills as they are reached, the plot library on demand."""
 
 from __future__ import annotations
 
@@ -13,18 +13,6 @@ from tests.api.conftest import Service, shared_service, soon
 pytestmark = pytest.mark.browser
 LAPTOP, TABLET = {"width": 1366, "height": 768}, {"width": 820, "height": 1180}
 
-COVERED = """() => [...document.querySelectorAll('.figure-box:has(.js-plotly-plot)')].flatMap((chart) => {
-  const boxes = (names) => names.flatMap((name) => [...chart.querySelectorAll(name)].map((part) => {
-    const at = part.getBoundingClientRect();
-    return at.width && at.height ? { name, left: at.left, right: at.right, top: at.top, bottom: at.bottom } : null;
-  })).filter(Boolean);
-  const meet = (a, b) => a.left < b.right - 1 && b.left < a.right - 1 && a.top < b.bottom - 1 && b.top < a.bottom - 1;
-  const above = boxes(['.modebar-group', '.legend', '.chart-tools']);
-  const below = boxes(['.legend', '.annotation', '.nsewdrag',
-    '.g-xtitle', '.g-ytitle', '.g-y2title', '.g-y3title']);
-  return above.flatMap((one) => below.filter((other) => other.name !== one.name && meet(one, other))
-    .map((other) => [chart.dataset.figure, one.name, other.name])); })"""
-"""Toolbar over anything, legend over lines, titles or the segments' names."""
 
 LINE = """() => getComputedStyle(document.querySelector('[data-figure=step] .scatterlayer .js-line')).stroke"""
 NAMED = """(name) => { const probe = document.createElement('i'); probe.style.color = `var(--${name})`;
@@ -44,15 +32,6 @@ def drawn(page: Any, service: Service, model: str) -> None:
     page.locator("[data-figure=signature-fatigue]").wait_for(state="attached")
     page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
     look_closer(page, "comparison", "recruitment", "step", "residual", "signature-fatigue")
-
-
-def test_toolbar_legend_and_titles_leave_each_other_room(tab: Any, service: Service, model: str) -> None:
-    for size in (LAPTOP, TABLET):
-        tab.set_viewport_size(size)
-        drawn(tab, service, model)
-        assert tab.evaluate(COVERED) == [], size
-    words = tab.locator("[data-figure=step] .modebar-btn").evaluate_all("all => all.map((e) => e.dataset.title)")
-    assert words == ["Zoom: draw a box", "Move", "Show all again", "Save as a picture"]
 
 
 def test_switching_colours_recolours_what_is_drawn_and_keeps_the_page(tab: Any, service: Service, model: str) -> None:
@@ -90,23 +69,6 @@ def test_without_scripts_the_switch_is_a_form(browser: Any, service: Service) ->
         assert (
             http.post("/colours", data={"colours": "dark"}, headers={"Origin": "http://x.example"}).status_code == 403
         )
-
-
-def test_the_pointer_reads_all_lines(browser: Any, service: Service, model: str) -> None:
-    for page in open_tab(browser, service):
-        page.set_viewport_size(LAPTOP)
-        drawn(page, service, model)
-        chart = page.locator("[data-figure=comparison]")
-        chart.scroll_into_view_if_needed()
-        plane = chart.locator(".nsewdrag").first
-        plane.hover(position={"x": 300, "y": 60})
-        plane.hover(position={"x": 310, "y": 60})
-        chart.locator(".hoverlayer .legend").wait_for()
-        told = chart.locator(".hoverlayer").text_content()
-        assert told.count("N·m") == 3 and told.count("µs") == 1, told
-        with page.expect_download() as saved:
-            page.locator("[data-figure=step] .modebar-btn").last.click()
-        assert saved.value.suggested_filename == f"{model}-step.png"
 
 
 AT_REST = """() => new Promise((done) => { let last = scrollY, frames = 0;

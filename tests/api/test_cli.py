@@ -17,8 +17,6 @@ import pytest
 from bench.muscles import hidden_records
 from stimrig import identify
 from stimrig.api.cli import main
-from stimrig.api.cli.commands.explain import story_lines
-from stimrig.api.models.explanation import place
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.workers import verbs
 from stimrig.identify.healing import place_words
@@ -28,14 +26,6 @@ from tests.harness import few_effects
 from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow
-
-GOOD = ["time_s,pulse_width_us,torque_nm,segment"] + [
-    f"{k / 40},{100 * (k // 20 % 2)},{k % 7 / 10},prbs" for k in range(400)
-]
-
-
-def edited(line: int, text: str) -> list[str]:
-    return [*GOOD[: line - 1], text, *GOOD[line:]]
 
 
 def run(capsys: pytest.CaptureFixture[str], *arguments: object) -> tuple[int, str, str]:
@@ -60,42 +50,12 @@ def test_fit_reports_and_writes_a_model(capsys: pytest.CaptureFixture[str], reco
     assert json.loads(model.read_text())["recruitment"]["pulse_width_us"]
 
 
-def test_predict_writes_the_three_columns(
-    capsys: pytest.CaptureFixture[str], record: Path, model: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / "out.csv"
-    code, out, _ = run(capsys, "predict", str(model), str(record), "-o", str(target), "--json")
-    assert code == 0 and json.loads(out)["rows"] == 1000
-    with target.open() as file:
-        rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["time_s", "torque_nm", "predicted_torque_nm"] and len(rows) == 1000
-    worst = max(abs(float(row["torque_nm"]) - float(row["predicted_torque_nm"])) for row in rows)
-    assert 0 < worst < 0.5
-
-
-BAD_CSV: list[tuple[str, list[str], tuple[str, ...]]] = [
-    ("missing column", ["time_s,pulse_width_us,segment", "0,0,prbs"], ("torque_nm",)),
-    ("text in a number", edited(7, "0.125,abc,0.1,prbs"), ("7", "abc")),
-    ("infinity", edited(9, "0.175,100,inf,prbs"), ("9", "torque_nm")),
-    ("time backwards", edited(12, "0.1,0,0.1,prbs"), ("12",)),
-    ("a unit that is not said", ["Zeit;PW;Drehmoment", "0,0;0;1,5"], ("line 1", "time_s=Zeit:s")),
-    ("too few fields", edited(5, "0.075,0"), ("5",)),
-    ("empty", [], ()),
-    ("header only", GOOD[:1], ()),
-]
-
-
-@pytest.mark.parametrize(("name", "lines", "named"), BAD_CSV, ids=[case[0].replace(" ", "-") for case in BAD_CSV])
 @pytest.mark.parametrize("verb", ["fit", "diagnose"])
-def test_bad_csv_is_one_line_naming_the_place(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, verb: str, name: str, lines: list[str], named: tuple[str, ...]
-) -> None:
+def test_bad_csv_is_one_line_naming_the_place(capsys: pytest.CaptureFixture[str], tmp_path: Path, verb: str) -> None:
     path = tmp_path / "bad.csv"
-    path.write_text("\n".join(lines) + "\n" if lines else "")
+    path.write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0,0.1,prbs\n0.025,abc,0.1,prbs\n")
     err = refused(capsys, verb, str(path), "--json")
-    assert "bad.csv" in err
-    for word in named:
-        assert word in err, err
+    assert "bad.csv" in err and "line 3" in err and "abc" in err
 
 
 def of_another_tool(record: Path, folder: Path) -> Path:
@@ -144,54 +104,6 @@ def test_models_and_predictions_as_mat_files(
     found = loadmat(tmp_path / "p.mat", squeeze_me=True)
     assert found["predicted_torque_nm"].shape == found["time_s"].shape == (1000,)
     assert "MODEL.json of the same fit" in refused(capsys, "compare", str(tmp_path / "M.mat"), str(record))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "fix"),
-    [
-        (["compare", "{record}", "{model}"], "The model comes first: stimrig compare MODEL.json DATA."),
-        (["predict", "{record}", "{model}", "-o", "p.csv"], "first: stimrig predict MODEL.json DATA -o FILE."),
-        (["diagnose", "{record}", "--model", "{record}"], "Give a file written by `stimrig fit -o`."),
-    ],
-)
-def test_a_recording_in_the_place_of_a_model_is_called_one(
-    capsys: pytest.CaptureFixture[str], record: Path, model: Path, arguments: list[str], fix: str
-) -> None:
-    words = refused(capsys, *[part.format(record=record, model=model) for part in arguments]).strip()
-    assert f"{record}: this is a recording, not a model. " in words and words.endswith(fix)
-
-
-def test_a_story_at_the_terminal_names_segments_as_the_file_does() -> None:
-    text = "falling validate, 0-300 µs: model too low by 0.5 N·m, 20 % of the error above the noise"
-    found = {"segment": "validate", "pulse_width_us": [0.0, 300.0], "direction": "falling", "share_of_excess": 0.2}
-    row = dict.fromkeys(("fit_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm"), 1.0)
-    places = [{**place({**found, "text": text}, 1), "became": "the error there fell"}]
-    made = {
-        "title": "",
-        "noise_sd_nm": 0.1,
-        "rows": [row, row],
-        "places": places,
-        "steps": [],
-        "ended": "",
-        "error": "rms_nm",
-    }
-    why = {"title": "", "missing": [], "free": []}
-    lines = story_lines({"story": {**made, "why": why, "then": {"experiment": None}}})
-    assert f"2 fails in     {text}" in lines
-    assert "  there        falling validate, 0-300 µs: the error there fell" in lines
-
-
-def test_half_written_recording(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    from stimrig.rig.messages import Profile, TestPlan
-    from tests.api.fake_rig import write_recording
-
-    plan = TestPlan(test_id="T1", participant="P1", profile=Profile(), segments=None)  # pyright: ignore[reportCallIssue]
-    path, _ = write_recording(
-        tmp_path, plan, [100.0] * 400, [1.0] * 4000, [{"name": "prbs", "start_s": 0, "end_s": 10}], 400.0, "completed"
-    )
-    half = tmp_path / "half.h5"
-    half.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    assert "half.h5" in refused(capsys, "fit", str(half))
 
 
 @pytest.mark.parametrize(
@@ -253,15 +165,6 @@ def test_progress_tells_share_and_text_to_who_looks(monkeypatch: pytest.MonkeyPa
         assert lines[-1] == "", "nothing stays behind it"
 
 
-def test_work_that_is_done_within_a_second_shows_no_bar(monkeypatch: pytest.MonkeyPatch) -> None:
-    shown = io.StringIO()
-    shown.isatty = lambda: True
-    monkeypatch.setattr("sys.stderr", shown)
-    with progress_bar() as progress:
-        progress(0.5, "tried tremor")
-    assert "tried" not in shown.getvalue()
-
-
 def test_unforeseen_error_is_one_line_and_a_log(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, record: Path
 ) -> None:
@@ -279,11 +182,6 @@ def test_every_verb_of_the_contract_is_there_and_helps() -> None:
     done = subprocess.run([sys.executable, "-m", "stimrig", "--help"], capture_output=True, text=True, check=True)
     for verb in ("serve", "emulate", "test", "fit", "predict", "compare", "diagnose", "improve", "effects", "table1"):
         assert f"\n  {verb}" in done.stdout
-
-
-def test_bad_input_as_a_process() -> None:
-    done = subprocess.run([sys.executable, "-m", "stimrig", "fit", "nowhere.csv"], capture_output=True, text=True)
-    assert done.returncode == 2 and done.stdout == "" and done.stderr.count("\n") == 1
 
 
 def test_emulate_hands_everything_on() -> None:
@@ -349,15 +247,6 @@ def test_a_file_twice_or_none_is_refused(parts: list[Path], capsys: pytest.Captu
     code, _, err = run(capsys, "fit", parts[0], parts[0])
     assert code == 2 and "named twice" in err
     assert run(capsys, "fit")[0] == 2
-
-
-def test_a_copy_or_a_link_is_no_second_recording(parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
-    copy, link = tmp_path / "copy.csv", tmp_path / "link.csv"
-    copy.write_bytes(parts[0].read_bytes())
-    link.symlink_to(parts[0])
-    for again in (copy, link, parts[0].parent / ".." / parts[0].parent.name / parts[0].name):
-        code, _, err = run(capsys, "fit", parts[0], again)
-        assert code == 2 and "measured in another" in err and again.name in err, err
 
 
 def test_what_cannot_be_joined_names_its_file(parts: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]):
@@ -505,15 +394,3 @@ def test_what_diagnose_writes_is_what_the_page_shows_and_small(tired: Path, tmp_
     for part in ('id="why"', 'id="missing-fatigue"', 'id="effect-fatigue"', 'id="error"', 'id="shares"', 'id="others"'):
         assert part in text
     assert said.split(" (probability")[0] in text and len(text) < 1_000_000
-
-
-def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:
-    record = hidden_records.generate("output_saturation", "middle", seed=42, rate_hz=100, design="short")
-    data = tmp_path / "record.csv"
-    hidden_records.write_csv(record, data)
-    model = json.loads(stimrig("fit", data, "--effects", "output_saturation", "--json"))
-    assert [effect["id"] for effect in model["effects"]] == ["output_saturation"]
-    assert {"linear", "recruitment", "valid_for", "uncertainty", "residual_tests", "data", "software"} <= set(model)
-    assert {"b", "a", "delay_samples"} <= set(model["linear"])
-    b, a = np.array(model["linear"]["b"]), np.array(model["linear"]["a"])
-    assert b.sum() / a.sum() == pytest.approx(1.0, abs=1e-6)

@@ -47,40 +47,6 @@ def test_the_list_follows_what_is_typed(tab: Any, service: Service) -> None:
     assert tab.errors == []
 
 
-def test_the_archive_on_the_pages(tab: Any, service: Service) -> None:
-    make(service, "Z1", side="left")
-    tab.goto(service.url + "/participants/Z1")
-    tab.get_by_role("button", name="Put into the archive").click()
-    tab.get_by_role("heading", name="Participants").wait_for()
-    assert tab.get_by_role("link", name="Z1", exact=True).count() == 0
-    tab.get_by_role("link", name=re.compile("Archive")).click()
-    tab.get_by_role("link", name="Z1", exact=True).wait_for()
-    examined(tab, "the archive")
-    tab.get_by_role("link", name="Z1", exact=True).click()
-    tab.get_by_text("In the archive since").wait_for()
-    examined(tab, "an archived participant")
-    assert tab.get_by_role("button", name="Start the pre-session test").count() == 0
-    tab.get_by_role("button", name="Take out of the archive").first.click()
-    tab.get_by_text("In the archive since").wait_for(state="detached")
-
-
-def test_a_note_is_shown_as_it_was_written_and_struck_with_a_click(tab: Any, service: Service) -> None:
-    participant(tab, service, "W1")
-    notes = tab.locator("#notes")
-    notes.get_by_label("About").select_option("electrodes")
-    notes.get_by_label("Note", exact=True).fill("<script>x</script> 2 cm distal")
-    notes.get_by_role("button", name="Write it down").click()
-    notes.get_by_text("<script>x</script> 2 cm distal").wait_for()
-    examined(tab, "a note")
-    notes.get_by_role("button", name="Strike").click()
-    notes.get_by_text("struck by Ada").wait_for()
-    notes.get_by_label("About").select_option("other")
-    notes.get_by_label("Note", exact=True).fill("two\u202elines")
-    notes.get_by_role("button", name="Write it down").click()
-    tab.get_by_text("U+202E cannot stand in it").wait_for()
-    assert tab.errors == [] or all("422" in words for words in tab.errors)
-
-
 def test_a_note_while_the_test_runs_does_not_leave_its_page(tab: Any, service: Service) -> None:
     service.rig.speed = 1.0
     participant(tab, service, "W2")

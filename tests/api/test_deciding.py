@@ -20,7 +20,6 @@ from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.web.pages import model_view
-from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.responses.models import ExperimentOut
 from stimrig.api.workers.verbs import experiment
 from stimrig.identify.records.record import Source
@@ -53,15 +52,6 @@ def test_it_goes_before_the_test_between_rivals_and_the_page_shows_it() -> None:
     gate = {"effect": "free_gate", "name": "A gate", "words": "", "left_out": ""}
     said = diagnosis_lines({**left, "free": [gate], "add": ["free_gate"]})[-1]
     assert "Add “A gate”" in said and "`stimrig explain DATA -o MODEL.json` adds" in said
-
-
-def test_the_page_says_of_a_test_without_rivals_that_it_teaches_and_of_others_that_they_tell_apart() -> None:
-    found = experiment(MISSING, DECIDING)
-    assert found is not None
-    card = environment.get_template("why.html").module.experiment  # pyright: ignore[reportAttributeAccessIssue]
-    for rivals, said, unsaid in (([], "teaches", "tells them apart"), (["fatigue"], "tells them apart", "teaches")):
-        html = card(explanation.tidy_experiment({**found, "rivals": rivals}, {}))
-        assert said in html and unsaid not in html and ("Decides" in html) == bool(rivals)
 
 
 def test_the_page_asks_for_it_at_the_rate_of_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import re
-
-import httpx
-
 from stimrig.api.effect_words import library, parameter_words
 from stimrig.api.models import explanation, stored_model
 from stimrig.identify import effects
-from tests.api.conftest import Service, play_test, run_test, shared_service, signed_in, soon
+from tests.api.conftest import Service, play_test, shared_service, signed_in, soon
 
 PLAIN = {
     "sample_rate_hz": 40.0,
@@ -34,17 +30,6 @@ def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -
     assert set(library()) == set(effects.registry())
 
 
-def test_a_parameter_is_told_by_what_it_is() -> None:
-    library = {entry["id"]: entry for entry in effects.library()}
-    given = {name: {"value": 1.0, "sd": 0.1, "unit": "1"} for name in ("depth", "onset_s")}
-    found = explanation.card({"effect": "fatigue", "parameters": given}, library, {})["parameters"]
-    assert found["depth"]["label"] == "largest share of torque that is lost"
-    assert found["onset_s"]["symbol"] == "onset", "as the equation calls it"
-    assert explanation.card({"effect": "own", "parameters": {"my_gain_nm": {}}}, {}, {})["parameters"] == {
-        "my_gain_nm": {"label": "my gain", "symbol": "my_gain"}
-    }
-
-
 def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
     row = {"id": "M-1", "added_effect": "fatigue,threshold_drift"}
     rival = {"effect": "fatigue", "confused_with": ["threshold_drift"]}
@@ -53,24 +38,6 @@ def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
     assert explanation.label(row) == f"+ fatigue, {title}"
     for known in ({}, library):
         assert explanation.card(rival, known, {})["rivals"] == [title]
-
-
-def test_no_page_shows_an_id(service: Service, client: httpx.Client) -> None:
-    client.post("/v1/participants", json={"code": "E1"})
-    title = library()["threshold_drift"]["name"]
-    other, plain = (run_test(client, "E1")["model_id"] for _ in range(2))
-    body = {"effects": ["threshold_drift"], "force": True, "reason": "seen last week"}
-    added = client.post(f"/v1/models/{plain}/effects", json=body)
-    assert added.status_code == 201, added.text
-    better = added.json()["id"]
-    pages = ("/participants/E1", "/participants/E1/trend", f"/compare?model={better}&model={other}",
-             f"/models/{better}", f"/models/{better}/report")  # fmt: skip
-    with signed_in(service) as browser:
-        for place in pages:
-            page = browser.get(place).text
-            shown = re.sub(r"<script\b.*?</script>|<[^>]*>", " ", page, flags=re.DOTALL)
-            assert not re.search(r"threshold_drift", shown), place
-            assert re.search(rf"(?i){title}", shown), place
 
 
 def test_a_page_that_waits_reads_how_far_the_work_is(service: Service) -> None:

@@ -102,15 +102,6 @@ def test_a_journal_becomes_a_recording_that_is_read(folder: Path, tmp_path: Path
     assert identify.read(Path(sealed["recording"])).time_s.size > 100
 
 
-@pytest.mark.parametrize("kind", SEALED)
-def test_each_kind_is_read_with_h5py_as_the_page_on_recordings_says(folder: Path, kind: str) -> None:
-    with h5py.File(folder / f"{kind}.h5") as file:
-        torque, time_s = file["torque/torque_nm"], file["torque/time_s"]
-        assert torque.shape == time_s.shape and file.attrs["format"] and float(file.attrs["pulse_rate_hz"]) > 0
-        names = file["segments/name"].asstr()[:]
-        assert len(names) == len(file["segments/start_s"]) == len(file["segments/end_s"])
-
-
 def test_a_long_plan_is_no_reason_to_refuse_a_recording(folder: Path, tmp_path: Path) -> None:
     """A test that stops itself has hundreds of segments in `configuration`: its export was refused."""
     data = tmp_path / "long.h5"

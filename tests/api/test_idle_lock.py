@@ -15,7 +15,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.people.auth import IdleLock
 from stimrig.api.people.pace import Pace
 from tests.api.browser import PASSWORD, without_values
-from tests.api.conftest import HTML, STUB, TOKEN, Service, run_service, wait_done
+from tests.api.conftest import HTML, STUB, TOKEN, Service, csrf, run_service, wait_done
 
 SCRIPT = {"Sec-Fetch-Dest": "empty", "Sec-Fetch-Mode": "cors"}
 
@@ -177,18 +177,14 @@ def test_the_red_button_works_on_a_locked_page(service: Service, clock: SetClock
 def test_a_session_by_token_asks_for_the_token(service: Service, clock: SetClock) -> None:
     with service.client(token=None) as http:
         http.post("/sign-in", data={"token": TOKEN})
-        page = http.post("/lock", data={"csrf": csrf_of(http)}, headers=HTML)
+        page = http.post("/lock", data={"csrf": csrf(http)}, headers=HTML)
         assert page.status_code == 303 and locked(http)
         form = http.get("/locked", headers=HTML).text
         assert "Access token" in form
-        csrf = form.split('name="csrf" value="')[1].split('"')[0]
-        assert http.post("/unlock", data={"secret": PASSWORD, "csrf": csrf}, headers=HTML).status_code == 401
-        assert http.post("/unlock", data={"secret": TOKEN, "csrf": csrf}, headers=HTML).status_code == 303
+        token = form.split('name="csrf" value="')[1].split('"')[0]
+        assert http.post("/unlock", data={"secret": PASSWORD, "csrf": token}, headers=HTML).status_code == 401
+        assert http.post("/unlock", data={"secret": TOKEN, "csrf": token}, headers=HTML).status_code == 303
         assert not locked(http)
-
-
-def csrf_of(http: httpx.Client) -> str:
-    return http.get("/", headers=HTML).text.split('name="csrf" value="')[1].split('"')[0]
 
 
 def test_somebody_else_may_leave_for_the_one_who_is_gone(service: Service, clock: SetClock) -> None:

@@ -67,17 +67,13 @@ def interrupted(log: Path, said: str, *words: object) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("hold", ["time.sleep(600)", DEAF])
-@pytest.mark.parametrize(
-    ("verb", "function"), [("diagnose", "diagnose"), ("improve", "improve"), ("explain", "explain"), ("fit", "fit")]
-)
-def test_ctrl_c_ends_a_verb_whatever_it_is_in(
-    record: Path, tmp_path: Path, verb: str, function: str, hold: str
-) -> None:
+@pytest.mark.parametrize("verb", ["diagnose", "explain"])
+def test_ctrl_c_ends_a_verb_whatever_it_is_in(record: Path, tmp_path: Path, verb: str, hold: str) -> None:
     output = tmp_path / "out" / "MODEL.json"
     output.parent.mkdir()
     output.write_text("as it was")
     options = () if verb == "diagnose" else ("-o", output)
-    code = BUSY.format(function=function, hold=hold)
+    code = BUSY.format(function=verb, hold=hold)
     log = tmp_path / "log"
     _, said = interrupted(log, "computing", sys.executable, "-c", code, verb, record, *options)
     assert "interrupted" in said and "Traceback" not in said

@@ -104,7 +104,7 @@ device = "{device}"
 port = "{port}"
 [load_cell]
 device = "can_load_cell"
-signal = "{signal}"
+signal = "Torque_Nm"
 [load_cell.bus]
 interface = "socketcand"
 host = "127.0.0.1"
@@ -114,19 +114,15 @@ channel = "can0"
 
 
 @pytest.mark.parametrize(
-    ("device", "signal_name", "verbs", "named"),
-    [
-        ("p99", "Torque_Nm", ("serve", "test"), ("rig.toml", "p99")),
-        ("p24", "Nonsense", ("serve", "test"), ("rig.toml", "Nonsense")),
-        ("p24", "Torque_Nm", ("test",), ("/dev/ttyUSB77",)),
-    ],
-    ids=["unknown-device", "wrong-DBC-signal", "no-such-port"],
+    ("device", "verbs", "named"),
+    [("p99", ("serve", "test"), ("rig.toml", "p99")), ("p24", ("test",), ("/dev/ttyUSB77",))],
+    ids=["unknown-device", "no-such-port"],
 )
 def test_rig_file_that_does_not_hold_is_one_line(
-    tmp_path: Path, device: str, signal_name: str, verbs: tuple[str, ...], named: tuple[str, ...]
+    tmp_path: Path, device: str, verbs: tuple[str, ...], named: tuple[str, ...]
 ) -> None:
     path = tmp_path / "rig.toml"
-    path.write_text(RIG_FILE.format(device=device, port="/dev/ttyUSB77", signal=signal_name))
+    path.write_text(RIG_FILE.format(device=device, port="/dev/ttyUSB77"))
     for verb in verbs:
         command = [sys.executable, "-m", "stimrig", verb, "--rig", str(path), "--data", str(tmp_path)]
         done = subprocess.run(command, capture_output=True, text=True, timeout=300)
