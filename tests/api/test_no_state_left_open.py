@@ -25,17 +25,6 @@ def fails(*_args: Any, **_more: Any) -> Any:
     raise RuntimeError("something\nunexpected")
 
 
-def reopened(service: Service, ended: dict[str, Any], **fields: Any) -> Any:
-    """What a restarted service finds: the test is open; gives the function that takes it up."""
-    context = service.context
-    context.runner.lifecycle.update(ended["id"], state="identifying", model_id=None, **fields)
-
-    def resume() -> None:
-        service.run(context.runner.resume())
-
-    return resume
-
-
 @pytest.mark.parametrize("with_recording", [True, False])
 def test_a_test_taken_up_after_a_restart_ends_whatever_fails(
     client: httpx.Client,
@@ -47,12 +36,13 @@ def test_a_test_taken_up_after_a_restart_ends_whatever_fails(
 ) -> None:
     context = service.context
     ended = run_test(client, participant)
-    resume = reopened(service, ended, **({} if with_recording else {"recording_id": None}))
+    without = {} if with_recording else {"recording_id": None}
+    context.runner.lifecycle.update(ended["id"], state="identifying", model_id=None, **without)
     broken = (context.versions, "add") if with_recording else (context.runner.lifecycle, "missed_end")
     monkeypatch.setattr(*broken, fails)
     queue = context.runner.hub.open()
     with caplog.at_level(logging.ERROR, logger="stimrig.trials"):
-        resume()
+        service.run(context.runner.resume())
         now = wait_done(client, ended["id"], 20)
     assert now["state"] == "failed" and now["reason"] == "something unexpected"
     assert [record.test_id for record in caplog.records if record.exc_info] == [ended["id"]]  # pyright: ignore[reportAttributeAccessIssue]

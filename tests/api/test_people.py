@@ -110,7 +110,7 @@ def test_a_form_signs_in_and_leads_on_and_another_site_does_not(service: Service
         assert away.headers["location"] == "/"
 
 
-def tries(asgi: Any, peer: str, forwarded: list[str], token: bool = False) -> list[int]:
+def tries(asgi: Any, peer: str, forwarded: list[str]) -> list[int]:
     """Wrong sign-ins from a peer under ever new names, one for each `X-Forwarded-For`; their status codes."""
 
     async def run() -> list[int]:
@@ -118,7 +118,7 @@ def tries(asgi: Any, peer: str, forwarded: list[str], token: bool = False) -> li
         async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1", timeout=PATIENCE_S) as http:
             codes = []
             for number, address in enumerate(forwarded):
-                form = {"token": "wrong"} if token else {"name": f"n{peer}-{number}", "password": "wrong"}
+                form = {"name": f"n{peer}-{number}", "password": "wrong"}
                 headers = {"X-Forwarded-For": address} if address else {}
                 codes.append((await http.post("/sign-in", data=form, headers=headers)).status_code)
             return codes

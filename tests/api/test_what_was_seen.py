@@ -141,11 +141,6 @@ def test_a_waiting_result_is_let_go_by_who_saw_it(service: Service, client: http
     assert service.rig.calibrated is None
 
 
-def found_limits() -> m.CalibrationResult:
-    limits = {"current_ma": 20.0, "max_pulse_width_us": 250.0, "max_torque_nm": 30.0}
-    return m.CalibrationResult.model_validate({"profile": limits, "recordings": []})
-
-
 def finished(service: Service) -> Any:
     """As if the service had not heard the rig's answer."""
     open_one = service.rig.calibration
@@ -501,7 +496,9 @@ def test_a_result_of_other_limits_is_not_offered_once_more(
     at = f"{HOME}/calibration"
     client.post(at, json={})
     client.post(f"{at}/step", json={"direction": "up"})
-    service.rig.calibrated = finished(service).model_copy(update={"result": found_limits()})
+    limits = {"current_ma": 20.0, "max_pulse_width_us": 250.0, "max_torque_nm": 30.0}
+    result = m.CalibrationResult.model_validate({"profile": limits, "recordings": []})
+    service.rig.calibrated = finished(service).model_copy(update={"result": result})
     version = client.get(at).headers["etag"].strip('"')
     client.put(f"{HOME}/profile", json={"max_torque_nm": 12})
     refused = pages.post(f"{PAGE}/calibration/finish", data={"csrf": csrf(pages), "calibration": version})

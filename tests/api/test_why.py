@@ -333,7 +333,13 @@ def test_what_is_left_to_add_is_said_by_the_diagnosis_that_named_it(
     soon(lambda: service.context.analyses.known(model, "diagnosis"))
     service.context.analyses._keep(model, "diagnosis", found)
     searched: list[Any] = []
-    monkeypatch.setattr(service.context.pool, "submit", _without_diagnosis(service.context.pool.submit, searched))
+    submit = service.context.pool.submit
+
+    def submitted(verb: str, **given: Any) -> Any:
+        searched.extend([given] if verb == "diagnosis" and "model_json" in given else [])
+        return submit(verb, **given)
+
+    monkeypatch.setattr(service.context.pool, "submit", submitted)
     child = client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
     told = service.context.analyses.known_diagnosis(service.context.versions.get(child))
     assert told and told["add"] == ["tremor"] and told["structure"] == ["fatigue"]
@@ -394,14 +400,6 @@ def test_a_further_test_is_told_what_it_decided() -> None:
     assert (
         said(missing, held=("potentiation",)) == said(missing, asked=None) == said(missing, asked={"rivals": []}) == ""
     )
-
-
-def _without_diagnosis(submit: Any, searched: list[Any]) -> Any:
-    def submitted(verb: str, **given: Any) -> Any:
-        searched.extend([given] if verb == "diagnosis" and "model_json" in given else [])
-        return submit(verb, **given)
-
-    return submitted
 
 
 def test_what_left_out_or_held_out_rows_say_is_the_reason_at_every_door() -> None:

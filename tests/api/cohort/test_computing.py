@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from stimrig.api.cohort import computing as own
-from stimrig.api.cohort.computing import Bounds, Computing, Done, run_parcel, run_record
+from stimrig.api.cohort.computing import Bounds, Computing, run_parcel, run_record
 from stimrig.api.cohort.sources import Entry
 from stimrig.api.cohort.tasks import Task
 from stimrig.api.version import software_version
@@ -262,25 +262,15 @@ def of_worker(content: bytes, one: Entry) -> dict[str, Any]:
     return run_record(Given(content), one, task, Bounds(PATIENCE_S, MEMORY, 10))  # pyright: ignore[reportArgumentType]
 
 
-def parcel(content: bytes, patience_s: float, software: str = "") -> Done:
-    records: Any = [(Given(content), Entry(name, name, name), ()) for name in "abc"]
-    return run_parcel(
-        records, Task("fit", software=software or software_version()), Bounds(PATIENCE_S, MEMORY, 10), patience_s
-    )
-
-
 def test_a_file_that_is_too_large_is_a_row_without_a_look_inside(good: bytes) -> None:
     found = of_worker(good, Entry("a", "a", "a", bytes=10**12))
     assert found["error_kind"] == "bad record" and "256 MB" in found["error"]
 
 
-def test_a_worker_of_another_version_refuses(good: bytes) -> None:
-    found = parcel(good, 60.0, software="9.9")
-    assert (found.rows, found.other_version) == ([], software_version())
-
-
 def test_a_parcel_ends_in_time_with_what_is_done() -> None:
     """The first record is done in any case: nothing is sent round for ever."""
+    records: Any = [(Given(b"no record"), Entry(name, name, name), ()) for name in "abc"]
+    task = Task("fit", software=software_version())
     for patience_s, names in ((60.0, ["a", "b", "c"]), (0.0, ["a"])):
-        found = parcel(b"no record", patience_s)
+        found = run_parcel(records, task, Bounds(PATIENCE_S, MEMORY, 10), patience_s)
         assert [row["address"] for row in found.rows] == names and found.took_s > 0
