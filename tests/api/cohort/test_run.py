@@ -149,7 +149,7 @@ class Endless:
     def check(self) -> None:
         pass
 
-    def entries(self, _selection: Selection) -> Iterator[Entry]:
+    def entries(self) -> Iterator[Entry]:
         counting = threading.current_thread() is not threading.main_thread()
         for number in range(self.count):
             if not counting:
@@ -231,8 +231,8 @@ def test_a_place_that_goes_while_it_is_listed_ends_the_run_and_keeps_what_is_don
     client: Client, folder: Path, tmp_path: Path
 ) -> None:
     class Gone(Endless):
-        def entries(self, selection: Selection) -> Iterator[Entry]:
-            yield from super().entries(selection)
+        def entries(self) -> Iterator[Entry]:
+            yield from super().entries()
             raise CohortError("bucket: gone")
 
     with pytest.raises(CohortError, match="gone"):
