@@ -83,10 +83,10 @@ class Figures(dict[str, dict[str, Any]]):
         """Where a figure is fetched from: `html` a still for the page, `svg` one to keep, `json` its lines."""
         return self.at.format(f"{name}.{kind}")
 
-    def still(self, name: str, width: float = 760.0, on_paper: bool = False) -> Markup:
+    def still(self, name: str, width: float = 760.0) -> Markup:
         """One of them, drawn; in a file on paper, and as wide as its place there."""
         if self.at:
-            return svg(self[name], width, on_paper=on_paper, right=TOOLBAR_PX)
+            return svg(self[name], width, right=TOOLBAR_PX)
         return svg(self[name], 1120.0 if name in WIDE else 560.0, on_paper=True)
 
 

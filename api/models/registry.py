@@ -81,7 +81,6 @@ class Versions:
     def __init__(self, store: Store, clock: Clock) -> None:
         self.store, self.clock = store, clock
         self._served: dict[str, Served] = {}
-        self._read: dict[str, dict[str, Any]] = {}
         self._damaged: set[str] = set()
 
     def add(
@@ -147,7 +146,7 @@ class Versions:
     def of(self, participant: str, since_utc: str = "") -> list[dict[str, Any]]:
         """A participant's versions as clients see them, newest first; with `since_utc` those made since then.
 
-        Three queries, and no model is read whole but those from before a verdict was kept beside them.
+        Three queries, and no model is read whole.
         """
         wanted = (Model.participant == participant, Model.created_utc >= since_utc)
         query = select(Model).options(defer(Model.document)).where(*wanted)
@@ -157,7 +156,6 @@ class Versions:
             rows = list(session.scalars(query.order_by(Model.created_utc.desc())))
             newest = {decision.model_id: decision for decision in session.scalars(decided)}
         holding = self.approved(participant)
-        rows = [row if "verdict" in row.fit else self.get(row.id) for row in rows]
         return [self._document(row, newest.get(row.id), holding) for row in rows]
 
     def child_with(self, parent: Model, effects: list[str], with_evidence: Collection[str] = ()) -> Model | None:
@@ -357,15 +355,8 @@ class Versions:
         return {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
 
     def quality(self, row: Model) -> dict[str, Any]:
-        """The verdict stored in the model; kept beside its figures, but for those stored before it was."""
-        if "verdict" in row.fit:
-            return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
-        if row.etag not in self._read:
-            try:
-                self._read[row.etag] = stored_model.quality(json.loads(row.document))
-            except (ValueError, TypeError, AttributeError):  # unknown; that it is damaged its own page says
-                self._read[row.etag] = stored_model.quality({})
-        return self._read[row.etag]
+        """The verdict of a version, kept beside its figures."""
+        return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
 
     def document(self, row: Model) -> dict[str, Any]:
         """A version as clients see it, without the model itself."""
@@ -375,9 +366,7 @@ class Versions:
         return {
             "model_id": row.id,
             **{name: getattr(row, name) for name in COLUMNS},
-            "without_evidence": [],  # of versions from before it was kept
             **row.fit,
-            **self.quality(row),
             "decision": None if decision is None else ("approved" if decision.approved else "rejected"),
             "decided_by": decision.by if decision else None,
             "decided_utc": decision.at_utc if decision else None,

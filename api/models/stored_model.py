@@ -236,7 +236,7 @@ UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "d
 def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
     """Threshold, plateau, time constant, damping, delay, and each effect's main parameter as `effect.parameter`.
 
-    Models from before the figures were stored have their values, without standard deviations.
+    A model without standard deviations of its figures has their values alone.
     """
     stored = (document.get("uncertainty") or {}).get("figures") or {}
     values = {**recruitment(document), **dynamics(document)}
@@ -254,7 +254,6 @@ def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
 
 
 def threshold_us(row: Model) -> float | None:
-    """The threshold of a version's curve, µs; None where it has none. Raises ApiError (500) where it is damaged."""
-    known = row.fit.get("figures") or muscle_figures(read(row))
-    value: float | None = known.get("threshold_us", {}).get("value")
+    """The threshold of a version's curve, µs; None where it has none."""
+    value: float | None = row.fit["figures"]["threshold_us"]["value"]
     return value

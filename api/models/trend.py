@@ -8,23 +8,19 @@ approved, the newest one of its newest recording.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
 from sqlalchemy import Row, select
 
-from stimrig.api.clock import Clock, local_day
-from stimrig.api.errors import ApiError
+from stimrig.api.clock import local_day
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store import Store
-from stimrig.api.store.tables import Analysis, Approval, Model, Note, Recording, Test
-from stimrig.api.workers.pool import Pool
+from stimrig.api.store.tables import Approval, Model, Note, Recording, Test
 
-KEPT_AS = "headline"
-"""The name under which the figures are kept of a model that was stored before its row held them."""
 CONDITIONS = ("electrodes", "side", "posture")
 """Kinds of notes that put a comparison in doubt where they differ."""
 OF_NOTE = ("at_utc", "kind", "text", "by", "test_id", "at_s")
@@ -48,7 +44,11 @@ class Session:
     charge_uc: float | None
     test_ids: tuple[str, ...]
     notes: list[Note] = field(default_factory=list)
-    figures: dict[str, stored_model.Figure] = field(default_factory=dict)
+
+    @property
+    def figures(self) -> dict[str, stored_model.Figure]:
+        """The model's."""
+        return self.model.fit.get("figures") or {}
 
     def state(self) -> State:
         """What is compared of it."""
@@ -96,23 +96,19 @@ class Session:
 
 
 class Trend:
-    """Reads sessions; the figures of models from before they were stored are found once, by a worker."""
+    """Reads sessions."""
 
-    def __init__(self, store: Store, clock: Clock, pool: Pool) -> None:
-        self.store, self.clock, self.pool = store, clock, pool
+    def __init__(self, store: Store) -> None:
+        self.store = store
 
     async def sessions(self, participant: str) -> list[Session]:
         """A participant's sessions, the oldest first."""
-        found, _models = await asyncio.to_thread(self._read, participant)
-        await self._complete(found)
-        return found
+        return (await asyncio.to_thread(self._read, participant))[0]
 
     async def for_models(self, participant: str, model_ids: Sequence[str]) -> list[Session]:
         """Of each model the session in which its recording was made, with this model for it."""
         sessions, models = await asyncio.to_thread(self._read, participant)
-        found = [_session_of(sessions, models, model_id) for model_id in model_ids]
-        await self._complete(found)
-        return found
+        return [_session_of(sessions, models, model_id) for model_id in model_ids]
 
     async def against(self, model: Model) -> tuple[Session, Session] | None:
         """The last approved session before the model's, and the model's with that model; None where there is none."""
@@ -121,10 +117,7 @@ class Trend:
         before = [
             one for one in sessions if one.at_utc < own.at_utc and one.approval is not None and one.key != own.key
         ]
-        if not before:
-            return None
-        await self._complete([before[-1], own])
-        return before[-1], own
+        return (before[-1], own) if before else None
 
     def _read(self, participant: str) -> tuple[list[Session], dict[str, Row[Any]]]:
         """The sessions, and all models by their ids."""
@@ -145,45 +138,6 @@ class Trend:
         found.sort(key=lambda one: one.at_utc)
         _attach(notes, found)
         return found, {row.id: row for row in models}
-
-    async def _complete(self, sessions: Iterable[Session]) -> None:
-        """The figures of each session's model: from its row, else kept from before, else found now."""
-        old = []
-        for one in sessions:
-            one.figures = one.model.fit.get("figures") or {}
-            if not one.figures:
-                old.append(one)
-        if not old:
-            return
-        known = await asyncio.to_thread(self._known, [one.model.id for one in old])
-        await asyncio.gather(*(self._read_document(one) for one in old if one.model.id not in known))
-        for one in old:
-            one.figures = known.get(one.model.id) or one.figures
-
-    def _known(self, ids: Sequence[str]) -> dict[str, dict[str, stored_model.Figure]]:
-        rows = self.store.all(Analysis, Analysis.kind == KEPT_AS, Analysis.model_id.in_(ids))
-        return {row.model_id: row.document for row in rows}
-
-    async def _read_document(self, one: Session) -> None:
-        """Read the model's whole document, once: without standard deviations where a worker cannot make them."""
-        row = await asyncio.to_thread(self.store.get, Model, one.model.id)
-        try:
-            document = stored_model.read(row)
-        except ApiError:  # it has no figures; that it is damaged its own page says
-            return
-        try:
-            made = await asyncio.shield(self.pool.submit("figures", model_json=row.document.decode()).result)
-            document["uncertainty"] = {**(document.get("uncertainty") or {}), "figures": made["figures"]}
-        except ApiError as error:
-            if error.status >= 500:  # not the document's fault: the next look tries again
-                one.figures = stored_model.muscle_figures(document)
-                return
-        one.figures = stored_model.muscle_figures(document)
-        await asyncio.to_thread(self._keep, row.id, one.figures)
-
-    def _keep(self, model_id: str, figures: dict[str, stored_model.Figure]) -> None:
-        with self.store.write() as session:
-            session.merge(Analysis(model_id=model_id, kind=KEPT_AS, document=figures, created_utc=self.clock.utc()))
 
 
 def _models(participant: str) -> Any:
@@ -206,7 +160,7 @@ def _tests(participant: str) -> Any:
 def _session_of(sessions: list[Session], models: dict[str, Row[Any]], model_id: str) -> Session:
     """A model's session, with this model for it."""
     row = models[model_id]
-    return replace(next(one for one in sessions if one.key == _key(row)), model=row, figures={})
+    return replace(next(one for one in sessions if one.key == _key(row)), model=row)
 
 
 def _key(row: Any) -> str:

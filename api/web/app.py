@@ -14,7 +14,6 @@ from fastapi import APIRouter, FastAPI
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp
 
-from stimrig.api.clock import Clock
 from stimrig.api.settings import Settings
 from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.version import software_version
@@ -33,17 +32,14 @@ class Service(FastAPI):
 
 
 def create_app(
-    settings: Settings | None = None, *, clock: Clock | None = None, worker: tuple[str, ...] = WORKER,
-    lock: ServiceLock | None = None,
-) -> FastAPI:  # fmt: skip
+    settings: Settings | None = None, *, worker: tuple[str, ...] = WORKER, lock: ServiceLock | None = None
+) -> FastAPI:
     """The application.
 
     Parameters
     ----------
     settings : Settings, optional
         Default: from the environment.
-    clock : Clock, optional
-        Another clock, for tests.
     worker : tuple of str
         How to start a worker process.
     lock : ServiceLock, optional
@@ -56,7 +52,7 @@ def create_app(
     HeldError
         Another service holds the data folder or the database.
     """
-    context = build(settings or Settings(), clock, worker, lock)
+    context = build(settings or Settings(), worker, lock)
     app = Service(
         title="stimrig",
         summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",

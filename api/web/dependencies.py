@@ -87,7 +87,7 @@ class Context:
             store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
             self.limits_lock,
         )  # fmt: skip
-        self.trend, self.jobs = Trend(store, clock, pool), Jobs(pool)
+        self.trend, self.jobs = Trend(store), Jobs(pool)
         self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
         stop_key = store.secret("stop-right")
         self.stop_rights = StopRights(stop_key, clock)
@@ -130,16 +130,14 @@ async def _repeat(every_s: float, work: Callable[[], object]) -> None:
             log.exception("regular work failed; it is done again at the next interval")
 
 
-def build(
-    settings: Settings, clock: Clock | None = None, worker: tuple[str, ...] = WORKER, lock: ServiceLock | None = None
-) -> Context:
+def build(settings: Settings, worker: tuple[str, ...] = WORKER, lock: ServiceLock | None = None) -> Context:
     """Make the parts; `lock` is held already, or taken now.
 
     Raises ApiError: the database cannot be opened. HeldError: another service holds the data folder or the database.
     """
     lock = lock or ServiceLock(settings)
     try:
-        return Context(settings, clock or Clock(), worker, lock)
+        return Context(settings, Clock(), worker, lock)
     except BaseException:
         lock.release()
         raise

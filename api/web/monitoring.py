@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import get_args
 
@@ -21,16 +21,15 @@ QUANTILES = {"median": "0.5", "p99": "0.99", "max": "1"}
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures that are read when they are asked for: `collect` gives one family after the other."""
+    """The service's figures, read when they are asked for."""
 
-    collect: Callable[[], Iterator[Metric]]
+    context: Context
 
-
-def figures(context: Context) -> Iterator[Metric]:
-    """The service's figures, one family after the other."""
-    for part in (_tests, _rig, _pulses, _store, _jobs, _operation):
-        yield from part(context)
-    yield from context.runner.counted.collect()
+    def collect(self) -> Iterator[Metric]:
+        """Give one family after the other."""
+        for part in (_tests, _rig, _pulses, _store, _jobs, _operation):
+            yield from part(self.context)
+        yield from self.context.runner.counted.collect()
 
 
 def gauges(rows: Iterable[tuple[str, str, float]]) -> Iterator[Metric]:

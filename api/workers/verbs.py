@@ -54,12 +54,6 @@ def fit(
     }
 
 
-def figures(progress: Progress, model_json: str) -> dict[str, Any]:
-    """Threshold, plateau and dynamics with their standard deviations, of a model from before these were stored."""
-    progress(0.1, "reading the model")
-    return json_value({"figures": identify.Model.from_json(model_json).figures()})
-
-
 def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """The structure of an earlier model on a new recording: the finding, and the carried model where there is one."""
     record = identify.read(Path(data))
@@ -222,7 +216,7 @@ def _warm_record() -> Any:
 
 
 OWN = (
-    fit, carry, comparison, figures, diagnosis, effects, warm, forecast, invert, export_csv, plain_csv,
+    fit, carry, comparison, diagnosis, effects, warm, forecast, invert, export_csv, plain_csv,
     find_recording, recorded,
 )  # fmt: skip
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {

@@ -147,15 +147,15 @@ def draw_noise(kind: str, rng: Generator, count: int, rate_hz: float, sd_nm: flo
     raise ValueError(f"noise {kind!r}: one of {', '.join(NOISES)}")
 
 
-def patient_record(seed: int, moving: bool = False) -> dict[str, Any]:
-    """A record of the patient that `--hidden SEED` plays (with an arm if `moving`), by the design that sized it.
+def patient_record(seed: int) -> dict[str, Any]:
+    """A record of the patient that `--hidden SEED` plays, by the design that sized it.
 
     White noise of 0.04 N·m, against which its strength was chosen.
     """
-    scenario = hidden.draw_patient(seed, moving)
-    rng = rng_of(seed, "noise of a patient", "moving" if moving else "still")
+    scenario = hidden.draw_patient(seed, False)
+    rng = rng_of(seed, "noise of a patient", "still")
     noise_nm = lambda count: rng.normal(0.0, hidden.NOISE_SD_NM, count)  # noqa: E731
-    return sampled(scenario, scenario.design, 400.0, noise_nm) | {"truth": hidden.reveal(seed, moving)}
+    return sampled(scenario, scenario.design, 400.0, noise_nm) | {"truth": hidden.reveal(seed, False)}
 
 
 def sampled(muscle: Staged, design: Design, rate_hz: float, noise_nm: Callable[[int], Floats]) -> dict[str, Any]:

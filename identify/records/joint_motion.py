@@ -166,9 +166,9 @@ class JointMotion:
         begun = cls(angle_rad, angle_rad, angle_rad, noises_rad, jerks, step_rad)
         return begun._smoothed(time_s, angle_rad, first, pace)
 
-    def read_again(self, time_s: np.ndarray, first: Sequence[int], seed: int = 0) -> JointMotion:
+    def read_again(self, time_s: np.ndarray, first: Sequence[int]) -> JointMotion:
         """The same movement as the same sensor would tell it another time: what its error does to a model."""
-        read_rad = self.angle_rad + np.random.default_rng(seed).normal(size=time_s.size) * np.repeat(
+        read_rad = self.angle_rad + np.random.default_rng(0).normal(size=time_s.size) * np.repeat(
             self.noise_rad, np.diff([*first, time_s.size])
         )
         return self._smoothed(time_s, read_rad, first)

@@ -8,7 +8,6 @@ import json
 import re
 import time
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
@@ -20,7 +19,6 @@ from stimrig.api.cli import main
 from stimrig.api.cli.commands.diagnose import effect_lines
 from stimrig.api.cli.session_report import report_lines
 from stimrig.api.models import advice, explanation, registry, stored_model
-from stimrig.api.models.registry import Versions
 from stimrig.api.web.pages import report_view
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.report_file import comparison_html
@@ -139,9 +137,6 @@ def test_a_verdict_is_no_better_than_its_gates(stored: dict[str, Any] | None, ve
     document = {"fit": {}} | ({} if stored is None else {"quality": stored})
     found = stored_model.quality(document)
     assert found["verdict"] == verdict and found["words"].startswith(words)
-    row: Any = SimpleNamespace(fit={}, etag="1", document=json.dumps(document).encode())
-    versions = Versions(None, None)  # pyright: ignore[reportArgumentType]
-    assert versions.quality(row) == versions.quality(row) == found
 
 
 # ---- A model that is not usable reaches a controller only with a reason that is one; a usable one with none

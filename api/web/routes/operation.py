@@ -14,7 +14,7 @@ from sqlalchemy import text
 from stimrig.api import schemas
 from stimrig.api.errors import NotFoundError
 from stimrig.api.web.dependencies import Ctx
-from stimrig.api.web.monitoring import Figures, figures
+from stimrig.api.web.monitoring import Figures
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import SchemaOut, SchemasOut, describe_answer
 from stimrig.api.web.responses.rig import HealthOut
@@ -45,7 +45,7 @@ def health(context: Ctx) -> dict[str, Any]:
 @router.get("/metrics", response_class=PlainTextResponse)
 def metrics(context: Ctx) -> Response:
     """Figures in Prometheus' text format."""
-    return Response(generate_latest(Figures(lambda: figures(context))), media_type=CONTENT_TYPE_PLAIN_0_0_4)
+    return Response(generate_latest(Figures(context)), media_type=CONTENT_TYPE_PLAIN_0_0_4)
 
 
 schemas_router = APIRouter(prefix="/v1/schemas", tags=["schemas"])

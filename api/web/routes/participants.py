@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
-from sqlalchemy import Row, func, select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import local_day
@@ -352,7 +352,7 @@ def list_rows(store: Store, versions: Versions, participants: list[Participant])
     rows = []
     for row in participants:
         model = models.get(row.code)
-        newest = {"id": model.id, **_judged_fit(model, versions)} if model else None
+        newest = {"id": model.id, **model.fit} if model else None
         rows.append(Listed(row, tests.get(row.code), newest, approved.get(row.code)))
     return rows
 
@@ -365,8 +365,3 @@ def _newest_rows(store: Store, table: Any, at_utc: Any, codes: list[str], *colum
     query = query.join(last, (table.participant == last.c.participant) & (at_utc == last.c.utc))
     with store.read() as session:
         return {row.participant: row for row in session.execute(query)}
-
-
-def _judged_fit(model: Row[Any], versions: Versions) -> dict[str, Any]:
-    """Figures and verdict; models from before the verdict was kept beside them are read for it."""
-    return model.fit if "verdict" in model.fit else {**model.fit, **versions.quality(versions.get(model.id))}
