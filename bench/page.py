@@ -1,8 +1,8 @@
 """`python -m bench.page [--runs N]`: what pages weigh, when a first chart is there, how long each page takes.
 
-And how fluent the live view is. Service, real workers and a fake rig (`tests/api/fake_rig.py`, 20 frames a second at
-the speed of the world) on this machine, Debian's chromium. *Cold*: an empty cache; *warm*: the cache of the page
-before. Pages are timed with a participant of many sessions, whose rows are copies of one test's with other days.
+Service, real workers and a fake rig (`tests/api/fake_rig.py`) on this machine, Debian's chromium. *Cold*: an empty
+cache; *warm*: the cache of the page before. Pages are timed with a participant of many sessions, whose rows are copies
+of one test's with other days.
 """
 
 from __future__ import annotations
@@ -22,10 +22,9 @@ from sqlalchemy import select
 from bench.common import parser
 from stimrig.api.store.tables import Analysis, Approval, Model, Note, Participant, Recording, Test
 from stimrig.api.workers.pool import WORKER
-from tests.api.browser import ARGUMENTS, CHROMIUM, NAME, PASSWORD, participant, start
+from tests.api.browser import ARGUMENTS, CHROMIUM, NAME, PASSWORD
 from tests.api.conftest import Service, run_service, run_test
 
-LIVE_S = 10.0
 WEIGHT = """() => {
   const all = ['navigation', 'resource'].flatMap((kind) => performance.getEntriesByType(kind));
   return [all.length, all.reduce((sum, entry) => sum + entry.transferSize, 0)]; }"""
@@ -35,12 +34,6 @@ FIRST_CHART = """() => new Promise((done) => {
   look(); })"""
 LOADED = "() => performance.getEntriesByType('navigation')[0].loadEventEnd"
 SESSIONS = 200
-FRAMES = """(ms) => new Promise((done) => {
-  const begin = performance.now(); let count = 0;
-  const tick = () => {
-    const elapsed = performance.now() - begin; count++;
-    if (elapsed < ms) requestAnimationFrame(tick); else done(1000 * count / elapsed); };
-  requestAnimationFrame(tick); })"""
 
 
 def opened(browser: Any, service: Service) -> Any:
@@ -136,24 +129,6 @@ def pages(browser: Any, service: Service, done: dict[str, Any], runs: int) -> di
     return {"weight": weights, "first_chart_ms": {key: round(statistics.median(v)) for key, v in charts.items()}}
 
 
-def live(browser: Any, service: Service) -> dict[str, Any]:
-    """Frames of data and of the screen, each second of a running test."""
-    service.rig.speed = 1.0
-    page = opened(browser, service)
-    heard: list[dict[str, Any]] = []
-    page.on("websocket", lambda socket: socket.on("framereceived", lambda text: heard.append(json.loads(text))))
-    participant(page, service, "P2")
-    start(page)
-    page.locator("#age", has_text="ms").wait_for()
-    before = sum(message["type"] == "live" for message in heard)
-    shown = page.evaluate(FRAMES, LIVE_S * 1000)
-    data = sum(message["type"] == "live" for message in heard) - before
-    with service.client() as http:
-        http.post("/v1/stop")
-    page.context.close()
-    return {"data_frames_per_s": round(data / LIVE_S, 1), "screen_frames_per_s": round(shown, 1)}
-
-
 def main() -> None:
     """Measure and say."""
     made = parser(__doc__)
@@ -170,7 +145,7 @@ def main() -> None:
                 http.get(f"/models/{done['model_id']}")
             with sync_playwright() as driver:
                 browser = driver.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
-                found = pages(browser, service, done, options.runs) | live(browser, service)
+                found = pages(browser, service, done, options.runs)
                 found |= {"page_ms": times(browser, service, seed(service, done), options.looks)}
                 browser.close()
             told = {**found, "runs": options.runs, "load_average": os.getloadavg(), "cores": os.cpu_count()}
