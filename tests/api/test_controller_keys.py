@@ -356,6 +356,8 @@ def test_a_program_makes_one_by_the_same_rules_as_the_page(
     with shared.client(made.json()["key"]) as key:
         wait_done(key, key.post("/v1/tests", json=TRIAL).json()["id"])
         assert "are played: 1." in refused(key.post("/v1/tests", json=TRIAL), "beyond-plan")
+        assert key.get("/v1/participants/P2/model").status_code == 403
+        assert key.post("/v1/stop").status_code == 200, "a key whose trials are used up still stops"
         assert admin.delete(f"/v1/tokens/{made.json()['id']}").status_code == 204
         assert key.get("/v1/participants/P1/model").status_code == 401
     with shared.client(shared.token("lacks run-test", *{*scopes} - {"run-test"})) as lacking:

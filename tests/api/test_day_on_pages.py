@@ -140,3 +140,20 @@ def test_the_report_names_the_session_and_has_a_place_to_sign(tab: Any, service:
     assert [box.inner_text() for box in tab.locator(".sign div").all()] == ["Name", "Date", "Signature"]
     assert len(re.findall(rb"/Type\s*/Page\b", tab.pdf(prefer_css_page_size=True))) <= 2
     examined(tab, "report", stop=False)
+
+
+def test_a_note_is_shown_as_it_was_written_and_struck_with_a_click(tab: Any, service: Service) -> None:
+    participant(tab, service, "W1")
+    notes = tab.locator("#notes")
+    notes.get_by_label("About").select_option("electrodes")
+    notes.get_by_label("Note", exact=True).fill("<script>x</script> 2 cm distal")
+    notes.get_by_role("button", name="Write it down").click()
+    notes.get_by_text("<script>x</script> 2 cm distal").wait_for()
+    examined(tab, "a note")
+    notes.get_by_role("button", name="Strike").click()
+    notes.get_by_text("struck by Ada").wait_for()
+    notes.get_by_label("About").select_option("other")
+    notes.get_by_label("Note", exact=True).fill("two\u202elines")
+    notes.get_by_role("button", name="Write it down").click()
+    tab.get_by_text("U+202E cannot stand in it").wait_for()
+    assert tab.errors == [] or all("422" in words for words in tab.errors)

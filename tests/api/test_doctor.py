@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import re
 from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
@@ -139,3 +140,17 @@ def test_log_lines_are_json_with_the_tests_id(client: httpx.Client, participant:
     assert any("fit done" in line for line in words), "the worker's line carries it, too"
     assert all({"time", "level", "logger", "message"} <= set(line) for line in lines)
     assert not any(participant in line["message"] for line in lines), "no participant in a log"
+
+
+def test_metrics_are_prometheus_text_and_tell_nothing_of_anybody(client: httpx.Client, participant: str) -> None:
+    run_test(client, participant)
+    answer = client.get("/metrics", headers={"Authorization": ""})
+    assert answer.headers["content-type"].startswith("text/plain; version=0.0.4")
+    values = dict(line.rsplit(" ", 1) for line in answer.text.splitlines() if not line.startswith("#"))
+    assert float(values['stimrig_tests{state="completed"}']) == 1
+    assert float(values["stimrig_rig_connected"]) == 1
+    for name in ("stimrig_audit_entries", "stimrig_approved_models", "stimrig_free_disk_bytes"):
+        assert float(values[name]) >= 0
+    for line in answer.text.splitlines():
+        assert re.match(r"^# (HELP|TYPE) stimrig_\w+ .+$|^stimrig_\w+(\{[^}]*\})? -?[0-9.e+-]+$", line), line
+    assert participant not in answer.text
