@@ -1,8 +1,7 @@
 """Create all tables.
 
-Until the tables are settled (issue 63) this revision creates whatever `stimrig.api.store.tables` defines, so a change
-there needs no change here. It is replaced by explicit `op.create_table` calls at the end of that work; from then on
-every change of the tables needs a revision of its own.
+Before the first release this revision creates what `stimrig.api.store.tables` defines. The release replaces it by
+explicit `op.create_table` calls; from then on every change of the tables needs a revision of its own.
 """
 
 from alembic import op
