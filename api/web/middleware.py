@@ -47,8 +47,6 @@ class HttpMiddleware:
 
 # ---- what every answer tells a browser: load from and post to this service alone, guess nothing, keep nothing private
 
-"""The choice; it says nothing about who chose."""
-
 
 def policy(*parts: str) -> str:
     """A Content-Security-Policy."""
