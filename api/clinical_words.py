@@ -8,7 +8,7 @@ from typing import Any
 
 from stimrig.rig.messages import LABEL_TITLES
 
-WORDS: dict[str, dict[str | None, Any]] = {
+WORDS: dict[str, dict[str | None, str]] = {
     "segment": {
         "rest": "Rest",
         "prbs": "Random pulses",

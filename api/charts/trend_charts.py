@@ -256,7 +256,7 @@ def _trial_panel(trials: Sequence[Mapping[str, Any]], name: str, bounds: Bounds)
     known = [point for point in points if point["value"] is not None]
     lines = [factor * end for end in bounds.get(name, ())]
     drawn = TrialPlane(points, lines, unit).svg(f"{title}, {unit}") if known else Markup("")
-    return {"title": str(title), "unit": unit, "latest": known[-1]["words"] if known else "–", "svg": drawn}
+    return {"title": title, "unit": unit, "latest": known[-1]["words"] if known else "–", "svg": drawn}
 
 
 def _trial_point(trial: Mapping[str, Any], name: str) -> Point:

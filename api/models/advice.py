@@ -20,10 +20,10 @@ class Gate(NamedTuple):
     """Texts of a check that failed: what was found, what to do with a model that is usable with care and with one that
     is not usable, and what the controller would do wrong."""
 
-    found: Any
-    look: Any
-    test: Any
-    risk: Any
+    found: str
+    look: str
+    test: str
+    risk: str
 
 
 @dataclass(frozen=True)
@@ -130,7 +130,7 @@ GATES: dict[str, Gate] = {
 """Each check of `stimrig.identify.estimation.quality`, and `stored_model.without_evidence`."""
 
 
-BESIDE: dict[str, Any] = {
+BESIDE: dict[str, str] = {
     "unsure": "Usable: approve it. Whether something is missing, this recording cannot tell.",
     "unexplained": "Usable: approve it. Some error is left that is not explained.",
     "missing": "Usable: approve it. An effect is possibly missing.",
@@ -166,11 +166,11 @@ def advice(
     if verdict == "usable":
         if missing:
             return Advice(add, f"Usable, and better with {effects}: add that first.")
-        return Advice("approve", str(BESIDE.get(kind or "", "Usable: approve it.")))
+        return Advice("approve", BESIDE.get(kind or "", "Usable: approve it."))
     if verdict == "usable with care":
         if missing:
             return Advice(add, f"Usable with care: add {effects} first.")
-        look = str(first.look) if first else "Usable with care: look at where the error sits first."
+        look = first.look if first else "Usable with care: look at where the error sits first."
         forced = bool(found) and found[0].gate == "evidence"
         return Advice("approve" if kind in ("nothing", "unsure") and not forced else "look", look)
     if verdict == "not usable":

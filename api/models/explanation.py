@@ -14,7 +14,7 @@ from stimrig.identify.conclusion import asked_for, conclude, in_order, is_likely
 from stimrig.identify.healing import stands_out
 from stimrig.identify.summary import probability, sure
 
-SPLITS: dict[str, Any] = {
+SPLITS: dict[str, str] = {
     "segment": "By part of the test",
     "level": "By level of pulse width",
     "direction": "By direction of pulse width",
@@ -245,7 +245,7 @@ def splits(comparison: dict[str, Any]) -> list[dict[str, Any]]:
             rows.pop()
         if rows:
             most = max(row["share_of_excess"] for row in rows) or 1.0
-            found.append({"title": str(title), "rows": rows, "most": most})
+            found.append({"title": title, "rows": rows, "most": most})
     return found
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-REASONS: dict[str, Any] = {
+REASONS: dict[str, str] = {
     "above-plateau": "too high for the widest pulse",
     "below-zero": "on the other side of zero, and a muscle only pulls",
     "rises-too-fast": "rises faster than the muscle, or than pulses may widen",

@@ -44,17 +44,21 @@ def write(session: Session, at_utc: str, who: str, action: str, subject: str, **
 
 ERASED, ERASE = "(erased)", "erase participant"
 """Subject of an entry whose content was taken away, and the action of the entry that vouches for what is left of it."""
+ON_ACCOUNTS = (*seen.ACCOUNTS, "issue token")
+"""Actions whose subject is the name of a user or a key."""
 
 
 def erase(session: Session, names: set[str], at_utc: str, who: str, **detail: Any) -> None:
     """Take away the content of entries that name one of these, and append the entry that vouches for what is left.
 
-    Number, time, person, action and hash of an entry stay, so that the trail stays a chain.
+    Number, time, person, action and hash of an entry stay, so that the trail stays a chain. A participant's code may
+    also be a word of the trail or the name of an account: entries of those stay.
     """
     newest, erased = seen.last(session), []
     subjects = names - {"page", "rig"}  # those of the trail's own words that are no participants
     for entry in session.scalars(select(AuditEntry).order_by(AuditEntry.seq)):
-        if entry.action != ERASE and (entry.subject in subjects or _mentions(entry.detail, names)):
+        named = entry.subject in subjects and entry.action not in ON_ACCOUNTS
+        if entry.action != ERASE and (named or _mentions(entry.detail, names)):
             entry.subject, entry.detail = ERASED, {"erased": newest.seq + 1 if newest else 1}
             if names & {entry.who, *entry.who.split(" ")}:  # what a test does by itself goes by its id
                 entry.who = ERASED
@@ -64,9 +68,9 @@ def erase(session: Session, names: set[str], at_utc: str, who: str, **detail: An
 
 
 def _mentions(value: Any, names: set[str]) -> bool:
-    """Return whether a value names one of these, at whatever depth."""
+    """Return whether a value names one of these, at whatever depth. Keys and scopes are words of the trail."""
     if isinstance(value, dict):
-        return any(_mentions(part, names) for pair in value.items() for part in pair)
+        return any(_mentions(part, names) for key, part in value.items() if key != "scopes")
     if isinstance(value, list):
         return any(_mentions(part, names) for part in value)
     return isinstance(value, str) and value in names

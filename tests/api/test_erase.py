@@ -86,6 +86,18 @@ def test_nothing_of_a_person_stays_and_nothing_of_others_goes(tmp_path: Path, sh
         assert http.post("/v1/participants", json={"code": CODE}).status_code == 201, "a code that is free again"
 
 
+@pytest.mark.parametrize("code", ["scopes", "read-model", "anna"])
+def test_a_code_that_is_a_word_of_the_trail_or_a_users_name_takes_nothing_of_others(rig: Rig, code: str) -> None:
+    with rig.store.write() as session:
+        for subject in ("anna", "Ada"):
+            audit.write(session, LONG_AGO, "administrator", "add user", subject, scopes=["read-model"])
+    play_sessions(rig, code, 1)
+    assert erase(rig, code) == 0
+    users = [entry for entry in trail(rig) if entry.action == "add user"]
+    assert [entry.subject for entry in users] == ["anna", "Ada"]
+    assert audit.first_broken(trail(rig)) is None and files_with(rig.folder / "recordings", "") == []
+
+
 def test_it_asks_before_and_says_what_it_did(
     rig: Rig, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -102,6 +114,7 @@ def test_it_asks_before_and_says_what_it_did(
     assert found == {"rows": {"participants": 1, "tests": 2, "recordings": 2, "models": 2, "approvals": 2}, "files": 2}
     assert unmet("erase", found) == []
     assert erase(rig, "P1") == 2 and "there is no participant" in capsys.readouterr().err
+    assert erase(rig, "") == 2 and "there is no participant" in capsys.readouterr().err
 
 
 def test_refused_while_a_test_goes_on_or_a_controller_may_use_a_model(

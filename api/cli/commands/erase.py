@@ -36,7 +36,7 @@ def erase(
     as_json: Json = False,
 ) -> None:
     """Delete recordings, models, tests, notes, limits and keys of a participant; the service must be stopped."""
-    if code in reason:
+    if code and code in reason:
         raise InputError("--reason: it stays in the audit trail. Give one that does not name the participant.")
     if not yes and (as_json or not sys.stdin.isatty()):
         raise InputError("Nothing was deleted. Add --yes to delete without being asked.")

@@ -22,7 +22,7 @@ from stimrig.api.web.routes import people
 
 router = APIRouter(include_in_schema=False, prefix="/administration")
 NEWEST = 60
-MAY: dict[str, Any] = {
+MAY: dict[str, str] = {
     "clinician": "runs tests, approves models",
     "operator": "runs tests; approves nothing",
     "reader": "looks on; may stop, like everyone",

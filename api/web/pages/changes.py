@@ -88,9 +88,9 @@ def words(entry: dict[str, Any] | None, of: str) -> str:
         return "nothing decided"
     detail = entry["detail"]
     if entry["action"] in DECIDED:
-        return ": ".join(part for part in (str(DECIDED[entry["action"]]), detail.get("reason")) if part)
+        return ": ".join(part for part in (DECIDED[entry["action"]], detail.get("reason")) if part)
     if of in ARCHIVED and entry["action"] in ARCHIVED:
-        return str(ARCHIVED[entry["action"]])
+        return ARCHIVED[entry["action"]]
     if detail.get("ran_by"):
         return str(detail["ran_by"])
     if entry["action"] == "latched":
@@ -140,7 +140,7 @@ async def again(request: Request, problem: ChangedError) -> Again | None:
     if found[0].field == "latch":
         hidden.append(("latch", problem.extra["latch"]))
     action = request.url.path.rpartition("/")[2]
-    button = str(BUTTONS.get(action, ALL_THE_SAME))
+    button = BUTTONS.get(action, ALL_THE_SAME)
     asked = wanted(action, found[1], dict(hidden))
     return Again(request.url.path, hidden, asked, any(name == "password" for name, _value in sent), button)
 
@@ -150,7 +150,7 @@ def wanted(action: str, names: dict[str, str], texts: dict[str, str]) -> list[st
     if action == "muscle":
         return [site_words((texts.get("side"), texts.get("muscle"), texts.get("placement")))]
     if action in ARCHIVED:
-        return [str(ARCHIVED[action])]
+        return [ARCHIVED[action]]
     if "model_id" in names:
         model, decided = model_words(names["model_id"]), DECIDED.get(action)
         return [model if decided is None else f"{model}: {decided}"]

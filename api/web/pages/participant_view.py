@@ -357,4 +357,4 @@ def served_age(context: Context, told: dict[str, Any]) -> str:
 def trial_row(trial: dict[str, Any]) -> dict[str, Any]:
     """A trial in the table."""
     cells = [trend_charts.trial_words(trial, name) for name in trend_charts.TRIAL_FIGURES]
-    return {**trial, "cells": cells, "words": str(OUTCOMES[trial["outcome"]])}
+    return {**trial, "cells": cells, "words": OUTCOMES[trial["outcome"]]}

@@ -168,7 +168,7 @@ SILENT_S = 1.6
 TORQUE_OLD_S = 1.0
 """An older torque is not shown as the torque of now."""
 
-WORDS: dict[str, tuple[Any, Any]] = {
+WORDS: dict[str, tuple[str, str]] = {
     "ready": ("No stimulation", "ready"),
     "calibrating": ("No stimulation", "a calibration is open"),
     "arming": ("Stimulating", "begins"),
