@@ -59,8 +59,6 @@ class News:
         """Take one event's."""
         for held, new in ((self.samples, event.samples), (self.outcomes, event.outcomes)):
             for name, values in {} if new is None else new:
-                if values is None:  # of a test of one channel nothing says whose a pulse was
-                    continue
                 held.setdefault(name, []).extend(values)
 
 
