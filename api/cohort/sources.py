@@ -18,6 +18,8 @@ from stimrig.api.cohort.tasks import CohortError
 SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 """What counts as a record in a folder: no Parquet file, which may be results. A file that is named itself is taken
 whatever its name."""
+EXPORT_TABLES = ("records.csv", "errors.csv")
+"""The two tables that `stimrig export` writes beside the records of its folder."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,10 @@ class Source(Protocol):
         ...
 
 
-def is_record(name: str) -> bool:
+def is_record(name: str, exported: bool) -> bool:
+    """Return whether a folder's file may be a record; `exported`: the folder holds both tables of an export."""
+    if exported and name in EXPORT_TABLES:
+        return False
     return not name.startswith((".", "_")) and name.lower().endswith(SUFFIXES)
 
 
@@ -89,13 +94,16 @@ class Folder:
             raise CohortError(f"{self.path}: neither a file nor a folder. Give a path, s3://… or https://…")
 
     def _within(self, folder: str) -> Iterator[Entry]:
+        exported = all(Path(folder, name).is_file() for name in EXPORT_TABLES)
         try:
             with os.scandir(folder) as found:
                 for item in found:
                     if item.is_dir(follow_symlinks=False):
                         if not item.name.startswith("."):
                             yield from self._within(item.path)
-                    elif is_record(item.name) and item.is_file():  # a link to a file counts; a pipe would never end
+                    elif (
+                        is_record(item.name, exported) and item.is_file()
+                    ):  # a link to a file counts; a pipe would never end
                         yield self._entry(Path(item.path))
         except OSError:  # opened as a record it gives the reason, as its row
             yield Entry(_sound(folder), _sound(Path(folder).name), folder, known={"origin": _sound(self.path)})
@@ -148,6 +156,7 @@ class Bucket(Source):
 
     def _within(self, files: Any, folder: str) -> Iterator[Entry]:
         found = files.ls(folder, detail=True)
+        exported = {item["name"].rpartition("/")[2] for item in found}.issuperset(EXPORT_TABLES)
         for item in sorted(found, key=lambda one: one["name"]):
             name = item["name"].rstrip("/").rpartition("/")[2]
             if item["name"].rstrip("/") == folder.rstrip("/"):
@@ -155,7 +164,7 @@ class Bucket(Source):
             if item["type"] == "directory":
                 if not name.startswith("."):
                     yield from self._within(files, item["name"])
-            elif is_record(name):
+            elif is_record(name, exported):
                 yield self._entry(files, item)
         files.invalidate_cache(folder)  # a listing of millions must not stay in memory
 

@@ -14,7 +14,7 @@ from typing import Any
 
 from stimrig.api.cohort.record import describe, read
 from stimrig.api.cohort.select import LABELS, Selection
-from stimrig.api.cohort.sources import Entry, Source, SourceError
+from stimrig.api.cohort.sources import EXPORT_TABLES, Entry, Source, SourceError
 from stimrig.api.cohort.tally import Tally, Tell, counting
 from stimrig.api.cohort.tasks import CohortError
 from stimrig.api.export.record_file import write_record
@@ -25,7 +25,7 @@ from stimrig.identify.records.cells import lines
 from stimrig.identify.records.record import Record
 from stimrig.identify.records.record import Source as RecordSource
 
-RECORDS, ERRORS = "records.csv", "errors.csv"
+RECORDS, ERRORS = EXPORT_TABLES
 UNDATED = ("file", "participant", "record_id", "sha256", "pulse_rate_hz", "rate_hz", "duration_s", "outcome")
 DATED = ("begun_utc", "test_id", "name", *LABELS, "notes")
 """Columns of `records.csv`: those that tell no day, and those that do, or that a person typed."""

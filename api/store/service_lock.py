@@ -46,47 +46,54 @@ class ServiceLock:
     """
 
     def __init__(self, settings: Settings) -> None:
-        self._files: list[IO[str]] = []
+        self._files: dict[Path, IO[str]] = {}
+        self._address = "an address not known yet"
         self._database: DatabaseLock | None = None
         self._since_utc = Clock().utc()
         try:
             for place, shown, fix in _lock_places(settings):
-                self._files.append(_take_file(place, shown, fix))
+                self._files[place] = _take_file(place, shown, fix)
             if settings.database.startswith("postgresql"):
                 self._database = DatabaseLock(make_url(settings.database))
         except BaseException:
             self.release()
             raise
-        self.tell("an address not known yet")
+        self.tell(self._address)
 
     def tell(self, address: str) -> None:
         """Write down who holds it, for whoever comes second."""
+        self._address = address
         words = {"pid": os.getpid(), "host": socket.gethostname(), "since_utc": self._since_utc, "address": address}
-        for file in self._files:
+        for file in self._files.values():
             file.seek(0)
             file.truncate()
             file.write(json.dumps(words) + "\n")
             file.flush()
 
     def keep(self) -> None:
-        """Take the lock of a PostgreSQL database again after its connection was lost; to be called every `KEEP_S`.
+        """Take again what was lost: a lock file that was removed, or PostgreSQL's connection; call it every `KEEP_S`.
 
-        Where another service has taken it meanwhile, this process is told to end.
+        Ends this process where another service has taken it meanwhile.
         """
-        if self._database is None:
-            return
         try:
-            self._database.take()
+            for place, file in self._files.items():
+                if not (place.exists() and os.path.samestat(place.stat(), os.fstat(file.fileno()))):
+                    log.warning("%s was removed while this service runs on it; it is locked anew", place)
+                    self._files[place] = _take_file(place, place, "do not remove lock files")
+                    file.close()
+                    self.tell(self._address)
+            if self._database is not None:
+                self._database.take()
         except SQLAlchemyError as error:
             log.warning("the database does not answer: %s", error)
-        except HeldError as error:
+        except (HeldError, OSError) as error:
             log.critical("this service ends: %s", error)
             os.kill(os.getpid(), signal.SIGTERM)
 
     def release(self) -> None:
         """Let go."""
         while self._files:
-            self._files.pop().close()
+            self._files.popitem()[1].close()
         if self._database is not None:
             self._database.release()
 

@@ -141,21 +141,27 @@ def test_a_backup_while_it_is_written_to_is_one_state(machine: Machine, capsys: 
         assert not sealed & {name.removesuffix(".journal") for name in names(folder / "rig/journals")}
 
 
-@pytest.mark.parametrize("spoil", ["changed", "gone", "disk"])
-def test_what_does_not_hold_is_told_in_one_line_and_leaves_nothing(
-    machine: Machine, spoil: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("spoil", ["differs from what the database says", "is missing"])
+def test_a_damaged_recording_is_named_and_the_others_are_saved(
+    machine: Machine, spoil: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = machine.rig / "recordings/20260101T080000Z_t1.h5"
-    if spoil == "changed":
-        recording.write_bytes(b"First" * 1000)
-    elif spoil == "gone":
-        recording.unlink()
-    else:
-        monkeypatch.setattr(backup, "sha256_of", lambda _: "0" * 64)
+    recording.unlink() if spoil == "is missing" else recording.write_bytes(b"First" * 1000)
+    assert main.run(["backup", str(machine.backups), *machine.folders, "--json"]) == 1
+    output = capsys.readouterr()
+    report = json.loads(output.out)
+    assert unmet("backup", report) == [] and report["damaged"] == [f"{recording}: the recording {spoil}"]
+    assert output.err.count("\n") == 1 and f"{recording}: the recording {spoil}" in output.err
+    assert "rig/recordings/20260101T090000Z_t2.h5" in names(Path(report["backup"]))
+
+
+def test_a_bad_disk_leaves_no_backup(
+    machine: Machine, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(backup, "sha256_of", lambda _: "0" * 64)
     assert main.run(["backup", str(machine.backups), *machine.folders]) == 1
     line = capsys.readouterr().err
-    words = {"changed": "differs from what the database says", "gone": "is missing", "disk": "is the disk sound?"}
-    assert line.count("\n") == 1 and words[spoil] in line and list(machine.backups.iterdir()) == []
+    assert line.count("\n") == 1 and "is the disk sound?" in line and list(machine.backups.iterdir()) == []
 
 
 def test_without_a_database_it_says_what_to_do(

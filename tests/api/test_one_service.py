@@ -97,6 +97,27 @@ def test_whichever_way_leads_to_it_it_is_held_once(tmp_path: Path) -> None:
     held(data_dir=two, database_url=f"sqlite:///{one}/stimrig.db").release()
 
 
+def test_a_removed_lock_file_is_locked_anew_or_the_service_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    signals: list[int] = []
+    monkeypatch.setattr(os, "kill", lambda _, number: signals.append(number))
+    first = held(data_dir=tmp_path)
+    (tmp_path / "service.lock").unlink()
+    first.keep()
+    with pytest.raises(HeldError, match="another service runs on it"):
+        held(data_dir=tmp_path)
+    for name in ("service.lock", "stimrig.db.lock"):
+        (tmp_path / name).unlink()
+    second = held(data_dir=tmp_path)
+    second.keep()
+    assert signals == []
+    first.keep()
+    assert signals == [signal.SIGTERM]
+    first.release()
+    second.release()
+
+
 def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
     Store(f"sqlite:///{tmp_path}/stimrig.db").close()
     os.link(tmp_path / "stimrig.db", tmp_path / "again.db")

@@ -44,8 +44,7 @@ def backup(
         # the database first: the files that it names are there by then, and are copied after it
         sums = {} if database is None else {DATABASE: copy_database(database, partial / DATABASE)}
         sums |= copy_files(partial, rig_data or settings.data_dir, settings.data_dir)
-        if database is not None:
-            check_recordings(partial / DATABASE, sums)
+        damaged = [] if database is None else damaged_recordings(partial / DATABASE, sums)
         (partial / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())), "utf-8")
         to_disk(partial / SUMS)
         partial.rename(created)
@@ -55,11 +54,14 @@ def backup(
         raise CommandError(f"{error}. No backup was made.") from error
     size = sum((created / name).stat().st_size for name in sums)
     if as_json:
-        say_json({"backup": str(created), "files": len(sums), "bytes": size, "database": database is not None})
-        return
-    say(f"{created}: {len(sums)} files, {size / 1e6:.1f} MB; `sha256sum --check {SUMS}` checks them again")
-    if database is None:
-        say("The database is not in it. Before each backup of the files make a dump: pg_dump --format=custom")
+        content = {"files": len(sums), "bytes": size, "database": database is not None, "damaged": damaged}
+        say_json({"backup": str(created)} | content)
+    else:
+        say(f"{created}: {len(sums)} files, {size / 1e6:.1f} MB; `sha256sum --check {SUMS}` checks them again")
+        if database is None:
+            say("The database is not in it. Before each backup of the files make a dump: pg_dump --format=custom")
+    if damaged:
+        raise CommandError(f"{'; '.join(damaged)}. All else is saved. Restore the recording from an earlier backup.")
 
 
 def copy_files(target: Path, rig_data: Path, api_data: Path) -> dict[str, str]:
@@ -100,12 +102,13 @@ def write(path: Path, content: bytes) -> str:
     return digest
 
 
-def check_recordings(database: Path, sums: dict[str, str]) -> None:
-    """Raise CommandError if a recording that the database names is not in the backup as the database knows it."""
+def damaged_recordings(database: Path, sums: dict[str, str]) -> list[str]:
+    """Return a line for each recording that is not in the backup as the database knows it."""
     copied = {Path(name).name: digest for name, digest in sums.items()}
     with closing(sqlite3.connect(f"{database.absolute().as_uri()}?mode=ro", uri=True)) as opened:
         rows = opened.execute("SELECT path, file_sha256 FROM recordings").fetchall()
-    for path, digest in rows:
-        if copied.get(Path(path).name) != digest:
-            state = "differs from what the database says" if Path(path).name in copied else "is missing"
-            raise CommandError(f"{path}: the recording {state}")
+    return [
+        f"{path}: the recording {'differs from what the database says' if Path(path).name in copied else 'is missing'}"
+        for path, digest in rows
+        if copied.get(Path(path).name) != digest
+    ]

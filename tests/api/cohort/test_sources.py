@@ -48,6 +48,16 @@ def test_a_folder_lists_records_and_nothing_else(tmp_path: Path) -> None:
     assert len(Folder(str(tmp_path)).open(found[0], 2)) == 3
 
 
+def test_the_tables_of_an_export_are_no_records(tmp_path: Path) -> None:
+    (tmp_path / "P1_a.csv").write_text("a")
+    (tmp_path / "records.csv").write_text("r")
+    for source in (Folder(str(tmp_path)), Bucket(f"file://{tmp_path}")):
+        assert [entry.name for entry in listed(source)] == ["P1_a.csv", "records.csv"], "a record may have this name"
+    (tmp_path / "errors.csv").write_text("e")
+    for source in (Folder(str(tmp_path)), Bucket(f"file://{tmp_path}")):
+        assert [entry.name for entry in listed(source)] == ["P1_a.csv"]
+
+
 def test_a_named_file_is_taken_whatever_its_name(tmp_path: Path) -> None:
     (tmp_path / "record.dat").write_bytes(b"x")
     assert [entry.name for entry in listed(Folder(str(tmp_path / "record.dat")))] == ["record.dat"]
