@@ -3,59 +3,30 @@
 from __future__ import annotations
 
 import contextlib
-import json
-import socket
-import subprocess
-import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
+from tests.harness.processes import Process, control
 
 
-class Emulated:
+class Emulated(Process):
     """A running emulator: its ready line, its process, its control line."""
 
-    def __init__(self, *arguments: str) -> None:
-        self.process = subprocess.Popen(
-            [sys.executable, "-m", "stimrig.hardware_sim", *arguments],
-            cwd=ROOT,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line, self.process.communicate()[1]
-        self.ready: dict[str, Any] = json.loads(line)
-        self._control = socket.socket(socket.AF_UNIX)
-        self._control.connect(self.ready["control"])
-        self._lines = self._control.makefile("rb")
-
     def ask(self, **request: Any) -> dict[str, Any]:
-        self._control.sendall(json.dumps(request).encode() + b"\n")
-        return json.loads(self._lines.readline())
-
-    def close(self) -> int:
-        self._lines.close()
-        self._control.close()
-        self.process.terminate()
-        code = self.process.wait(30)
-        for stream in (self.process.stdout, self.process.stderr):
-            if stream is not None:
-                stream.close()
-        return code
+        return control(self.ready["control"], request)
 
 
 @contextlib.contextmanager
 def emulated(*arguments: str) -> Iterator[Emulated]:
-    running = Emulated(*arguments)
-    try:
-        yield running
-    finally:
-        running.close()
+    with tempfile.TemporaryDirectory(prefix="emulated-") as folder:
+        running = Emulated("stimrig.hardware_sim", *arguments, log=Path(folder) / "log")
+        try:
+            yield running
+        finally:
+            running.stop()
 
 
 def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:

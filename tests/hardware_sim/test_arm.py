@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -80,12 +79,6 @@ class TestLaws:
         assert np.all(np.diff(share) <= 1e-12)
         assert np.all((share >= 0.0) & (share < 2.0))
         assert (share[0] > 1.1 and share[-1] < 0.3) or name == "none"
-
-    @pytest.mark.parametrize("name", ["hill", "logarithmic"])
-    def test_the_slope_at_rest_is_the_same_on_both_sides(self, name: str) -> None:
-        share = law("torque_velocity", name).share
-        below, at, above = (float(share(REFERENCE_RAD, v)) for v in (-1e-4, 0.0, 1e-4))
-        assert at - below == pytest.approx(above - at, rel=1e-3)
 
     def test_numbers_of_the_papers(self) -> None:
         hill = law("torque_velocity", "hill", {"largest_rad_s": 10.0, "curvature": 0.25, "plateau": 1.5})
@@ -184,15 +177,12 @@ class TestFree:
 
     @pytest.mark.slow
     def test_it_loads_no_cell_and_the_flexor_flexes_it(self) -> None:
-        limb = Limb(Constant(1.0), Arm("free", {}, replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))))
-        found = rows(limb, 8.0)
+        tissue = replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))
+        found = rows(Limb(Constant(1.0), Arm("free", {}, tissue)), 8.0)
         assert not found[:, 0].any()
         assert abs(found[-1, 2]) < 0.02, "it has come to rest"
-        tissue = replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))
         balance_nm = tissue.g(found[-1, 1], 0.0) + tissue.h_nm(found[-1, 1], 0.0)
         assert balance_nm == pytest.approx(0.0, abs=0.03)
-        stronger = rows(Limb(Constant(3.0), Arm("free", {}, tissue)), 8.0)
-        assert stronger[-1, 1] > found[-1, 1]
 
     def test_stops_end_the_range_and_never_pull(self) -> None:
         for torque_nm, ends_deg in ((15.0, 145.0), (-15.0, -5.0)):
@@ -265,29 +255,15 @@ class TestMovers:
             assert 100.0 - math.degrees(angle) == pytest.approx((1.0 + turn) * math.exp(-turn), abs=0.01)
 
     @pytest.mark.slow
-    def test_a_hand_is_not_steady_and_no_two_sweeps_are_alike(self) -> None:
-        def sweeps(seed: int, seconds: float, **settings: float) -> np.ndarray:
-            arm = Arm("hand", {"from_deg": 40, "to_deg": 110, "deg_s": 40, **settings}, heavy())
-            return rows(Limb(Constant(), arm, seed), seconds)
-
-        uneven, again, other, steady = sweeps(1, 16.0), sweeps(1, 2.0), sweeps(2, 2.0), sweeps(1, 12.0, unsteady=0)
-        assert np.array_equal(uneven[: len(again)], again)
-        assert not np.allclose(again, other)
-        peaks = {name: turning_points(each) for name, each in (("uneven", uneven), ("steady", steady))}
-        assert np.std(peaks["uneven"]) > math.radians(1.0)
-        assert np.std(peaks["steady"]) < math.radians(0.1)
-        speeds = np.degrees(np.abs(uneven[:, 2]))
-        assert 35.0 < np.percentile(speeds, 80) < 60.0
-
-    @pytest.mark.slow
-    def test_a_hand_that_holds_still_wanders_and_trembles_by_some_millinewtonmetres(self) -> None:
-        found = rows(Limb(Constant(), Arm("hand", {}, heavy()), 3), 20.0)[3200:]
+    def test_a_hand_that_holds_still_wanders_and_trembles_and_no_two_sweeps_are_alike(self) -> None:
+        found = rows(Limb(Constant(), Arm("hand", {}, heavy()), 3), 10.0)[3200:]
         assert 0.1 < np.degrees(np.std(found[:, 1])) < 1.2
         spectrum = np.abs(np.fft.rfft(found[:, 0] * np.hanning(found.shape[0])))
         hz = np.fft.rfftfreq(found.shape[0], STEP_S)
-        tremor = spectrum[(hz > 7.0) & (hz < 13.0)].max()
-        assert tremor > 20.0 * np.median(spectrum[(hz > 3.0) & (hz < 7.0)])
-        assert 0.002 < np.std(found[:, 0]) < 0.05
+        assert spectrum[(hz > 7.0) & (hz < 13.0)].max() > 20.0 * np.median(spectrum[(hz > 3.0) & (hz < 7.0)])
+        sweep = {"from_deg": 40, "to_deg": 110, "deg_s": 40}
+        first, again, other = (rows(Limb(Constant(), Arm("hand", sweep, heavy()), seed), 2.0) for seed in (1, 1, 2))
+        assert np.array_equal(first, again) and not np.allclose(first, other)
 
     def test_a_script_goes_through_its_points(self) -> None:
         points = [[0.0, 90], [1.0, 60], [2.5, 100], [3.0, 100], [4.0, 80]]
@@ -298,15 +274,6 @@ class TestMovers:
         assert seen == pytest.approx([deg for _, deg in points], abs=0.1)
         assert angle.min() > 59.9 and angle.max() < 100.1
         assert abs(found[-1, 2]) < 1e-9
-
-    def test_it_starts_where_its_movement_begins(self) -> None:
-        for arm, deg in (
-            (Arm("held", {"angle_deg": 45}), 45.0),
-            (Arm("robot", {"from_deg": 33}), 33.0),
-            (Arm("script", {"points": [[0, 70], [1, 80]]}), 70.0),
-            (Arm("free"), 90.0),
-        ):
-            assert math.degrees(Limb(Constant(), arm).motion.angle_rad) == pytest.approx(deg)
 
     @pytest.mark.parametrize(
         ("mode", "settings", "told"),
@@ -329,13 +296,6 @@ class TestMovers:
         with pytest.raises(ArmError, match=told):
             limb.move(mode, settings)
         assert limb.mode == "robot"
-
-
-def turning_points(found: np.ndarray) -> np.ndarray:
-    """Angles at which sweeps turn back into extension, rad."""
-    highest = found[:, 1] > 0.5 * (found[:, 1].min() + found[:, 1].max())
-    borders = np.flatnonzero(highest[1:] != highest[:-1])
-    return np.array([found[a:b, 1].max() for a, b in pairwise(borders) if highest[a + 1]])
 
 
 class TestFile:

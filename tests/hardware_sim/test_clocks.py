@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from stimrig.hardware_sim.errors import FaultError
-from stimrig.hardware_sim.load_cells.cells import CanOpen, Counts, Plain
+from stimrig.hardware_sim.load_cells.cells import Counts, Plain
 from stimrig.hardware_sim.load_cells.frames import Sample
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from tests.hardware_sim.test_load_cells import cell
@@ -75,12 +75,6 @@ def test_packed_values_have_stops_and_a_counter_jump_shows() -> None:
     assert frame(1.0, -70.0, 70.0) == (500, -32767, 32767, 0)
     assert frame(math.nan, 0.001, 0.0, counter=1003) == (-32767, 0, 0, 335)
     assert Counts(2).encode([Sample(50.0, 0, False, 1), Sample(-60.0, 1, False, 2)])[1:3] == (b"\xff\xff\0\0", 2)
-
-
-def test_what_the_cells_carry() -> None:
-    carried = {made: (made.has_counter, made.has_sync) for made in (Plain(), Plain(3), CanOpen())}
-    assert list(carried.values()) == [(True, True), (True, False), (True, True)]
-    assert not Counts().has_counter
 
 
 class TestFaults:

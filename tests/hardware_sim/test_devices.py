@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import subprocess
-import sys
 
 import pytest
 
@@ -13,7 +10,6 @@ from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
 from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
-from tests.hardware_sim.emulated import ROOT
 from tests.hardware_sim.virtual_host import VirtualHost
 
 PULSE = config(*biphasic(250, 20))
@@ -55,14 +51,6 @@ LOSSES = ("frames_dropped", "torque_nan", "frames_corrupt", "corrupt_answers", "
 def test_inputs_decide_and_how_often_time_advances_does_not(described: dict[str, object]) -> None:
     seen = {played(step_s, **described) for step_s in (0.001, 0.0125)}  # pyright: ignore[reportArgumentType]
     assert len(seen) == 1
-
-
-def test_a_processs_hash_seed_decides_nothing() -> None:
-    code = f"from {__name__} import LOSSES, played; print(played(0.0125, faults=LOSSES))"
-    for seed in ("1", "2"):
-        environment = {**os.environ, "PYTHONHASHSEED": seed}
-        told = subprocess.check_output([sys.executable, "-c", code], cwd=ROOT, env=environment, text=True)
-        assert told.strip() == played(0.0125, faults=LOSSES)
 
 
 def test_bytes_carry_the_time_at_which_they_were_written() -> None:

@@ -45,48 +45,24 @@ def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
     raise AssertionError("no suitable base in 30")
 
 
-def test_some_effects_are_foreign() -> None:
-    """That every effect of the library has its file here: tests/identify/test_effects.py."""
-    assert {"rate_dependent_recruitment", "antagonist", "slipped_electrode"} <= set(OUTSIDERS)
-    assert len(OUTSIDERS) >= 8 and len(OUTSIDERS_HELD_BACK) >= 5
-    assert len(NAMES) == len(EFFECTS) + len(OUTSIDERS) + len(OUTSIDERS_HELD_BACK)
-
-
-@pytest.mark.parametrize(("effect", "index"), ALL)
-def test_magnitude_zero_is_the_base_muscle(effect: str, index: int) -> None:
-    base, formulation = written(effect, index)
-    design = make_design("full", rng_of(1), float(base.largest_width_us), moving=True)
-    plain = simulate(base, base.stages(), design, STEP_S)
-    neutral = simulate(base, combine(base, [(formulation, 0.0)]), design, STEP_S)
-    assert np.abs(neutral - plain).max() < 1e-4
-    full = simulate(base, combine(base, [(formulation, formulation.largest_magnitude)]), design, STEP_S)
-    assert np.abs(full - plain).max() > 0.05
-
-
-def depends_on_the_step(effect: str, index: int) -> bool:
-    return effect in BY_STEP or (effect, find_forms(KNOWN[effect])[index].name) in RANDOM_BY_STEP
-
-
-def test_what_depends_on_the_step_is_there() -> None:
-    known = {(effect, form.name) for effect in EFFECTS for form in find_forms(EFFECTS[effect])}
-    assert known >= RANDOM_BY_STEP
-    assert set(NAMES) >= BY_STEP
-
-
 @pytest.mark.parametrize(
     ("effect", "index"),
     [
-        pytest.param(*one, marks=[pytest.mark.campaign] if one[1] else [])  # the first form of each effect
-        for one in ALL
-        if not depends_on_the_step(*one)
-    ],
+        pytest.param(*one, marks=[pytest.mark.campaign] if one[1] else []) for one in ALL
+    ],  # the first form of each effect
 )
-def test_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
+def test_magnitude_zero_is_the_base_muscle_and_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
     base, formulation = written(effect, index)
     design = make_design("full", rng_of(2), float(base.largest_width_us), moving=True, validate_s=4.0)
-    stages = combine(base, [(formulation, 0.4 * formulation.largest_magnitude)])
-    coarse = simulate(base, stages, design, STEP_S)
-    fine = simulate(base, stages, design, STEP_S / 4.0)[::4]
+    zero, some, full = (
+        combine(base, [(formulation, share * formulation.largest_magnitude)]) for share in (0.0, 0.4, 1.0)
+    )
+    plain = simulate(base, base.stages(), design, STEP_S)
+    assert np.abs(simulate(base, zero, design, STEP_S) - plain).max() < 1e-4
+    assert np.abs(simulate(base, full, design, STEP_S) - plain).max() > 0.05
+    if effect in BY_STEP or (effect, find_forms(KNOWN[effect])[index].name) in RANDOM_BY_STEP:
+        return
+    coarse, fine = simulate(base, some, design, STEP_S), simulate(base, some, design, STEP_S / 4.0)[::4]
     assert np.sqrt(np.mean((coarse - fine) ** 2)) < 0.004 * base.largest_nm
 
 

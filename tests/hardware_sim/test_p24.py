@@ -116,6 +116,7 @@ def test_an_open_electrode_is_seen_from_15_ma_and_nothing_flows(ready: Bench) ->
 
 def test_the_muscle_hangs_on_one_output(ready: Bench) -> None:
     assert ready.ask(LL_CONFIG, config(*biphasic(250, 20), channel=2, connector=1)).data == bytes((ELECTRODE, 0x12, 0))
+    assert [pulse.output for pulse in ready.electrodes.log] == [(1, 2)]
 
 
 def test_high_voltage_off_or_broken(bench: Bench) -> None:

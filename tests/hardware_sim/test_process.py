@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -13,15 +12,10 @@ from pathlib import Path
 import pytest
 
 from stimrig.hardware_sim.__main__ import main
-from tests.hardware_sim.emulated import ROOT, Emulated, emulated, wait_for
+from tests.hardware_sim.emulated import emulated, wait_for
+from tests.harness.processes import ROOT, stat
 
 pytestmark = pytest.mark.wire
-
-
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "stimrig.hardware_sim", *arguments], cwd=ROOT, capture_output=True, text=True, timeout=30
-    )
 
 
 def test_the_ready_line_and_the_speed_of_the_emulators_time() -> None:
@@ -31,7 +25,7 @@ def test_the_ready_line_and_the_speed_of_the_emulators_time() -> None:
         assert Path(ready["stimulator"]).is_char_device()
         assert Path(ready["stimulator_link"]).resolve() == Path(ready["stimulator"])
         assert set(ready["can"]) == {"interface", "host", "port", "channel"}
-        wanted = {"pid": rig.process.pid, "sample_rate_hz": 800.0, "speed": 10.0, "patient": "paper", "noise_seed": 3}
+        wanted = {"pid": rig.popen.pid, "sample_rate_hz": 800.0, "speed": 10.0, "patient": "paper", "noise_seed": 3}
         assert {key: ready[key] for key in wanted} == wanted
         asked_s, before, told_s = time.monotonic(), rig.ask(cmd="state"), time.monotonic()
         time.sleep(0.2)
@@ -43,40 +37,23 @@ def test_the_ready_line_and_the_speed_of_the_emulators_time() -> None:
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
 def test_signals_end_it_cleanly(number: signal.Signals) -> None:
-    rig = Emulated()
-    rig.process.send_signal(number)
-    output, errors = rig.process.communicate(timeout=30)
-    assert (rig.process.returncode, output, errors) == (0, "", "")
+    with emulated() as rig:
+        rig.popen.send_signal(number)
+        output, _ = rig.popen.communicate(timeout=30)
+        assert (rig.popen.returncode, output, rig.log.read_text()) == (0, "", "")
     assert not Path(rig.ready["control"]).parent.exists()
-    rig.close()
 
 
 def test_it_ends_with_its_parent() -> None:
-    parent = subprocess.Popen(
-        [
-            sys.executable,
-            "-c",
-            "import subprocess, sys, time\n"
-            "subprocess.Popen([sys.executable, '-m', 'stimrig.hardware_sim', '--die-with-parent'])\n"
-            "time.sleep(60)",
-        ],
-        cwd=ROOT,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    start = "subprocess.Popen([sys.executable, '-m', 'stimrig.hardware_sim', '--die-with-parent'])"
+    code = f"import subprocess, sys, time\n{start}\ntime.sleep(60)"
+    parent = subprocess.Popen([sys.executable, "-c", code], cwd=ROOT, stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None
     child = json.loads(parent.stdout.readline())["pid"]
     parent.kill()
     parent.wait()
-    wait_for(lambda: not Path(f"/proc/{child}").exists() or _is_zombie(child))
+    wait_for(lambda: (stat(child) or "Z")[0] == "Z")
     parent.stdout.close()
-
-
-def _is_zombie(pid: int) -> bool:
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] == "Z"
-    except FileNotFoundError:
-        return True
 
 
 def test_patient_file_faults_and_readable_lines(tmp_path: Path) -> None:
@@ -101,7 +78,6 @@ BAD_INPUT = {
     "--patient nobody.toml": "nobody.toml: cannot be read",
     "--noise-nm much": "--noise-nm",
     "--noise-nm nan": "--noise-nm must be between 0 and 10",
-    "--noise-nm -1": "--noise-nm must be between 0 and 10",
     "--rate-hz 0": "--rate-hz must be between",
     "--speed inf": "--speed must be between",
     "--clock-jitter-us -1": "--clock-jitter-us must be between",
@@ -117,10 +93,7 @@ BAD_INPUT = {
     "--cell canopen --samples-per-frame 3": "must be 1 with --cell canopen",
     "--wrong": "--wrong",
     "--arm fly": "neither a file nor one of",
-    "--arm design": "neither a file nor one of",
     "--arm held,angle_deg=ten": "'angle_deg=ten' must be SETTING=NUMBER",
-    "--arm held,angle=10": "no setting 'angle'; it has angle_deg",
-    "--arm held,angle_deg=200": "must be between -10 and 160",
     "--arm held --angle-bits 30": "--angle-bits must be between 8 and 20",
     "--arm held --angle-noise-deg nan": "--angle-noise-deg must be between",
     "--arm held --angle in-cell --cell plain": "--cell with_angle goes with",
@@ -140,20 +113,15 @@ def test_bad_input_is_one_line_and_exit_2(arguments: str, told: str, capsys: pyt
 
 
 def test_bad_input_ends_the_process_with_2() -> None:
-    done = run("--wrong")
+    command = [sys.executable, "-m", "stimrig.hardware_sim", "--wrong"]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=30)
     assert (done.returncode, done.stdout, done.stderr.count("\n")) == (2, "", 1)
-
-
-def test_help() -> None:
-    done = run("--help")
-    assert done.returncode == 0
-    assert "--speed" in done.stdout
 
 
 def test_stopped_and_continued_it_catches_up() -> None:
     with emulated() as rig:
-        os.kill(rig.process.pid, signal.SIGSTOP)
+        rig.popen.send_signal(signal.SIGSTOP)
         time.sleep(0.5)
-        os.kill(rig.process.pid, signal.SIGCONT)
+        rig.popen.send_signal(signal.SIGCONT)
         state = rig.ask(cmd="state")
         assert state["samples"] == pytest.approx(1600 * state["time_s"], abs=2)

@@ -70,6 +70,13 @@ def test_low_level() -> None:
         rig.ask(cmd="fault", name="electrode_error")
         low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
         assert acks(device, 1)[0].result == ResultAndError.ELECTRODE_ERROR
+        rig.ask(cmd="fault", name="electrode_error", on=False)
+        await low.init(LowLevelMode.STIM_CURRENT, LowLevelHighVoltageSource.STANDARD)
+        low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
+        (ack,) = acks(device, 1)
+        step_us = ack.sampling_time_in_microseconds
+        on_us = step_us * sum(sample == 20.0 for sample in ack.measurement_samples)
+        assert (ack.mode, on_us) == (LowLevelMode.STIM_CURRENT, pytest.approx(500, abs=2 * step_us))
         await low.stop()
         assert await general.get_stim_status() == (StimStatus.NO_LEVEL_INITIALIZED, False)
         connection.close()
@@ -77,28 +84,11 @@ def test_low_level() -> None:
     with emulated() as rig:
         asyncio.run(session(rig))
         pulses = rig.ask(cmd="pulses")["pulses"]
-        assert [(p["width_us"], p["current_ma"]) for p in pulses] == [PULSE] * 21
-        assert [p["delivered"] for p in pulses] == [True] * 20 + [False]
+        assert [(p["width_us"], p["current_ma"]) for p in pulses] == [PULSE] * 22
+        assert [p["delivered"] for p in pulses] == [True] * 20 + [False, True]
         state = rig.ask(cmd="state")
         assert (state["unbalanced_pulses"], state["corrupt_frames"], state["mode"]) == (0, 0, "none")
         assert state["torque_nm"] > 0.5
-
-
-def test_measured_current_of_a_pulse() -> None:
-    async def session(rig: Emulated) -> None:
-        connection, device = await opened(rig)
-        low = device.get_layer_low_level()
-        await low.init(LowLevelMode.STIM_CURRENT, LowLevelHighVoltageSource.STANDARD)
-        low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
-        (ack,) = acks(device, 1)
-        assert ack.mode == LowLevelMode.STIM_CURRENT
-        step_us = ack.sampling_time_in_microseconds
-        on_us = step_us * sum(sample == 20.0 for sample in ack.measurement_samples)
-        assert on_us == pytest.approx(500, abs=2 * step_us)
-        connection.close()
-
-    with emulated() as rig:
-        asyncio.run(session(rig))
 
 
 def test_mid_level_pulses_by_itself_and_falls_silent_after_2_s() -> None:
@@ -126,18 +116,3 @@ def test_mid_level_pulses_by_itself_and_falls_silent_after_2_s() -> None:
         steps = [later - earlier for earlier, later in itertools.pairwise(times)]
         assert len(times) > 80
         assert steps == pytest.approx([0.025] * len(steps), abs=1e-9)
-
-
-def test_a_client_may_leave_and_come_back() -> None:
-    async def session(rig: Emulated) -> None:
-        for _ in range(3):
-            connection, device = await opened(rig)
-            low = device.get_layer_low_level()
-            await low.init(LowLevelMode.NO_MEASUREMENT, LowLevelHighVoltageSource.STANDARD)
-            low.send_channel_config(True, Channel.RED, Connector.YELLOW, shape(*PULSE))
-            acks(device, 1)
-            connection.close()
-
-    with emulated() as rig:
-        asyncio.run(session(rig))
-        assert rig.ask(cmd="state")["pulses_delivered"] == 3

@@ -187,18 +187,12 @@ class TestChannelList:
         start_s = running.timeline.now_s
         running.run(0.010)
         assert running.mode() == STARTED
+        assert running.result(INIT_LIST, setup()) == WRONG_MODE
         running.run(10.0)
         assert running.times() == pytest.approx([start_s + 0.025 * k for k in range(49)])
         assert running.times()[-1] - start_s == pytest.approx(1.2)  # 1.19 s after the last command
         assert running.packets(ERROR) == []
         assert running.firmware.state()["mode"] == "none"
-
-    def test_watchdog_keeps_it_pulsing(self, running: Host) -> None:
-        for _ in range(5):
-            running.run(1.0)
-            running.send(WATCHDOG)
-        running.run(0.01)
-        assert len(running.muscle.pulses) == 201
 
     def test_update_waits_for_the_devices_grid(self, running: Host) -> None:
         start_s = running.timeline.now_s
@@ -231,11 +225,6 @@ class TestChannelList:
         assert running.result(START, pulse(250, 20)) == WRONG_MODE
         assert running.result(STOP) == OK
 
-    def test_init_while_running_is_the_wrong_mode(self, running: Host) -> None:
-        assert running.result(INIT_LIST, setup()) == WRONG_MODE
-        running.run(0.03)
-        assert len(running.muscle.pulses) == 2
-
     def test_a_bad_update_changes_nothing(self, running: Host) -> None:
         for data in (b"", pulse(501, 20), pulse(250, 127), pulse(250, 20, mode=3), pulse(250, 20) * 2, pulse(19, 20)):
             assert running.result(START, data) == PARAMETER
@@ -248,19 +237,30 @@ class TestChannelList:
             assert connected.result(INIT_LIST, data) == PARAMETER
             assert connected.mode() == START_MODE
 
-    def test_doublets_and_triplets(self, connected: Host) -> None:
-        assert connected.result(INIT_LIST, setup()) == OK
+    @pytest.mark.parametrize(
+        ("made", "asked", "times_s"),
+        [
+            ({}, pulse(250, 20, mode=2), [0.0, 0.008, 0.016, 0.025, 0.033, 0.041]),
+            ({"period": 46}, pulse(250, 20, mode=2), [0.0, 0.008, 0.016, 0.024, 0.032, 0.040, 0.048]),
+            ({"low": 1, "factor": 1}, pulse(250, 20), [0.0]),
+            ({"active": 0b101}, pulse(250, 20) + pulse(100, 0), [0.0, 0.025]),
+        ],
+        ids=["triplets", "the shortest period of triplets", "a low frequency", "several channels"],
+    )
+    def test_groups_of_pulses(self, connected: Host, made: dict[str, int], asked: bytes, times_s: list[float]) -> None:
+        assert connected.result(INIT_LIST, setup(**made)) == OK
         start_s = connected.timeline.now_s
-        assert connected.result(START, pulse(250, 20, mode=2)) == OK
+        assert connected.result(START, asked) == OK
         connected.run(0.049)
-        expected = [0.0, 0.008, 0.016, 0.025, 0.033, 0.041]
-        assert [time - start_s for time in connected.times()] == pytest.approx(expected)
-        connected.send(STOP)
-        assert connected.result(INIT_LIST, setup(period=46)) == OK  # 24 ms hold just three of 8 ms
-        assert connected.result(START, pulse(250, 20, mode=2)) == OK
-        connected.send(STOP)
-        assert connected.result(INIT_LIST, setup(period=45)) == OK
-        assert connected.result(START, pulse(250, 20, mode=2)) == PARAMETER
+        assert [time - start_s for time in connected.times()] == pytest.approx(times_s)
+        assert connected.packets(ERROR) == []
+
+    @pytest.mark.parametrize(
+        ("made", "asked"), [({"period": 45}, pulse(250, 20, mode=2)), ({"active": 0b101}, pulse(250, 20))]
+    )
+    def test_what_does_not_fit_the_list_is_refused(self, connected: Host, made: dict[str, int], asked: bytes) -> None:
+        assert connected.result(INIT_LIST, setup(**made)) == OK
+        assert connected.result(START, asked) == PARAMETER
 
     def test_one_shot(self, connected: Host) -> None:
         assert connected.result(INIT_LIST, setup(period=0)) == OK
@@ -271,21 +271,6 @@ class TestChannelList:
         assert connected.result(START, pulse(300, 20)) == OK
         connected.run(0.1)
         assert connected.widths() == [250, 250, 300]
-
-    def test_a_low_frequency_channel_leaves_groups_out(self, connected: Host) -> None:
-        connected.send(INIT_LIST, setup(low=1, factor=3))
-        start_s = connected.timeline.now_s
-        connected.send(START, pulse(250, 20))
-        connected.run(0.25)
-        assert [time - start_s for time in connected.times()] == pytest.approx([0.0, 0.1, 0.2])
-
-    def test_several_channels_come_in_the_order_of_the_mask(self, connected: Host) -> None:
-        assert connected.result(INIT_LIST, setup(active=0b101)) == OK
-        assert connected.result(START, pulse(250, 20)) == PARAMETER
-        assert connected.result(START, pulse(250, 20) + pulse(100, 0)) == OK
-        connected.run(0.03)
-        assert connected.widths() == [250, 250]
-        assert connected.packets(ERROR) == []
 
 
 class TestErrors:
