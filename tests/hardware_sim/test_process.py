@@ -13,7 +13,7 @@ import pytest
 
 from stimrig.hardware_sim.__main__ import main
 from tests.hardware_sim.emulated import emulated, wait_for
-from tests.harness.processes import ROOT, stat
+from tests.harness.processes import ROOT, alive
 
 pytestmark = pytest.mark.wire
 
@@ -52,7 +52,7 @@ def test_it_ends_with_its_parent() -> None:
     child = json.loads(parent.stdout.readline())["pid"]
     parent.kill()
     parent.wait()
-    wait_for(lambda: (stat(child) or "Z")[0] == "Z")
+    wait_for(lambda: not alive(child))
     parent.stdout.close()
 
 

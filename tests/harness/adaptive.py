@@ -59,15 +59,9 @@ class Muscle:
 
 def sigmoid(seed: int) -> Muscle:
     """The paper's kind of curve: gain 1.5-15 N·m, rise 10-150 µs, T 0.1-0.6 s, damping 0.6-1.2."""
-    dynamics = _dynamics(np.random.default_rng([seed, 131]))
-    return Muscle("sigmoid", sigmoid_of(seed).recruitment(np.arange(512.0)), 300.0, *dynamics)
-
-
-def sigmoid_of(seed: int) -> Patient:
-    """Of that muscle, what draws its curve."""
     rng = np.random.default_rng([seed, 131])
-    _dynamics(rng)
-    return Patient.draw(rng)
+    dynamics = _dynamics(rng)
+    return Muscle("sigmoid", Patient.draw(rng).recruitment(np.arange(512.0)), 300.0, *dynamics)
 
 
 def shaped(seed: int) -> Muscle:

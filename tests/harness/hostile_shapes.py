@@ -32,24 +32,6 @@ class Hostile:
 Change = Callable[[h5py.File, Path], Any]
 
 
-def all_files(folder: Path, seed: int, count: int, only: Collection[str] | None = None) -> Iterator[Hostile]:
-    """At least `count` files: every shape once, then good files with bytes changed, and cut, by the seed.
-
-    `folder` holds what some of them point to: a secret, and a recording that nobody gave. `only`: the names of the
-    shapes wanted.
-    """
-    (folder / "secret.txt").write_bytes(SECRET)
-    (folder / "other.h5").write_bytes(good())
-    made = 0
-    for hostile in (*hdf5_shapes(folder, only), *csv_shapes(), *model_shapes()):
-        if only is None or hostile.name in only:
-            made += 1
-            yield hostile
-    rng = random.Random(seed)
-    for number in range(max(0, count - made)):
-        yield spoiled(rng, number)
-
-
 def columns() -> dict[str, Any]:
     """A small sound recording: 16 s at 100 samples/s of a muscle that lags."""
     pulses = np.arange(640) / 40
@@ -155,8 +137,13 @@ def deep(file: h5py.File, _folder: Path) -> None:
     file["torque/again"] = file["torque"]
 
 
-def hdf5_shapes(folder: Path, only: Collection[str] | None = None) -> Iterator[Hostile]:
-    """Each way in which a recording may be something else; of most of them `only` the named ones."""
+def hdf5_shapes(folder: Path, only: Collection[str] = ()) -> Iterator[Hostile]:
+    """Each way in which a recording may be something else, or `only` the named ones.
+
+    `folder` holds what some of them point to: a secret, and a recording that nobody gave.
+    """
+    (folder / "secret.txt").write_bytes(SECRET)
+    (folder / "other.h5").write_bytes(good())
     many = 10**12
     values = columns()
     torque, times = "torque/torque_nm", "torque/time_s"
@@ -225,8 +212,10 @@ def hdf5_shapes(folder: Path, only: Collection[str] | None = None) -> Iterator[H
         for value in (np.inf, -1e300):
             shapes[f"{value} in {path}"] = cell(path, index, value)
     for name, change in shapes.items():
-        if only is None or name in only:
+        if not only or name in only:
             yield Hostile(name, ".h5", good(change, folder))
+    if only:
+        return
     yield Hostile("deep and round", ".h5", good(deep, folder), refused=False)
     yield Hostile("sound", ".h5", good(), refused=False)
     yield Hostile("sound, newest layout", ".h5", good(libver="latest"), refused=False)

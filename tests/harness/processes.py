@@ -13,9 +13,10 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+
+import psutil
 
 ROOT = Path(__file__).resolve().parents[2]
 READY_TIMEOUT_S = 30.0
@@ -150,12 +151,7 @@ class RigClient:
 class Bench:
     """An emulator and, on demand, a rig on it, in a folder of their own.
 
-    Parameters
-    ----------
-    folder
-        Where data, logs and the socket go; a socket's path must be short, so it lies in a temporary folder.
-    emulator_options
-        Passed to `python -m stimrig.hardware_sim`.
+    A socket's path must be short, so it lies in a temporary folder.
     """
 
     def __init__(self, folder: Path, *emulator_options: str, speed: float = 1.0) -> None:
@@ -243,42 +239,17 @@ def default_plan(test_id: str, **fields: Any) -> dict[str, Any]:
     return {"test_id": test_id, "participant": "P01", "profile": profile, **fields}
 
 
-@contextlib.contextmanager
-def busy_process() -> Iterator[subprocess.Popen[bytes]]:
-    """A process that wants a whole core, as a fit does."""
-    popen = subprocess.Popen([sys.executable, "-c", "while True: sum(range(10000))"])
+def alive(pid: int) -> bool:
+    """Tell whether a process runs; one that has ended and is not waited for does not."""
     try:
-        yield popen
-    finally:
-        popen.kill()
-        popen.wait()
-
-
-def children_of(pid: int) -> list[int]:
-    """Process ids of a process's children."""
-    path = Path(f"/proc/{pid}/task/{pid}/children")
-    return [int(child) for child in path.read_text().split()] if path.exists() else []
-
-
-def stat(pid: int) -> tuple[str, int] | None:
-    """Return a process's state and its parent; None: there is no such process."""
-    try:
-        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(") ")[2].split()
-    except OSError:
-        return None
-    return fields[0], int(fields[1])
+        return psutil.Process(pid).status() != psutil.STATUS_ZOMBIE
+    except psutil.NoSuchProcess:
+        return False
 
 
 def below(root: int) -> list[int]:
     """List the ids of all processes below one."""
-    children: dict[int, list[int]] = {}
-    for path in Path("/proc").iterdir():
-        if path.name.isdigit() and (found := stat(int(path.name))):
-            children.setdefault(found[1], []).append(int(path.name))
-    tree = [root]
-    for pid in tree:
-        tree.extend(children.get(pid, []))
-    return sorted(tree[1:])
+    return [process.pid for process in psutil.Process(root).children(recursive=True)]
 
 
 def kill_hard(process: Process) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+import stimrig
 from stimrig import identify
 from stimrig.api.clock import Clock
 from stimrig.api.models.registry import Versions
@@ -27,6 +28,7 @@ FIRST = datetime(2026, 8, 3, 11, 0, tzinfo=UTC)
 PROFILE = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_torque_nm": 30.0}
 RATE_HZ = 100
 TOP_US = 300.0
+BY = "Ada"
 
 
 class SetBack(Clock):
@@ -41,23 +43,7 @@ class SetBack(Clock):
 
 @dataclass(frozen=True)
 class Planned:
-    """One session.
-
-    Parameters
-    ----------
-    patient : Patient
-        The muscle on that day.
-    day : float
-        Days after the first one.
-    approved : bool
-        Whether somebody approved its model.
-    current_ma : float
-        Of its test.
-    notes : dict of str to str
-        Kind to text.
-    noise_nm : float
-        Noise of a torque sample.
-    """
+    """One session: its muscle, the day after the first one, what was decided, written and measured."""
 
     patient: Patient
     day: float
@@ -81,55 +67,42 @@ def record(session: Planned, seed: int) -> identify.Record:
     return as_record(noisy, widths, RATE_HZ, list(names))
 
 
-def make(store: Store, folder: Path, code: str, planned: list[Planned], seed: int = 1, by: str = "Ada") -> list[str]:
+def make(store: Store, folder: Path, code: str, planned: list[Planned]) -> list[str]:
     """Store the sessions of a new participant; their models' ids, in order."""
     with store.write() as session:
-        created = label(FIRST)
-        session.add(Participant(code=code, profile=dict(PROFILE), created_utc=created, created_by=by))
-    return [_stored(store, folder, code, number, one, seed, by) for number, one in enumerate(planned)]
+        session.add(Participant(code=code, profile=dict(PROFILE), created_utc=label(FIRST), created_by=BY))
+    return [_stored(store, folder, code, number, one) for number, one in enumerate(planned)]
 
 
-def _stored(store: Store, folder: Path, code: str, number: int, one: Planned, seed: int, by: str) -> str:
+def _stored(store: Store, folder: Path, code: str, number: int, one: Planned) -> str:
     at = FIRST + timedelta(days=one.day)
-    made = record(one, seed)
-    versions = Versions(store, SetBack(at))
+    at_utc, made = label(at), record(one, 1)
     test_id, recording_id = f"T-{code}-{number:03d}", f"R-{code}-{number:03d}"
-    path = folder / f"{recording_id}.csv"
-    digest = _written(path, made)
-    charge_uc = float(np.sum(made.pulse_width_us) * one.current_ma * 40.0 / RATE_HZ / 1000.0)
-    with store.write() as session:
-        session.add(_test(test_id, code, one, label(at), recording_id, charge_uc, by))
-        session.flush()
-        row = Recording(id=recording_id, participant=code, test_id=test_id, path=str(path), file_sha256=digest)
-        row.origin, row.created_utc = "rig", label(at)
-        session.add(row)
-        for kind, text in one.notes.items():
-            note = Note(id=f"N-{code}-{number}-{kind}", participant=code, test_id=test_id, kind=kind, text=text)
-            note.by, note.at_utc = by, label(at)
-            session.add(note)
-    model = versions.add(identify.fit(made).to_json(), code, recording_id, by)
-    if one.approved:
-        versions.decide(model.id, True, by, "as last time")
-    return model.id
-
-
-def _test(test_id: str, code: str, one: Planned, at_utc: str, recording_id: str, charge_uc: float, by: str) -> Test:
+    folder.mkdir(parents=True, exist_ok=True)
+    path = stimrig.save(made, folder / f"{recording_id}.csv")
     plan: dict[str, Any] = {"test_id": test_id, "participant": code, "profile": {"current_ma": one.current_ma}}
-    row = Test(id=test_id, participant=code, kind="pre-session", state="completed", plan=plan)
-    row.summary, row.recording_id = {"charge_uc": charge_uc, "duration_s": 35.0}, recording_id
-    row.requested_by, row.requested_utc, row.finished_utc = by, at_utc, at_utc
-    return row
-
-
-def _written(path: Path, made: identify.Record) -> str:
-    """The record as a CSV file; its SHA-256."""
-    names = [made.segment_names[index] for index in made.segment]
-    rows = zip(made.time_s, made.pulse_width_us, made.torque_nm, names, strict=True)
-    lines = [f"{t:.4f},{u:.2f},{y:.6f},{name}" for t, u, y, name in rows]
-    text = "\n".join(["time_s,pulse_width_us,torque_nm,segment", *lines, ""])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text, encoding="utf-8")
-    return hashlib.sha256(text.encode()).hexdigest()
+    charge_uc = float(np.sum(made.pulse_width_us) * one.current_ma * 40.0 / RATE_HZ / 1000.0)
+    test = Test(
+        id=test_id, participant=code, kind="pre-session", state="completed", plan=plan, recording_id=recording_id,
+        summary={"charge_uc": charge_uc, "duration_s": 35.0}, requested_by=BY, requested_utc=at_utc,
+        finished_utc=at_utc,
+    )  # fmt: skip
+    recording = Recording(
+        id=recording_id, participant=code, test_id=test_id, path=str(path), origin="rig", created_utc=at_utc,
+        file_sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )  # fmt: skip
+    with store.write() as session:
+        session.add(test)
+        session.flush()
+        session.add(recording)
+        for kind, text in one.notes.items():
+            name = f"N-{code}-{number}-{kind}"
+            session.add(Note(id=name, participant=code, test_id=test_id, kind=kind, text=text, by=BY, at_utc=at_utc))
+    versions = Versions(store, SetBack(at))
+    model = versions.add(identify.fit(made).to_json(), code, recording_id, BY)
+    if one.approved:
+        versions.decide(model.id, True, BY, "as last time")
+    return model.id
 
 
 def label(at: datetime) -> str:

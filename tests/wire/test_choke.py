@@ -12,14 +12,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from stimrig.rig.messages import stop_socket
-from tests.harness.processes import Bench, RigClient, children_of, default_plan
+from tests.harness.processes import Bench, RigClient, alive, below, default_plan
 
 pytestmark = pytest.mark.wire
 
@@ -52,10 +51,6 @@ def wait_until(met: Callable[[], bool]) -> None:
     while not met():
         assert time.monotonic() < end
         time.sleep(0.01)
-
-
-def has_no_child(pid: int, child: int) -> bool:
-    return child not in children_of(pid)
 
 
 def stop_apart(bench: Bench) -> dict[str, Any]:
@@ -139,11 +134,11 @@ def test_a_builder_that_died_is_begun_anew(shared: tuple[Bench, RigClient]):
         built = client.ask("preview", plan=default_plan("p", segments=LONGEST), timeout_s=60.0)
         assert built["ok"], built
         assert built["body"]["duration_s"] == 300.0
-        children = children_of(bench.rig.popen.pid)
+        children = below(bench.rig.popen.pid)
         (builder,) = (pid for pid in children if b"previews" in Path(f"/proc/{pid}/cmdline").read_bytes())
         assert os.sched_getscheduler(builder) == os.SCHED_OTHER
         os.kill(builder, signal.SIGKILL)
-        wait_until(partial(has_no_child, bench.rig.popen.pid, builder))
+        wait_until(lambda gone=builder: not alive(gone))
         reply = client.ask("preview", plan=default_plan("p"), timeout_s=60.0)
         assert reply["ok"] or reply["problem"]["code"] == "bad-plan"
 

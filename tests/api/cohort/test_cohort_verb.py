@@ -20,7 +20,7 @@ from stimrig.api.cli import main
 from stimrig.api.cohort import cluster
 from tests.api.test_schemas import unmet
 from tests.harness.cohort_records import cohort
-from tests.harness.processes import below, stat
+from tests.harness.processes import alive, below
 
 pytestmark = pytest.mark.slow
 
@@ -141,10 +141,6 @@ def until(reached: Callable[[], Any], what: str, run: subprocess.Popen[str] | No
 def rows_in(parts: Path) -> int:
     """Rows that are on the disk."""
     return sum(pq.read_metadata(part).num_rows for part in parts.glob("[0-9]*.parquet"))
-
-
-def alive(pid: int) -> bool:
-    return (stat(pid) or "Z")[0] != "Z"
 
 
 @pytest.mark.campaign
