@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
-import gzip
 import json
 import os
 import re
 import subprocess
 import sys
+import tempfile
+import time
 from collections.abc import Iterator
 from html.parser import HTMLParser
 from pathlib import Path
@@ -16,9 +18,12 @@ from typing import Any
 
 import h5py
 import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from stimrig.api.cli import main
 
 HERE = Path(__file__).resolve().parents[2]
-PACKAGE = "stimrig.api" if (HERE / "stimrig" / "api").exists() else "api"
 NUMBER = re.compile(r"[-−+]?\d+(?:\.\d+)?(?:e[-+]?\d+)?")
 LONG = 12
 """Of longer rows of numbers only their shape, ends and moments are kept."""
@@ -34,79 +39,78 @@ VOLATILE = (
         ),
         r"\1 <id>",
     ),
-    (re.compile(r"ses-s[0-9a-f]{10}"), "ses-<hidden>"),
     (re.compile(r"(done before, |in )\d+(?:\.\d+)? m?s\b"), r"\1<duration>"),
     (re.compile(r"(stimrig_rig_|Model )(?:[\w-]{30,}|[0-9a-f]{8}\b)"), r"\1<id>"),
     (re.compile(r"\b(?:stimrig )?\d+\.\d+\.\d+(?:[.+]\w+)*\b"), "<version>"),
     (re.compile(r"\b(?:stimrig\.)?((?:identify|api|rig|hardware_sim)\.[a-z_.]+)"), r"\1"),
 )
-ALONE = f"import sys; sys.argv[0] = 'stimrig'; from {PACKAGE}.cli.main import main; main()"
 NEW_EACH_TIME = {"model_id", "created", "software", "elapsed_s", "took_s", "age_s", "torque_age_s", "uptime_s", "csrf"}
 
 
-class CommandLine:
-    """The command line in a folder; all calls in one process, but for Python itself (`-c`) and the
-    emulator, which becomes another program.
+@contextlib.contextmanager
+def working_in(folder: Path) -> Iterator[None]:
+    """Calls of the command line work in this folder, in UTC and on lines of 100 characters."""
+    environment = {"PYTHONPATH": str(HERE), "COLUMNS": "100", "OPENBLAS_NUM_THREADS": "1", "TZ": "UTC"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name in [name for name in os.environ if name.startswith("STIMRIG_")]:
+            patch.delenv(name)
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        patch.chdir(folder)
+        time.tzset()
+        yield
+    time.tzset()
 
-    Parameters
-    ----------
-    folder
-        Where the calls work.
-    """
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        kept = {name: value for name, value in os.environ.items() if not name.startswith("STIMRIG_")}
-        self._environment = kept | {"PYTHONPATH": str(HERE), "COLUMNS": "100", "OPENBLAS_NUM_THREADS": "1", "TZ": "UTC"}
-        self._session = self._begin("-m", "tests.frozen.session")
+def call(line: str) -> dict[str, Any]:
+    """Exit code, standard output and error of a call, and every file that is new in the working folder after it."""
+    folder = Path.cwd()
+    before = _files(folder)
+    done = run(line)
+    new = [path for path, changed in _files(folder).items() if before.get(path) != changed]
+    answer = {
+        "exit": done["exit"],
+        "out": _text(done["out"], folder),
+        "error": _text(done["error"], folder) if done["exit"] else "",  # else progress
+        "files": {_plain(str(path.relative_to(folder)), folder): condensed_file(path, folder) for path in sorted(new)},
+    }
+    for name, document in answer["files"].items():
+        if document == answer["out"]:
+            answer["out"] = f"<as {name}>"
+    return answer
 
-    def __enter__(self) -> CommandLine:
-        return self
 
-    def __exit__(self, *_: object) -> None:
-        self._session.communicate()
+def run(line: str) -> dict[str, Any]:
+    """Exit code, standard output and error as they are; in this process, but for code and the emulator."""
+    if line.startswith(("-c", "emulate")):  # which becomes another program
+        words = [line[:2], line[2:]] if line.startswith("-c") else ["-m", "stimrig", *line.split()]
+        done = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=900)
+        return {"exit": done.returncode, "out": done.stdout, "error": done.stderr}
+    before = os.dup(1), os.dup(2)
+    with (
+        tempfile.TemporaryFile("w+") as out,
+        tempfile.TemporaryFile("w+") as error,
+        pytest.MonkeyPatch.context() as patch,
+    ):
+        patch.setattr("sys.argv", ["stimrig", *line.split()])
+        os.dup2(out.fileno(), 1), os.dup2(error.fileno(), 2)  # of children, too
+        try:
+            with contextlib.redirect_stdout(out), contextlib.redirect_stderr(error):
+                code = main.run(line.split())
+        except SystemExit as end:
+            code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        finally:
+            os.dup2(before[0], 1), os.dup2(before[1], 2)
+            os.close(before[0]), os.close(before[1])
+        texts = []
+        for file in (out, error):
+            file.seek(0)
+            texts.append(file.read())
+    return {"exit": code, "out": texts[0], "error": texts[1]}
 
-    def call(self, line: str) -> dict[str, Any]:
-        """Exit code, standard output and error, and every file that is new in the folder after it."""
-        before = self._files()
-        done = self.run(line)
-        new = [path for path, changed in self._files().items() if before.get(path) != changed]
-        names = {path: _plain(str(path.relative_to(self.folder)), self.folder) for path in sorted(new)}
-        answer = {
-            "exit": done["exit"],
-            "out": _text(done["out"], self.folder),
-            "error": _text(done["error"], self.folder) if done["exit"] else "",  # else progress
-            "files": {name: condensed_file(path, self.folder) for path, name in names.items()},
-        }
-        for name, document in answer["files"].items():
-            if document == answer["out"]:
-                answer["out"] = f"<as {name}>"
-        return answer
 
-    def run(self, line: str) -> dict[str, Any]:
-        """Exit code, standard output and error as they are."""
-        if line.startswith(("-c", "emulate")):
-            done = self._begin("-c", line[2:]) if line[0] == "-" else self._begin("-c", ALONE, *line.split())
-            out, error = done.communicate(timeout=900)
-            return {"exit": done.returncode, "out": out, "error": error}
-        assert self._session.stdin is not None
-        assert self._session.stdout is not None
-        self._session.stdin.write(json.dumps(line.split()) + "\n")
-        self._session.stdin.flush()
-        if told := self._session.stdout.readline():
-            return json.loads(told)
-        code = self._session.wait()
-        self._session = self._begin("-m", "tests.frozen.session")
-        return {"exit": f"the process died: {code}", "out": "", "error": ""}
-
-    def _begin(self, *arguments: str) -> subprocess.Popen[str]:
-        pipes: Any = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
-        error = None if "tests.frozen.session" in arguments else subprocess.PIPE
-        command = [sys.executable, *arguments]
-        return subprocess.Popen(command, cwd=self.folder, env=self._environment, stderr=error, **pipes)
-
-    def _files(self) -> dict[Path, int]:
-        return {path: path.stat().st_mtime_ns for path in self.folder.rglob("*") if path.is_file()}
+def _files(folder: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in folder.rglob("*") if path.is_file()}
 
 
 def _text(text: str, folder: Path) -> Any:
@@ -165,15 +169,10 @@ def condensed_file(path: Path, folder: Path) -> Any:
     if path.suffix == ".csv":
         return _table(path, folder)
     if path.suffix == ".parquet":
-        import pyarrow.parquet as pq
-
         return condensed(json.loads(json.dumps(pq.read_table(path).to_pydict(), default=str)), folder)
     if path.suffix == ".h5" and h5py.is_hdf5(path):
         return _hdf5(path, folder)
-    if path.suffix == ".gz":
-        rows = [line.split("\t") for line in gzip.decompress(path.read_bytes()).decode().split("\n") if line]
-        return [_column(list(column), folder) for column in zip(*rows, strict=True)]
-    if path.suffix in ("", ".tsv", ".html"):
+    if path.suffix in ("", ".html"):
         return words_of(path.read_text("utf-8", "replace"), folder)
     return f"<{path.suffix} file>"
 

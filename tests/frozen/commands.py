@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tests.frozen.answers import CommandLine, condensed_file
+from tests.frozen.answers import call, condensed_file, run, working_in
 from tests.frozen.records import MORE_WORDS, RECORDS
 from tests.frozen.rig_records import of_kind
 from tests.harness import cohort_records
@@ -97,8 +97,8 @@ def diagnosed(name: str, folder: Path) -> dict[str, Any]:
 
 def _all_of(name: str, calls: list[str], folder: Path) -> dict[str, Any]:
     _reference(folder)
-    with CommandLine(folder) as line:
-        return {call: line.call(f"{call} {MORE_WORDS.get(name, '')}") for call in calls}
+    with working_in(folder):
+        return {line: call(f"{line} {MORE_WORDS.get(name, '')}") for line in calls}
 
 
 def without_record(folder: Path) -> dict[str, Any]:
@@ -113,17 +113,16 @@ def without_record(folder: Path) -> dict[str, Any]:
         (folder / f"{name}.journal").write_bytes(content)
     cohort_records.cohort(folder / "cohort", 2, people=2)
     (folder / "cohort" / "broken.h5").write_bytes(b"")
-    with CommandLine(folder) as line:
-        line.run("fit plain.csv -o model.json")
+    with working_in(folder):
+        run("fit plain.csv -o model.json")
         model = (folder / "model.json").read_text()
         (folder / "cut.json").write_text(model[:500])
         (folder / "future.json").write_text(json.dumps(json.loads(model) | {"schema_version": "9.0"}))
-        schemas = [address.split(":")[-2] for address in line.run("schema")["out"].split()]
+        schemas = [address.split(":")[-2] for address in run("schema")["out"].split()]
         more = [*(f"schema {name}" for name in schemas), *(f"{verb} --help" for verb in VERBS)]
-        calls = [*REFUSED, *DONE, "schema", *more]
-        answers = {call: line.call(call) for call in calls}
-        answers |= {call: shape(line.call(call)["out"]) for call in SHAPES}
-        return answers | {"import stimrig": line.call(f"-c{SCRIPT}")}
+        answers = {line: call(line) for line in (*REFUSED, *DONE, "schema", *more)}
+        answers |= {line: shape(call(line)["out"]) for line in SHAPES}
+        return answers | {"import stimrig": call(f"-c{SCRIPT}")}
 
 
 def shape(value: Any) -> Any:

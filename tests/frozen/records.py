@@ -6,7 +6,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 import scipy.io
 
@@ -57,41 +56,6 @@ def _mat(folder: Path) -> Path:
     return folder / "record.mat"
 
 
-def _broken(kind: str) -> Make:
-    """Files that must be refused in one line."""
-
-    def make(folder: Path) -> Path:
-        path = folder / ("record.h5" if kind == "not_hdf5" else "record.csv")
-        record = generate(None, seed=43, rate_hz=50, design="short")
-        write_csv(record, path)
-        lines = path.read_text().split("\n")
-        if kind == "word":
-            lines[100] = lines[100].rsplit(",", 2)[0] + ",strong,prbs"
-        if kind == "no_torque":
-            lines[0] = lines[0].replace("torque_nm", "force")
-        if kind == "backwards":
-            lines[50], lines[90] = lines[90], lines[50]
-        if kind == "empty":
-            lines = lines[:1]
-        path.write_text("\n".join(lines))
-        return path
-
-    return make
-
-
-def _other_sealed(kind: str) -> Make:
-    def make(folder: Path) -> Path:
-        path = cohort_records.write(folder / "record.h5", cohort_records.Session(seed=9, muscle=9))
-        with h5py.File(path, "r+") as file:
-            if kind == "future":
-                file.attrs["format_version"] = 99
-            else:
-                del file["/pulses/status"]
-        return path
-
-    return make
-
-
 def _arm(kind: str, seed: int) -> Make:
     return _csv(lambda: arm_records.record(arm_records.arm_patient(seed), kind, seed))
 
@@ -129,8 +93,6 @@ RECORDS: dict[str, Make] = {
     **{f"rig_{kind}": _of_rig(kind) for kind in KINDS if kind != "journal"},
     "other_words": _in_other_words,
     "mat": _mat,
-    **{f"broken_{kind}": _broken(kind) for kind in ("word", "no_torque", "backwards", "empty", "not_hdf5")},
-    **{f"broken_{kind}": _other_sealed(kind) for kind in ("future", "no_status")},
 }
 MORE_WORDS = {"other_words": "--map time_s=t:ms --map pulse_width_us=pw:ms --map torque_nm=Drehmoment:mNm"}
 """What every call on a recording says more."""
