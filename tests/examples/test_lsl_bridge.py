@@ -25,11 +25,7 @@ class Outlet:
         self.sent.append((list(values), round(at_s, 6)))
 
 
-@pytest.fixture
-def bridge(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
-    """The script with a stand-in for pylsl whose clock stands still."""
-    fake = SimpleNamespace(cf_double64=1, cf_string=3, local_clock=lambda: NOW_S)
-    monkeypatch.setitem(sys.modules, "pylsl", fake)
+def load() -> ModuleType:
     spec = importlib.util.spec_from_file_location("lsl_bridge", SCRIPT)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
@@ -48,7 +44,11 @@ def live(elapsed_s: float, segment: str, time_s: list[float], pulses: list[tuple
     return {"type": "live", **event.model_dump(exclude={"event"})}
 
 
-def test_each_bin_pulse_and_mark_is_sent_at_its_time(bridge: ModuleType) -> None:
+def test_each_bin_pulse_and_mark_is_sent_at_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    fake = SimpleNamespace(cf_double64=1, cf_string=3, local_clock=lambda: NOW_S)
+    monkeypatch.setitem(sys.modules, "pylsl", fake)
+    bridge = load()
+
     def messages(test_id: str) -> Iterator[dict[str, Any]]:
         assert test_id == "T1"
         first = live(0.5, "rest", [0.45], [])
@@ -72,12 +72,9 @@ def test_outlets_are_described(monkeypatch: pytest.MonkeyPatch) -> None:
     pylsl = pytest.importorskip("pylsl", reason="pylsl is not installed: pip install pylsl", exc_type=Exception)
     infos = []
     monkeypatch.setattr(pylsl, "StreamOutlet", infos.append)  # nothing is sent to a network
-    spec = importlib.util.spec_from_file_location("lsl_bridge", SCRIPT)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    for part, described in module.STREAMS.items():
-        module.open_outlet(f"stimrig-{part}", *described)
+    bridge = load()
+    for part, described in bridge.STREAMS.items():
+        bridge.open_outlet(f"stimrig-{part}", *described)
     texts = [info.as_xml() for info in infos]
     assert [info.channel_count() for info in infos] == [2, 1, 1]
     assert "<label>torque_min</label>" in texts[0] and "N·m" in texts[0] and "stimrig-marks" in texts[2]
