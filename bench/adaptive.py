@@ -66,30 +66,26 @@ def unseen_percent(muscle: Any, predict: Callable[[Record], np.ndarray], seed: i
     return best_fit_percent(record.torque_nm, predict(record))
 
 
-def row(
-    muscle: Any, widths: np.ndarray, covered: tuple[bool, bool, float], unseen: float, **more: Any
-) -> dict[str, Any]:
+def row(muscle: Any, widths: np.ndarray, covered: tuple[bool, bool], unseen: float, **more: Any) -> dict[str, Any]:
     """One line of the results."""
     dose = float(np.sum(muscle.curve(widths))) / 40.0
-    curve, step, band = covered
     return {
         "seconds": widths.size / 40.0,
         "dose": dose,
-        "curve_covered": curve,
-        "step_covered": step,
-        "band_percent": band,
+        "curve_covered": covered[0],
+        "step_covered": covered[1],
         "unseen": unseen,
     } | more
 
 
-def covered_by(known: Knowledge, muscle: Any) -> tuple[bool, bool, float]:
-    """Whether the bands contain both true curves, and the largest half-width of f's, %."""
+def covered_by(known: Knowledge, muscle: Any) -> tuple[bool, bool]:
+    """Whether the bands contain both true curves."""
     away = np.abs(muscle.curve(known.curve.at) / known.plateau_nm - known.curve.value)
     beside = np.abs(muscle.step(known.step.at) - known.step.value)
-    return bool(np.all(away <= known.curve.half)), bool(np.all(beside <= known.step.half)), known.curve.percent
+    return bool(np.all(away <= known.curve.half)), bool(np.all(beside <= known.step.half))
 
 
-def covered_by_model(model: Model, muscle: Any) -> tuple[bool, bool, float]:
+def covered_by_model(model: Model, muscle: Any) -> tuple[bool, bool]:
     """The same of a model's own whole bands."""
     curve, step = model.bands["recruitment"], model.bands["step_response"]
     true = muscle.curve(np.asarray(curve["pulse_width_us"]))
@@ -97,8 +93,7 @@ def covered_by_model(model: Model, muscle: Any) -> tuple[bool, bool, float]:
     first = np.all((curve["whole_lower"] - slack <= true) & (true <= curve["whole_upper"] + slack))
     true_step = muscle.step(np.asarray(step["time_s"]))
     second = np.all((step["whole_lower"] - 1e-6 <= true_step) & (true_step <= step["whole_upper"] + 1e-6))
-    half = np.max(np.asarray(curve["whole_upper"]) - curve["value"])
-    return bool(first), bool(second), 100.0 * float(half / np.max(true))
+    return bool(first), bool(second)
 
 
 def fixed(muscle: Muscle, test: tuple[np.ndarray, list[str]], noise: np.ndarray, seed: int) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Black boxes in the manner of the well-known toolbox and of recent papers, plain: numpy and scipy alone.
 
 Each fits the rows that may be fitted and predicts all rows in free run, from the inputs and the fitted rows at the
-begin of each part. Their settings are fixed for all tasks; where they choose, they choose on fitted rows.
+begin. Their settings are fixed for all tasks; where they choose, they choose on fitted rows.
 """
 
 from __future__ import annotations
@@ -48,12 +48,6 @@ class Scaled:
         return float(fitted.mean()), float(fitted.std())
 
 
-def lagged(column: np.ndarray, parts: list[slice], lags: range) -> np.ndarray:
-    """Earlier values, shape (N, lags); before a part's begin its first value."""
-    at = np.concatenate([np.maximum(np.arange(p.stop - p.start)[:, None] - lags, 0) + p.start for p in parts])
-    return column[at]
-
-
 def several(fits: Iterator[tuple[float, np.ndarray]]) -> np.ndarray:
     """The parameters of the start with the smallest cost, within the budget."""
     end = time.perf_counter() + BUDGET_S
@@ -70,18 +64,15 @@ def several(fits: Iterator[tuple[float, np.ndarray]]) -> np.ndarray:
 IN_KNOTS, OUT_KNOTS = np.linspace(0.0, 1.0, 9), np.linspace(-3.0, 3.0, 7)
 
 
-def _hammerstein_wiener(x: np.ndarray, order: int, u: np.ndarray, parts: list[slice]) -> np.ndarray:
-    """x: values at the knots of the input and of the output, rates, numerator, and levels before the begins."""
+def _hammerstein_wiener(x: np.ndarray, order: int, u: np.ndarray) -> np.ndarray:
+    """x: values at the knots of the input and of the output, rates, numerator, and the level before the begin."""
     shape_in, shape_out = x[: IN_KNOTS.size], x[IN_KNOTS.size : IN_KNOTS.size + OUT_KNOTS.size]
     more = x[IN_KNOTS.size + OUT_KNOTS.size :]
     a = np.poly(_poles(more[:order]))
-    numerator, begins = more[order : 2 * order], more[2 * order :]
+    numerator, begin = more[order : 2 * order], more[2 * order]
     b = np.r_[0.0, 1.0 - numerator[1:].sum(), numerator[1:]] * a.sum()
     drive = np.interp(u, IN_KNOTS, shape_in)
-    rest = lfilter_zi(b, a)
-    linear = np.concatenate(
-        [lfilter(b, a, drive[p], zi=rest * (drive[p.start] + off))[0] for p, off in zip(parts, begins, strict=True)]
-    )
+    linear = lfilter(b, a, drive, zi=lfilter_zi(b, a) * (drive[0] + begin))[0]
     inner = np.interp(linear, OUT_KNOTS, shape_out)
     slopes = (shape_out[1] - shape_out[0], shape_out[-1] - shape_out[-2])
     below, above = np.minimum(linear - OUT_KNOTS[0], 0.0), np.maximum(linear - OUT_KNOTS[-1], 0.0)
@@ -99,19 +90,19 @@ def _poles(x: np.ndarray) -> np.ndarray:
 def hammerstein_wiener(task: Task) -> Predict:
     """`nlhw`: orders two and three, from three speeds each; the one with the smallest error and cost of parameters."""
     scaled = Scaled(task)
-    u, y, parts, fitted = scaled.u, scaled.y, task.parts, task.fitted
+    u, y, fitted = scaled.u, scaled.y, task.fitted
     top = float(np.percentile(y[fitted], 98))
 
     def simulate(x: np.ndarray, order: int) -> np.ndarray:
-        return _hammerstein_wiener(x, order, u, parts)
+        return _hammerstein_wiener(x, order, u)
 
     def fits() -> Iterator[tuple[float, np.ndarray]]:
         for lag in (4.0, 15.0, 1.5):
             for order in (2, 3):
                 inner = y.min() + (top - y.min()) * IN_KNOTS
                 poles = np.r_[-np.log(lag), 0.0, np.log(0.5)][:order]
-                start = np.r_[inner, OUT_KNOTS, poles, np.zeros(order), np.zeros(len(parts))]
-                tie = np.r_[np.full(start.size - len(parts), 1e-2), np.full(len(parts), 0.1)]
+                start = np.r_[inner, OUT_KNOTS, poles, np.zeros(order), 0.0]
+                tie = np.r_[np.full(start.size - 1, 1e-2), 0.1]
 
                 def residual(x: np.ndarray, order: int = order, start: np.ndarray = start, tie=tie) -> np.ndarray:
                     return np.r_[(simulate(x, order) - y)[fitted], tie * (x - start)]
@@ -138,7 +129,7 @@ def gaussian_process(task: Task) -> Predict:
     """
     scaled = Scaled(task)
     y, fitted = scaled.y, np.flatnonzero(task.fitted)
-    past = lagged(scaled.u, task.parts, range(EDGES[-1] + 1))
+    past = scaled.u[np.maximum(np.arange(y.size)[:, None] - np.arange(EDGES[-1] + 1), 0)]
     x = np.stack([past[:, a : max(b, a + 1)].mean(axis=1) for a, b in pairwise(EDGES)], axis=1)
     some = fitted[np.linspace(0, fitted.size - 1, min(SEARCHED, fitted.size)).astype(int)]
 

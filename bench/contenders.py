@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from unittest import mock
 
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.optimize import least_squares
 
 from bench.black_boxes import gaussian_process, hammerstein_wiener
-from bench.tasks import OWN_EFFECTS, Task
+from bench.tasks import Task
 from stimrig import identify
 from tests.harness.muscle import second_order, sigmoid
 
 SPLINES = 8
-SHORTEST = 5
-"""Rows from which a state can be learnt."""
 
 
 class Passes(Exception):
@@ -54,19 +50,6 @@ def ours_improved(task: Task) -> Callable[[], np.ndarray]:
     return lambda: identify.predict(model, task.record)
 
 
-def ours_with_own_effect(task: Task) -> Callable[[], np.ndarray]:
-    """With an effect from a file of one's own, of physics that the library doesn't hold.
-
-    Of several curves the one with the smallest free-run error on the fitted rows.
-    """
-    if not task.own:
-        raise Passes("no effect of its own")
-    with mock.patch.dict(os.environ, STIMRIG_EFFECTS_DIR=str(OWN_EFFECTS)):
-        tried = [identify.predict(identify.fit(task.record, **options), task.record) for options in task.own]
-    errors = [np.mean((predicted - task.record.torque_nm)[task.fitted] ** 2) for predicted in tried]
-    return lambda: tried[int(np.argmin(errors))]
-
-
 def oracle(task: Task) -> Callable[[], np.ndarray]:
     """scipy's least squares on the five true parameters, from a start that is 20 % off."""
     if not task.true:
@@ -84,26 +67,18 @@ def oracle(task: Task) -> Callable[[], np.ndarray]:
     return lambda: simulate(found.x)
 
 
-def longest(task: Task) -> slice:
-    """The longest stretch that may be fitted."""
-    return max(task.stretches, key=lambda rows: rows.stop - rows.start)
-
-
 def sippy(task: Task) -> Callable[[], np.ndarray]:
-    """N4SID of order 2 on the PRBS (or the longest stretch), then the spline by least squares through what it found.
+    """N4SID of order 2 on the PRBS, then the spline by least squares through what it found.
 
     With the splines as inputs of one N4SID it runs away: two levels of a PRBS don't excite ten inputs.
     """
     from sippy_unipi import system_identification
 
     names = np.array(task.record.segment_names)[task.record.segment]
-    rows = slice(0, int(np.flatnonzero(names == "prbs")[-1]) + 1) if "prbs" in names else longest(task)
+    rows = slice(0, int(np.flatnonzero(names == "prbs")[-1]) + 1)
     level = task.record.pulse_width_us[rows] / np.max(task.record.pulse_width_us)
     measured = task.record.torque_nm
-    offsets = (0.0, 0.0) if "prbs" in names else (measured[rows].mean(), level.mean())
-    found = system_identification(
-        (measured[rows] - offsets[0])[None], (level - offsets[1])[None], "N4SID", SS_fixed_order=2, SS_A_stability=True
-    )
+    found = system_identification(measured[rows][None], level[None], "N4SID", SS_fixed_order=2, SS_A_stability=True)
 
     def respond(columns: np.ndarray) -> np.ndarray:
         state, response = np.zeros((2, columns.shape[1])), np.empty_like(columns)
@@ -112,16 +87,13 @@ def sippy(task: Task) -> Callable[[], np.ndarray]:
             state = found.A @ state + found.B * u
         return response
 
-    inputs = spline_inputs(task)
-    columns = np.concatenate([respond(inputs[part]) for part in task.parts])
-    if len(task.parts) > 1:
-        columns = np.c_[columns, np.ones(len(columns))]
+    columns = respond(spline_inputs(task))
     weights = np.linalg.lstsq(columns[task.fitted], measured[task.fitted], rcond=None)[0]
     return lambda: columns @ weights
 
 
 def jax_sysid(task: Task) -> Callable[[], np.ndarray]:
-    """Two states, spline inputs, L-BFGS; each part begins where its first fitted rows say."""
+    """Two states, spline inputs, L-BFGS."""
     import jax
     from jax_sysid.models import LinearModel
 
@@ -132,32 +104,17 @@ def jax_sysid(task: Task) -> Callable[[], np.ndarray]:
     model = LinearModel(2, 1, SPLINES, feedthrough=False)
     model.loss(rho_x0=1e-3, rho_th=1e-9)
     model.optimization(adam_epochs=0, lbfgs_epochs=3000, iprint=-1)
-    used = [rows for rows in task.stretches if rows.stop - rows.start > 2 * SHORTEST] if len(task.parts) > 1 else []
-    if used:
-        model.fit([measured[rows] for rows in used], [inputs[rows] for rows in used])
-    else:
-        model.fit(measured[longest(task)], inputs[longest(task)])
-
-    def begin(part: slice) -> np.ndarray:
-        rows = next((rows for rows in task.stretches if rows.start == part.start), part)
-        if len(task.parts) == 1 or rows.stop - rows.start < SHORTEST:
-            return np.zeros((2, 1))
-        return np.asarray(model.learn_x0(inputs[rows], measured[rows], rho_x0=1e-6)).reshape(2, 1)
-
-    def run() -> np.ndarray:
-        parts = [model.predict(begin(part), inputs[part])[0] for part in task.parts]
-        return np.concatenate([np.asarray(part).ravel() for part in parts]) * scale
-
-    return run
+    model.fit(measured[task.longest], inputs[task.longest])
+    return lambda: np.asarray(model.predict(np.zeros((2, 1)), inputs)[0]).ravel() * scale
 
 
 def sysidentpy(task: Task) -> Callable[[], np.ndarray]:
-    """FROLS on spline inputs with extended least squares, scored in free run from each part's first samples."""
+    """FROLS on spline inputs with extended least squares, scored in free run from the first samples."""
     from sysidentpy.basis_function import Polynomial
     from sysidentpy.model_structure_selection import FROLS
     from sysidentpy.parameter_estimation import LeastSquares
 
-    inputs, rows, measured = spline_inputs(task), longest(task), task.record.torque_nm[:, None]
+    inputs, rows, measured = spline_inputs(task), task.longest, task.record.torque_nm[:, None]
     model = FROLS(
         ylag=2,
         xlag=[[1, 2]] * SPLINES,
@@ -169,20 +126,13 @@ def sysidentpy(task: Task) -> Callable[[], np.ndarray]:
         model_type="NARMAX",
     )
     model.fit(X=inputs[rows], y=measured[rows])
-
-    def run() -> np.ndarray:
-        firsts = [measured[part][: model.max_lag] for part in task.parts]
-        parts = [model.predict(X=inputs[part], y=first) for part, first in zip(task.parts, firsts, strict=True)]
-        return np.concatenate([np.asarray(part).ravel() for part in parts])
-
-    return run
+    return lambda: np.asarray(model.predict(X=inputs, y=measured[: model.max_lag])).ravel()
 
 
 CONTENDERS = (
     Contender("oracle", "scipy, the 5 true parameters", oracle, fine=True),
     Contender("ours, plain", "identify, the default", ours, fine=True),
     Contender("ours, improve", "effects of the library", ours_improved),
-    Contender("ours, own effect", "an effect of one's own, in one file", ours_with_own_effect),
     Contender("ours, two-stage", "identify, the paper's method", partial(ours, method="two-stage"), fine=True),
     Contender("ours, narx", "identify's polynomial NARX by FROLS", partial(ours, method="narx")),
     Contender("SIPPY", "sippy_unipi, N4SID on the PRBS + spline", sippy, fine=True),

@@ -155,9 +155,7 @@ def judged(arm: ArmPatient, model: Model, unseen: dict[str, Any]) -> dict[str, A
         found[name] = {
             "rms": float(np.sqrt(np.mean(error**2))) / scale,
             "p95": float(np.percentile(np.abs(error), 95)) / scale,
-            "largest": float(np.max(np.abs(error))) / scale,
             "covered": float(np.mean(inside[seen])),
-            "half_width": float(np.median((known[f"{name}_upper{unit}"] - known[f"{name}{unit}"])[seen])) / scale,
         }
     error_nm = unseen["torque_nm"] - predict(model, as_record(unseen))
     # The sensor's zero of another day is not the model's.
@@ -182,8 +180,6 @@ def active_errors(arm: ArmPatient, model: Model, reference_rad: float) -> dict[s
     return {
         "f": float(np.sqrt(np.mean((model.recruitment(width_us) - f_nm) ** 2)) / np.ptp(f_nm)),
         "G": float(np.sqrt(np.mean((model.linear.step_response(time_s) - step) ** 2))),
-        "fit_percent": model.fit["fit_percent"],
-        "ceiling_percent": model.fit["ceiling_percent"],
     }
 
 

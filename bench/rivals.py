@@ -1,7 +1,7 @@
-"""`python -m bench rivals [--data FOLDER] [--only WORD,WORD]`: ours, peers, black boxes and the oracle, side by side.
+"""`python -m bench rivals [--only WORD,WORD]`: ours, peers, black boxes and the oracle, side by side.
 
 Task by contender: error in free run on rows that nobody fitted, and seconds of the fit. Each sees the same record, on
-the same machine, in the same run. A package that is not installed, or a record that is not at hand, is told so.
+the same machine, in the same run. A package that is not installed is told so.
 `--only` takes words of tasks or contenders; `--write` puts the table into docs/results/bench.md.
 """
 
@@ -11,7 +11,6 @@ import platform
 import time
 import warnings
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -19,10 +18,9 @@ from bench import black_boxes
 from bench.black_boxes import BUDGET_S
 from bench.common import RESULTS, parser, table, written_by
 from bench.contenders import CONTENDERS, Contender, Passes
-from bench.measured import Absent
 from bench.tasks import Task, makers
 from stimrig.identify.diagnosis import side_by_side
-from stimrig.identify.errors import BadRequest, IdentifyError
+from stimrig.identify.errors import IdentifyError
 
 SEED = 90_001
 """Nothing was developed on seeds from here on."""
@@ -46,8 +44,6 @@ def one(contender: Contender, task: Task, warm: bool) -> str:
         return "–"
     except ImportError as missing:
         return f"not installed ({missing.name})"
-    except BadRequest:
-        return "not for several parts"
     except (IdentifyError, ValueError, ArithmeticError, np.linalg.LinAlgError, IndexError) as failed:
         return f"failed ({type(failed).__name__}: {' '.join(str(failed).split())[:60]})"
     told = f"{error:.3g}" if error < RUNS_AWAY else "runs away"
@@ -60,20 +56,15 @@ def wanted(only: Sequence[str], name: str, names: Sequence[str]) -> bool:
     return not mine or any(word in name for word in mine)
 
 
-def measure(seed: int, data: Path | None, only: Sequence[str]) -> tuple[list[Contender], list[Row]]:
+def measure(seed: int, only: Sequence[str]) -> tuple[list[Contender], list[Row]]:
     """A row for each task."""
-    tasks = list(makers(seed, data))
+    tasks = list(makers(seed))
     chosen = [c for c in CONTENDERS if wanted(only, c.name, [c.name for c in CONTENDERS])]
     rows: list[Row] = []
     for name, make in tasks:
         if not wanted(only, name, [name for name, _ in tasks]):
             continue
-        try:
-            task = make()
-        except Absent as absent:
-            rows.append([name, str(absent), *[""] * len(chosen)])
-            print(f"{name}: {absent}", flush=True)
-            continue
+        task = make()
         rows.append([task.name, task.unit])
         for contender in chosen:
             rows[-1].append(one(contender, task, warm=len(rows) == 1 and black_boxes.BUDGET_S > 0))
@@ -83,23 +74,18 @@ def measure(seed: int, data: Path | None, only: Sequence[str]) -> tuple[list[Con
 
 def document(seed: int, chosen: Sequence[Contender], rows: Sequence[Row]) -> str:
     """docs/results/bench.md: a column for each task, since there are fewer of them."""
-    here = [row for row in rows if row[2]]
-    heads = ["", "what", *(f"{name}, {unit}" for name, unit, *_ in here)]
-    lines = [[c.name, c.what, *(row[2 + at] for row in here)] for at, c in enumerate(chosen)]
-    absent = [f"- {name}: {why}" for name, why, *rest in rows if not rest[0]]
+    heads = ["", "what", *(f"{name}, {unit}" for name, unit, *_ in rows)]
+    lines = [[c.name, c.what, *(row[2 + at] for row in rows)] for at, c in enumerate(chosen)]
     machine = f"Machine: {platform.processor() or platform.machine()}, Python {platform.python_version()}."
     return "\n".join(["# Identification beside its rivals", "", written_by("python -m bench rivals"), INTRO,
-                      f"Seed {seed}. {machine}", "", *table(heads, lines), "", *absent, "", NOTES])  # fmt: skip
+                      f"Seed {seed}. {machine}", "", *table(heads, lines), "", NOTES])  # fmt: skip
 
 
 INTRO = """One run, one core, the same records. Root mean square in free run on rows that nobody fitted, and the seconds
 of one fit. Of simulated muscles it counts in standard deviations of the white noise, which is in the measured torque: 1
 is all that can be predicted. The paper's muscle: PRBS of 15.9 s and ramp of 10 s with rests, then a multi-level input.
 The emulator's: a test of 47 s, with nothing or one thing hidden, or of a muscle of other physics. As of an arm: the
-last of four equal ramps, in errors of the mean of the others. Frogs: the last tetanus of an animal from those before
-it. Cascaded tanks: the second run, from its 51st sample on (published: 0.191 V grey-box, 0.306 V CT-SUBNET, 0.396 V
-GRU). Coupled drives: 200 samples of each run after 300 that were fitted (published, in another split: 0.115 and 0.074
-ticks/s)."""
+last of four equal ramps, in errors of the mean of the others."""
 NOTES = """The peers take the recruitment as eight spline inputs and choose memory in samples; at 1600 samples a second
 the same number of samples is a fortieth of the time. Ours works on the grid of pulses, at any sampling rate. The black
 boxes have fixed settings and choose on fitted rows alone; who tunes them for one task will find better ones.
@@ -110,7 +96,6 @@ def run(arguments: Sequence[str] | None = None) -> None:
     """Measure, and print the table."""
     made = parser(__doc__)
     made.prog = "python -m bench rivals"
-    made.add_argument("--data", type=Path, help="folder of local copies, see bench/measured")
     made.add_argument("--only", default="", help="words of tasks or contenders, separated by commas")
     made.add_argument(
         "--budget", type=float, default=BUDGET_S, help="s in which a box looks for better starts; 0: one, cold"
@@ -120,7 +105,7 @@ def run(arguments: Sequence[str] | None = None) -> None:
     options = made.parse_args(arguments)
     warnings.filterwarnings("ignore")
     black_boxes.BUDGET_S, side_by_side.WORKERS = options.budget, 1
-    text = document(options.seed, *measure(options.seed, options.data, [w for w in options.only.split(",") if w]))
+    text = document(options.seed, *measure(options.seed, [w for w in options.only.split(",") if w]))
     print(text)
     if options.write:
         TARGET.write_text(text)

@@ -104,7 +104,6 @@ class Simulated:
         self.record: Record | None = None
         self.served: list[dict[str, Any]] = []
         self.seconds: list[float] = []
-        self.gains: list[float] = []
 
     def play(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A trial with its rests, after the rest before it."""
@@ -112,7 +111,6 @@ class Simulated:
         before, after = round(ilc.BEFORE_S * ilc.PULSE_RATE_HZ), round(ilc.AFTER_S * ilc.PULSE_RATE_HZ)
         names = ["rest"] * before + ["trial"] * widths_us.size + ["rest"] * after
         self.record = self.person.play(np.r_[np.zeros(before), widths_us, np.zeros(after)], names)
-        self.gains.append(float(getattr(self.person.muscle, "gain", 1.0)))
         torque = self.record.torque_nm.reshape(-1, PER)
         baseline_nm = torque[round(0.3 * before) : before].mean()
         return torque[before : before + widths_us.size].mean(axis=1) - baseline_nm, widths_us
@@ -150,10 +148,8 @@ def session(person: Person, model: Model, reference: ilc.Reference, tracked: boo
     return {
         "who": TRACKED if tracked else UNTRACKED,
         "errors": [trial.error_percent for trial in done],
-        "gains": service.gains,
         "seconds": service.seconds,
         "moves": moves(service.served),
-        "outcomes": [served.get("outcome") for served in service.served],
     }
 
 

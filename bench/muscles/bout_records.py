@@ -2,8 +2,7 @@
 
 The muscle has two parallel ways, quick and slow, each with its own recruitment curve and two equal lags in a row, so
 that twitches and short bouts look fast and ramps slow: no single second-order model describes both. Twitches, short
-bouts, a PRBS, short bouts again, then four equal slow ramps; the last ramp is `validate`. What each peculiarity does
-can be seen without it: every one has a switch, and switching one leaves the draws of the others as they are.
+bouts, a PRBS, short bouts again, then four equal slow ramps; the last ramp is `validate`.
 
 Seeds 0 to 99 are for development; reported figures use seeds from 1000.
 """
@@ -30,44 +29,12 @@ QUICK_SHARE = (0.35, 0.65)
 SPREAD_NM = (0.03, 1.0)
 """Standard deviation of the torque that stimulation makes: as small as on arms."""
 READ_HZ = (20.0, 45.0)
-RAMPS, IDLE_US = 4, 20.0
+RAMPS = 4
 BOUT_VARIES, LATER_US = 0.05, 1.0
 """Between bouts: a factor's standard deviation, and by how many µs the threshold moves."""
 WEAKER = (0.7, 0.9)
 WEAKER_IN = 0.15
 """Share of the records whose last bout is weaker."""
-
-
-@dataclass(frozen=True)
-class Peculiar:
-    """What a record has of an arm's; without any, a plain muscle's with a little white noise.
-
-    Parameters
-    ----------
-    held : bool
-        The converter repeats each reading, read at 20 to 45 Hz, until the next.
-    jumps : bool
-        The reading jumps now and then and creeps back, with heavy tails, in place of white noise of 2 % of the spread.
-    wander : bool
-        The zero is a random walk, six times as quick (in variance) between bouts as in them.
-    weaker : bool or None
-        The last bout has 0.7 to 0.9 of its strength; None: in one of seven records.
-    two_ways : bool
-        The quick way and the slow one; otherwise one way of second order with the time constant between them.
-    varied : bool
-        Every bout has its own strength (5 %) and threshold (1 µs).
-    idle : bool
-        Between bouts pulses go on below threshold, so that no row of the record has a width of 0. Not in the records
-        that are otherwise made: then nothing but these rows tells zero from plateau.
-    """
-
-    held: bool = True
-    jumps: bool = True
-    wander: bool = True
-    weaker: bool | None = None
-    two_ways: bool = True
-    varied: bool = True
-    idle: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,15 +49,8 @@ class Bouts:
     bout: np.ndarray
 
 
-def record_of_bouts(seed: int, peculiar: Peculiar | None = None) -> dict[str, Any]:
-    """One record.
-
-    Parameters
-    ----------
-    seed
-        Decides every random number.
-    peculiar
-        What of an arm's it has; None: everything.
+def record_of_bouts(seed: int) -> dict[str, Any]:
+    """The record of this seed.
 
     Returns
     -------
@@ -98,27 +58,23 @@ def record_of_bouts(seed: int, peculiar: Peculiar | None = None) -> dict[str, An
         `time_s`, `pulse_width_us`, `torque_nm`, `segment`, shape (n,), at 400, 800 or 1000 Hz; `bout`, the number of
         the bout of each row, and `clean_nm`, the muscle's torque alone, which a method must not see; and `truth`.
     """
-    peculiar = peculiar or Peculiar()
     rng = rng_of(seed, "bouts")
     rate_hz = int(rng.choice(RATES_HZ))
     largest_us = int(rng.integers(200, 401))
     bouts = draw_bouts(rng_of(seed, "bouts", "design"), float(largest_us))
-    sent_us = np.where(bouts.width_us > 0.0, bouts.width_us, IDLE_US if peculiar.idle else 0.0)
     repeated = rate_hz // PULSES_PER_S
-    clean_nm, muscle = _muscle_nm(seed, peculiar, bouts, largest_us, rate_hz)
+    clean_nm, muscle = _muscle_nm(seed, bouts, largest_us, rate_hz)
     working = np.repeat(bouts.width_us > 0.0, repeated)
-    added_nm, sensor = _disturbed_nm(seed, peculiar, working, muscle["spread_nm"], rate_hz)
-    reading_nm = clean_nm + added_nm
-    if peculiar.held:
-        reading_nm, sensor["read_hz"] = _held(rng_of(seed, "bouts", "converter"), reading_nm, rate_hz)
+    added_nm, sensor = _disturbed_nm(seed, working, muscle["spread_nm"], rate_hz)
+    reading_nm, sensor["read_hz"] = _held(rng_of(seed, "bouts", "converter"), clean_nm + added_nm, rate_hz)
     return {
         "time_s": np.arange(clean_nm.size) / rate_hz,
-        "pulse_width_us": np.repeat(sent_us, repeated),
+        "pulse_width_us": np.repeat(bouts.width_us, repeated),
         "torque_nm": reading_nm,
         "segment": np.repeat(bouts.segment, repeated),
         "bout": np.repeat(bouts.bout, repeated),
         "clean_nm": clean_nm,
-        "truth": {"seed": seed, "rate_hz": rate_hz, "muscle": muscle, "sensor": sensor, "peculiar": vars(peculiar)},
+        "truth": {"seed": seed, "rate_hz": rate_hz, "muscle": muscle, "sensor": sensor},
     }
 
 
@@ -143,27 +99,20 @@ def draw_bouts(rng: Generator, top_us: float) -> Bouts:
     return Bouts(np.round(np.concatenate(widths)), np.concatenate(segments), np.concatenate(numbers))
 
 
-def _muscle_nm(
-    seed: int, peculiar: Peculiar, bouts: Bouts, largest_us: int, rate_hz: int
-) -> tuple[Floats, dict[str, Any]]:
+def _muscle_nm(seed: int, bouts: Bouts, largest_us: int, rate_hz: int) -> tuple[Floats, dict[str, Any]]:
     """The muscle's torque at every sample, N·m, and what was drawn."""
     rng, variation = rng_of(seed, "bouts", "muscle"), rng_of(seed, "bouts", "variation")
     last = int(bouts.bout[-1])
-    gain, later_us = np.ones(last + 1), np.zeros(last + 1)
-    if peculiar.varied:
-        gain = 1.0 + BOUT_VARIES * variation.standard_normal(last + 1)
-        later_us = LATER_US * variation.standard_normal(last + 1)
+    gain = 1.0 + BOUT_VARIES * variation.standard_normal(last + 1)
+    later_us = LATER_US * variation.standard_normal(last + 1)
     chance, size = rng.random(), float(rng.uniform(*WEAKER))
-    weaker = size if (chance < WEAKER_IN if peculiar.weaker is None else peculiar.weaker) else 1.0
+    weaker = size if chance < WEAKER_IN else 1.0
     gain[last] *= weaker
     quick_s, slow_s = (float(np.exp(rng.uniform(*np.log(bounds)))) for bounds in (QUICK_S, SLOW_S))
     share = float(rng.uniform(*QUICK_SHARE))
-    ways = [(share, quick_s), (1.0 - share, slow_s)]
-    if not peculiar.two_ways:
-        ways = [(1.0, math.sqrt(quick_s * slow_s))]
     felt_us = np.where(bouts.width_us > 0.0, np.maximum(bouts.width_us - later_us[bouts.bout], 0.0), 0.0)
     torque, shapes = np.zeros(felt_us.size * (rate_hz // PULSES_PER_S)), []
-    for part, tau_s in ways:
+    for part, tau_s in ((share, quick_s), (1.0 - share, slow_s)):
         shape, table, _, own_largest_us = recruitment.draw(rng, False, TABLE_SIZE)
         share_of_top = np.interp(felt_us * own_largest_us / largest_us, np.arange(TABLE_SIZE), table)
         drive = part * share_of_top / table[own_largest_us] * gain[bouts.bout]
@@ -172,8 +121,8 @@ def _muscle_nm(
     spread_nm = float(np.exp(rng.uniform(*np.log(SPREAD_NM))))
     before = np.repeat(bouts.bout < last, rate_hz // PULSES_PER_S)  # so that a weaker last bout changes no other
     size_nm = spread_nm / float(np.std(torque[before])) * float(rng.choice([-1.0, 1.0]))
-    told = {"spread_nm": spread_nm, "size_nm": size_nm, "weaker": weaker, "tau_s": [tau for _, tau in ways]}
-    return size_nm * torque, told | {"shares": [part for part, _ in ways], "recruitment": shapes}
+    told = {"spread_nm": spread_nm, "size_nm": size_nm, "weaker": weaker, "tau_s": [quick_s, slow_s]}
+    return size_nm * torque, told | {"shares": [share, 1.0 - share], "recruitment": shapes}
 
 
 def _two_lags(drive: Floats, tau_s: float, rate_hz: int) -> Floats:
@@ -185,29 +134,24 @@ def _two_lags(drive: Floats, tau_s: float, rate_hz: int) -> Floats:
     return np.asarray(lfilter([0.0, first, second], [1.0, -2.0 * pole, pole * pole], drive))
 
 
-def _disturbed_nm(
-    seed: int, peculiar: Peculiar, working: np.ndarray, spread_nm: float, rate_hz: int
-) -> tuple[Floats, dict[str, Any]]:
-    """What the sensor adds at every sample, N·m: noise or jumps, and the zero."""
+def _disturbed_nm(seed: int, working: np.ndarray, spread_nm: float, rate_hz: int) -> tuple[Floats, dict[str, Any]]:
+    """What the sensor adds at every sample, N·m: jumps that creep back, and the zero."""
     count = working.size
     rng = rng_of(seed, "bouts", "noise")
-    added = rng.normal(0.0, 0.02 * spread_nm, count)
-    told: dict[str, Any] = {"white_nm": 0.02 * spread_nm}
-    if peculiar.jumps:
-        per_s, creep_s = float(rng.uniform(0.4, 1.5)), float(rng.uniform(0.3, 3.0))
-        size_nm = spread_nm * float(rng.uniform(0.04, 0.1))
-        jump = np.where(rng.random(count) < per_s / rate_hz, rng.standard_t(2.5, count), 0.0) * size_nm
-        added = np.asarray(lfilter([1.0], [1.0, -math.exp(-1.0 / (rate_hz * creep_s))], jump))
-        told = {"white_nm": 0.0, "jumps_per_s": per_s, "creep_s": creep_s, "jump_nm": size_nm}
-    if peculiar.wander:
-        rng = rng_of(seed, "bouts", "zero")
-        speed_nm = spread_nm * float(np.exp(rng.uniform(*np.log((0.003, 0.015)))))
-        steps = rng.standard_normal(count) * np.where(working, 1.0, math.sqrt(6.0)) * speed_nm / math.sqrt(rate_hz)
-        # an arm settles over tenths of a second: a walk of its speed, not of white steps
-        added = added + np.cumsum(lfilter([1.0 - math.exp(-3.0 / rate_hz)], [1.0, -math.exp(-3.0 / rate_hz)], steps))
-        told["zero_nm_per_root_s"] = speed_nm
+    rng.standard_normal(count)  # drawn and left: the numbers below stay those of earlier figures
+    per_s, creep_s = float(rng.uniform(0.4, 1.5)), float(rng.uniform(0.3, 3.0))
+    size_nm = spread_nm * float(rng.uniform(0.04, 0.1))
+    jump = np.where(rng.random(count) < per_s / rate_hz, rng.standard_t(2.5, count), 0.0) * size_nm
+    added = lfilter([1.0], [1.0, -math.exp(-1.0 / (rate_hz * creep_s))], jump)
+    rng = rng_of(seed, "bouts", "zero")
+    speed_nm = spread_nm * float(np.exp(rng.uniform(*np.log((0.003, 0.015)))))
+    # the zero walks six times as quick (in variance) between bouts as in them
+    steps = rng.standard_normal(count) * np.where(working, 1.0, math.sqrt(6.0)) * speed_nm / math.sqrt(rate_hz)
+    # an arm settles over tenths of a second: a walk of its speed, not of white steps
+    added = added + np.cumsum(lfilter([1.0 - math.exp(-3.0 / rate_hz)], [1.0, -math.exp(-3.0 / rate_hz)], steps))
     offset_nm = spread_nm * float(rng_of(seed, "bouts", "offset").normal(0.0, 2.0))
-    return added + offset_nm, told | {"offset_nm": offset_nm}
+    drawn = {"jumps_per_s": per_s, "creep_s": creep_s, "jump_nm": size_nm, "zero_nm_per_root_s": speed_nm}
+    return added + offset_nm, drawn | {"offset_nm": offset_nm}
 
 
 def _held(rng: Generator, torque: Floats, rate_hz: int) -> tuple[Floats, float]:

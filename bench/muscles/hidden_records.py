@@ -17,7 +17,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.signal import lfilter
 
-from bench.muscles.outsiders_held_back import OUTSIDERS_HELD_BACK
+from bench.common import seed_range
 from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.design import UNRECORDED, Design, make_design
@@ -96,7 +96,6 @@ def generate(
         moving=moving,
         pulsed=pulsed,
         design=design,
-        more=OUTSIDERS_HELD_BACK,
         with_validate=with_validate,
     )
     sequence = scenario.design
@@ -196,11 +195,6 @@ def write_csv(record: dict[str, Any], path: str | Path) -> None:
     Path(path).write_text("\n".join(lines) + "\n")
 
 
-def _seeds(text: str) -> range:
-    first, _, last = text.partition(":")
-    return range(int(first), int(last)) if last else range(int(first), int(first) + 1)
-
-
 def _record_of(effect: str | None, strength: str, seed: int, settings: argparse.Namespace) -> dict[str, Any]:
     names = list(draw_pair(rng_of(seed, "pair"))) if effect == "pairs" else effect.split("+") if effect else None
     return generate(
@@ -220,7 +214,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Write a set of records and `truth.json`."""
     parser = argparse.ArgumentParser(prog="python -m bench.muscles.hidden_records", description=main.__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder, made if absent")
-    parser.add_argument("--seeds", type=_seeds, default=range(1), help="first:last, last not included")
+    parser.add_argument("--seeds", type=seed_range, default=range(1), help="first:last, last not included")
     parser.add_argument(
         "--effects",
         default="all",

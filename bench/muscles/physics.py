@@ -2,7 +2,7 @@
 
 `PHYSICS` are those of the yardstick, `FURTHER` come from elsewhere in the literature; `physics_places` has those of
 other places than the muscle. Nothing here is fitted to a measured muscle: numbers lie about those of the papers, slowed
-where a whole arm is slower than a fibre. `sarcomere_chain` and `closed_space` were once sealed, under other names.
+where a whole arm is slower than a fibre.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Muscles whose departure from the plain structure lies elsewhere: in spinal cord, axons, electrode or fixture.
 
-As `physics`; the muscle itself is two lags. From `worn_reflex` on they were once sealed, under other names.
+As `physics`; the muscle itself is two lags.
 """
 
 from __future__ import annotations

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from importlib import import_module
 from pkgutil import iter_modules
-from types import MappingProxyType
 
 from stimrig.hardware_sim.hidden import effects
 from stimrig.hardware_sim.hidden.forms import Effect, Form
@@ -22,8 +20,8 @@ MOVING = frozenset(name for name, effect in EFFECTS.items() if effect.moving)
 STILL = [name for name in EFFECTS if name not in MOVING]
 
 
-def find_effect(name: str, more: Mapping[str, Effect] = MappingProxyType({})) -> Effect:
-    """Return the effect of this name; `more` holds effects beside those of this package.
+def find_effect(name: str) -> Effect:
+    """Return the effect of this name.
 
     Raises
     ------
@@ -31,7 +29,7 @@ def find_effect(name: str, more: Mapping[str, Effect] = MappingProxyType({})) ->
         There is none.
     """
     try:
-        return {**EFFECTS, **OUTSIDERS, **more}[name]
+        return {**EFFECTS, **OUTSIDERS}[name]
     except KeyError:
         raise ValueError(f"effect {name!r}: one of {', '.join((*EFFECTS, *OUTSIDERS))}") from None
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -80,13 +78,11 @@ def draw_scenario(
     moving: bool = False,
     pulsed: bool = False,
     design: str = "full",
-    more: Mapping[str, Effect] = MappingProxyType({}),
     **design_settings: Any,
 ) -> Scenario:
     """A scenario with the effects `names`, each of the given strength on its own.
 
-    Bases, formulations and magnitudes are drawn until the strength's band is reached. `more` holds effects beside those
-    of this package.
+    Bases, formulations and magnitudes are drawn until the strength's band is reached.
 
     Raises
     ------
@@ -95,7 +91,7 @@ def draw_scenario(
     """
     if strength not in BANDS:
         raise ValueError(f"strength {strength!r}: one of {', '.join(BANDS)}")
-    effects = [(name, find_effect(name, more)) for name in names]
+    effects = [(name, find_effect(name)) for name in names]
     moving = moving or bool(MOVING & set(names))
     for attempt in range(ATTEMPTS):
         rng = rng_of(seed, *names, strength, str(attempt))

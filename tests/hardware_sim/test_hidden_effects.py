@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from bench.muscles.outsiders_held_back import OUTSIDERS_HELD_BACK
 from stimrig.hardware_sim.hidden.base import Base, draw_base
 from stimrig.hardware_sim.hidden.chain import Chain, combine, simulate
 from stimrig.hardware_sim.hidden.design import make_design
@@ -21,7 +20,7 @@ pytestmark = pytest.mark.slow
 
 STEP_S = 1.0 / 1600.0
 NOISE_SD_NM = 0.04
-KNOWN = {**EFFECTS, **OUTSIDERS, **OUTSIDERS_HELD_BACK}
+KNOWN = {**EFFECTS, **OUTSIDERS}
 NAMES = list(KNOWN)
 ALL = [(effect, index) for effect in NAMES for index in range(len(find_forms(KNOWN[effect])))]
 # noise drawn at each step, or a moment that is rounded to a step and changes all that follows
@@ -30,7 +29,7 @@ RANDOM_BY_STEP = {
     ("mains_hum", "the grid's frequency wanders"),
 }
 """Single formulations of the same kind: effect and the formulation's name."""
-BY_STEP = {"tremor", "delay_jitter", "stick_slip", "slow_converter", "clonus", "kind_b"}
+BY_STEP = {"tremor", "delay_jitter", "stick_slip", "slow_converter", "clonus"}
 
 
 def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
@@ -82,7 +81,7 @@ SOME = {(0, ("weak", KEPT_BACK)), (3, ("strong", DEVELOPMENT))}
     ],
 )
 def test_strength_lands_in_its_band(effect: str, strength: str, seed: int) -> None:
-    scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM, more=OUTSIDERS_HELD_BACK)
+    scenario = draw_scenario((effect,), strength, seed, noise_sd_nm=NOISE_SD_NM)
     low, high = BANDS[strength]
     assert low <= scenario.hidden[0].excess["counted_nm"] / NOISE_SD_NM <= high
     torque = simulate(scenario.base, scenario.stages(), scenario.design, STEP_S)
