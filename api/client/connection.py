@@ -121,26 +121,8 @@ class Connection:
     def request(self, method: str, path: str, **more: Any) -> httpx.Response:
         """Send a request, once. `more` goes to httpx: `json`, `params`, `content`, `headers`, `timeout`.
 
-        Parameters
-        ----------
-        method : str
-            As "GET".
-        path : str
-            Path of the service, as "/v1/rig".
-        **more
-            For httpx.
-
-        Returns
-        -------
-        httpx.Response
-            With a status of success, or 304.
-
-        Raises
-        ------
-        Unreachable
-            There was no answer.
-        Refused
-            The answer is a problem. Its class tells the status: `NotFound`, `Conflict`, `Invalid`, …
+        The answer has a status of success, or 304. Raises Unreachable: there was no answer. Raises Refused: the answer
+        is a problem; its class tells the status: `NotFound`, `Conflict`, `Invalid`, …
         """
         try:
             return _accepted(self.http.request(method, path, **more))
@@ -148,54 +130,15 @@ class Connection:
             raise self._unreachable(error) from error
 
     def get(self, path: str, **more: Any) -> Any:
-        """The JSON document at a path.
-
-        Parameters
-        ----------
-        path : str
-            Path of the service, as "/v1/rig".
-        **more
-            For httpx, as `params`.
-
-        Returns
-        -------
-        object
-        """
+        """The JSON document at a path, as "/v1/rig"."""
         return self.request("GET", path, **more).json()
 
     def post(self, path: str, **more: Any) -> Any:
-        """Send, and return the JSON document of the answer.
-
-        Parameters
-        ----------
-        path : str
-            Path of the service, as "/v1/rig".
-        **more
-            For httpx, as `json`.
-
-        Returns
-        -------
-        object
-        """
+        """Send, and return the JSON document of the answer."""
         return self.request("POST", path, **more).json()
 
     def messages(self, path: str) -> Iterator[dict[str, Any]]:
-        """JSON messages of a WebSocket until the service closes it.
-
-        Parameters
-        ----------
-        path : str
-            Path of the service, as "/v1/rig".
-
-        Yields
-        ------
-        dict
-            Each message.
-
-        Raises
-        ------
-        Unreachable, Refused
-        """
+        """JSON messages of a WebSocket until the service closes it. Raises Unreachable or Refused."""
         address = self.url.replace("http", "ws", 1) + path
         try:
             with connect(address, additional_headers=self._headers, open_timeout=self.http.timeout.connect) as socket:

@@ -41,34 +41,17 @@ class Client(Connection):
     # ---- the service and its rig
 
     def health(self) -> dict[str, Any]:
-        """Whether the service and its rig answer; needs no token.
-
-        Returns
-        -------
-        dict
-        """
+        """Whether the service and its rig answer; needs no token."""
         return self.get("/health")
 
     def rig(self) -> dict[str, Any]:
-        """State, devices, newest torque and its age.
-
-        Returns
-        -------
-        dict
-        """
+        """State, devices, newest torque and its age."""
         return self.get("/v1/rig")
 
     def stop(self, reason: str = "") -> dict[str, Any]:
         """Stop stimulation. Returns only if the rig confirms that stimulation has stopped.
 
-        Parameters
-        ----------
-        reason : str
-            Why; it stands in the audit trail.
-
-        Returns
-        -------
-        dict
+        `reason` stands in the audit trail.
         """
         return self.post("/v1/stop", json={"reason": reason} if reason else {})
 
@@ -77,85 +60,32 @@ class Client(Connection):
         self.request("POST", "/v1/sessions/lock")
 
     def effects(self) -> list[dict[str, Any]]:
-        """The library of effects of the service.
-
-        Returns
-        -------
-        list of dict
-        """
+        """The library of effects of the service."""
         return self.get("/v1/effects")["effects"]
 
     def issue_token(self, name: str, scopes: Sequence[str]) -> str:
-        """A new token for a program; only an administrator may do this.
-
-        Parameters
-        ----------
-        name : str
-            What the program is called.
-        scopes : sequence of str
-            What it may do, as "read-model".
-
-        Returns
-        -------
-        str
-        """
+        """A new token for a program of this name, with scopes as "read-model"; only an administrator may do this."""
         return self.post("/v1/tokens", json={"name": name, "scopes": list(scopes)})["token"]
 
     # ---- participants
 
     def participants(self, q: str = "", archived: bool | None = None) -> list[Participant]:
-        """All participants, most recent first. `q`: a part of the code; `archived`: only those that are, or are not.
-
-        Parameters
-        ----------
-        q : str
-            A part of the code.
-        archived : bool, optional
-            True: only those in the archive; False: only the others.
-
-        Returns
-        -------
-        list of Participant
-        """
+        """All participants, most recent first. `q`: a part of the code; `archived`: only those that are, or are not."""
         given = {"q": q or None, "archived": archived}
         return self.get("/v1/participants", params={key: value for key, value in given.items() if value is not None})
 
     def participant(self, code: str) -> Participant:
-        """One participant with its limits.
-
-        Parameters
-        ----------
-        code : str
-            Code of the participant.
-
-        Returns
-        -------
-        Participant
-        """
+        """One participant with its limits."""
         return self.get(f"/v1/participants/{code}")
 
     def make_participant(
         self, code: str, profile: dict[str, float] | None = None, side: str | None = None, muscle: str | None = None,
         placement: str | None = None,
     ) -> Participant:  # fmt: skip
-        """Make a participant: a code, never a name.
+        """Make a participant: a code of letters, digits, - and _, never a name.
 
-        Parameters
-        ----------
-        code : str
-            Letters, digits, - and _.
-        profile : dict, optional
-            current_ma, max_pulse_width_us, max_torque_nm.
-        side : str, optional
-            "left" or "right".
-        muscle : str, optional
-            As "biceps brachii".
-        placement : str, optional
-            Of the electrodes; with side and muscle the site, to which models belong.
-
-        Returns
-        -------
-        Participant
+        `profile`: current_ma, max_pulse_width_us, max_torque_nm. `side` ("left" or "right"), `muscle` and `placement`
+        of the electrodes are the site, to which models belong.
         """
         more = {"profile": profile, "side": side, "muscle": muscle, "placement": placement}
         return self.post(
@@ -165,155 +95,47 @@ class Client(Connection):
     def set_muscle(
         self, code: str, side: str | None, muscle: str | None, placement: str | None = None
     ) -> Participant:  # fmt: skip
-        """Say which site is stimulated; refused where a calibration would be lost by it.
-
-        Parameters
-        ----------
-        code : str
-            Code of the participant.
-        side : str, optional
-            "left" or "right".
-        muscle : str, optional
-            As "biceps brachii".
-        placement : str, optional
-            Of the electrodes.
-
-        Returns
-        -------
-        Participant
-        """
+        """Say which site is stimulated, as in `make_participant`; refused where a calibration would be lost by it."""
         site = {"side": side, "muscle": muscle, "placement": placement}
         return self.request("PUT", f"/v1/participants/{code}/muscle", json=site).json()
 
     def archive(self, code: str) -> Participant:
-        """Put a participant into the archive: no test starts any more, and nothing is deleted.
-
-        Parameters
-        ----------
-        code : str
-            Code of the participant.
-
-        Returns
-        -------
-        Participant
-        """
+        """Put a participant into the archive: no test starts any more, and nothing is deleted."""
         return self.post(f"/v1/participants/{code}/archive")
 
     def unarchive(self, code: str) -> Participant:
-        """Take a participant out of the archive.
-
-        Parameters
-        ----------
-        code : str
-            Code of the participant.
-
-        Returns
-        -------
-        Participant
-        """
+        """Take a participant out of the archive."""
         return self.post(f"/v1/participants/{code}/unarchive")
 
     # ---- notes
 
     def notes(self, participant: str) -> list[Note]:
-        """The notes of a participant, newest first, the struck ones among them.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-
-        Returns
-        -------
-        list of Note
-        """
+        """The notes of a participant, newest first, the struck ones among them."""
         return self.get(f"/v1/participants/{participant}/notes")
 
     def add_note(self, participant: str, kind: str, text: str = "", **more: Any) -> Note:
-        """Write a note. `more`: `test_id`, and the time in that test as `at_s`, or `now=True` while it runs.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-        kind : str
-            Kind of the note.
-        text : str
-            What it says.
-        **more
-            `test_id`, and `at_s` or `now`.
-
-        Returns
-        -------
-        Note
-        """
+        """Write a note. `more`: `test_id`, and the time in that test as `at_s`, or `now=True` while it runs."""
         return self.post(f"/v1/participants/{participant}/notes", json={"kind": kind, "text": text, **more})
 
     def strike_note(self, participant: str, note_id: str) -> Note:
-        """Mark a note as wrong; it stays readable.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-        note_id : str
-            Id of the note.
-
-        Returns
-        -------
-        Note
-        """
+        """Mark a note as wrong; it stays readable."""
         return self.post(f"/v1/participants/{participant}/notes/{note_id}/strike")
 
     def ensure_participant(self, code: str) -> Participant:
-        """The participant; makes it if there is none (two requests).
-
-        Parameters
-        ----------
-        code : str
-            Code of the participant.
-
-        Returns
-        -------
-        Participant
-        """
+        """The participant; makes it if there is none (two requests)."""
         try:
             return self.participant(code)
         except NotFound:
             return self.make_participant(code)
 
     def set_limits(self, code: str, **limits: float) -> Participant:
-        """Change the limits that are named; the others stay as they are.
-
-        Parameters
-        ----------
-        code : str
-            Code of the participant.
-        **limits
-            As `current_ma=20.0`, with units in the names.
-
-        Returns
-        -------
-        Participant
-        """
+        """Change the limits that are named, as `current_ma=20.0`; the others stay as they are."""
         return self.request("PUT", f"/v1/participants/{code}/profile", json=limits).json()
 
     # ---- tests
 
     def preview(self, participant: str, **more: Any) -> dict[str, Any]:
-        """Duration, dose and pulse widths of a test. Nothing is played. `more` as in `start_test`.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-        **more
-            As in `start_test`.
-
-        Returns
-        -------
-        dict
-        """
+        """Duration, dose and pulse widths of a test. Nothing is played. `more` as in `start_test`."""
         return self.post("/v1/preview", json={"participant": participant, **more})
 
     def start_test(self, participant: str, **more: Any) -> SessionTest:
@@ -321,105 +143,36 @@ class Client(Connection):
 
         With `kind="adaptive"` it stops itself: `target`, `max_duration_s`, `max_torque_time_nm_s`, `anyway`.
         What it can reach is then asked for before, in a request of its own.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-        **more
-            Keys of the request, as `kind="sequence"`.
-
-        Returns
-        -------
-        SessionTest
         """
         if more.get("kind") == "adaptive":  # a start must be played at once or not at all, and this may take long
             self.post("/v1/preview", json={"participant": participant, **more}, timeout=OUTLOOK_S)
         return self.post("/v1/tests", json={"participant": participant, **more})
 
     def test(self, test_id: str) -> SessionTest:
-        """A test as it is now.
-
-        Parameters
-        ----------
-        test_id : str
-            Id of the test.
-
-        Returns
-        -------
-        SessionTest
-        """
+        """A test as it is now."""
         return self.get(f"/v1/tests/{test_id}")
 
     def tests(self, participant: str) -> list[SessionTest]:
-        """The tests of a participant, newest first.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-
-        Returns
-        -------
-        list of SessionTest
-        """
+        """The tests of a participant, newest first."""
         return self.get(f"/v1/participants/{participant}/tests")
 
     def follow(self, test_id: str) -> Iterator[SessionTest]:
-        """A test ten times a second until it is done, whatever its end.
-
-        Parameters
-        ----------
-        test_id : str
-            Id of the test.
-
-        Yields
-        ------
-        SessionTest
-            The test as it is then.
-        """
+        """A test ten times a second until it is done, whatever its end."""
         while not (test := self.test(test_id))["done"]:
             yield test
             time.sleep(POLL_S)
         yield test
 
     def live(self, test_id: str) -> Iterator[dict[str, Any]]:
-        """Live signals of a test until its end: messages of `type` "history", "live", "state" and "test".
-
-        Parameters
-        ----------
-        test_id : str
-            Id of the test.
-
-        Yields
-        ------
-        dict
-            Each message.
-        """
+        """Live signals of a test until its end: messages of `type` "history", "live", "state" and "test"."""
         return self.messages(f"/v1/tests/{test_id}/live")
 
     def run_test(
         self, participant: str, watch: Callable[[SessionTest], object] = lambda _: None, **more: Any
     ) -> SessionTest:
-        """Start a test and follow it to its end.
+        """Start a test, as `start_test`, and follow it to its end; `watch` is called with the test ten times a second.
 
-        Parameters
-        ----------
-        participant : str
-            Code.
-        watch : callable
-            Called with the test ten times a second.
-        **more
-            As in `start_test`.
-
-        Returns
-        -------
-        SessionTest
-
-        Raises
-        ------
-        NotCompleted
-            The test was stopped, or failed.
+        Raises NotCompleted: the test was stopped, or failed.
         """
         test = self.start_test(participant, **more)
         for state in self.follow(test["id"]):
@@ -430,166 +183,52 @@ class Client(Connection):
         return test
 
     def set_ran_by(self, test_id: str, name: str | None) -> SessionTest:
-        """Say who ran a test at the rig; None: who asked for it.
-
-        Parameters
-        ----------
-        test_id : str
-            Id of the test.
-        name : str, optional
-            Of the person; None: who asked for the test.
-
-        Returns
-        -------
-        SessionTest
-        """
+        """Say who ran a test at the rig; None: who asked for it."""
         return self.request("PUT", f"/v1/tests/{test_id}/ran-by", json={"ran_by": name}).json()
 
     def enough(self, test_id: str) -> dict[str, Any]:
-        """End a running adaptive test well, at the next pulse; its recording is identified like any other.
-
-        Parameters
-        ----------
-        test_id : str
-            Id of the test.
-
-        Returns
-        -------
-        dict
-        """
+        """End a running adaptive test well, at the next pulse; its recording is identified like any other."""
         return self.post(f"/v1/tests/{test_id}/enough")
 
     def keep_plain(self, test_id: str) -> SessionTest:
-        """End the fit of last session's structure after a test: the plain model is offered. Refused when none runs.
-
-        Parameters
-        ----------
-        test_id : str
-            Id of the test.
-
-        Returns
-        -------
-        SessionTest
-        """
+        """End the fit of last session's structure after a test: the plain model is offered. Refused when none runs."""
         return self.post(f"/v1/tests/{test_id}/keep-plain")
 
     # ---- recordings
 
     def recording(self, recording_id: str) -> bytes:
-        """The raw recording (HDF5), as it was sealed.
-
-        Parameters
-        ----------
-        recording_id : str
-            Id of the recording.
-
-        Returns
-        -------
-        bytes
-        """
+        """The raw recording (HDF5), as it was sealed."""
         return self.request("GET", f"/v1/recordings/{recording_id}").content
 
     def recording_csv(self, recording_id: str) -> bytes:
-        """The recording as CSV.
-
-        Parameters
-        ----------
-        recording_id : str
-            Id of the recording.
-
-        Returns
-        -------
-        bytes
-        """
+        """The recording as CSV."""
         return self.request("GET", f"/v1/recordings/{recording_id}/csv").content
 
     def upload(self, participant: str, data: bytes | Path) -> dict[str, Any]:
-        """Send a recording of another tool (CSV or HDF5). Returns `recording_id`, its new `model`, and `warnings`.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-        data : bytes or path
-            The file, or what is in it.
-
-        Returns
-        -------
-        dict
-        """
+        """Send a recording of another tool (CSV or HDF5). Returns `recording_id`, its new `model`, and `warnings`."""
         content = data if isinstance(data, bytes) else data.read_bytes()
         return self.post(f"/v1/participants/{participant}/recordings", content=content, timeout=UPLOAD_S)
 
     # ---- models
 
     def versions(self, participant: str) -> list[Version]:
-        """Model versions of a participant, newest first.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-
-        Returns
-        -------
-        list of Version
-        """
+        """Model versions of a participant, newest first."""
         return self.get(f"/v1/participants/{participant}/models")
 
     def trend(self, participant: str) -> Trend:
-        """Sessions of a participant, oldest first: figures with their uncertainty, and what changed.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-
-        Returns
-        -------
-        Trend
-        """
+        """Sessions of a participant, oldest first: figures with their uncertainty, and what changed."""
         return self.get(f"/v1/participants/{participant}/trend")
 
     def trend_csv(self, participant: str) -> bytes:
-        """The same as a CSV file.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-
-        Returns
-        -------
-        bytes
-        """
+        """The same as a CSV file."""
         return self.request("GET", f"/v1/participants/{participant}/trend.csv").content
 
     def version(self, model_id: str) -> Version:
-        """One model version.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-
-        Returns
-        -------
-        Version
-        """
+        """One model version."""
         return self.get(f"/v1/models/{model_id}")
 
     def model_file(self, model_id: str) -> dict[str, Any]:
-        """MODEL.json of a version, as `stimrig.Model.from_dict` takes it.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-
-        Returns
-        -------
-        dict
-        """
+        """MODEL.json of a version, as `stimrig.Model.from_dict` takes it."""
         return self.get(f"/v1/models/{model_id}/file")
 
     def approved_model(
@@ -601,19 +240,6 @@ class Client(Connection):
         says how, and in `ask` why a new test is needed, if one is.
 
         Raises NotFound: no model is approved today.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-        known : ApprovedModel, optional
-            The one that is there already.
-        tracked : bool
-            As it was followed to the last trial.
-
-        Returns
-        -------
-        ApprovedModel
         """
         headers = {"If-None-Match": known.etag} if known else {}
         params = {"tracked": True} if tracked else {}
@@ -626,68 +252,24 @@ class Client(Connection):
         """The trials since the approval that holds: how gain, threshold and time scale moved, and whether to ask.
 
         Raises NotFound: no model is approved today.
-
-        Parameters
-        ----------
-        participant : str
-            Code of the participant.
-
-        Returns
-        -------
-        Tracking
         """
         return self.get(f"/v1/participants/{participant}/tracking")
 
     def approve(self, model_id: str, reason: str = "", tracking: dict[str, float] | None = None) -> Version:
-        """Let the controller have this version.
+        """Let the controller have this version; a `reason` is needed for a model that is not usable.
 
-        Parameters
-        ----------
-        model_id : str
-            The version.
-        reason : str
-            Why; needed for a model that is not usable.
-        tracking : dict, optional
-            `gain_percent`, `threshold_percent`, `time_scale_percent`: how far the tracked model may move, each 0 (not
-            tracked) to 60; 20 where it is left out.
-
-        Returns
-        -------
-        Version
+        `tracking`: `gain_percent`, `threshold_percent`, `time_scale_percent`, how far the tracked model may move, each
+        0 (not tracked) to 60; 20 where it is left out.
         """
         body = {"reason": reason, **({} if tracking is None else {"tracking": tracking})}
         return self.post(f"/v1/models/{model_id}/approve", json=body)
 
     def reject(self, model_id: str, reason: str = "") -> Version:
-        """Keep this version from the controller.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-        reason : str
-            In words; it stands in the audit trail.
-
-        Returns
-        -------
-        Version
-        """
+        """Keep this version from the controller."""
         return self.post(f"/v1/models/{model_id}/reject", json={"reason": reason})
 
     def undo(self, model_id: str, reason: str = "") -> Version:
-        """Go back to the version this one was made from; returns that one.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-        reason : str
-            In words; it stands in the audit trail.
-
-        Returns
-        -------
-        Version
-        """
+        """Go back to the version this one was made from; returns that one."""
         return self.post(f"/v1/models/{model_id}/undo", json={"reason": reason})
 
     def predict(
@@ -701,21 +283,6 @@ class Client(Connection):
 
         `pulse_rate_hz`: by default the model's. `angle_rad`: of the joint in each period, rad; a model that depends on
         it needs it.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-        pulse_width_us : sequence of float
-            One width for each pulse, µs.
-        pulse_rate_hz : float, optional
-            Pulses a second, Hz; default: the model's.
-        angle_rad : sequence of float, optional
-            Of the joint in each pulse's period, rad.
-
-        Returns
-        -------
-        list of float
         """
         body: dict[str, Any] = {"pulse_width_us": list(pulse_width_us), "pulse_rate_hz": pulse_rate_hz}
         if angle_rad is not None:
@@ -727,71 +294,25 @@ class Client(Connection):
     ) -> dict[str, Any]:
         """The pulse widths with which the model follows a torque best, and what of it is out of reach.
 
-        Parameters
-        ----------
-        model_id : str
-            Version.
-        reference : sequence of float
-            Torque above rest, N·m: one for each pulse, or one for each of `time_s`.
-        time_s : sequence of float, optional
-            Times, s, rising.
-        **more
-            `pulse_rate_hz`, `max_pulse_width_us`, `max_rise_us`, `whole_us`.
-
-        Returns
-        -------
-        dict
-            `pulse_width_us`, `predicted_torque_nm`, `unreachable`, `fit_percent`, and `segments` for `start_test`.
+        `reference`: torque above rest, N·m, one for each pulse, or one for each of the rising times `time_s`. `more`:
+        `pulse_rate_hz`, `max_pulse_width_us`, `max_rise_us`, `whole_us`. Returns `pulse_width_us`,
+        `predicted_torque_nm`, `unreachable`, `fit_percent`, and `segments` for `start_test`.
         """
         body = {"reference_torque_nm": list(reference), "time_s": None if time_s is None else list(time_s), **more}
         return self.post(f"/v1/models/{model_id}/widths", json=body)
 
     def curves(self, model_id: str) -> dict[str, Any]:
-        """Measured and predicted torque, pulse widths and step response, for drawing.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-
-        Returns
-        -------
-        dict
-        """
+        """Measured and predicted torque, pulse widths and step response, for drawing."""
         return self.get(f"/v1/models/{model_id}/curves")
 
     def comparison(self, model_id: str, recording_id: str | None = None) -> dict[str, Any]:
-        """The model against its own recording, or against another one.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-        recording_id : str, optional
-            Id of another recording; default: the model's own.
-
-        Returns
-        -------
-        dict
-        """
+        """The model against its own recording, or against another one."""
         return self.get(f"/v1/models/{model_id}/comparison", params={"recording": recording_id} if recording_id else {})
 
     # ---- long work: a job that is followed, however long it takes, and cancelled where it is interrupted
 
     def diagnosis(self, model_id: str, progress: Progress | None = None) -> dict[str, Any]:
-        """What is missing in the model. `progress` as in `add_effects`.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-        progress : callable, optional
-            Called with a share of 0 to 1 and a line of text; what it raises ends the work.
-
-        Returns
-        -------
-        dict
-        """
+        """What is missing in the model. `progress` as in `add_effects`."""
         return self._long("GET", f"/v1/models/{model_id}/diagnosis", progress)
 
     def add_effects(
@@ -802,77 +323,27 @@ class Client(Connection):
         reason: str = "",
         progress: Progress | None = None,
     ) -> Version:
-        """Fit a new version with more effects.
+        """Fit a new version with more effects; the version they are added to stays as it is.
 
-        Parameters
-        ----------
-        model_id : str
-            Version to add to; it stays as it is.
-        effects : sequence of str
-            Ids of effects.
-        force : bool
-            Add them even if the recording does not ask for them; needs a `reason`.
-        progress : callable, optional
-            Called with a share of 0 to 1 and a line of text. What it raises cancels the work.
-        reason : str
-            Why it is forced.
+        `force` adds them even if the recording does not ask for them, and needs a `reason`. `progress` is called with a
+        share of 0 to 1 and a line of text; what it raises cancels the work.
 
-        Returns
-        -------
-        Version
-
-        Raises
-        ------
-        Conflict
-            The recording does not ask for an effect, or the model holds it already.
-        NotCompleted
-            Somebody cancelled the job.
+        Raises Conflict: the recording does not ask for an effect, or the model holds it already. Raises NotCompleted:
+        somebody cancelled the job.
         """
         body = {"effects": list(effects), "force": force, "reason": reason}
         return self._long("POST", f"/v1/models/{model_id}/effects", progress, json=body)
 
     def improve(self, model_id: str, progress: Progress | None = None) -> Version:
-        """Add effects one by one while the evidence asks for them; returns the last version. `progress` as above.
-
-        Parameters
-        ----------
-        model_id : str
-            Id of the model version.
-        progress : callable, optional
-            Called with a share of 0 to 1 and a line of text; what it raises ends the work.
-
-        Returns
-        -------
-        Version
-        """
+        """Add effects one by one while the evidence asks for them; returns the last version. `progress` as above."""
         return self._long("POST", f"/v1/models/{model_id}/improve", progress)
 
     def job(self, job_id: str) -> Job:
-        """Long work as it is now.
-
-        Parameters
-        ----------
-        job_id : str
-            Id of the job.
-
-        Returns
-        -------
-        Job
-        """
+        """Long work as it is now."""
         return self.get(f"/v1/jobs/{job_id}")
 
     def cancel(self, job_id: str) -> Job:
-        """Cancel long work. What is done already stays done.
-
-        Parameters
-        ----------
-        job_id : str
-            Id of the job.
-
-        Returns
-        -------
-        Job
-        """
+        """Cancel long work. What is done already stays done."""
         return self.request("DELETE", f"/v1/jobs/{job_id}").json()
 
     def _long(self, method: str, path: str, progress: Progress | None, **more: Any) -> Any:
