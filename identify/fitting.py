@@ -56,10 +56,6 @@ def fit(
     **options
         Options of the method: see `identify.methods.methods()[id].options`.
 
-    Returns
-    -------
-    Model
-
     Raises
     ------
     BadRequest

@@ -101,10 +101,6 @@ class Model(Summarised):
         ----------
         record : Record
             Whose pulse widths are played.
-
-        Returns
-        -------
-        ndarray
         """
         from stimrig.identify.simulation.predict import predict  # here: reading a model does not import numba
 
@@ -114,10 +110,6 @@ class Model(Summarised):
         """Threshold, plateau, saturation, and of a second-order block its parameters: `value`, `sd` and `unit` of each.
 
         An `sd` is None if the model has no covariance.
-
-        Returns
-        -------
-        dict
         """
         found = landmarks(self.recruitment, self.curve_covariance)
         if isinstance(self.linear, SecondOrder):
@@ -136,12 +128,7 @@ class Model(Summarised):
         return known.matrix[np.ix_(rows, rows)]
 
     def to_dict(self) -> dict[str, Any]:
-        """MODEL.json as a dict of lists, numbers and texts.
-
-        Returns
-        -------
-        dict
-        """
+        """MODEL.json as a dict of lists, numbers and texts."""
         width, torque = self.recruitment.table()
         level, needed = self.recruitment.inverse()
         rate = self.sample_rate_hz if isinstance(self.linear, SecondOrder) else 1.0 / self.linear.step_s
@@ -196,10 +183,6 @@ class Model(Summarised):
         ----------
         indent : int, optional
             Spaces for each level; None: one line.
-
-        Returns
-        -------
-        str
         """
         return json.dumps(self.to_dict(), indent=indent, ensure_ascii=False, allow_nan=False)
 
@@ -211,10 +194,6 @@ class Model(Summarised):
         ----------
         data : dict
             What `to_dict` gave.
-
-        Returns
-        -------
-        Model
         """
         if not isinstance(data, dict):
             raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
@@ -246,10 +225,6 @@ class Model(Summarised):
         ----------
         text : str or bytes
             Of a MODEL.json.
-
-        Returns
-        -------
-        Model
         """
         if len(text) > LARGEST_TEXT:
             raise BadModel(f"more than {LARGEST_TEXT} characters", fix="Give a file written by `stimrig fit -o`.")
@@ -265,10 +240,6 @@ class Model(Summarised):
         ----------
         **changes
             Fields with their new values.
-
-        Returns
-        -------
-        Model
         """
         return replace(self, **changes)
 

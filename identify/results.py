@@ -39,12 +39,7 @@ class Result(Summarised):
     """A dataclass that is shown, and written as JSON."""
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields as dicts, lists, numbers and texts; None for a number that is not finite.
-
-        Returns
-        -------
-        dict
-        """
+        """All fields as dicts, lists, numbers and texts; None for a number that is not finite."""
         return {
             name: [model.to_dict() for model in value] if name == "models" else json_value(value)
             for name, value in vars(self).items()
@@ -140,12 +135,7 @@ class Diagnosis(Result):
         return conclude(vars(self))
 
     def to_dict(self) -> dict[str, Any]:
-        """All fields, and `conclusion`.
-
-        Returns
-        -------
-        dict
-        """
+        """All fields, and `conclusion`."""
         return super().to_dict() | {"conclusion": asdict(self.conclusion)}
 
     def _sheet(self) -> Sheet:
@@ -212,12 +202,7 @@ class Explanation(Result):
     after: Comparison  # of the last model
 
     def to_dict(self) -> dict[str, Any]:
-        """The keys of `explain --json`: no models, and no series for plots.
-
-        Returns
-        -------
-        dict
-        """
+        """The keys of `explain --json`: no models, and no series for plots."""
         improvement = self.improvement.to_dict()
         del improvement["models"]
         before, after = self.before.to_dict(), self.after.to_dict()
@@ -272,12 +257,7 @@ class Carried(Result):
         return self.models[-1 if self.offered == "carried" else 0]
 
     def finding(self) -> dict[str, Any]:
-        """What was found, as `to_dict()`, without the models.
-
-        Returns
-        -------
-        dict
-        """
+        """What was found, as `to_dict()`, without the models."""
         found = self.to_dict()
         del found["models"]
         return found

@@ -69,12 +69,7 @@ class Summarised:
         raise NotImplementedError
 
     def summary(self) -> str:
-        """A summary of about ten lines.
-
-        Returns
-        -------
-        str
-        """
+        """A summary of about ten lines."""
         return self._sheet().text()
 
     def __str__(self) -> str:

@@ -31,10 +31,6 @@ def fit(data: Sequence[str | Path], output: str | Path, **options: Any) -> Repor
         Parquet file to write; one that was cut off goes on.
     **options
         Those of the command line.
-
-    Returns
-    -------
-    Report
     """
     return _run("fit", data, output, options)
 
@@ -50,10 +46,6 @@ def diagnose(data: Sequence[str | Path], output: str | Path, **options: Any) -> 
         Parquet file to write; one that was cut off goes on.
     **options
         Those of the command line.
-
-    Returns
-    -------
-    Report
     """
     return _run("diagnose", data, output, options)
 
@@ -69,10 +61,6 @@ def improve(data: Sequence[str | Path], output: str | Path, **options: Any) -> R
         Parquet file to write; one that was cut off goes on.
     **options
         Those of the command line.
-
-    Returns
-    -------
-    Report
     """
     return _run("improve", data, output, options)
 
@@ -86,10 +74,6 @@ def changed(old: str | Path, new: str | Path) -> Report:
         Results of the earlier run.
     new : path
         Results of the later one.
-
-    Returns
-    -------
-    Report
     """
     from stimrig.api.cli.commands.cohort import need_extra
 
@@ -108,10 +92,6 @@ def figures(results: str | Path, html: str | Path) -> Report:
         The Parquet file of a run.
     html : path
         File to write.
-
-    Returns
-    -------
-    Report
     """
     from stimrig.api.cli.commands.cohort import drawn
 

@@ -42,10 +42,6 @@ def fit(
         line of text.
     **options
         Of the method.
-
-    Returns
-    -------
-    Model
     """
     with _telling(progress) as tell:
         return identify.fit(record, method, effects, fit_on, tell, **options)
@@ -63,10 +59,6 @@ def carry(record: identify.Record, model: identify.Model, progress: Progress = T
     progress : bool or callable
         True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
         line of text.
-
-    Returns
-    -------
-    Carried
     """
     with _telling(progress) as tell:
         return identify.carry(record, model, tell)
@@ -86,10 +78,6 @@ def diagnose(
     progress : bool or callable
         True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
         line of text.
-
-    Returns
-    -------
-    Diagnosis
     """
     with _telling(progress) as tell:
         return identify.diagnose(record, model, tell)
@@ -117,10 +105,6 @@ def improve(
         Ids of effects that are added whatever the evidence.
     model : Model, optional
         To begin with; default: the plain one.
-
-    Returns
-    -------
-    Improvement
     """
     with _telling(progress) as tell:
         return identify.improve(record, tell, max_effects, force, model)
@@ -140,10 +124,6 @@ def explain(
     progress : bool or callable
         True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
         line of text.
-
-    Returns
-    -------
-    Explanation
     """
     with _telling(progress) as tell:
         return identify.explain(record, tell, model)

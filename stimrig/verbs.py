@@ -49,10 +49,6 @@ def join(data: Iterable[str | Path], map: Sequence[str] | None = None) -> identi
         Files.
     map : sequence of str, optional
         Names of columns of other tools, as "torque_nm=Drehmoment:Nm".
-
-    Returns
-    -------
-    Record
     """
     from stimrig.api import record_files
 
@@ -82,10 +78,6 @@ def invert(
         Of the reference, s.
     angle_rad : sequence of float, optional
         Of the joint at each of them, rad.
-
-    Returns
-    -------
-    Inversion
 
     Raises
     ------
@@ -148,10 +140,6 @@ def recover(journal: str | Path, folder: str | Path | None = None) -> Report:
         Its file.
     folder : path, optional
         For the recording; default: beside the journal.
-
-    Returns
-    -------
-    Report
     """
     from stimrig.api.cli.commands.recover import sealed
 
@@ -165,10 +153,6 @@ def table1(trials: int = 100) -> Report:
     ----------
     trials : int
         Fits for each noise level and method.
-
-    Returns
-    -------
-    Report
     """
     from stimrig.identify import paper
 

@@ -28,7 +28,7 @@ def generators() -> ModuleType:
 def lacking(name: str, one: Any) -> str:
     """Say what the docstring of a function, a property or a class lacks; empty: nothing.
 
-    A method of the client is one request, which docs/api.md describes: its signature and a sentence are enough.
+    What is returned, the annotation says; of a method of the client, docs/api.md says the rest.
     """
     if not inspect.getdoc(one) or (inspect.isclass(one) and str(one.__doc__).startswith(f"{one.__name__}(")):
         return f"{name}: no docstring"
@@ -37,9 +37,7 @@ def lacking(name: str, one: Any) -> str:
     doc, signature = FunctionDoc(one), inspect.signature(one)
     documented = {part.strip().lstrip("*") for row in doc["Parameters"] for part in row.name.split(",")}
     parameters = set(signature.parameters) - {"self", "cls"}
-    returns = str(signature.return_annotation) not in ("None", str(inspect.Signature.empty))
     parts = [f"Parameters of {word}" for word in sorted(parameters ^ documented)]
-    parts += ["Returns"] if returns and not doc["Returns"] and not doc["Yields"] else []
     return f"{name}: {', '.join(parts)}" if parts else ""
 
 

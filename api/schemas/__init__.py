@@ -34,10 +34,6 @@ def load(name: str) -> dict[str, Any]:
     ----------
     name : str
         As "fit" or "model".
-
-    Returns
-    -------
-    dict
     """
     return json.loads(FILES[OF_VERB.get(name, name)].read_text("utf-8"))
 

@@ -277,10 +277,6 @@ def direction_of(record: Record) -> np.ndarray:
     ----------
     record : Record
         The measurement.
-
-    Returns
-    -------
-    ndarray
     """
     u = record.pulse_width_us
     back = max(round(0.3 * record.sample_rate_hz), 1)

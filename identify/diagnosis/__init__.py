@@ -64,10 +64,6 @@ def structure_of(model: Model | None) -> list[str]:
     ----------
     model : Model, optional
         None: the plain structure.
-
-    Returns
-    -------
-    list of str
     """
     if model is None:
         return []
@@ -121,10 +117,6 @@ def planned(missing: Sequence[Mapping[str, Any]], further: Mapping[str, Any] | N
         As `Diagnosis.missing`.
     further : mapping, optional
         What would teach most about what is left.
-
-    Returns
-    -------
-    Experiment or None
     """
     if further:
         return Experiment(rivals=(), **further)

@@ -113,10 +113,6 @@ def diagnose_and_improve(
         Called with a share of 0 to 1 and a line of text; what it raises ends the work.
     model : Model, optional
         To begin with; default: the plain one.
-
-    Returns
-    -------
-    tuple[Diagnosis, Improvement]
     """
     structure = structure_of(model)
     grid, raw = prepare(record)

@@ -66,10 +66,6 @@ def registry() -> dict[str, Effect]:
     """All effects by id: the library's, those of entry points, those in the user's folder.
 
     Raises BadEffect: a user's folder is not there, or one of the files cannot be loaded or used.
-
-    Returns
-    -------
-    dict
     """
     return dict(_everything(os.environ.get(FOLDER_VARIABLE, "")))
 
@@ -81,10 +77,6 @@ def find_effect(effect_id: str) -> Effect:
     ----------
     effect_id : str
         Id of an effect.
-
-    Returns
-    -------
-    Effect
     """
     effects = registry()
     if effect_id not in effects:
@@ -101,10 +93,6 @@ def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
     ----------
     entry : mapping
         As in `Model.effects`.
-
-    Returns
-    -------
-    tuple[Effect, Form] or None
     """
     effect, name = registry().get(entry["id"]), entry.get("form", "")
     forms = effect.forms if effect else ()
@@ -118,10 +106,6 @@ def depend_on_joint(names: Iterable[str]) -> bool:
     ----------
     names : iterable of str
         Ids of effects.
-
-    Returns
-    -------
-    bool
     """
     return any(find_effect(name).moves_with_joint for name in names)
 
@@ -133,21 +117,12 @@ def any_free(names: Iterable[str]) -> bool:
     ----------
     names : iterable of str
         Ids of effects.
-
-    Returns
-    -------
-    bool
     """
     return any(find_effect(name).shape for name in names)
 
 
 def library() -> list[dict[str, Any]]:
-    """The library as dicts, for `stimrig effects` and the page.
-
-    Returns
-    -------
-    list of dict
-    """
+    """The library as dicts, for `stimrig effects` and the page."""
     return [effect.to_dict() for effect in registry().values()]
 
 

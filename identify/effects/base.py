@@ -52,10 +52,6 @@ class Parameter:
         ----------
         scene : Scene
             The record on its grid of pulses.
-
-        Returns
-        -------
-        Parameter
         """
         if not self.relative:
             return self
@@ -71,12 +67,7 @@ class Parameter:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As the library tells it.
-
-        Returns
-        -------
-        dict
-        """
+        """As the library tells it."""
         return {
             "name": self.name,
             "unit": self.unit,
@@ -171,10 +162,6 @@ class Scene:
         ----------
         degrees : int
             The highest.
-
-        Returns
-        -------
-        ndarray
         """
         home = self._placed(float(self.angle[0] - self.away_rad[0]))
         return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
@@ -250,10 +237,6 @@ class Form:
         ----------
         source : str
             Of the effect.
-
-        Returns
-        -------
-        dict
         """
         return {
             "name": self.name,
@@ -270,10 +253,6 @@ class Form:
         ----------
         scene : Scene
             The record on its grid of pulses.
-
-        Returns
-        -------
-        list of dict
         """
         on = [p.on(scene) for p in self.parameters]
         runs = max((len(p.start) for p in on), default=1)
@@ -291,10 +270,6 @@ class Form:
             Parameters by name, each of shape (M, 1).
         scene : Scene
             The record on its grid of pulses.
-
-        Returns
-        -------
-        object
         """
         assert self.apply is not None
         if self.batched:
@@ -384,10 +359,6 @@ class Effect:
         ----------
         name : str
             Of the form; empty: the first.
-
-        Returns
-        -------
-        Form
         """
         for form in self.forms:
             if form.name == name or not name:
@@ -395,12 +366,7 @@ class Effect:
         raise KeyError(name)
 
     def to_dict(self) -> dict[str, Any]:
-        """As the library tells it; without forms of a great many parameters.
-
-        Returns
-        -------
-        dict
-        """
+        """As the library tells it; without forms of a great many parameters."""
         first = self.forms[0]
         return {
             "id": self.id,
@@ -436,10 +402,6 @@ def form(stage: str, equation: str, *parameters: Parameter, name: str = "", **mo
         Of the form.
     **more
         Other fields of `Form`.
-
-    Returns
-    -------
-    callable
     """
 
     def made(apply: Apply) -> Form:

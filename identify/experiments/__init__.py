@@ -66,10 +66,6 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
         Which does not separate the rivals.
     fits : mapping
         By effect id, or `NOTHING`.
-
-    Returns
-    -------
-    Experiment
     """
     largest_us = float(record.pulse_width_us.max())
     rows = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(largest_us)]
@@ -113,10 +109,6 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
         In which structure is left.
     fitted : Fitted
         The last model.
-
-    Returns
-    -------
-    Experiment
     """
     largest_us, rate_hz = float(record.pulse_width_us.max()), record.pulse_rate_hz
     # the smallest width with a tenth of the largest torque
@@ -173,10 +165,6 @@ def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[st
         Which does not separate the rivals.
     fits : mapping
         By effect id, or `NOTHING`.
-
-    Returns
-    -------
-    float
     """
     simulated = _blank(record, width_us)
     return float(min(separation(fits[one], fits[other], simulated) for one, other in permutations(fits, 2)))
@@ -203,10 +191,6 @@ def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
         The other one.
     record : Record
         The new test.
-
-    Returns
-    -------
-    float
     """
     true_mean = _simulate(truth, record, False)[0]
     rival_mean, slopes = _simulate(rival, record, True)

@@ -74,12 +74,7 @@ class Inversion(Result):
         return Sheet(f"Pulse widths for a torque: {self.pulse_width_us.size} pulses, {fit}", tuple(rows))
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON.
-
-        Returns
-        -------
-        dict
-        """
+        """As JSON."""
         reference = self.reference
         return json_value(
             {
@@ -127,10 +122,6 @@ def invert(
         Whole µs. What rounding takes is given back by the pulses after.
     shortest_us : float
         The stimulator's shortest pulse, µs: a narrower one is not sent, so it is 0 here.
-
-    Returns
-    -------
-    Inversion
 
     Raises
     ------

@@ -71,10 +71,6 @@ class Reference:
         name : str
             How the torque is called in messages.
 
-        Returns
-        -------
-        Reference
-
         Raises
         ------
         BadRequest

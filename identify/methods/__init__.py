@@ -31,12 +31,7 @@ class Method:
 
 @cache
 def methods() -> dict[str, Method]:
-    """Every method by its id.
-
-    Returns
-    -------
-    dict
-    """
+    """Every method by its id."""
     modules = [import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
     found = [module.METHOD for module in modules if isinstance(getattr(module, "METHOD", None), Method)]
     return {method.id: method for method in sorted(found, key=lambda method: method.id)}
@@ -49,10 +44,6 @@ def method_of(name: str) -> Method:
     ----------
     name : str
         Id of a method.
-
-    Returns
-    -------
-    Method
     """
     if name not in methods():
         raise BadRequest(f"unknown method {name!r}", place="method", fix=f"Known: {', '.join(methods())}.")

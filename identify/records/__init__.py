@@ -33,10 +33,6 @@ def read(
         Columns of another tool's file by ours: `{"torque_nm": "Drehmoment:Nm"}`, or `["torque_nm=Drehmoment:Nm"]`. The
         unit after the last colon may be left out where the column's name holds it; `#3` is the third column.
 
-    Returns
-    -------
-    Record
-
     Raises
     ------
     BadRecord

@@ -150,10 +150,6 @@ class Record(Summarised):
             Where the record comes from.
         parts : sequence of Part
             Of a joined record.
-
-        Returns
-        -------
-        Record
         """
         time_s = np.ascontiguousarray(time_s, float)
         size = time_s.size
@@ -203,22 +199,12 @@ class Record(Summarised):
         return Sheet(f"Record {self.source.name or 'without a name'}: {long}, {rates}", tuple(rows))
 
     def columns(self) -> dict[str, np.ndarray]:
-        """The optional columns that this record has, by name.
-
-        Returns
-        -------
-        dict
-        """
+        """The optional columns that this record has, by name."""
         found = {name: getattr(self, name) for name in OPTIONAL}
         return {name: column for name, column in found.items() if column is not None}
 
     def samples(self) -> dict[str, np.ndarray]:
-        """Times, pulse widths, torques and the optional columns, by name.
-
-        Returns
-        -------
-        dict
-        """
+        """Times, pulse widths, torques and the optional columns, by name."""
         return {name: getattr(self, name) for name in NEEDED} | self.columns()
 
     def take(self, rows: np.ndarray) -> Record:
@@ -228,10 +214,6 @@ class Record(Summarised):
         ----------
         rows : ndarray
             Of the record: bool of shape (N,), or rising indices.
-
-        Returns
-        -------
-        Record
         """
         return Record.from_arrays(
             **{name: column[rows] for name, column in self.samples().items()},
@@ -282,10 +264,6 @@ class Record(Summarised):
         ----------
         name : str
             As "angle_rad".
-
-        Returns
-        -------
-        bool
         """
         return getattr(self, name) is not None or (name == "velocity_rad_s" and self.angle_rad is not None)
 
@@ -320,10 +298,6 @@ class Record(Summarised):
         ----------
         torque_nm : ndarray
             Torque, N·m, shape (N,).
-
-        Returns
-        -------
-        Record
         """
         return replace(self, torque_nm=np.ascontiguousarray(torque_nm, float))
 

@@ -33,10 +33,6 @@ class Curve:
             Largest error, as a share of the curve's range.
         most : int
             So many points at most.
-
-        Returns
-        -------
-        tuple[ndarray, ndarray]
         """
         size = 151
         while True:
@@ -53,10 +49,6 @@ class Curve:
 
         The running maximum is inverted, so a curve that falls somewhere still has one answer: the smallest charge that
         gives the torque.
-
-        Returns
-        -------
-        tuple[ndarray, ndarray]
         """
         u, torque = self.table()
         sign = 1.0 if torque[np.argmax(np.abs(torque))] >= 0 else -1.0
@@ -71,12 +63,7 @@ class Curve:
         return sign * level, u[before] + share * (u[reached] - u[before])
 
     def to_dict(self) -> dict:
-        """As MODEL.json has it.
-
-        Returns
-        -------
-        dict
-        """
+        """As MODEL.json has it."""
         return {"basis": self.basis.to_dict() | {"coefficients_nm": [float(x) for x in self.coefficients_nm]}}
 
 
@@ -101,20 +88,11 @@ class FixedShape:
             µs.
         derivative : int
             0: the values; 1: their slope.
-
-        Returns
-        -------
-        ndarray
         """
         return self.curve(pulse_width_us, derivative)[..., None]
 
     def to_dict(self) -> dict:
-        """As MODEL.json has it.
-
-        Returns
-        -------
-        dict
-        """
+        """As MODEL.json has it."""
         return self.curve.to_dict()
 
 
@@ -129,10 +107,6 @@ def basis_from_dict(data: dict[str, Any]) -> Basis:
     ----------
     data : dict
         What `to_dict` of a basis gave.
-
-    Returns
-    -------
-    Basis
     """
     match data["kind"]:
         case "cubic-spline":
@@ -161,10 +135,6 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
         The recruitment curve.
     covariance_nm2 : ndarray, optional
         Of the coefficients, N²·m².
-
-    Returns
-    -------
-    dict
     """
     width_us, torque_nm = curve.table()
     top = int(np.argmax(np.abs(torque_nm)))
@@ -216,10 +186,6 @@ def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> Sigmo
         Of the sigmoid, µs.
     largest_us : float
         Largest pulse width, µs.
-
-    Returns
-    -------
-    SigmoidBasis
     """
     a2 = float(np.exp(steepness_log))
     return SigmoidBasis(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
@@ -241,10 +207,6 @@ def fit_shape(
         Largest pulse width, µs.
     seen_us : ndarray
         Widths that were applied, µs.
-
-    Returns
-    -------
-    SigmoidBasis
     """
     from scipy.optimize import least_squares
 
@@ -276,10 +238,6 @@ def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:
         µs, shape (K,).
     torque_nm : ndarray
         N·m, shape (K,).
-
-    Returns
-    -------
-    Curve
     """
     largest = float(np.max(width_us))
 

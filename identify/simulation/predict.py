@@ -78,10 +78,6 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
         Whose pulse widths, and angle, are used.
     earlier_trial : Record, optional
         A record of the same movement.
-
-    Returns
-    -------
-    ndarray
     """
     refuse_rate(model, record)
     grid = make_grid(record)

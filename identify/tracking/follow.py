@@ -88,12 +88,7 @@ class Step:
         return [list(stretch) for stretch in self.seen.disturbed]
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON: the levels of this trial and of the next with their bands, and what people may ask.
-
-        Returns
-        -------
-        dict
-        """
+        """As JSON: the levels of this trial and of the next with their bands, and what people may ask."""
         return {
             "outcome": str(self.outcome),
             "trial": self.after.trials,
@@ -117,10 +112,6 @@ def levels_of(state: State) -> dict[str, dict[str, float]]:
     ----------
     state : State
         What is known of the muscle.
-
-    Returns
-    -------
-    dict
     """
     mean, half = state.mean[:LEVELS], 1.96 * np.sqrt(np.diag(state.covariance)[:LEVELS])
     ends = {"value": state.values, "low": Values.of(mean - half), "high": Values.of(mean + half)}
@@ -136,10 +127,6 @@ def begin(model: Model, rates: Rates = USUAL) -> State:
         The approved one.
     rates : Rates
         How fast muscles change.
-
-    Returns
-    -------
-    State
     """
     return State.start(curve_covariance(model), rates)
 
@@ -162,10 +149,6 @@ def follow(
     rest_s : float, optional
         Rest between the end of what was seen last and this record's begin, s. None: by their clocks, `Part.begun_s`.
         If it is not known, or no rest (negative, not a number), the muscle is taken to have recovered.
-
-    Returns
-    -------
-    Step
 
     Raises
     ------
@@ -214,10 +197,6 @@ def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Mo
         Least and most of each quantity that may move; the others stay as approved. All three are followed
         nevertheless: one that was held would be taken for a change of the others. By default all move freely.
         Whether the expected values themselves are inside, the caller has to look.
-
-    Returns
-    -------
-    Model
     """
     coming, effects = step.coming, {effect: states["coming"] for effect, states in step.effects.items()}
     if bounds is None:
@@ -240,10 +219,6 @@ def slow_forms(model: Model) -> dict[str, tuple[Form, dict[str, Any]]]:
     ----------
     model : Model
         The model.
-
-    Returns
-    -------
-    dict]
     """
     found = {}
     for entry in model.effects:
@@ -300,10 +275,6 @@ def passed(model: Model, state: State, record: Record, rest_s: float | None = No
         The measurement.
     rest_s : float, optional
         Before the record, s; None: not known.
-
-    Returns
-    -------
-    State
     """
     if not slow_forms(model):
         return state
@@ -370,10 +341,6 @@ def moved_model(
         Added to the coefficients of the curve, N·m.
     effects : mapping, optional
         By effect id, where it begins.
-
-    Returns
-    -------
-    Model
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics are tracked", fix="Fit with maximum-likelihood.")

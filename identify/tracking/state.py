@@ -66,10 +66,6 @@ class Values:
         ----------
         levels : ndarray
             Log gain, shift of the threshold (µs), log time scale.
-
-        Returns
-        -------
-        Values
         """
         return cls(float(np.exp(levels[0])), float(levels[1]), float(np.exp(levels[2])))
 
@@ -105,10 +101,6 @@ class State:
             Of the curve's coefficients, (N·m)².
         rates : Rates
             How fast muscles change.
-
-        Returns
-        -------
-        State
         """
         size = len(curve_covariance)
         covariance = np.zeros((CURVE + size, CURVE + size))
@@ -138,10 +130,6 @@ class State:
         ----------
         rates : Rates
             How fast muscles change.
-
-        Returns
-        -------
-        State
         """
         move = np.eye(self.mean.size)
         move[:LEVELS, LEVELS:CURVE] = np.eye(LEVELS)
@@ -149,12 +137,7 @@ class State:
         return replace(self, mean=move @ self.mean, covariance=move @ self.covariance @ move.T + spread)
 
     def to_dict(self) -> dict[str, Any]:
-        """As JSON.
-
-        Returns
-        -------
-        dict
-        """
+        """As JSON."""
         return json_value(vars(self))
 
     @classmethod
@@ -165,10 +148,6 @@ class State:
         ----------
         data : dict
             What `to_dict` gave.
-
-        Returns
-        -------
-        State
         """
         odd = data.get("odd")
         return cls(

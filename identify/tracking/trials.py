@@ -53,10 +53,6 @@ def track(model: Model, trials: Sequence[Record]) -> Tracked:
     trials : sequence of Record
         At least one, each with its rest before and after.
 
-    Returns
-    -------
-    Tracked
-
     Raises
     ------
     BadModel, BadRecord
