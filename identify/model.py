@@ -95,13 +95,7 @@ class Model(Summarised):
     software: dict[str, Any] = field(default_factory=made_by)  # name and version
 
     def predict(self, record: Record) -> np.ndarray:
-        """Free-run torque at the record's samples, N·m, shape (N,).
-
-        Parameters
-        ----------
-        record : Record
-            Whose pulse widths are played.
-        """
+        """Free-run torque at the record's samples, N·m, shape (N,)."""
         from stimrig.identify.simulation.predict import predict  # here: reading a model does not import numba
 
         return predict(self, record)
@@ -188,13 +182,7 @@ class Model(Summarised):
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> Model:
-        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid.
-
-        Parameters
-        ----------
-        data : dict
-            What `to_dict` gave.
-        """
+        """The model that `to_dict` wrote. Raises BadModel: a key is missing, or its value is not valid."""
         if not isinstance(data, dict):
             raise BadModel("not a JSON object", fix="Give a file written by `stimrig fit -o`.")
         version = str(data.get("schema_version", ""))[:20]
@@ -220,11 +208,6 @@ class Model(Summarised):
         """The model in a MODEL.json text.
 
         Raises BadModel: not JSON, too long, too deep, with a duplicate key or an invalid number, or not a model.
-
-        Parameters
-        ----------
-        text : str or bytes
-            Of a MODEL.json.
         """
         if len(text) > LARGEST_TEXT:
             raise BadModel(f"more than {LARGEST_TEXT} characters", fix="Give a file written by `stimrig fit -o`.")
@@ -234,13 +217,7 @@ class Model(Summarised):
             raise BadModel(str(error), fix=model_schema.FIX) from error
 
     def with_(self, **changes: Any) -> Model:
-        """A copy of the model with some fields changed.
-
-        Parameters
-        ----------
-        **changes
-            Fields with their new values.
-        """
+        """A copy of the model with some fields changed."""
         return replace(self, **changes)
 
     def _sheet(self) -> Sheet:

@@ -46,13 +46,7 @@ class Parameter:
     about: str = ""  # one line for people
 
     def on(self, scene: Scene) -> Parameter:
-        """The parameter with its bounds in absolute units.
-
-        Parameters
-        ----------
-        scene : Scene
-            The record on its grid of pulses.
-        """
+        """The parameter with its bounds in absolute units."""
         if not self.relative:
             return self
         unit = {"width": scene.largest_us, "span": scene.span_s}.get(self.relative, scene.scale_nm)
@@ -156,13 +150,7 @@ class Scene:
         return np.clip((2.0 * angle_rad - low - high) / max(high - low, LEAST_RANGE_RAD), -1.0, 1.0)
 
     def bends(self, degrees: int) -> np.ndarray:
-        """Chebyshev polynomials of `place`, of degrees 1 to `degrees`, all 0 at the reference angle, shape (n, K).
-
-        Parameters
-        ----------
-        degrees : int
-            The highest.
-        """
+        """Chebyshev polynomials of `place`, of degrees 1 to `degrees`, all 0 at the reference angle, shape (n, K)."""
         home = self._placed(float(self.angle[0] - self.away_rad[0]))
         return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
 
@@ -231,13 +219,7 @@ class Form:
     `state(x, p, scene)`, called as a batched `apply` is, returns it after the last interval, shape (M,)."""
 
     def to_dict(self, source: str) -> dict[str, Any]:
-        """As the library tells it; `source` is that of the effect.
-
-        Parameters
-        ----------
-        source : str
-            Of the effect.
-        """
+        """As the library tells it; `source` is that of the effect."""
         return {
             "name": self.name,
             "stage": self.stage,
@@ -247,30 +229,14 @@ class Form:
         }
 
     def starts(self, scene: Scene) -> list[dict[str, float]]:
-        """Starting values, one dict per run.
-
-        Parameters
-        ----------
-        scene : Scene
-            The record on its grid of pulses.
-        """
+        """Starting values, one dict per run."""
         on = [p.on(scene) for p in self.parameters]
         runs = max((len(p.start) for p in on), default=1)
         listed = [{p.name: p.start[min(i, len(p.start) - 1)] for p in on} for i in range(runs)]
         return listed + [dict(start) for start in self.restarts]
 
     def call(self, x: Any, p: dict[str, np.ndarray], scene: Scene) -> Any:
-        """`apply` for M rows of parameters: x of shape (M, K), a tuple of such arrays, or None; p of shape (M, 1).
-
-        Parameters
-        ----------
-        x : object
-            What comes into the stage.
-        p : dict
-            Parameters by name, each of shape (M, 1).
-        scene : Scene
-            The record on its grid of pulses.
-        """
+        """`apply` for M rows of parameters: x of shape (M, K), a tuple of such arrays, or None; p of shape (M, 1)."""
         assert self.apply is not None
         if self.batched:
             return self.apply(x, p, scene)
@@ -353,13 +319,7 @@ class Effect:
         return {"pulse_width": "f", "gain": "f", "additive": "", "sensor": "", "output": ""}.get(self.stage, "G")
 
     def form(self, name: str) -> Form:
-        """A form by its name; the first form if the name is empty.
-
-        Parameters
-        ----------
-        name : str
-            Of the form; empty: the first.
-        """
+        """A form by its name; the first form if the name is empty."""
         for form in self.forms:
             if form.name == name or not name:
                 return form

@@ -208,13 +208,7 @@ class Record(Summarised):
         return {name: getattr(self, name) for name in NEEDED} | self.columns()
 
     def take(self, rows: np.ndarray) -> Record:
-        """The record of some of its rows (bool or indices, rising), with every column it has, and its pulses.
-
-        Parameters
-        ----------
-        rows : ndarray
-            Of the record: bool of shape (N,), or rising indices.
-        """
+        """The record of some of its rows (bool or indices, rising), with every column it has, and its pulses."""
         return Record.from_arrays(
             **{name: column[rows] for name, column in self.samples().items()},
             segment=self.segment[rows],
@@ -258,13 +252,7 @@ class Record(Summarised):
         return JointMotion.of(self.time_s, self.angle_rad, [part.first for part in self.parts])
 
     def knows(self, name: str) -> bool:
-        """Whether it has an optional column; the velocity of the joint follows from its angle.
-
-        Parameters
-        ----------
-        name : str
-            As "angle_rad".
-        """
+        """Whether it has an optional column; the velocity of the joint follows from its angle."""
         return getattr(self, name) is not None or (name == "velocity_rad_s" and self.angle_rad is not None)
 
     @cached_property
@@ -292,13 +280,7 @@ class Record(Summarised):
         return tuple(dict.fromkeys((*self.source.notes, *of_parts)))
 
     def with_torque(self, torque_nm: np.ndarray) -> Record:
-        """The same record with another torque, N·m, shape (N,).
-
-        Parameters
-        ----------
-        torque_nm : ndarray
-            Torque, N·m, shape (N,).
-        """
+        """The same record with another torque, N·m, shape (N,)."""
         return replace(self, torque_nm=np.ascontiguousarray(torque_nm, float))
 
 

@@ -60,13 +60,7 @@ class Values:
 
     @classmethod
     def of(cls, levels: np.ndarray) -> Values:
-        """From log gain, µs, log time scale.
-
-        Parameters
-        ----------
-        levels : ndarray
-            Log gain, shift of the threshold (µs), log time scale.
-        """
+        """From log gain, µs, log time scale."""
         return cls(float(np.exp(levels[0])), float(levels[1]), float(np.exp(levels[2])))
 
     @property
@@ -93,15 +87,7 @@ class State:
 
     @classmethod
     def start(cls, curve_covariance: np.ndarray, rates: Rates = USUAL) -> State:
-        """Before the first trial; `curve_covariance` is that of the approved curve's coefficients, (N·m)².
-
-        Parameters
-        ----------
-        curve_covariance : ndarray
-            Of the curve's coefficients, (N·m)².
-        rates : Rates
-            How fast muscles change.
-        """
+        """Before the first trial; `curve_covariance` is that of the approved curve's coefficients, (N·m)²."""
         size = len(curve_covariance)
         covariance = np.zeros((CURVE + size, CURVE + size))
         covariance[:CURVE, :CURVE] = np.diag(np.r_[rates.start, rates.trend_sd] ** 2)
@@ -124,13 +110,7 @@ class State:
         return np.r_[np.arange(LEVELS), np.arange(CURVE, self.mean.size)]
 
     def ahead(self, rates: Rates = USUAL) -> State:
-        """Before the next trial.
-
-        Parameters
-        ----------
-        rates : Rates
-            How fast muscles change.
-        """
+        """Before the next trial."""
         move = np.eye(self.mean.size)
         move[:LEVELS, LEVELS:CURVE] = np.eye(LEVELS)
         spread = np.diag(np.r_[rates.step, rates.turn, np.zeros(self.mean.size - CURVE)] ** 2)
@@ -142,13 +122,7 @@ class State:
 
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> State:
-        """The state that `to_dict` wrote.
-
-        Parameters
-        ----------
-        data : dict
-            What `to_dict` gave.
-        """
+        """The state that `to_dict` wrote."""
         odd = data.get("odd")
         return cls(
             np.array(data["mean"], float),
