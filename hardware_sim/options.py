@@ -48,13 +48,7 @@ def parse(arguments: Sequence[str] | None = None, prog: str = "stimrig emulate")
 
 
 def settings(options: argparse.Namespace, patient: str) -> Settings:
-    """The checked settings of these options.
-
-    Raises
-    ------
-    SettingsError
-        A number is out of its range.
-    """
+    """The checked settings of these options. Raises SettingsError: a number is out of its range."""
     given = {one.name: getattr(options, one.name) for one in fields(Settings) if hasattr(options, one.name)}
     if options.noise_seed is None:
         given["noise_seed"] = secrets.randbelow(2**31)

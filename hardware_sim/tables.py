@@ -37,13 +37,7 @@ def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[st
 
 
 def pick(kinds: Mapping[str, Kind], what: str, name: str) -> Kind:
-    """The one of this name.
-
-    Raises
-    ------
-    SettingsError
-        There is none; the message lists all.
-    """
+    """The one of this name. Raises SettingsError: there is none; the message lists all."""
     if name not in kinds:
         raise SettingsError(f"unknown {what} '{name}'; there are {', '.join(kinds)}")
     return kinds[name]

@@ -56,10 +56,7 @@ class Arm:
 def read(text: str) -> Arm:
     """The arm that `--arm` names.
 
-    Raises
-    ------
-    ArmError
-        It is neither a mode with settings nor a readable file that describes an arm.
+    Raises ArmError: it is neither a mode with settings nor a readable file that describes an arm.
     """
     mode, *pairs = text.split(",")
     if mode in MOVERS:
@@ -73,10 +70,7 @@ def read(text: str) -> Arm:
 def set_laws(arm: Arm, texts: Sequence[str]) -> Arm:
     """The arm with other laws, each as `PLACE=NAME[,PARAMETER=NUMBER…]`.
 
-    Raises
-    ------
-    ArmError
-        There is no such place, law or parameter.
+    Raises ArmError: there is no such place, law or parameter.
     """
     laws = {}
     for text in texts:

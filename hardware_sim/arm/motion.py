@@ -47,13 +47,7 @@ def radians_per_s(name: str, degrees_per_s: float) -> float:
 
 
 def within(name: str, value: float, low: float, high: float) -> float:
-    """A setting, checked.
-
-    Raises
-    ------
-    ArmError
-        It is no number or out of its range.
-    """
+    """A setting, checked. Raises ArmError: it is no number or out of its range."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and low <= value <= high):
         raise ArmError(f"the arm's '{name}' must be between {low:g} and {high:g}, not {value!r}")

@@ -316,10 +316,7 @@ MOVERS: dict[str, Callable[..., Mover]] = {
 def make_mover(mode: str, begin: Begin, settings: Mapping[str, Any]) -> Mover:
     """The named mover.
 
-    Raises
-    ------
-    ArmError
-        There is no such mover, or it has no such setting, or a value makes no sense.
+    Raises ArmError: there is no such mover, or it has no such setting, or a value makes no sense.
     """
     if mode not in MOVERS:
         raise ArmError(f"unknown mode of the arm {mode!r}; there are {', '.join(MOVERS)}")

@@ -58,10 +58,7 @@ class Mechanics:
 def law(place: str, name: str, parameters: Mapping[str, Any] | None = None) -> Any:
     """The named law of a place, with some of its parameters overridden.
 
-    Raises
-    ------
-    ArmError
-        There is no such place, law or parameter, or a value is not a finite number or out of range.
+    Raises ArmError: there is no such place, law or parameter, or a value is not a finite number or out of range.
     """
     if place not in LAWS:
         raise ArmError(f"the arm has no laws of {place!r}; it has {', '.join(LAWS)}")
@@ -78,10 +75,7 @@ def law_name(place: str, law: Any) -> str:
 def build(kind: Any, what: str, parameters: Mapping[str, Any]) -> Any:
     """The dataclass of numbers `kind` with these parameters, each above what its field says.
 
-    Raises
-    ------
-    ArmError
-        It has no such parameter, or a value is not a finite number or out of range.
+    Raises ArmError: it has no such parameter, or a value is not a finite number or out of range.
     """
     known = {each.name: each.metadata.get("above", -math.inf) for each in dataclasses.fields(kind)}
     for key, value in parameters.items():

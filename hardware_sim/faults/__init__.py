@@ -138,10 +138,7 @@ class Faults:
     def on(self, name: str, settings: dict[str, Any], for_s: float | None = None) -> None:
         """Switch a fault on, for `for_s` emulated seconds or until it is switched off.
 
-        Raises
-        ------
-        FaultError
-            No such fault, or no such setting, or a setting of another type than its default.
+        Raises FaultError: no such fault, or no such setting, or a setting of another type than its default.
         """
         make = self._find(name)
         known = _settings(make)
@@ -159,13 +156,7 @@ class Faults:
             self._target.timeline.after(for_s, lambda: self._end(name, undo))
 
     def off(self, name: str) -> None:
-        """Switch a fault off; nothing happens if it is off already.
-
-        Raises
-        ------
-        FaultError
-            No such fault.
-        """
+        """Switch a fault off; nothing happens if it is off already. Raises FaultError: no such fault."""
         self._find(name)
         undo = self._on.pop(name, None)
         if undo is not None:

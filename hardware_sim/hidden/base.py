@@ -141,13 +141,7 @@ class Base:
         return float(np.argmax(share >= 0.1)), float(np.argmax(share >= 0.9))
 
     def two_lags_s(self) -> tuple[float, float]:
-        """The two time constants, the shorter first.
-
-        Raises
-        ------
-        NotSuited
-            The dynamics are not two first-order lags.
-        """
+        """The two time constants, the shorter first. Raises NotSuited: the dynamics are not two first-order lags."""
         if self.lags_s is None:
             raise NotSuited("needs two real time constants")
         return min(self.lags_s), max(self.lags_s)

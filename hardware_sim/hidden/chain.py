@@ -135,13 +135,7 @@ class Chain:
 
 
 def combine(base: Base, hidden: list[tuple[Formulation, float]]) -> list[Stage]:
-    """The base's stages together with those of the effects.
-
-    Raises
-    ------
-    NotSuited
-        Two effects replace the same stage.
-    """
+    """The base's stages together with those of the effects. Raises NotSuited: two effects replace the same stage."""
     stages = [stage for formulation, magnitude in hidden for stage in formulation.build(magnitude)]
     taken = [stage.slot for stage in stages if stage.slot in _REPLACED]
     if len(set(taken)) < len(taken):

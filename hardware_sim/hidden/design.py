@@ -109,10 +109,7 @@ def make_design(
     `full`: rest 2 s, PRBS 12.7 s, rest 3 s, ramp 5 s up and 5 s down, rest 2 s, multi-level `validate`, rest 2 s.
     `short`: PRBS and ramp only.
 
-    Raises
-    ------
-    ValueError
-        No such design.
+    Raises ValueError: no such design.
     """
     if name not in DESIGNS:
         raise ValueError(f"design {name!r}: one of {', '.join(DESIGNS)}")

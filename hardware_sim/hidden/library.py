@@ -21,13 +21,7 @@ STILL = [name for name in EFFECTS if name not in MOVING]
 
 
 def find_effect(name: str) -> Effect:
-    """Return the effect of this name.
-
-    Raises
-    ------
-    ValueError
-        There is none.
-    """
+    """Return the effect of this name. Raises ValueError: there is none."""
     try:
         return {**EFFECTS, **OUTSIDERS}[name]
     except KeyError:

@@ -84,10 +84,7 @@ def draw_scenario(
 
     Bases, formulations and magnitudes are drawn until the strength's band is reached.
 
-    Raises
-    ------
-    ValueError
-        Unknown effect, strength or design; or no muscle found that shows the effect this strongly.
+    Raises ValueError: unknown effect, strength or design; or no muscle found that shows the effect this strongly.
     """
     if strength not in BANDS:
         raise ValueError(f"strength {strength!r}: one of {', '.join(BANDS)}")

@@ -201,10 +201,7 @@ def find_magnitude(
 
     By secant steps in the logarithm, kept within a bracket.
 
-    Raises
-    ------
-    NotSuited
-        The excess of the largest magnitude is too small, or the fit without the effect too poor.
+    Raises NotSuited: the excess of the largest magnitude is too small, or the fit without the effect too poor.
     """
     excess = _Excess(counted, formulation, base, design)
     if excess.own_nm > 0.5 * target_nm:

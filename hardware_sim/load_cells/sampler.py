@@ -117,13 +117,7 @@ class LoadCell:
 
 
 def _make_cell(settings: Settings) -> Cell:
-    """The cell's electronics.
-
-    Raises
-    ------
-    SettingsError
-        It has no frame of so many samples.
-    """
+    """The cell's electronics. Raises SettingsError: it has no frame of so many samples."""
     kind = pick(CELLS, "load cell", settings.cell)
     if settings.samples_per_frame not in kind.layouts:
         takes = " or ".join(map(str, kind.layouts))

@@ -62,10 +62,7 @@ def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
 def from_file(path: Path) -> Muscle:
     """The patient that a TOML or JSON file describes.
 
-    Raises
-    ------
-    PatientError
-        The file cannot be read, is malformed, or describes no patient; names the file.
+    Raises PatientError: the file cannot be read, is malformed, or describes no patient; names the file.
     """
     described = read_table(path, PatientError, "a table with 'patient' and 'parameters'")
     unknown = sorted(set(described) - {"patient", "parameters"})
