@@ -21,8 +21,10 @@ ARGUMENTS = [
 WIDE, NARROW, PHONE = (1280, 860), (1024, 768), (390, 844)
 TABLET, ZOOMED = (820, 1180), (640, 430)
 """ZOOMED: what a window of WIDE shows at 200 %."""
-
-
+UNCOVERED = """() => { const b = document.getElementById('stop').getBoundingClientRect();
+  const at = (x, y) => document.elementFromPoint(b.left + b.width * x, b.top + b.height * y);
+  return [[.5, .5], [.03, .1], [.97, .9]].every(([x, y]) => at(x, y)?.id === 'stop'); }"""
+"""Nothing lies over the stop button."""
 NAME, PASSWORD = "Ada", "correct horse battery"
 
 

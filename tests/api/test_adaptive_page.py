@@ -8,42 +8,25 @@ import pytest
 
 from tests.api.browser import participant
 from tests.api.conftest import Service, csrf, own_service, signed_in, wait_done
-from tests.api.test_axe import examined
 from tests.api.test_forms import fields
 
 service = own_service(speed=0.25)
 """Slow enough to look at a running test from all sides."""
 
 
-def chosen(tab: Any, target: str) -> None:
-    """The choice is made and sent."""
-    tab.locator("[name=plan][value=adaptive]").check()
-    tab.locator("[name=target]").fill(target)
-    tab.locator("button.stimulate").first.click()
-
-
-def begun(tab: Any, target: str) -> None:
-    chosen(tab, target)
-    tab.locator("form.steps button.stimulate").click()
-    tab.locator("#knows").wait_for()
-
-
 @pytest.mark.browser
 def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> None:
     participant(tab, service, "X1")
     tab.locator("[name=plan][value=adaptive]").check()
-    examined(tab, "the choice")
-    chosen(tab, "0,2")
+    tab.locator("[name=target]").fill("0,2")
+    tab.locator("button.stimulate").first.click()
     tab.get_by_text("The target should be reached").wait_for()
-    examined(tab, "the question")
     tab.locator("form.steps button.stimulate").click()
     tab.locator("#knows").wait_for()
     tab.get_by_text("Stops once both are known within 0.2 %").wait_for()
-    examined(tab, "a first look")
     tab.locator("#known-words", has_text="known within 8.0 %").wait_for()
     tab.locator("#least-known", has_text="140 µs").wait_for()
     assert float(tab.locator("#dose-used").inner_text()) > 0
-    examined(tab, "while it is chosen")
     with service.client() as client:
         test_id = client.get("/v1/tests").json()[0]["id"]
         box = tab.get_by_role("button", name="Enough").bounding_box()
@@ -55,17 +38,7 @@ def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> Non
     after = tab.context.new_page()  # the running test's page goes on to the model by itself, at a moment of its own
     after.goto(f"{service.url}/tests/{test_id}")
     after.get_by_text("A person said that it is enough").wait_for()
-    examined(after, "after it")
     assert tab.errors == []
-
-
-@pytest.mark.browser
-def test_a_worker_that_dies_is_told_on_the_page(tab: Any, service: Service) -> None:
-    service.rig.speed = 1.0
-    participant(tab, service, "X1")
-    begun(tab, "45")
-    tab.locator("#fixed-why").get_by_text("The fixed plan plays on").wait_for()
-    tab.locator("#stops-once").wait_for(state="hidden")
 
 
 def test_what_is_no_target_starts_nothing(service: Service) -> None:

@@ -24,11 +24,8 @@ from stimrig.api.charts.svg import svg
 from stimrig.api.sessions import joint_plan
 from stimrig.api.workers.curves import curves
 from tests.api import made_up_joint
-from tests.api.browser import look_closer, open_tab
 from tests.api.conftest import REAL, Service, play_test, run_test, serving, shared_service
 from tests.api.fake_rig import default_widths, muscle
-from tests.api.test_axe import examined
-from tests.api.test_chart_boxes import LAPTOP
 
 Done = tuple[httpx.Client, dict[str, Any], Path]
 
@@ -370,12 +367,6 @@ def models(service: Service) -> tuple[str, str]:
         return test["model_id"], both.json()["id"]
 
 
-def opened(page: Any, service: Service, model: str) -> None:
-    page.goto(f"{service.url}/models/{model}?diagnose=0")
-    page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-    look_closer(page, "joint_g", "joint_h")
-
-
 def test_reports_have_them_and_pages_of_other_models_do_not(client: httpx.Client, models: tuple[str, str]) -> None:
     at_rest, moving = models
     for path, count in ((f"/models/{moving}", 2), (f"/models/{at_rest}", 0)):
@@ -383,13 +374,3 @@ def test_reports_have_them_and_pages_of_other_models_do_not(client: httpx.Client
         assert page.count('data-figure="joint_') == count and ("joint_g.json" in page) == bool(count)
     assert client.get(f"/models/{moving}/report").text.count("<svg") == 5
     assert client.get(f"/models/{at_rest}/report").text.count("<svg") == 3
-
-
-@pytest.mark.browser
-@pytest.mark.parametrize("scheme", ["dark", "light"])
-def test_the_page_is_examined(browser: Any, service: Service, models: tuple[str, str], scheme: str):
-    for page in open_tab(browser, service, color_scheme=scheme):
-        page.set_viewport_size(LAPTOP)
-        opened(page, service, models[1])
-        examined(page, f"joint, {scheme}")
-        assert page.errors == []

@@ -190,7 +190,7 @@ def test_what_the_rig_would_not_hear_out_is_not_sent():
 
 
 SEED = int(os.environ.get("STIMRIG_SEED", "20261120"))
-EXAMPLES = int(os.environ.get("STIMRIG_EXAMPLES", "8"))
+EXAMPLES = int(os.environ.get("STIMRIG_EXAMPLES", "3"))
 """Of each operation; a hunt takes more."""
 AUTHORIZED = {"Authorization": f"Bearer {TOKEN}"}
 # A stop is open to any body by design; the controller's fetch and the page's form have their own tests.

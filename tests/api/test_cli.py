@@ -17,8 +17,8 @@ import pytest
 from bench.muscles import hidden_records
 from stimrig import identify
 from stimrig.api.cli import main
+from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.progress_bar import progress_bar
-from stimrig.api.workers import verbs
 from stimrig.identify.healing import place_words
 from stimrig.identify.records.join import write_joined
 from tests.api.test_worker import made_up_csv
@@ -294,9 +294,9 @@ def test_options_of_another_structure_are_one_line(files: tuple[Path, Path], cap
 
 
 def stimrig(*words: object) -> str:
-    """Standard output of a verb that must succeed; of three effects it finds what is missing."""
+    """Standard output of a verb that must succeed; of two effects it finds what is missing."""
     out, err = io.StringIO(), io.StringIO()
-    few = few_effects.only("fatigue", "output_saturation", "potentiation")
+    few = few_effects.only("fatigue", "output_saturation")
     with few, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         code = main.run(list(map(str, words)))
     assert code == 0, err.getvalue()
@@ -342,8 +342,8 @@ def test_what_a_model_holds_is_not_missing_in_it_and_auto_adds_what_improve_adds
     added = [step["added"] for step in improved["steps"][1:]]
     assert [effect["id"] for effect in fitted["effects"]] == added and "fatigue" in added
     forms = [f"{effect['id']} ({effect['form']})" for effect in fitted["effects"]]
-    assert f"structure      {', '.join(forms)}\n" in stimrig("diagnose", data, "--model", held)
-    own = verbs.diagnosis(str(data), lambda *_: None, held.read_text())
+    own = json.loads(stimrig("diagnose", data, "--model", held, "--json"))
+    assert f"structure      {', '.join(forms)}" in diagnosis_lines(own)
     assert [name.partition(":")[0] for name in own["structure"]] == added
     assert own["verdict"] == "nothing_missing" and own["missing"] == []
     tried = {row["effect"] for rows in own["candidates"] for row in rows}

@@ -1,4 +1,4 @@
-"""A whole day by keys alone, from signing in to the comparison; and how many presses it takes to an approved model."""
+"""A whole day by keys alone, from signing in to an approved model; and how many presses it takes."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import NAME, PASSWORD, chart, expected, open_tab, settled
+from tests.api.browser import NAME, PASSWORD, expected, open_tab, settled
 from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
@@ -108,6 +108,10 @@ def test_from_signing_in_to_an_approved_model(hand: Hand, service: Service) -> N
     hand.type("code", "D1")
     hand.enter()
     hand.page.get_by_role("heading", name="D1").wait_for()
+    settled(hand.page)
+    for name in ("Skip to content", "Stop stimulation"):
+        hand.page.keyboard.press("Tab")
+        assert hand.page.evaluate("document.activeElement.textContent.trim()") == name
     calibrate(hand)
     test_and_approve(hand)
     assert hand.count == 10, "name, password, in; code, create; begin; start, now; password, approve"
@@ -122,49 +126,3 @@ def test_from_signing_in_to_an_approved_model(hand: Hand, service: Service) -> N
     hand.page.go_back()
     test_and_approve(hand)
     assert hand.count <= 9, "the one that looks at the calibration stands for the one that begins it"
-
-
-def test_what_else_a_day_has(hand: Hand, service: Service) -> None:
-    page = hand.page
-    sign_in(hand, service)
-    hand.type("code", "D2")
-    hand.enter()
-    page.get_by_role("heading", name="D2").wait_for()
-    service.rig.speed = 0.5
-    hand.press("Start the pre-session test")
-    page.get_by_role("heading", name="Start the pre-session test of").wait_for()
-    hand.press("Start now")
-    page.locator("#age", has_text="ms").wait_for()
-    page.keyboard.press("Escape")
-    page.get_by_text("The rig confirms that stimulation is off.").wait_for()
-    hand.press("To the participants")
-    page.get_by_role("button", name="I have checked: re-arm").wait_for()
-    expected(page.get_by_role("button", name="I have checked: re-arm")).to_be_enabled()
-    hand.press("I have checked: re-arm")
-    page.get_by_text("stays stopped").wait_for(state="detached")
-    service.rig.speed = 4.0
-    first = service.play_test("D2")["model_id"]
-    page.goto(f"{service.url}/models/{first}")
-    page.get_by_role("button", name="Add this effect").first.wait_for()
-    chart(page, "overview")
-    hand.press("Add this effect")
-    page.locator("#versions").wait_for()
-    assert first not in page.url
-    hand.type("undo-password", PASSWORD)
-    hand.enter()
-    page.wait_for_url(f"**/models/{first}*")
-    hand.press("see that version")
-    page.wait_for_url(lambda now: "/models/" in now and first not in now)
-    hand.press("Step by step")
-    page.wait_for_url(lambda now: now.endswith("/story") and first not in now)
-    hand.press("To the model: approve it, or look at the details")
-    page.wait_for_url(lambda now: "/models/" in now and not now.endswith("/story"))
-    hand.press("Report")
-    page.wait_for_url("**/report")
-    page.goto(service.url + "/participants/D2")
-    for box in page.get_by_role("checkbox", name="Compare the model").all()[:2]:
-        hand.to(box.get_attribute("aria-label"))
-        if not box.is_checked():
-            page.keyboard.press("Space")
-    hand.press("Compare the ticked ones")
-    page.wait_for_url("**/compare?model=*&model=*")

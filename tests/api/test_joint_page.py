@@ -1,4 +1,4 @@
-"""The pages of a moving joint in a real browser: poses, range, the guided tests, and nothing of it without a sensor."""
+"""The pages of a moving joint in a real browser: what they follow while a person moves the joint."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import after_the_end, expected, painted_soon, participant
+from tests.api.browser import after_the_end, painted_soon, participant
 from tests.api.conftest import Service, own_service, soon
 from tests.api.fake_arm import back_and_forth, still
 
@@ -38,62 +38,6 @@ def at(tab: Any, service: Service, angle_deg: float) -> None:
     """Move the joint there, and wait until the page knows."""
     service.rig.arm.way = still(math.radians(angle_deg))
     tab.locator('[data-now="angle"]', has_text=f"{angle_deg:.0f}°").first.wait_for()
-
-
-def test_two_poses_on_the_page_and_the_first_once_more(tab: Any, sensor: Service) -> None:
-    sensor.rig.arm.way = still(math.radians(15))
-    tab.goto(f"{sensor.url}/rig/angle")
-    tab.get_by_text("Not calibrated.").wait_for()
-    tab.locator('[data-now="angle"]', has_text="15°").wait_for()
-    tab.get_by_label("The goniometer shows (°)").fill("zwei")
-    tab.get_by_role("button", name="Take the first pose").click()
-    tab.get_by_text("is not a plain number").wait_for()
-    assert tab.get_by_label("The goniometer shows (°)").input_value() == "zwei"
-    for slip in ("200", "-90"):
-        tab.get_by_label("The goniometer shows (°)").fill(slip)
-        tab.get_by_role("button", name="Take the first pose").click()
-        tab.locator(".wrong", has_text=f"{slip}° is not within −6° … 138°, as this rig asks").wait_for()
-        assert tab.get_by_label("The goniometer shows (°)").input_value() == slip
-    tab.get_by_label("The goniometer shows (°)").fill("51")  # a slip
-    tab.get_by_role("button", name="Take the first pose").click()
-    tab.get_by_role("heading", name="Second pose").wait_for()
-    tab.get_by_role("link", name="Start again").click()
-    tab.get_by_label("The goniometer shows (°)").fill("15")
-    tab.get_by_role("button", name="Take the first pose").click()
-    tab.get_by_text("The first pose is taken: 15°").wait_for()
-    tab.get_by_label("The goniometer shows (°)").fill("20")
-    tab.get_by_role("button", name="Take the second pose").click()
-    tab.get_by_role("alert").get_by_text("less than 0.5 rad apart").wait_for()
-    tab.get_by_label("The goniometer shows (°)").fill("100,4")
-    tab.get_by_role("button", name="Take the second pose").click()
-    tab.get_by_text("by Ada, at 15° and 100°").wait_for()
-    tab.get_by_text("Check it: bring the joint to a third angle").wait_for()
-    assert [round(math.degrees(pose.angle_rad), 1) for pose in sensor.rig.arm.calibration.poses] == [15.0, 100.4]
-    assert sensor.rig.arm.calibration.by == "Ada"
-
-
-def test_a_range_is_typed_in_degrees(tab: Any, sensor: Service) -> None:
-    with_range(tab, sensor)
-    with sensor.client() as http:
-        found = http.get("/v1/participants/X1").json()["profile"]["angle_range_rad"]
-    assert [round(math.degrees(value), 6) for value in found] == [20, 110]
-    for low, high, words in (("110", "20", "must be at least 10° above"), ("x", "110", "not a plain number"),
-                             ("20", "170", "as this rig asks"), ("20", "200", "as this rig asks")):  # fmt: skip
-        tab.locator("#angle_from_deg").fill(low)
-        tab.locator("#angle_to_deg").fill(high)
-        tab.get_by_role("button", name="Set the limits").click()
-        tab.locator(".wrong", has_text=words).wait_for()
-    tab.locator("#angle_from_deg").fill("−5")
-    tab.locator("#angle_to_deg").fill("90")
-    tab.get_by_role("button", name="Set the limits").click()
-    tab.wait_for_load_state()
-    expected(tab.locator("#angle_from_deg")).to_have_value("-5")
-    tab.locator("#angle_from_deg").fill("")
-    tab.locator("#angle_to_deg").fill("")
-    tab.get_by_role("button", name="Set the limits").click()
-    tab.wait_for_load_state()
-    tab.goto(f"{sensor.url}/participants/X1/joint")
-    tab.get_by_text("Set the range first.").wait_for()
 
 
 def test_a_passive_test_shows_its_map_and_ends_by_itself(tab: Any, sensor: Service) -> None:
@@ -144,23 +88,3 @@ def test_held_angles_start_only_there_and_survive_a_reload(tab: Any, sensor: Ser
     at(tab, sensor, 35)
     again.click()
     tab.get_by_role("heading", name="Start the held-angle test of X1?").wait_for()
-
-
-def test_movement_under_stimulation_and_one_model_of_all(tab: Any, sensor: Service) -> None:
-    sensor.rig.speed = 1.0  # it is still playing when a busy machine has loaded its page
-    with_range(tab, sensor)
-    tab.goto(f"{sensor.url}/participants/X1/joint")
-    tab.get_by_role("button", name="Start the movement under stimulation…").click()
-    tab.get_by_text("of the pre-session test's").wait_for()
-    sensor.rig.arm.way = back_and_forth(LOW + 0.01, HIGH - 0.01, (0.6, 1.6))
-    tab.get_by_role("button", name="Start now").click()
-    tab.wait_for_url("**/tests/T*")
-    tab.locator("#dose-used", has_text="N·m·s").wait_for()
-    tab.get_by_role("button", name="Enough").click()
-    after_the_end(tab, "/participants/X1/joint", "Back to the joint")
-    tab.locator("input[name=recording]:checked").wait_for()
-    tab.get_by_text("Not recorded today: passive movement, held-angle test.").wait_for()
-    expected(tab.locator("main .primary")).to_have_count(1)  # the passive movement comes before the model
-    tab.get_by_role("button", name="Fit one model to the ticked ones").click()
-    tab.wait_for_url("**/models/M-*")
-    assert tab.errors == []

@@ -39,7 +39,7 @@ def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
     with Services(settings(tmp_path), [], TOKEN) as services, Client(services.url, TOKEN) as rest:
         http = rest.http
         assert http.get("/rig/now").json()["emulated"] is True
-        document = rest.run_test(rest.make_participant("P-SECRET-7")["code"])
+        document = rest.run_test(rest.make_participant("P-SECRET-7")["code"], protocol="short")
         assert document["summary"]["lost_samples"] == 0
         fit = document["fit"]
         assert fit["ceiling_percent"] > 95 and fit["fit_percent"] > 90

@@ -10,7 +10,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +23,7 @@ from stimrig.api.cli.launcher import Services
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.service_lock import HeldError, ServiceLock, refuse_if_held
+from stimrig.api.store.tables import Participant
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 from tests.harness.looks_first import LooksFirst
 
@@ -37,8 +38,8 @@ def command(data: Path, **more: str) -> dict[str, Any]:
 
 @contextmanager
 def served(data: Path, **more: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
-    """A service as a process; it and its address."""
-    process = subprocess.Popen(**command(data, **more), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+    """A service as a process that was started with an open mask; it and its address."""
+    process = subprocess.Popen(**command(data, **more), umask=0, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
     try:
         assert process.stdout is not None
         yield process, json.loads(process.stdout.readline())["url"]
@@ -49,22 +50,24 @@ def served(data: Path, **more: str) -> Iterator[tuple[subprocess.Popen[str], str
 
 @pytest.mark.slow
 def test_a_second_service_is_told_who_holds_the_data_and_a_kill_lets_go(tmp_path: Path) -> None:
-    data, other, link = tmp_path / "data", tmp_path / "other", tmp_path / "link.db"
+    data = tmp_path / "data"
     with served(data) as (first, url):
-        link.symlink_to(data / "stimrig.db")
-        for folder, more in ((data, {}), (other, {"DATABASE_URL": f"sqlite:///{link}"})):
-            done = subprocess.run(**command(folder, **more), capture_output=True, timeout=60)
-            (line,) = [line for line in done.stderr.splitlines() if not line.startswith("{")]
-            assert done.returncode == 2 and done.stdout == ""
-            assert f"process {first.pid} on {socket.gethostname()}, since 20" in line and f"at {url}; stop it" in line
+        done = subprocess.run(**command(data), capture_output=True, timeout=60)
+        (line,) = [line for line in done.stderr.splitlines() if not line.startswith("{")]
+        assert done.returncode == 2 and done.stdout == ""
+        assert f"process {first.pid} on {socket.gethostname()}, since 20" in line and f"at {url}; stop it" in line
         assert main.run(["audit", "verify", "--data", str(data)]) == 0, "who only reads is let in"
         http = httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S)
         assert http.post("/v1/participants", json={"code": "P1"}).status_code == 201, "the first works on"
+        sent = http.post("/v1/participants/P1/recordings", content=b"time_s,pulse_width_us,torque_nm,segment\n")
+        files = [path for path in data.rglob("*") if path.is_file()]
+        assert sent.status_code in (201, 422) and files
+        assert [path for path in files if mode(path) & 0o077] == [], "by the process's own mask, uploads and logs too"
         first.send_signal(signal.SIGKILL)
         first.wait(20)
-    with served(other, DATABASE_URL=f"sqlite:///{link}") as (_, url):
-        http = httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S)
-        assert [row["code"] for row in http.get("/v1/participants").json()] == ["P1"]
+    held(data_dir=data).release()
+    with closing(Store(f"sqlite:///{data}/stimrig.db")) as store:
+        assert store.get(Participant, "P1") is not None
 
 
 def held(**given: Any) -> ServiceLock:
@@ -186,22 +189,6 @@ def test_new_folders_are_closed_and_shared_ones_stay_as_they_are(tmp_path: Path)
     shared.chmod(0o770)
     held(data_dir=shared).release()
     assert mode(shared) == 0o770
-
-
-@pytest.mark.slow
-def test_files_of_the_process_are_its_owners_alone(tmp_path: Path) -> None:
-    """Uploads, exports and logs too: by the process's own mask, whatever it was started with."""
-    before = os.umask(0)
-    try:
-        with served(tmp_path / "data") as (_, url):
-            http = httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S)
-            http.post("/v1/participants", json={"code": "P1"})
-            sent = http.post("/v1/participants/P1/recordings", content=b"time_s,pulse_width_us,torque_nm,segment\n")
-            files = [path for path in (tmp_path / "data").rglob("*") if path.is_file()]
-            assert sent.status_code in (201, 422) and files
-            assert [path for path in files if mode(path) & 0o077] == []
-    finally:
-        os.umask(before)
 
 
 def test_the_message_names_nobody_who_is_gone(tmp_path: Path) -> None:

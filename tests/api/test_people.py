@@ -312,20 +312,6 @@ def test_stop_is_open_to_anyone_signed_in_and_to_nobody_else(service: Service) -
     assert service.client(None).post("/v1/stop").status_code == 401
 
 
-def test_stop_by_plain_form_works_without_csrf_and_after_the_session_ran_out(
-    service: Service, pages: httpx.Client, participant: str
-) -> None:
-    service.rig.speed = 0.5
-    with service.client() as client:
-        client.post("/v1/tests", json={"participant": participant})
-    service.sql("UPDATE page_sessions SET expires_unix_s = 0")
-    assert pages.get("/v1/rig").status_code in (303, 401)
-    page = pages.post("/v1/stop", data={"reason": "stop pressed on the page"}, follow_redirects=True)
-    assert page.status_code == 200
-    assert "The rig confirms that stimulation is off" in page.text
-    assert service.rig.stopped_by == "administrator"
-
-
 def test_stop_says_so_when_the_rig_is_gone(client: httpx.Client, service: Service) -> None:
     service.rig_thread.__exit__()
     answer = client.post("/v1/stop")

@@ -24,7 +24,7 @@ from stimrig.api.record_files import find_recording
 from stimrig.api.workers import confinement
 from stimrig.api.workers.pool import WORKER, Pool
 from stimrig.api.workers.process import Places
-from tests.api.conftest import STUB, Service, run_service, serving, soon
+from tests.api.conftest import REAL, STUB, Service, run_service, serving, soon
 from tests.api.test_problems import problem
 from tests.api.test_worker import with_pool
 from tests.harness import hostile_files, hostile_shapes
@@ -219,9 +219,8 @@ def test_an_upload_that_a_worker_dies_of_is_refused_in_one_line(deadly: Service)
 
 
 def test_no_path_of_this_machine_is_told_of_an_upload(tmp_path: Path, short_dir: Path) -> None:
-    for service in run_service(tmp_path, short_dir, WORKER, workers=1):
+    for service in run_service(tmp_path, short_dir, REAL, workers=1):
         with service.client() as client:
-            client.timeout = None  # a worker gives way to every other process
             client.post("/v1/participants", json={"code": "P017"})
             content = hostile_shapes.good(hostile_shapes.virtual_over_raw, tmp_path)
             for body in (content, b"time_s,pulse_width_us,torque_nm,segment\n1,2,x,y\n"):
