@@ -132,7 +132,7 @@ def test_a_slow_cell_keeps_its_samples() -> None:
     assert verbs.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
 
 
-@pytest.mark.parametrize(("seed", "dropped"), [(74, 0.0), (73, 0.05)])
+@pytest.mark.parametrize(("seed", "dropped"), [(73, 0.05), pytest.param(74, 0.0, marks=pytest.mark.campaign)])
 def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
     """Also where a busy machine drops pulses: the muscle did not feel them, which is no misfit of the structure."""
     muscle = sigmoid(seed)

@@ -65,9 +65,9 @@ def test_each_verb_takes_each_kind(folder: Path, tmp_path: Path, kind: str) -> N
     done("fit", data, "-o", model)
     done("predict", model, data, "-o", table)
     done("compare", model, data, "--html", tmp_path / "c.html")
-    told = json.loads(done("explain", data, "--html", tmp_path / "s.html", "-o", tmp_path / "last.json", "--json"))
-    assert told["diagnosis"]["verdict"] and (tmp_path / "s.html").stat().st_size > 10_000
-    done("fit", data, "-o", tmp_path / "model.mat")
+    if kind in ("plain", "moving"):  # the longest verb: at rest and with an angle
+        told = json.loads(done("explain", data, "--html", tmp_path / "s.html", "-o", model, "--json"))
+        assert told["diagnosis"]["verdict"] and (tmp_path / "s.html").stat().st_size > 10_000
     predicted = np.genfromtxt(table, delimiter=",", names=True)
     assert predicted.dtype.names == ("time_s", "torque_nm", "predicted_torque_nm") and len(predicted) > 100
     record = identify.read(data)
@@ -77,7 +77,7 @@ def test_each_verb_takes_each_kind(folder: Path, tmp_path: Path, kind: str) -> N
     lines = "".join(f"{time_s:.6f},{width_us:g},{torque_nm:.6f},{name}\n" for time_s, width_us, torque_nm, name in rows)
     plain.write_text(f"time_s,pulse_width_us,torque_nm,segment\n{lines}")
     if record.angle_rad is None:  # a joint that moves needs its angle
-        done("compare", tmp_path / "last.json", plain)
+        done("compare", model, plain)
 
 
 @pytest.mark.parametrize("kind", sorted(TOO_LITTLE))
@@ -122,6 +122,6 @@ def test_a_verb_that_did_nothing_of_what_was_asked_does_not_end_well(folder: Pat
     for number, verb in enumerate((("export", "-o"), ("cohort", "fit", "--workers", 1, "-o"))):
         code, _out, err = run(*verb, tmp_path / f"{number}.parquet", bad.parent)
         assert code == 1 and "nothing was done" in err and err.count("\n") <= 2, err
-        nobodys = ("--select", "participant == 'nobody'", folder / "plain.h5")
-        code, _out, err = run(*verb, tmp_path / f"other {number}.parquet", *nobodys)
-        assert code == 1 and "no record" in err
+    nobodys = ("--select", "participant == 'nobody'", folder / "plain.h5")
+    code, _out, err = run("export", "-o", tmp_path / "other", *nobodys)
+    assert code == 1 and "no record" in err

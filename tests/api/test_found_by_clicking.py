@@ -1,9 +1,7 @@
-"""A hidden effect, found and added by clicking: a record of the emulator's muscle, real workers, a real browser."""
+"""A hidden effect, found and added by clicking: a record of the emulator's muscle, a real fit, a real browser."""
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,19 +9,20 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from stimrig.api.workers.pool import WORKER
+from bench.muscles import hidden_records
 from tests.api.browser import PASSWORD, chart, expected, participant, there
-from tests.api.conftest import Service, run_service
+from tests.api.conftest import REAL, Service, run_service
+from tests.harness import few_effects
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
-ROOT = Path(__file__).parents[2]
 HIDDEN = ["--effects", "recruitment_hysteresis", "--seeds", "29:30", "--strengths", "strong", "--rate-hz", "80"]
 PATIENCE_MS = 400_000
 
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    yield from run_service(tmp_path_factory.mktemp("clicking"), short_dir, WORKER)
+    with few_effects.only("recruitment_hysteresis", "fatigue"):
+        yield from run_service(tmp_path_factory.mktemp("clicking"), short_dir, REAL)
 
 
 def error_of(row: Any) -> float:
@@ -32,8 +31,7 @@ def error_of(row: Any) -> float:
 
 
 def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service: Service, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "bench.muscles.hidden_records", "--out", str(tmp_path), *HIDDEN]
-    subprocess.run(command, check=True, cwd=ROOT, capture_output=True)
+    assert hidden_records.main(["--out", str(tmp_path), *HIDDEN]) == 0
     (record,) = tmp_path.glob("*.csv")
     participant(tab, service, "H1")
     tab.get_by_text("Upload a recording of another tool").click()

@@ -165,14 +165,6 @@ def test_each_member_that_a_problem_carries_is_in_its_schema(client: httpx.Clien
     assert "latch" in document["components"]["schemas"]["RigOut"]["properties"]
 
 
-def test_the_document_describes_live_messages_and_what_was_tracked(document: dict[str, Any]) -> None:
-    schemas = document["components"]["schemas"]
-    assert {"time_s", "torque_min_nm", "pulse_width_us"} <= set(schemas["LiveOut"]["properties"])
-    assert "negative" in schemas["LiveOut"]["description"]
-    assert schemas["ModelJson"]["properties"]["tracking"] == {"$ref": "#/components/schemas/TrackedOut"}
-    assert {"ask", "disturbed_s"} <= set(schemas["TrackedOut"]["properties"])
-
-
 def test_a_pulse_rate_has_the_range_of_the_rig_where_it_is_played(document: dict[str, Any]) -> None:
     schemas, own = document["components"]["schemas"], HARD_LIMITS["pulse_rate_hz"]
     asked = schemas["TestIn"]["properties"]["pulse_rate_hz"]
@@ -182,12 +174,6 @@ def test_a_pulse_rate_has_the_range_of_the_rig_where_it_is_played(document: dict
         assert "default" not in asked or asked["default"] is None
         (number,) = (part for part in asked["anyOf"] if part["type"] == "number")
         assert (number["minimum"], number["maximum"]) == (own.lo, 100.0), "a model of another tool's recording, too"
-
-
-def test_a_client_sees_which_sequences_there_are_and_what_they_take(service: Service) -> None:
-    with service.client(service.token("controller", "read-model")) as client:
-        found = client.get("/v1/sequences").json()
-    assert [sequence["id"] for sequence in found["sequences"]] == ["rest"]
 
 
 def test_every_sequence_of_the_rig_says_each_setting_with_its_unit() -> None:

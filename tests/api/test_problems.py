@@ -85,11 +85,6 @@ def test_no_model_approved_says_how_to_approve(client: httpx.Client, participant
     assert found["type"] == "/problems/no-approved-model" and "approve" in found["detail"]
 
 
-def test_unknown_scope(shared_client: httpx.Client) -> None:
-    found = problem(shared_client.post("/v1/tokens", json={"name": "x", "scopes": ["everything"]}), 422)
-    assert "everything" in found["detail"] and "read-model" in found["detail"]
-
-
 def test_rig_that_is_gone_and_comes_back(client: httpx.Client, service: Service, participant: str) -> None:
     service.rig_thread.__exit__()
     soon(lambda: not client.get("/v1/rig").json()["connected"])
@@ -188,11 +183,6 @@ def test_upload_too_large_or_empty(client: httpx.Client, service: Service, parti
     problem(client.post(f"/v1/participants/{participant}/recordings", content=b"x" * 2000), 413)
     problem(client.post(f"/v1/participants/{participant}/recordings", content=b""), 422)
     assert list((service.data / "recordings").rglob("upload-*")) == []
-
-
-def test_page_shows_a_problem_in_words(shared_client: httpx.Client) -> None:
-    answer = shared_client.get("/models/M404", headers={"Accept": "text/html"})
-    assert answer.status_code == 404 and "There is no model" in answer.text and "<h1>" in answer.text
 
 
 def test_unforeseen_error_is_a_problem_too(client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch):

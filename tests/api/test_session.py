@@ -187,18 +187,3 @@ def test_version_with_other_contents_is_refused_and_the_old_one_stays(
     assert same.created_by != "somebody"
     after = client.get(path)
     assert after.content == before.content and after.headers["etag"] == before.headers["etag"]
-
-
-def test_no_route_changes_or_deletes_a_model(client: httpx.Client, participant: str) -> None:
-    document = run_test(client, participant)
-    for address in (document["model_url"], f"{document['model_url']}/file", document["recording_url"]):
-        for method in ("PUT", "PATCH", "DELETE"):
-            assert client.request(method, address).status_code == 405
-    described = client.get("/openapi.json").json()["paths"]
-    changing = {
-        (method, path)
-        for path, methods in described.items()
-        for method in methods
-        if method in ("put", "patch", "delete") and ("/models" in path or "/recordings" in path)
-    }
-    assert changing == set()

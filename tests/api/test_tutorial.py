@@ -44,8 +44,3 @@ def test_every_block_runs_in_order(tmp_path: Path, strange: bool) -> None:
     assert [trace.name for trace in figure.data] == ["fitted pulses", "held-out pulses"]
     drawn = stimrig.plot(scope["model"], scope["record"])
     assert {"measured", "model, free run", "measured − model", "pulse width"} <= {trace.name for trace in drawn.data}
-
-
-def test_plot_of_something_else_says_what_it_takes() -> None:
-    with pytest.raises(stimrig.errors.BadRequest, match=r"plot\(model, record\)"):
-        stimrig.plot({})
