@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,14 +12,14 @@ import pytest
 
 import stimrig
 from stimrig.api.cli import main
-from stimrig.errors import BadRecord, BadRequest, InputError
+from stimrig.errors import BadRequest, InputError
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
 from tests.api.test_worker import made_up_csv
 from tests.frozen.rig_records import of_kind
 from tests.harness import few_effects
 from tests.stimrig.verbs_table import COMMAND_ONLY, PAGE, function_of, page, verbs
 
-EFFECTS = ("threshold_drift", "fatigue")
+EFFECTS = ("threshold_drift",)
 
 
 @pytest.fixture(scope="module")
@@ -111,16 +109,12 @@ def recovers(_at: Path, new: Path) -> None:
         stimrig.recover(new / "nowhere")
 
 
-def cohort_runs(verb: str) -> Callable[[Path, Path], None]:
-    def runs(at: Path, new: Path) -> None:
-        found = getattr(stimrig.cohort, verb)([at / "record.csv"], new / "results.parquet", workers=1)
-        assert (found["ok"], found["errors"]) == (1, 0), found
-        if verb == "fit":
-            assert stimrig.cohort.changed(new / "results.parquet", new / "results.parquet")["unchanged"] == 1
-            assert stimrig.cohort.figures(new / "results.parquet", new / "cohort.html")["records"] == 1
-            assert "<html" in (new / "cohort.html").read_text()
-
-    return runs
+def cohort_fits(at: Path, new: Path) -> None:
+    found = stimrig.cohort.fit([at / "record.csv"], new / "results.parquet", workers=1)
+    assert (found["ok"], found["errors"]) == (1, 0), found
+    assert stimrig.cohort.changed(new / "results.parquet", new / "results.parquet")["unchanged"] == 1
+    assert stimrig.cohort.figures(new / "results.parquet", new / "cohort.html")["records"] == 1
+    assert "<html" in (new / "cohort.html").read_text()
 
 
 def exports(at: Path, new: Path) -> None:
@@ -144,22 +138,17 @@ REST: dict[str, Callable[[Path, Path], Any]] = {
     "predict": predicts,
     "recover": recovers,
     "export": exports,
-    "cohort fit": cohort_runs("fit"),
-    "cohort diagnose": cohort_runs("diagnose"),
-    "cohort improve": cohort_runs("improve"),
+    "cohort fit": cohort_fits,
     "emulate": emulates,
-    "effects": lambda *_: stimrig.effects()[0]["equation"],
+    "effects": lambda *_: [row["equation"] and row["source"] for row in stimrig.effects()],
     "schema": lambda *_: stimrig.schema("invert")["properties"]["pulse_width_us"],
 }
-ELSEWHERE = {"cohort changed": "cohort fit", "cohort figures": "cohort fit", "test": "a_test"}
-"""Run by another one of these tests."""
-LONG = ("cohort diagnose", "cohort improve")
+ELSEWHERE = ("cohort changed", "cohort figures", "test", "cohort diagnose", "cohort improve")
+"""Run by another one of these tests, or as the others of a cohort by `tests/api/cohort`."""
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "verb", [pytest.param(verb, marks=[pytest.mark.campaign] if verb in LONG else []) for verb in REST]
-)
+@pytest.mark.parametrize("verb", REST)
 def test_the_function_of_each_other_verb_runs(verb: str, folder: Path, tmp_path: Path) -> None:
     REST[verb](folder, tmp_path)
 
@@ -197,21 +186,6 @@ def test_a_report_is_the_one_of_the_verb(folder: Path, record: Any, model: Any, 
     stimrig.save(model, ours, record)
     assert main.run(["compare", str(folder / "MODEL.json"), str(folder / "record.csv"), "--html", str(theirs)]) == 0
     assert ours.read_text() == theirs.read_text()
-    with few_effects.only(*EFFECTS):
-        explained = stimrig.explain(record)
-    assert "record.csv" in stimrig.save(explained, ours, record).read_text()
-
-
-def test_several_records_are_joined(folder: Path, tmp_path: Path) -> None:
-    other = tmp_path / "other.csv"
-    head, *rows = (folder / "record.csv").read_text().splitlines()
-    cells = (row.split(",") for row in rows)
-    other.write_text("\n".join([head, *(f"{t},{u},{float(m) * 1.1:.6f},{s}" for t, u, m, s in cells)]) + "\n")
-    joined = stimrig.join([folder / "record.csv", other])
-    assert len(joined.parts) == 2
-    assert len(stimrig.read(stimrig.save(joined, tmp_path / "joined.csv")).parts) == 2
-    with pytest.raises(BadRecord, match=r"nowhere\.csv"):
-        stimrig.join([other, "nowhere.csv"])
 
 
 def test_a_model_is_tracked_over_trials(record: Any, model: Any) -> None:
@@ -224,9 +198,3 @@ def test_a_model_is_tracked_over_trials(record: Any, model: Any) -> None:
     assert tracked.approved is model
     with pytest.raises(BadRequest, match="no trial"):
         stimrig.track(model, [])
-
-
-def test_the_whole_module_is_there_without_a_first_look() -> None:
-    code = "import stimrig; print(stimrig.cohort.fit.__name__, all(getattr(stimrig, n) for n in stimrig.__all__))"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "fit True\n"
