@@ -109,7 +109,7 @@ def test_a_database_that_is_not_there_or_newer_is_refused_in_one_line(cluster: C
         Store("postgresql://ann:secret@127.0.0.1:1/stimrig")
     line = str(caught.value)
     assert "127.0.0.1" in line and "secret" not in line and "\n" not in line and "STIMRIG_DATABASE_URL" in line
-    newer = cluster.empty("newer")
+    newer = cluster.database("newer")
     store = Store(newer)
     with store.write() as session:
         session.connection().exec_driver_sql("UPDATE alembic_version SET version_num = '0900'")
@@ -124,13 +124,10 @@ def test_a_stop_is_answered_while_the_database_is_frozen(cluster: Cluster, tmp_p
     with serving(tmp_path, short_dir, STUB, speed=2.0) as (service, client):
         client.post("/v1/participants", json={"code": "P1"})
         test_id = client.post("/v1/tests", json={"participant": "P1"}).json()["id"]
-        cluster.freeze()
-        try:
+        with cluster.frozen():
             answer = client.post("/v1/stop", json={"reason": "frozen"})
             assert answer.status_code == 200, answer.text
             assert service.rig.status().state != "playing"
-        finally:
-            cluster.thaw()
         assert wait_done(client, test_id)["state"] in ("stopped", "aborted", "fault")
         cluster.restart()
         assert soon(lambda: client.get("/v1/audit").status_code == 200)

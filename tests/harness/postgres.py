@@ -19,6 +19,7 @@ from pathlib import Path
 import psycopg
 
 from stimrig.api.store import Store
+from tests.harness.processes import below
 
 USER, TEMPLATE = "stimrig", "stimrig_template"
 UNPRIVILEGED = "postgres" if os.getuid() == 0 else None
@@ -40,7 +41,10 @@ class Cluster:
     """A cluster in a folder that PostgreSQL's user may enter; it need not survive a crash of the machine."""
 
     def __init__(self, folder: Path, place: Path) -> None:
-        self.folder, self.place, self.port = folder, place, free_port()
+        self.folder, self.place = folder, place
+        with socket.socket() as probe:
+            probe.bind(("127.0.0.1", 0))
+            self.port = probe.getsockname()[1]
         self.process: subprocess.Popen[bytes] | None = None
         folder.mkdir(mode=0o700)
         if UNPRIVILEGED is not None:
@@ -93,28 +97,18 @@ class Cluster:
                 connection.execute(f"CREATE DATABASE {name} TEMPLATE {TEMPLATE}")
         return self.address(name)
 
-    def empty(self, name: str) -> str:
-        """The URL of a new database without a table."""
-        with psycopg.connect(self.address("postgres"), autocommit=True) as connection:
-            connection.execute(f"CREATE DATABASE {name}")
-        return self.address(name)
-
-    def freeze(self) -> None:
-        """All its processes stand still, as on a machine that is gone."""
-        self._signal(signal.SIGSTOP)
-
-    def thaw(self) -> None:
-        """They go on."""
-        self._signal(signal.SIGCONT)
-
-    def _signal(self, number: signal.Signals) -> None:
-        """To every process of it: each backend leads a session of its own."""
+    @contextmanager
+    def frozen(self) -> Iterator[None]:
+        """All its processes stand still, as on a machine that is gone; each backend leads a session of its own."""
         assert self.process is not None
-        listed = subprocess.run(["ps", "-e", "-o", "pid=,ppid="], capture_output=True, text=True, check=True).stdout
-        for line in listed.splitlines():
-            pid, parent = map(int, line.split())
-            if self.process.pid in (pid, parent):
-                os.kill(pid, number)
+        pids = [self.process.pid, *below(self.process.pid)]
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            for pid in pids:
+                os.kill(pid, signal.SIGCONT)
 
     def restart(self) -> None:
         """As after a crash of it: all connections are cut."""
@@ -127,24 +121,14 @@ def _end_with_parent() -> None:
     ctypes.CDLL(None).prctl(1, signal.SIGINT)
 
 
-def free_port() -> int:
-    """A port on which nobody listens now."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
-
-
 @contextmanager
 def running(place: Path) -> Iterator[Cluster]:
     """A new cluster of the programs in `place`, started; it is gone at the end."""
-    folder = Path(tempfile.mkdtemp(prefix="stimrig-pg-"))
-    folder.chmod(0o711)
-    try:
-        cluster = Cluster(folder / "cluster", place)
+    with tempfile.TemporaryDirectory(prefix="stimrig-pg-", ignore_cleanup_errors=True) as folder:
+        Path(folder).chmod(0o711)
+        cluster = Cluster(Path(folder) / "cluster", place)
         try:
             cluster.start()
             yield cluster
         finally:
             cluster.stop()
-    finally:
-        shutil.rmtree(folder, ignore_errors=True)
