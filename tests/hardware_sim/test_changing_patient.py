@@ -75,15 +75,6 @@ def test_rest_returns_what_was_lost() -> None:
     assert muscle.gain == pytest.approx(1.0, abs=1e-6)
 
 
-def test_more_use_tires_more() -> None:
-    lost = []
-    for width_us in (THIRD_US, 300.0):
-        muscle = ChangingMuscle(Parameters(fatigue_share=0.2))
-        play(muscle, session(3, width_us=width_us))
-        lost.append(1 - muscle.gain)
-    assert lost[1] > 1.1 * lost[0]
-
-
 def test_potentiation_rises_with_use_and_fades() -> None:
     muscle = ChangingMuscle(Parameters(potentiation_share=0.3))
     torque = play(muscle, session(10))
@@ -145,17 +136,6 @@ def test_the_times_of_reading_do_not_matter() -> None:
     widths = varied(20.0)
     often, seldom = (play(ChangingMuscle(everything()), widths, rate_hz) for rate_hz in (1600.0, 100.0))
     np.testing.assert_allclose(often[::16], seldom, atol=1e-9)
-
-
-def test_a_late_pulse_leaves_no_gap_in_torque_or_use() -> None:
-    widths, rng = np.full(40 * 20, 250.0), np.random.default_rng(2)
-    even, late = ChangingMuscle(everything()), ChangingMuscle(everything())
-    times = np.arange(widths.size) / PULSES_PER_S
-    expected = simulate(even, times, widths, 20.0, 400.0, 20.0)
-    jitter_s = np.r_[0.0, 0.002 * rng.random(widths.size - 1)]
-    torque = simulate(late, times + jitter_s, widths, 20.0, 400.0, 20.0)
-    assert np.abs(torque - expected).max() < 0.005
-    assert late.gain == pytest.approx(even.gain, abs=1e-4)
 
 
 def test_a_shift_may_be_negative_a_time_and_a_share_of_one_may_not() -> None:

@@ -46,9 +46,8 @@ def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
 
 @pytest.mark.parametrize(
     ("effect", "index"),
-    [
-        pytest.param(*one, marks=[pytest.mark.campaign] if one[1] else []) for one in ALL
-    ],  # the first form of each effect
+    # the first form of each effect; the others are for a campaign
+    [pytest.param(*one, marks=[pytest.mark.campaign] if one[1] else []) for one in ALL],
 )
 def test_magnitude_zero_is_the_base_muscle_and_a_finer_step_gives_the_same_torque(effect: str, index: int) -> None:
     base, formulation = written(effect, index)
