@@ -245,15 +245,6 @@ class TestMovers:
         assert np.degrees(found[:, 1].min()) == pytest.approx(30.0, abs=1.0)
         assert np.degrees(found[:, 1].max()) == pytest.approx(120.0, abs=1.0)
 
-    def test_the_servo_is_of_second_order(self) -> None:
-        still = {"from_deg": 100.0, "to_deg": 100.0, "deg_s": 1000.0, "limit_deg_s": 1000.0, "pause_s": 9}
-        begin = Begin(0.0, Motion(math.radians(99.0)))
-        robot = make_mover("robot", begin, {**still, "bandwidth_hz": 1.0, "damping": 1.0})
-        for time_s in np.linspace(0.05, 1.0, 20):
-            angle = robot.advance(float(time_s), lambda _x, _v: 0.0).angle_rad
-            turn = 2.0 * math.pi * time_s
-            assert 100.0 - math.degrees(angle) == pytest.approx((1.0 + turn) * math.exp(-turn), abs=0.01)
-
     @pytest.mark.slow
     def test_a_hand_that_holds_still_wanders_and_trembles_and_no_two_sweeps_are_alike(self) -> None:
         found = rows(Limb(Constant(), Arm("hand", {}, heavy()), 3), 10.0)[3200:]
@@ -281,10 +272,8 @@ class TestMovers:
             ("fly", {}, "unknown mode of the arm 'fly'; there are free, hand, held, robot, script, waves"),
             ("held", {"angle": 3}, "no setting 'angle'; it has angle_deg, deg_s"),
             ("held", {"angle_deg": 161}, "'angle_deg' must be between -10 and 160"),
-            ("held", {"angle_deg": "up"}, "'angle_deg' must be between"),
             ("held", {"angle_deg": math.inf}, "must be a finite number"),
             ("robot", {"deg_s": 0}, "'deg_s' must be between"),
-            ("robot", {"damping": True}, "'damping' must be between"),
             ("script", {"points": [[1, 2], [0, 3]]}, "must rise"),
             ("script", {"points": "abc"}, "two or more"),
             ("waves", {"hz": [1.0], "deg": [1.0, 2.0]}, "equally long"),

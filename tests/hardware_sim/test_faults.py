@@ -188,16 +188,6 @@ def test_unplugged_mid_frame_and_back(rig: Emulated) -> None:
 
 
 @pytest.mark.wire
-def test_bus_errors_are_error_frames_to_python_can(rig: Emulated) -> None:
-    with can.Bus(**rig.ready["can"]) as bus:
-        assert rig.ask(cmd="fault", name="error_frames", probability=0.5)["ok"]
-        messages = [bus.recv(10.0) for _ in range(600)]
-        assert rig.ask(cmd="fault", name="error_frames", on=False)["ok"]
-    assert None not in messages
-    assert any(message is not None and message.is_error_frame for message in messages)
-
-
-@pytest.mark.wire
 def test_cell_unplugged_and_back() -> None:
     for transport in ("socketcand", "slcan"):
         with emulated("--load-cell", transport) as rig:
@@ -209,13 +199,6 @@ def test_cell_unplugged_and_back() -> None:
             assert rig.ask(cmd="fault", name="cell_unplugged", on=False)["ok"]
             with can.Bus(**rig.ask(cmd="state")["can"]) as again:
                 assert again.recv(10.0) is not None
-
-
-@pytest.mark.wire
-def test_the_library_is_listed(rig: Emulated) -> None:
-    listed = rig.ask(cmd="faults")["faults"]
-    assert set(listed) == set(library()) >= {"no_ack", "cell_silent"}
-    assert "" not in {entry["what"] for entry in listed.values()}
 
 
 @pytest.mark.wire

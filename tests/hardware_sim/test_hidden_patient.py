@@ -74,15 +74,6 @@ def test_on_the_wires_side_and_off_line_are_one_arm(effect: str) -> None:
     assert np.abs(play_moving(held) - torque)[settled].max() > 0.05 * scenario.base.largest_nm
 
 
-def test_jitter_delays_but_tears_no_holes() -> None:
-    scenario = draw_scenario(("fatigue",), "middle", 401)
-    late = np.random.default_rng(1).uniform(0.0, 0.004, scenario.design.width_us.size)
-    steady = play(HiddenMuscle(scenario), scenario, np.full_like(late, 0.002))
-    jittered = play(HiddenMuscle(scenario), scenario, late)
-    assert np.sqrt(np.mean((jittered - steady) ** 2)) < 0.01 * scenario.base.largest_nm
-    assert jittered.max() == pytest.approx(steady.max(), rel=0.01)
-
-
 @pytest.mark.parametrize("late_ms", [7.0, 12.0, 18.0])
 def test_a_late_pulse_acts_whole_and_so_does_the_next(late_ms: float) -> None:
     """What the pulses drive is the same in the end; the next one cut a late one, which looked like an effort."""
@@ -151,19 +142,16 @@ def test_reveal_tells_of_the_muscle_that_make_gives(capsys: pytest.CaptureFixtur
     assert capsys.readouterr() == ("", ""), "making a patient prints nothing"
 
 
-def test_the_seed_hides_effects_of_the_movement_and_others() -> None:
+def test_the_seed_hides_effects_of_the_movement_and_others(capsys: pytest.CaptureFixture[str]) -> None:
     hidden_effects = [hidden.reveal(seed, moving=True)["effects"] for seed in range(100, 108)]
     moving = [names for names in hidden_effects if names and names[0] in MOVING]
     assert 0.3 < len(moving) / len(hidden_effects) < 1.0
     assert len({names[0] for names in moving}) > 1
+    for arm in ([], ["--arm", "design"]):
+        assert main(["--reveal", "104", *arm]) == 0
+        assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(hidden.reveal(104, moving=bool(arm))))
     assert set(hidden.movement(100)) == {"hz", "deg", "phase_rad"}
     assert all(amplitude >= 10.0 for amplitude in hidden.movement(100)["deg"])
-
-
-@pytest.mark.parametrize("arm", [[], ["--arm", "design"]])
-def test_another_patient_with_an_arm_than_without(arm: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["--reveal", "104", *arm]) == 0
-    assert json.loads(capsys.readouterr().out) == json.loads(json.dumps(hidden.reveal(104, moving=bool(arm))))
 
 
 @pytest.mark.wire

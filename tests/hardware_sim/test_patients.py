@@ -105,11 +105,6 @@ class TestCalcium:
         assert expected.max() > 5
         assert np.abs(torque - expected).max() < 2e-3
 
-    def test_plateau_is_an_elbows(self) -> None:
-        widths = np.full(80, 300.0)
-        torque = simulate(CalciumMuscle(), train(widths), widths, 20.0, 1600.0, 2.0)
-        assert 8.0 < torque[-40:].mean() < 10.0
-
     def test_below_threshold_nothing(self) -> None:
         widths = np.full(40, 131.0)
         assert not simulate(CalciumMuscle(), train(widths), widths, 20.0, 1600.0, 1.0).any()

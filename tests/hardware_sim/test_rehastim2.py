@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import pytest
 
 from stimrig.hardware_sim.stimulators.rehastim2 import RehaStim2
@@ -201,19 +199,6 @@ class TestChannelList:
         running.run(0.050)
         assert running.widths() == [250, 250, 100, 100]
         assert running.times()[-1] == pytest.approx(start_s + 0.075)
-
-    @pytest.mark.parametrize(("host_period_s", "repeated", "lost"), [(0.026, (3, 5), (0, 0)), (0.024, (0, 1), (3, 5))])
-    def test_the_hosts_and_the_devices_grids_slip(
-        self, running: Host, host_period_s: float, repeated: tuple[int, int], lost: tuple[int, int]
-    ) -> None:
-        """A slower host has a level repeated now and then, a faster one has a level left out."""
-        for k in range(100):
-            running.run(host_period_s)
-            running.send(START, pulse(100 + k, 20))
-        widths = running.widths()
-        assert repeated[0] <= sum(a == b for a, b in pairwise(widths)) <= repeated[1]
-        last = round(widths[-1]) - 100
-        assert lost[0] <= sum(100 + k not in widths for k in range(last)) <= lost[1]
 
     def test_stop_ends_it_and_the_mode(self, running: Host) -> None:
         running.run(0.1)
