@@ -7,7 +7,9 @@ import os
 import signal
 import subprocess
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,6 @@ import httpx
 import pytest
 
 from tests.harness.c_program import compiled
-from tests.harness.http_double import answering
 
 CODE, ODD_CODE = "P017", "P 1/../P2?x"
 PLANNED = {"pulse_rate_hz": 50.0, "segments": [{"name": "trial"}], "unreachable": []}
@@ -52,6 +53,47 @@ class Service:
     @property
     def stops(self) -> int:
         return [path for path, _ in self.heard].count("POST /v1/stop")
+
+
+@contextmanager
+def answering(answer: Callable[[httpx.Request], httpx.Response]) -> Iterator[str]:
+    """Address of a server that answers one request after the other; a broken line closes the connection."""
+    turn = threading.Lock()
+
+    class Handler(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def answer(self) -> None:
+            length = int(self.headers.get("Content-Length", 0))
+            body = self.rfile.read(length)
+            if len(body) < length:
+                return  # whoever sent it was killed
+            request = httpx.Request(self.command, f"http://here{self.path}", headers=dict(self.headers), content=body)
+            try:
+                with turn:
+                    given = answer(request)
+            except httpx.TransportError:
+                self.close_connection = True
+                return
+            self.send_response(given.status_code)
+            self.send_header("Content-Length", str(len(given.content)))
+            self.end_headers()
+            self.wfile.write(given.content)
+
+        do_GET = do_POST = do_PUT = answer  # noqa: N815
+
+        def log_message(self, *_: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_port}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
 
 
 @pytest.fixture(scope="module")
