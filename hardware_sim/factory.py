@@ -24,22 +24,11 @@ def make_devices(
 ) -> Devices:
     """The devices of these settings, at emulated time 0, with their muscle at rest.
 
-    Parameters
-    ----------
-    settings : Settings
-        Its `patient` is a name, the path of a file, or `hidden:SEED`.
-    arm : str, optional
-        As `--arm` takes it: a mode with settings, or a file; for a hidden patient also `design`. None: the joint is
-        held still and has no sensor.
-    arm_laws : sequence of str
-        Other laws of the arm's tissue, each `PLACE=NAME[,PARAMETER=NUMBER…]`.
-    epoch_us : int
-        What the sensors' clocks show at time 0, µs.
+    The patient is a name, the path of a file, or `hidden:SEED`. `arm`: as `--arm` takes it, a mode with settings, or a
+    file; for a hidden patient also `design`; None: the joint is held still and has no sensor. `arm_laws`: other laws of
+    the arm's tissue, each `PLACE=NAME[,PARAMETER=NUMBER…]`. `epoch_us`: what the sensors' clocks show at time 0, µs.
 
-    Raises
-    ------
-    HardwareSimError
-        Patient, arm or a setting cannot be used.
+    Raises HardwareSimError: patient, arm or a setting cannot be used.
     """
     seed = _hidden_seed(settings.patient)
     if seed is not None and seed < 0:

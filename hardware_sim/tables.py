@@ -16,12 +16,8 @@ Kind = TypeVar("Kind")
 def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[str, Any]:
     """The table that a file holds.
 
-    Parameters
-    ----------
-    error : type
-        What is raised where it cannot be read, is neither TOML nor JSON, or holds something else; names the file.
-    holds : str
-        What should be in it, for the message.
+    `error`: what is raised where it cannot be read, is neither TOML nor JSON, or holds something else; names the file.
+    `holds`: what should be in it, for the message.
     """
     is_json = path.suffix.lower() == ".json"
     try:

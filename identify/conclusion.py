@@ -36,13 +36,7 @@ class Conclusion:
 
 
 def conclude(found: Mapping[str, Any]) -> Conclusion:
-    """The verdict of a diagnosis, for people.
-
-    Parameters
-    ----------
-    found : Mapping
-        The keys of `diagnose --json`. `add` and `residual_check` are not in those of older versions.
-    """
+    """The verdict of a diagnosis, for people; `found` has the keys of `diagnose --json`."""
     missing = list(found.get("missing") or [])
     if found["verdict"] == "unexplained_structure" or (found.get("free") and not missing):
         words = "The error depends on what the muscle does, so it is not measurement noise."

@@ -28,16 +28,9 @@ def looks_like_noise(comparison: Mapping[str, Any]) -> bool:
 def healed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The worst places of a comparison, each with the error there before and after.
 
-    Parameters
-    ----------
-    before, after : Mapping
-        The keys of `compare --json`, of two models and the same record; the series may be thinned.
-
-    Returns
-    -------
-    list of dict
-        The keys of `where`, and `before_nm`, `after_nm` (rms of measured minus model, N·m), `noise_nm`, and `healed`:
-        whether the error left there is not larger than the noise explains.
+    `before`, `after`: the keys of `compare --json`, of two models and the same record; the series may be thinned.
+    Returns rows with the keys of `where`, and `before_nm`, `after_nm` (rms of measured minus model, N·m), `noise_nm`,
+    and `healed`: whether the error left there is not larger than the noise explains.
     """
     noise_nm = max(before["noise_sd_nm"], after["noise_sd_nm"])
     rows = []

@@ -12,12 +12,8 @@ TOO_LARGE = "Beside the torque that is too much to tell a share that the model e
 
 
 def repetition_sentences(figures: Mapping[str, Any]) -> list[str]:
-    """What repetition says cannot be better, and how much of what repeats the model explains.
-
-    Parameters
-    ----------
-    figures : Mapping
-        Fit statistics; `repetition` as `identify.estimation.repetition` gives it. Models of older versions have none.
+    """What repetition says cannot be better, and how much of what repeats the model explains; `figures`: fit
+    statistics.
     """
     return [*_repeating(figures.get("repetition")), *_unforeseen(figures.get("unforeseen_nm"))]
 

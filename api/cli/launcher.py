@@ -58,16 +58,8 @@ class Endings:
 class Services:
     """The whole rig: with no rig file, the emulator stands in for the hardware.
 
-    Parameters
-    ----------
-    settings : Settings
-        Data folder, host, port, rig file.
-    emulator_arguments : list of str
-        Passed to the emulator.
-    admin_token : str or None
-        Set the administrator's token instead of drawing one.
-    attach : Path or None
-        Socket of a rig that runs already: none is started, and none is ended.
+    `admin_token`: set the administrator's token instead of drawing one. `attach`: socket of a rig that runs already:
+    none is started, and none is ended.
     """
 
     def __init__(

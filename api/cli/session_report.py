@@ -24,25 +24,10 @@ def run_test(
 ) -> SessionTest:
     """Run a test, the default pre-session test unless `more` says otherwise, and show its progress.
 
-    Parameters
-    ----------
-    client : Client
-        Of the service.
-    participant : str
-        Code; made unless it is there.
-    events : callable
-        Says which processes of the service have ended; one is enough to give up.
-    over : callable
-        Called as soon as nothing of the test is played any more.
-    **more
-        As in `Client.start_test`.
+    The participant is made unless it is there. `events` says which processes of the service have ended; one is enough
+    to give up. `over` is called as soon as nothing of the test is played any more.
 
-    Raises
-    ------
-    CommandError
-        A process has ended.
-    ServiceError
-        The test was refused, or did not complete.
+    Raises CommandError: a process has ended. Raises ServiceError: the test was refused, or did not complete.
     """
     show = Progress()
 

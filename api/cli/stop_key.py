@@ -64,13 +64,8 @@ def in_foreground(descriptor: int) -> bool:
 def at_rig(path: Path, stray: Callable[[], bool] = lambda: True) -> Callable[[], str]:
     """What stops the rig at a socket, past the service: it need not be alive.
 
-    Parameters
-    ----------
-    path : Path
-        The rig's socket.
-    stray : callable
-        Whether a key may be a stray one while the rig plays nothing. A program that has asked for a test says no: the
-        key is to stop what is about to begin.
+    `stray`: whether a key may be a stray one while the rig plays nothing. A program that has asked for a test says no:
+    the key is to stop what is about to begin.
     """
     from stimrig.api.clock import Clock
     from stimrig.api.sessions.rig_client import RigClient

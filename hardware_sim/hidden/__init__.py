@@ -43,19 +43,10 @@ def draw_patient(seed: int, moving: bool = False) -> Scenario:
 
 
 def make(seed: int, moving: bool = False) -> HiddenMuscle:
-    """The patient that `seed` hides, at rest.
+    """The patient that `seed` hides, at rest; if `moving` another one, whose effect may show only then
+    (`MOVING_KINDS`).
 
-    Parameters
-    ----------
-    seed
-        Any whole number from 0.
-    moving
-        Its joint will move: another patient, whose effect may show only then (`MOVING_KINDS`).
-
-    Raises
-    ------
-    ValueError
-        A negative seed.
+    Raises ValueError: a negative seed.
     """
     from stimrig.hardware_sim.hidden.live import HiddenMuscle
 

@@ -69,16 +69,9 @@ def _run(
 
 
 class Chain:
-    """Stages in the order of their slots, with their state.
+    """Stages in the order of their slots, with their state; within a slot they keep the given order.
 
-    Parameters
-    ----------
-    stages
-        Any number. Within a slot they keep the given order.
-    largest_nm
-        The base's largest torque; activation and force are shares of it, N·m.
-    step_s
-        Step of the simulation, s.
+    `largest_nm` is the base's largest torque: activation and force are shares of it, N·m. `step_s`: of the simulation.
     """
 
     def __init__(self, stages: list[Stage], largest_nm: float, step_s: float) -> None:

@@ -38,11 +38,6 @@ class HiddenMuscle:
     A pulse's width is held for 25 ms. Jitter leaves gaps between two holds; a gap of up to 5 ms is closed by going back
     to its beginning. A longer one stays: the pulse after it is late, and acts for its 25 ms besides the next one, as
     two twitches add up. Another current than 20 mA scales the width by charge.
-
-    Parameters
-    ----------
-    staged
-        The base muscle and its stages.
     """
 
     def __init__(self, staged: Staged) -> None:

@@ -94,14 +94,9 @@ def _product(x, coefficients):
 
 @dataclass
 class EffectFreeFit:
-    """The effect-free fit for one base and one design, at the pulse rate.
+    """The effect-free fit for one design at the pulse rate, with knots and starting values from a base.
 
-    Parameters
-    ----------
-    base
-        Gives knots and starting values.
-    width_us, held_out
-        Pulse widths at the pulse rate, shape (n,); rows of the held-out segment, bool, shape (n,).
+    `held_out`: rows of the held-out segment, bool, shape (n,).
     """
 
     base: Base

@@ -30,19 +30,10 @@ NAMES = tuple(PATIENTS)
 
 
 def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
-    """The named patient at rest, with some of its parameters overridden.
+    """The named patient (one of `NAMES`) at rest, with some of its parameters overridden.
 
-    Parameters
-    ----------
-    name
-        One of `NAMES`.
-    parameters
-        Numbers by name.
-
-    Raises
-    ------
-    PatientError
-        There is no such patient, or it has no such parameter, or a value is not a finite number or out of range.
+    Raises PatientError: there is no such patient, or it has no such parameter, or a value is not a finite number or out
+    of range.
     """
     given = parameters or {}
     if name not in PATIENTS:

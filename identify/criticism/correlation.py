@@ -27,21 +27,11 @@ WORDS = {
 
 
 def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
-    """Correlation functions of a residual on the grid of pulses, with bands.
+    """Correlation functions of a residual (at the record's samples) on the grid of pulses, with bands.
 
-    Parameters
-    ----------
-    grid : Grid
-        Of the record.
-    residual_nm : ndarray, shape (N,)
-        At the record's samples.
-
-    Returns
-    -------
-    dict
-        `lags_s`; `tests`: one for each of residual, u, u2, y with `values`, `band`, `passed`, `largest`, `words`;
-        `false_alarm_rate` of each function; `innovations`: whether the cross-correlations are those of the residual
-        without its slow noise.
+    Returns `lags_s`; `tests`: one for each of residual, u, u2, y with `values`, `band`, `passed`, `largest`, `words`;
+    `false_alarm_rate` of each function; `innovations`: whether the cross-correlations are those of the residual without
+    its slow noise.
     """
     known = (grid.count > 0) & ~grid.doubted
     residual = np.where(known, block_means(grid, residual_nm), 0.0)

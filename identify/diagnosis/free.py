@@ -111,17 +111,9 @@ def _doubted(verdict: Verdict, left: bool) -> bool:
 def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, progress: Progress) -> EffectSearch:
     """The search with free effects, where they predict left-out blocks better than what it found; else as it was.
 
-    Parameters
-    ----------
-    search : EffectSearch
-        In whose last model structure is left.
-    names : sequence of str
-        Of its effects the first ones, against which held-out pulses do not speak.
-    named : bool
-        Whether they are named: then they stay beside free effects. A free effect describes more than a name's own form,
-        so it would often do better alone where the name is right.
-    progress : callable
-        As `search_effects` takes it.
+    `names`: of its effects the first ones, against which held-out pulses do not speak. `named`: whether they are named;
+    then they stay beside free effects. A free effect describes more than a name's own form, so it would often do better
+    alone where the name is right.
     """
     count = len(names)
     whole = Chain(tuple(search.chain[: count + 1]), tuple(search.left_out[: count + 1]), tuple(names))

@@ -106,23 +106,10 @@ def search_effects(
 ) -> EffectSearch:
     """Try all effects on a record, add the best, and continue while the evidence is sufficient.
 
-    Parameters
-    ----------
-    grid, raw : Grid, Raw
-        What was measured, as `prepare` makes it.
-    rows : ndarray of bool, shape (K,)
-        Pulse intervals to fit.
-    progress : callable or None
-        Called with the share done and a line of text; it may raise `Cancelled`.
-    most : int
-        Effects to add at most.
-    structure : sequence of str
-        Effects, "id" or "id:form", that the examined model already has.
+    `grid` and `raw` are as `prepare` makes them, `rows` the pulse intervals to fit. `most`: effects to add at most.
+    `structure`: effects, "id" or "id:form", that the examined model already has. `progress` may raise `Cancelled`.
 
-    Raises
-    ------
-    NotIdentifiable
-        Less than `thresholds.LEAST_S` may be fitted, or as `fit_plain`.
+    Raises NotIdentifiable: less than `thresholds.LEAST_S` may be fitted, or as `fit_plain`.
     """
     count = int(rows.sum())
     if count * grid.step_s < thresholds.LEAST_S:

@@ -90,19 +90,10 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
 def text_of(effect: Effect, form: Form, found: Mapping[str, tuple[float, float]], name: str) -> str:
     """A file of one's own that holds what a free effect was found to be, to be edited and named.
 
-    Parameters
-    ----------
-    effect, form : Effect, Form
-        The free effect, and its form.
-    found : mapping of str to (float, float)
-        By parameter, its value and its standard deviation: where a fit starts, and how far it may go (`REACH`).
-    name : str
-        The id of the effect in the file.
+    `found`: by parameter, its value and its standard deviation: where a fit starts, and how far it may go (`REACH`).
+    `name`: the id of the effect in the file.
 
-    Raises
-    ------
-    BadRequest
-        The name is none, or the free effect's.
+    Raises BadRequest: the name is none, or the free effect's.
     """
     if not re.fullmatch(ID, name) or name == effect.id:
         fix = "Use small letters, digits and _, beginning with a letter, and another name than the free effect's."

@@ -39,16 +39,8 @@ COVERED = 0.95
 def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
     """The plain fit with the noise and the rows that predict best.
 
-    Parameters
-    ----------
-    grid : Grid
-        The record.
-    rows : ndarray of bool, shape (K,)
-        Rows that may be fitted.
-    best : Fitted
-        The plain fit to all of them, with slow noise. It stays where nothing speaks against its likelihood.
-    fit : callable
-        Fits the plain structure to some rows, with noise held white or not.
+    `best`: the plain fit to all rows that may be fitted, with slow noise; it stays where nothing speaks against its
+    likelihood. `fit`: fits the plain structure to some rows, with noise held white or not.
     """
     if not best.distrusted:
         return best

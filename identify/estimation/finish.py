@@ -33,16 +33,7 @@ def finish(
 ) -> Model:
     """The model of a fit, with all that MODEL.json contains.
 
-    Parameters
-    ----------
-    method_id : str
-        Id of the method.
-    fitted : Fitted
-        With effects or without.
-    reasons : sequence of str
-        Why the structure is as it is.
-    statistics : dict, optional
-        The fit statistics, if they are known already.
+    `reasons`: why the structure is as it is. `statistics`: the fit statistics, if they are known already.
     """
     statistics = statistics or evaluate(fitted)
     tests = residual_tests(fitted)

@@ -49,22 +49,12 @@ def rms(residual_nm: np.ndarray) -> float:
 def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: float, white: bool) -> float:
     """White measurement noise at the record's own rate, N·m.
 
-    If the residual is white on the grid of pulses, as large as white samples make it, and hardly more than the samples
-    show before any fit, the whole residual is used, which is efficient. Otherwise it contains something else (a missing
-    effect, correlated noise, hum), and the noise is estimated from second differences, which slow parts hardly change.
+    If the residual is white on the grid of pulses (`white`), as large as white samples make it, and hardly more than
+    the samples show before any fit, the whole residual is used, which is efficient. Otherwise it contains something
+    else (a missing effect, correlated noise, hum), and the noise is estimated from second differences, which slow parts
+    hardly change.
 
-    Parameters
-    ----------
-    grid : Grid
-        The record.
-    predicted_nm : ndarray, shape (N,)
-        Torque of the model, N·m.
-    block_sd_nm : float
-        Standard deviation of the residual on the grid.
-    freedom : float
-        Effective number of parameters.
-    white : bool
-        Whether the residual on the grid is white rather than correlated.
+    `block_sd_nm`: standard deviation of the residual on the grid. `freedom`: effective number of parameters.
     """
     rows = grid.fitted[grid.interval] & ~grid.record.held_out
     residual = grid.record.torque_nm - predicted_nm
@@ -110,22 +100,11 @@ def fit_statistics(
 
     Percentages are NaN if the torque is constant. Doubted samples are not counted.
 
-    Parameters
-    ----------
-    grid : Grid
-        The record.
-    rows : ndarray of bool, shape (K,)
-        Fitted intervals.
-    predicted_nm : ndarray, shape (N,)
-        Torque of the model, N·m.
-    sd_nm : float
-        White noise of a sample, N·m.
-    held_out_change : ndarray or None, shape (K,)
-        Of fitted intervals where they are left out of the fit, N·m: see the function of that name.
-    foreseen_nm : ndarray or None, shape (N,)
-        Torque without what could not have been foreseen, N·m. By this the model is judged where rows are held out. What
-        it leaves out there (`unforeseen_nm`) counts as noise in the ceiling: it is known, and of no muscle. It is never
-        more than the error there leaves beside the noise: an effect that goes astray there excuses nothing.
+    `rows`: fitted intervals. `sd_nm`: white noise of a sample. `held_out_change`: of fitted intervals where they are
+    left out of the fit, N·m: see the function of that name. `foreseen_nm`: torque without what could not have been
+    foreseen. By this the model is judged where rows are held out. What it leaves out there (`unforeseen_nm`) counts as
+    noise in the ceiling: it is known, and of no muscle. It is never more than the error there leaves beside the noise:
+    an effect that goes astray there excuses nothing.
     """
     record = grid.record
     measured = record.torque_nm

@@ -142,24 +142,11 @@ def solve(
     floor: float | None = None,
     profiled: bool = True,
 ) -> Fitted:
-    """Find the most probable parameters, from a start.
+    """Find the most probable parameters, from a start `theta` on the scale on which parameters are varied.
 
-    Parameters
-    ----------
-    problem : Problem
-        What is solved.
-    theta : ndarray, shape (P,)
-        Start, on the scale on which parameters are varied.
-    noise : NoiseLevel
-        Start of the noise.
-    most : int
-        Largest number of steps.
-    tolerance : float
-        Stop when the log posterior rises by less.
-    floor : float or None
-        Stop after the first step if this log evidence is out of reach.
-    profiled : bool
-        Whether the noise is estimated at each step; else it stays as given.
+    It stops after `most` steps, when the log posterior rises by less than `tolerance`, or after the first step if the
+    log evidence `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on; else it
+    stays as given.
     """
     start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
     assert start is not None
@@ -279,16 +266,10 @@ def newton_step(at: Point, damping: float) -> tuple[np.ndarray, float]:
 
 
 def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:
-    """A start for a larger problem: the solution of a smaller one, and values for the additional effects.
+    """A start for a larger problem: the solution `base` of a smaller one, and values for the additional effects.
 
-    Parameters
-    ----------
-    problem : Problem
-        The larger problem.
-    base : Fitted
-        Solution of the smaller one. Its effects come first in `problem.chosen`, in the same order.
-    values : dict
-        For each index in `problem.chosen`: parameters by name, in their units.
+    The effects of `base` come first in `problem.chosen`, in the same order. `values`: for each index in
+    `problem.chosen`, parameters by name, in their units.
     """
     theta = np.zeros(problem.size)
     common = problem.coefficients.stop

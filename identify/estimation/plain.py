@@ -329,14 +329,9 @@ def renewed_curve(base: Fitted) -> Fitted:
     """The model with the knots and the smoothness of its curve chosen with all rows, where the evidence rises by that.
 
     The plain structure is fitted where the joint is held still (`still_rows`), since elsewhere it lacks g and h; its
-    curve is as smooth as those rows alone ask for. Once g and h are there, the other rows tell of f, too.
-
-    Parameters
-    ----------
-    base : Fitted
-        A model with its effects. It is returned as it is if its curve was chosen with all rows already (also where
-        the joint was nowhere still for long enough), if no effect of it depends on the joint, or if its curve is no
-        smoothed spline.
+    curve is as smooth as those rows alone ask for. Once g and h are there, the other rows tell of f, too. The model is
+    returned as it is if its curve was chosen with all rows already (also where the joint was nowhere still for long
+    enough), if no effect of it depends on the joint, or if its curve is no smoothed spline.
     """
     if not _can_be_renewed(base):
         return base

@@ -145,18 +145,9 @@ class Projection:
 class Solution:
     """The joint linear problem solved for some dynamics.
 
-    Parameters
-    ----------
-    projection : Projection
-        Record and basis.
-    linear : SecondOrder
-        Dynamics.
-    ar1 : float
-        Correlation of the noise, with which rows are whitened.
-    weight : float, optional
-        Weight of the roughness penalty; by REML if it is not given.
-    variance : float, optional
-        About the variance of the innovations, N²m²: what the rests say of the zero is weighed against it.
+    `ar1`: correlation of the noise, with which rows are whitened. `weight`: of the roughness penalty; by REML if it is
+    not given. `variance`: about the variance of the innovations, N²m²: what the rests say of the zero is weighed
+    against it.
     """
 
     def __init__(
@@ -401,22 +392,10 @@ LARGEST_AR1 = 0.995
 
 
 def whiten(rows: np.ndarray, stretches: list[slice], ar1: float) -> np.ndarray:
-    """Whiten rows of AR(1) noise exactly, stretch by stretch.
+    """Whiten rows of AR(1) noise (residuals or design columns on the grid) exactly, stretch by stretch.
 
-    Parameters
-    ----------
-    rows : ndarray, shape (K,) or (K, M)
-        Residuals or design columns on the grid.
-    stretches : list of slice
-        Runs of fitted rows; correlation does not cross from one to the next.
-    ar1 : float
-        Correlation of neighbours, -1 < ar1 < 1.
-
-    Returns
-    -------
-    ndarray
-        The fitted rows in order. The first of each stretch is scaled by sqrt(1 - ar1²), so that the likelihood is that
-        of the stationary process.
+    `stretches`: runs of fitted rows; correlation does not cross from one to the next. Returns the fitted rows in order.
+    The first of each stretch is scaled by sqrt(1 - ar1²), so that the likelihood is that of the stationary process.
     """
     if ar1 == 0.0:
         parts = [rows[stretch] for stretch in stretches]

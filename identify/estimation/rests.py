@@ -18,22 +18,10 @@ SHORT = 8
 
 
 def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Torque at rest in each part of a record, and how far the part's zero may be from it.
+    """Torque at rest in each part of a record, and how far the part's zero may be from it, N·m.
 
     The median over the relaxed rows, and their robust scatter: of a zero that wanders, its spread. A part without a
     rest has its zero somewhere in the range of its torque.
-
-    Parameters
-    ----------
-    grid : Grid
-        The record on the grid of pulses.
-    rows : ndarray of bool, shape (K,)
-        Rows that are fitted.
-
-    Returns
-    -------
-    level_nm, sd_nm : ndarray, shape (B,)
-        N·m, of each part.
     """
     for strongest_us in (0.0, IDLE_SHARE * float(np.max(grid.pulse_width_us))):
         since_s = grid.step_s * since_pulse(grid, strongest_us)

@@ -19,20 +19,9 @@ PERCENTILES = 2.5, 97.5
 def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] | None:
     """What one effect of a fit does; None of an effect that is not free.
 
-    Parameters
-    ----------
-    fitted : Fitted
-        With effects.
-    index : int
-        Of the effect in `fitted.problem.chosen`.
-    matrix : ndarray, shape (P, P)
-        Covariance of all parameters in their units.
-
-    Returns
-    -------
-    dict or None
-        `enters`, `driven_by`, `words`, `driver`, `at`, `effect`, and `lines`: by name `value`, `lower` and `upper`
-        (95 % of draws of the effect's parameters), each of shape (n,).
+    `index`: of the effect in `fitted.problem.chosen`. `matrix`: covariance of all parameters in their units. Returns
+    `enters`, `driven_by`, `words`, `driver`, `at`, `effect`, and `lines`: by name `value`, `lower` and `upper` (95 % of
+    draws of the effect's parameters), each of shape (n,).
     """
     chosen = fitted.problem.chosen[index]
     shape = find_effect(chosen.effect).shape

@@ -97,27 +97,12 @@ def fit_short(
     fine: bool = False,
     draws: int = DRAWS,
 ) -> Short:
-    """Fit a short record.
+    """Fit some intervals of a short record.
 
-    Parameters
-    ----------
-    grid : Grid
-        As `prepare` makes it.
-    rows : ndarray of bool, shape (K,)
-        Intervals to fit.
-    last : Earlier, optional
-        What is known of this person from the last session.
-    before : Short, optional
-        The fit to a shorter part of the same record: the search starts there.
-    fine : bool
-        Twice the knots, for a curve with a sudden bend.
-    draws : int
-        Number of draws.
+    `last`: what is known of this person from the last session. `before`: the fit to a shorter part of the same record,
+    where the search starts. `fine`: twice the knots, for a curve with a sudden bend. `draws`: number of draws.
 
-    Raises
-    ------
-    numpy.linalg.LinAlgError
-        No solution is found.
+    Raises numpy.linalg.LinAlgError: no solution is found.
     """
     search = _Search(grid, rows, last, before, fine)
     if before is not None:

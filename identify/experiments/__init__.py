@@ -58,8 +58,6 @@ def _short(value: Any) -> str:
 def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     """The shortest test that separates rivals, each simulated as it was fitted to a record.
 
-    `record`: the record that does not separate the rivals; `fits`: by effect id, or `NOTHING`.
-
     Parameters
     ----------
     record : Record
@@ -100,8 +98,6 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
 
     Held random levels, in the design after which the model's own standard error on other such levels is smallest: jumps
     of level while stimulated are what the paper's test lacks. A further ramp taught muscles of other physics nothing.
-
-    `record`: in which structure is left; `fitted`: the last model of it.
 
     Parameters
     ----------

@@ -109,21 +109,11 @@ def decide(
 ) -> Decision:
     """The next piece of an adaptive test, or its end.
 
-    Parameters
-    ----------
-    record : Record or None
-        What was measured so far, from the test's first pulse; None before the first.
-    played_us : array, shape (P,)
-        Widths of all pulses that were played or are committed, µs; may reach beyond the record's end.
-    asked : Asked
-        What the test is to find out, with what is left of its limits.
-    before : Decision, optional
-        The decision before this one: the search then starts from its fit.
+    `record`: what was measured so far, from the test's first pulse; None before the first. `played_us`: widths of all
+    pulses that were played or are committed, which may reach beyond the record's end. `asked`: what the test is to find
+    out, with what is left of its limits. `before`: the decision before this one; the search then starts from its fit.
 
-    Raises
-    ------
-    BadRecord
-        The record holds what no measurement gives.
+    Raises BadRecord: the record holds what no measurement gives.
     """
     if record is None or record.time_s[-1] - record.time_s[0] < LEAST_S:
         return _opening(asked)
@@ -276,17 +266,10 @@ class Reach:
 def reach(asked: Asked, plateau_nm: float) -> Reach:
     """What an adaptive test can reach.
 
-    Parameters
-    ----------
-    asked : Asked
-        What it is to find out, within which limits.
-    plateau_nm : float
-        Torque at the largest width, N·m: from the calibration, or a guess. A known person's last model is used instead.
+    `plateau_nm`: torque at the largest width, N·m, from the calibration, or a guess. A known person's last model is
+    used instead.
 
-    Raises
-    ------
-    BadRequest
-        A number that is none.
+    Raises BadRequest: a number that is none.
     """
     value = plateau_nm
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < float("inf"):

@@ -45,18 +45,10 @@ class Banded:
 def best_demand(
     a: np.ndarray, b: np.ndarray, target_nm: np.ndarray, largest_nm: float, rise_nm: np.ndarray | None = None
 ) -> np.ndarray:
-    """The demand within the bounds whose torque is closest to a target, N·m, shape (K,).
+    """The demand from 0 to `largest_nm` whose torque is closest to a target, N·m, shape (K,).
 
-    Parameters
-    ----------
-    a, b : ndarray
-        Coefficients of G on the grid of pulses, a[0] = 1.
-    target_nm : ndarray, shape (K,)
-        Torque, N·m.
-    largest_nm : float
-        The largest demand; the smallest is 0.
-    rise_nm : ndarray or None, shape (K,)
-        Largest rise of the demand to each pulse from the one before, N·m; the first from 0.
+    `a`, `b`: coefficients of G on the grid of pulses, a[0] = 1. `rise_nm`: largest rise of the demand to each pulse
+    from the one before; the first from 0.
     """
     size = target_nm.size
     A, B = Banded(a, size), Banded(b, size)

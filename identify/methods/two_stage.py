@@ -104,23 +104,11 @@ def output_error(
     start: np.ndarray | None = None,
     most: int = 40,
 ) -> OutputError:
-    """Minimise (12) over b, a and a baseline, for given (l, n, d).
+    """Minimise (12) over b, a and a baseline, for a given order (l, n, d): poles, zeros, delay.
 
-    Parameters
-    ----------
-    torque, drive : ndarray, shape (K,)
-        Output and input.
-    rows : ndarray of bool, shape (K,)
-        Rows that are fitted.
-    order : tuple of int
-        (l, n, d): poles, zeros, delay.
-    start : ndarray, optional
-        Start for A; by default from (25), improved by the iteration of Steiglitz and McBride.
+    `start`: for A; by default from (25), improved by the iteration of Steiglitz and McBride.
 
-    Raises
-    ------
-    NotIdentifiable
-        The input never changes.
+    Raises NotIdentifiable: the input never changes.
     """
     poles, zeros, delay = order
     if not np.ptp(drive) > 0:

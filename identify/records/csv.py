@@ -238,16 +238,9 @@ MISSING = {"", "nan", "na", "n/a", "n.a.", "#n/a", "#nv", "null", "none", "-", "
 class Table:
     """What the rows hold: numbers by column, segments by name, and the line each row stands in.
 
-    Parameters
-    ----------
-    name : str
-        How messages call the file.
-    columns : mapping of str to Column
-        Where each column stands, and its factor; a `segment` may be missing.
-    cells : mapping of str to int
-        Where the cells stand that describe a part; empty where the file has none.
-    commas : bool
-        Whether numbers may have decimal commas: not where commas separate the cells.
+    `name`: how messages call the file. `columns`: where each column stands, and its factor; a `segment` may be missing.
+    `cells`: where the cells stand that describe a part; empty where the file has none. `commas`: whether numbers may
+    have decimal commas: not where commas separate the cells.
     """
 
     def __init__(self, name: str, columns: Mapping[str, Column], cells: Mapping[str, int], commas: bool) -> None:

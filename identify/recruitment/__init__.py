@@ -126,15 +126,12 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
 
     A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients.
 
-    `curve`: f(u); where it falls, its plateau is below zero. `covariance_nm2`: shape (basis.size, basis.size);
-    covariance of the coefficients, N²·m².
-
     Parameters
     ----------
     curve : Curve
-        The recruitment curve.
+        f(u); where it falls, its plateau is below zero.
     covariance_nm2 : ndarray, optional
-        Of the coefficients, N²·m².
+        Of the coefficients, N²·m², shape (basis.size, basis.size).
     """
     width_us, torque_nm = curve.table()
     top = int(np.argmax(np.abs(torque_nm)))
@@ -196,17 +193,14 @@ def fit_shape(
 ) -> SigmoidBasis:
     """Least-squares estimate of the two shape parameters: a coarse scan, then a bounded trust-region search.
 
-    `residual_of`: gives the residual for a shape, with all linear parameters solved for. `largest_us`: largest pulse
-    width. `seen_us`: pulse widths that were applied, µs; they bound the middle.
-
     Parameters
     ----------
     residual_of : callable
-        Residual of a shape.
+        Gives the residual for a shape, with all linear parameters solved for.
     largest_us : float
         Largest pulse width, µs.
     seen_us : ndarray
-        Widths that were applied, µs.
+        Widths that were applied, µs; they bound the middle.
     """
     from scipy.optimize import least_squares
 

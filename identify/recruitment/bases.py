@@ -65,16 +65,8 @@ def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 
 
     Not from scipy.interpolate, whose import would add 0.2 s to every start of the command.
 
-    Parameters
-    ----------
-    padded : ndarray
-        Knots, with the outer ones repeated `degree` times.
-    degree : int
-        3 is cubic.
-    at : ndarray, shape (N,)
-        Places within the knots.
-    derivative : int
-        0 to `degree`.
+    `padded`: knots, with the outer ones repeated `degree` times. `at`: places within the knots, shape (N,).
+    `derivative`: 0 to `degree`.
     """
     if derivative:
         lower = bsplines(padded[1:-1], degree - 1, at, derivative - 1)

@@ -128,18 +128,8 @@ def choose_weight(
     The penalty is taken as a prior, the coefficients are integrated out, and the noise variance is profiled (Wahba
     1985; Wood 2011). One eigendecomposition serves all weights.
 
-    Parameters
-    ----------
-    gram, moment, energy : ndarray (P, P), ndarray (P,), float
-        Z'Z, Z'y and y'y of whitened rows; columns without a penalty are already projected out.
-    rows : int
-        Number of rows.
-    roughness : ndarray, shape (P, P)
-        R.
-    free : int
-        Number of columns that were projected out.
-    null : int, optional
-        `straight_lines(roughness)`, if it is known already.
+    `gram`, `moment`, `energy`: Z'Z, Z'y and y'y of `rows` whitened rows; `free` columns without a penalty are already
+    projected out. `roughness`: R. `null`: `straight_lines(roughness)`, if it is known already.
     """
     # This dimension is computed from the penalty, not from the data, which do not cover all shapes.
     straight = straight_lines(roughness) if null is None else null

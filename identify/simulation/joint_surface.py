@@ -164,22 +164,11 @@ def joint_tables(
 ) -> dict[str, Any]:
     """What MODEL.json has under `joint`: g and h on a grid, with 95 % bands, and how long each cell was seen.
 
-    Parameters
-    ----------
-    effects : sequence of mapping
-        Those of the model.
-    names, matrix : sequence of str, and ndarray, shape (P, P)
-        Of its parameters and their covariance.
-    angle_rad, velocity_rad_s : ndarray, shape (K,)
-        Angle and velocity of each fitted pulse interval.
-    at_work : ndarray of bool, shape (K,)
-        Those in which the muscle was stimulated: only they show g.
+    `names`, `matrix`: of the model's parameters and their covariance. `angle_rad`, `velocity_rad_s`: of each fitted
+    pulse interval. `at_work`: those in which the muscle was stimulated: only they show g.
 
-    Returns
-    -------
-    dict
-        Empty if nothing of the model depends on the joint. Tables have one row for each angle and one column for each
-        velocity; `seen_g` and `seen_h` count the pulse intervals nearest to each.
+    Empty if nothing of the model depends on the joint. Tables have one row for each angle and one column for each
+    velocity; `seen_g` and `seen_h` count the pulse intervals nearest to each.
     """
     surfaces = Surfaces.of(effects)
     if surfaces is None:

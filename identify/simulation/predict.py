@@ -150,20 +150,10 @@ def problem_of(
     """The model as a `Problem` on a record, and its parameters there; on another record than its own without effects
     that cannot be foreseen.
 
-    Parameters
-    ----------
-    model : Muscle
-        With second-order dynamics.
-    grid : Grid
-        The record.
-    further : sequence of (Form, sequence of float)
-        Forms that act beside the model's effects, next to the curve (a gain before all others, what changes the widths
-        after them), and the values of their parameters.
+    `further`: forms that act beside the model's effects, next to the curve (a gain before all others, what changes the
+    widths after them), and the values of their parameters.
 
-    Raises
-    ------
-    BadModel
-        As `predict`.
+    Raises BadModel: as `predict`.
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")

@@ -54,24 +54,10 @@ def above_rest(
     """Mean torque in each pulse's period, N·m, after one second of rest, effects included; shape (K,).
 
     What the same model gives without any pulse is taken off: voluntary effort, tremor, hum and drift of the day of the
-    test are no answer to a stimulus, and won't be there again. Of a joint that moves its passive torque stays: only
-    what there is at rest at the movement's first angle is taken off, as by the rest before a trial.
+    test are no answer to a stimulus, and won't be there again. Of a joint that moves (`motion`) its passive torque
+    stays: only what there is at rest at the movement's first angle is taken off, as by the rest before a trial.
 
-    Parameters
-    ----------
-    model : Muscle
-        The model.
-    pulse_width_us : ndarray, shape (K,)
-        One for each pulse, µs.
-    pulse_rate_hz : float
-        Pulses per second.
-    motion : Motion, optional
-        How the joint moves. A model that depends on the joint needs it.
-
-    Raises
-    ------
-    BadModel
-        As `predict`; the model depends on the joint, and nothing says where that is.
+    Raises BadModel: as `predict`; the model depends on the joint, and nothing says where that is.
     """
     rest = round(REST_S * pulse_rate_hz)
     widths = np.asarray(pulse_width_us, float)

@@ -138,22 +138,11 @@ class State:
 def updated(before: State, vector: np.ndarray, information: np.ndarray) -> tuple[State, float]:
     """The state after a trial, and how odd the trial was.
 
-    Parameters
-    ----------
-    before : State
-        Before the trial.
-    vector : ndarray, shape (3 + n,)
-        Information times the levels and the curve that explain the trial best.
-    information : ndarray, shape (3 + n, 3 + n)
-        Inverse of their covariance; zero in a direction of which the trial tells nothing.
+    `information`: inverse of the covariance of the levels and the curve that explain the trial best; zero in a
+    direction of which the trial tells nothing. `vector`: information times those levels and that curve.
 
-    Returns
-    -------
-    State
-        After the trial.
-    float
-        Squared distance by which the trial moves the levels, in the standard deviations that are expected of such a
-        move; about 3 on average if the trial tells something of all three.
+    How odd: the squared distance by which the trial moves the levels, in the standard deviations that are expected of
+    such a move; about 3 on average if the trial tells something of all three.
     """
     after = _filtered(before, vector, information)
     move = (after.mean - before.mean)[:LEVELS]

@@ -89,21 +89,10 @@ def drift(_none: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
 def placed(model: Model, levels: np.ndarray, grid: Grid) -> tuple[Problem, np.ndarray]:
     """The approved model on a record, at such levels and curve, and its parameters.
 
-    The first form is the gain, the last two are the shift and the drift.
+    The first form is the gain, the last two are the shift and the drift. `levels`: log gain, threshold shift (µs), log
+    time scale, and what is added to the curve's coefficients (N·m), shape (3 + n,).
 
-    Parameters
-    ----------
-    model : Model
-        The approved one.
-    levels : ndarray, shape (3 + n,)
-        Log gain, threshold shift (µs), log time scale, and what is added to the curve's coefficients (N·m).
-    grid : Grid
-        The record.
-
-    Raises
-    ------
-    BadModel
-        As `stimrig.identify.simulation.predict.problem_of`.
+    Raises BadModel: as `stimrig.identify.simulation.predict.problem_of`.
     """
     log_gain, shift_us, log_time = levels[:LEVELS].tolist()
     forms = ((gain, (log_gain, 0.0)), (shift, (shift_us, 0.0)), (drift, (0.0,)))
@@ -152,21 +141,9 @@ def curve_covariance(model: Model) -> np.ndarray:
 
 
 def look(model: Model, expected: State, record: Record) -> Seen:
-    """Fit a trial.
+    """Fit a trial, from its rest before to its rest after, from what is expected of it on.
 
-    Parameters
-    ----------
-    model : Model
-        The approved one, with second-order dynamics.
-    expected : State
-        What is expected of it: where the fit begins.
-    record : Record
-        The trial, from its rest before to its rest after.
-
-    Raises
-    ------
-    BadModel, BadRecord
-        As `stimrig.identify.simulation.predict.predict`; and a trial shorter than a second.
+    Raises BadModel, BadRecord: as `stimrig.identify.simulation.predict.predict`; and a trial shorter than a second.
     """
     grid = make_grid(record)
     if not np.sum(grid.fitted) * grid.step_s >= SHORTEST_S:
