@@ -27,16 +27,15 @@ def model(service: Service) -> str:
     return service.play_test("B1")["model_id"]
 
 
-def drawn(page: Any, service: Service, model: str) -> None:
-    page.goto(f"{service.url}/models/{model}?diagnose=1")
-    page.locator("[data-figure=signature-fatigue]").wait_for(state="attached")
+def drawn(page: Any, service: Service, model: str, name: str) -> None:
+    page.goto(f"{service.url}/models/{model}?diagnose=0")
     page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-    look_closer(page, "comparison", "recruitment", "step", "residual", "signature-fatigue")
+    look_closer(page, name)
 
 
 def test_switching_colours_recolours_what_is_drawn_and_keeps_the_page(tab: Any, service: Service, model: str) -> None:
     tab.set_viewport_size(LAPTOP)
-    drawn(tab, service, model)
+    drawn(tab, service, model, "step")
     tab.evaluate("window.stays = true")
     seen = {}
     for words in ("Light", "Dark"):
@@ -94,7 +93,7 @@ def swipe(page: Any, chart: Any) -> None:
 def test_a_finger_scrolls_the_page_and_zooms_when_asked(browser: Any, service: Service, model: str) -> None:
     for page in open_tab(browser, service, has_touch=True, is_mobile=True):
         page.set_viewport_size(TABLET)
-        drawn(page, service, model)
+        drawn(page, service, model, "comparison")
         chart = page.locator("[data-figure=comparison]")
         chart.scroll_into_view_if_needed()
         before = page.evaluate(AT_REST)

@@ -406,16 +406,3 @@ def test_fit_with_effects_gives_a_model_of_the_contract(tmp_path: Path) -> None:
     assert {"b", "a", "delay_samples"} <= set(model["linear"])
     b, a = np.array(model["linear"]["b"]), np.array(model["linear"]["a"])
     assert b.sum() / a.sum() == pytest.approx(1.0, abs=1e-6)
-
-
-def test_predict_writes_the_three_columns(
-    capsys: pytest.CaptureFixture[str], record: Path, model: Path, tmp_path: Path
-) -> None:
-    target = tmp_path / "out.csv"
-    code, out, _ = run(capsys, "predict", str(model), str(record), "-o", str(target), "--json")
-    assert code == 0 and json.loads(out)["rows"] == 1000
-    with target.open() as file:
-        rows = list(csv.DictReader(file))
-    assert list(rows[0]) == ["time_s", "torque_nm", "predicted_torque_nm"] and len(rows) == 1000
-    worst = max(abs(float(row["torque_nm"]) - float(row["predicted_torque_nm"])) for row in rows)
-    assert 0 < worst < 0.5

@@ -18,7 +18,7 @@ import pytest
 
 from stimrig.api.sessions import controllers
 from tests.api.browser import bring_to_rest
-from tests.api.conftest import REAL, Service, run_service
+from tests.api.conftest import REAL, Service, run_service, soon
 from tests.api.test_worker import made_up_csv
 from tests.harness.c_program import compiled
 
@@ -187,19 +187,12 @@ def test_whoever_interrupts_a_program_stops_its_trial(
         subprocess.run(["bash", "-euc", "\n".join(script[:-1])], cwd=tmp_path, env=environment(own), check=True)
         words = shlex.split(script[-1])
         with subprocess.Popen(words, cwd=tmp_path, env=environment(own), stderr=subprocess.PIPE, text=True) as run:
-            await_state(service, "running")
+            soon(lambda: service.rig.state == "running")
             run.send_signal(number)
             run.communicate(timeout=60)
         assert run.returncode != 0 and str(service.rig.stopped_by).startswith(program)
     finally:
         service.rig.speed = 12.0
-
-
-def await_state(service: Service, state: str) -> None:
-    until = time.monotonic() + 60
-    while service.rig.state != state:
-        assert time.monotonic() < until, service.rig.state
-        time.sleep(0.05)
 
 
 @pytest.fixture(scope="module")

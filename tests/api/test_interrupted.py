@@ -66,8 +66,7 @@ def interrupted(log: Path, said: str, *words: object) -> tuple[int, str]:
     return process.pid, log.read_text()
 
 
-@pytest.mark.parametrize("hold", ["time.sleep(600)", DEAF])
-@pytest.mark.parametrize("verb", ["diagnose", "explain"])
+@pytest.mark.parametrize(("verb", "hold"), [("diagnose", DEAF), ("explain", "time.sleep(600)")])
 def test_ctrl_c_ends_a_verb_whatever_it_is_in(record: Path, tmp_path: Path, verb: str, hold: str) -> None:
     output = tmp_path / "out" / "MODEL.json"
     output.parent.mkdir()

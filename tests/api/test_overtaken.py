@@ -112,9 +112,11 @@ TRIAL = {"kind": "sequence", "segments": [
     {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [0, 100, 150] * 20}}]}  # fmt: skip
 
 
-def key_of(service: Service, client: httpx.Client, participant: str) -> tuple[str, httpx.Client]:
+def key_of(
+    service: Service, client: httpx.Client, participant: str, maker: httpx.Client | None = None
+) -> tuple[str, httpx.Client]:
     """A controller's key of the participant: its public id, and a client with it."""
-    page = client.post(f"/participants/{participant}/keys", data=PLAN, headers={"Accept": "text/html"})
+    page = (maker or client).post(f"/participants/{participant}/keys", data=PLAN, headers={"Accept": "text/html"})
     text = re.search(r"stimrig_[\w-]{43}", html.unescape(page.text))
     assert text is not None, page.text
     key = next(token["id"] for token in client.get("/v1/tokens").json() if token["name"].startswith("ilc"))

@@ -35,9 +35,9 @@ HOME = "/v1/participants/P017"
 PAGE = "/participants/P017"
 
 
-def playing(service: Service, client: httpx.Client, code: str) -> str:
+def playing(service: Service, client: httpx.Client, code: str, maker: httpx.Client | None = None) -> str:
     """A controller's trial plays; the public id of its key."""
-    key, controller = key_of(service, client, code)
+    key, controller = key_of(service, client, code, maker)
     service.rig.speed = 0.2
     assert controller.post("/v1/tests", json={"participant": code, **TRIAL}).status_code == 202
     return key
@@ -47,23 +47,10 @@ def test_a_trial_ends_with_the_right_of_who_made_its_key(
     service: Service, client: httpx.Client, participant: str, approved: str
 ) -> None:
     maker = service.client(service.token("clin", "approve-model", "run-test", "read-live", "read-model"))
-    playing(service, maker_and(client, maker), participant)
+    playing(service, client, participant, maker)
     of_maker = next(token["id"] for token in client.get("/v1/tokens").json() if token["name"] == "clin")
     assert client.delete(f"/v1/tokens/{of_maker}").status_code == 204
     assert [request.begun for request in service.rig.withdrawn] == [True] and approved
-
-
-def maker_and(admin: httpx.Client, maker: httpx.Client) -> Any:
-    """Makes keys as the one, and lists tokens as the other."""
-
-    class Both:
-        def post(self, *given: Any, **more: Any) -> httpx.Response:
-            return maker.post(*given, **more)
-
-        def get(self, *given: Any, **more: Any) -> httpx.Response:
-            return admin.get(*given, **more)
-
-    return Both()
 
 
 def test_a_withdrawal_that_the_rig_does_not_take_is_repeated_and_stops_meanwhile(
@@ -376,7 +363,7 @@ def test_a_trial_ends_with_its_makers_token_and_a_programs_test_does_not(
     context, starts = service.context, service.rig.starts
     maker = service.client(service.token("clin", "approve-model", "run-test", "read-live", "read-model"))
     if by_key:
-        playing(service, maker_and(client, maker), participant)
+        playing(service, client, participant, maker)
     else:
         service.rig.speed = 0.2
         assert maker.post("/v1/tests", json={"participant": participant, **TRIAL}).status_code == 202

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import importlib.util
 import json
-import os
-import signal
 import subprocess
 import sys
 import time
@@ -20,7 +18,6 @@ from stimrig.api.cli import main
 from stimrig.api.cohort import cluster
 from tests.api.test_schemas import unmet
 from tests.harness.cohort_records import cohort
-from tests.harness.processes import alive, below
 
 pytestmark = pytest.mark.slow
 
@@ -121,15 +118,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return place
 
 
-def started(folder: Path, output: Path) -> subprocess.Popen[str]:
-    words = ["cohort", "fit", str(folder), "-o", str(output), "--json", "--renew", "20"]
-    command = [sys.executable, "-c", COMMAND, *words]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True,
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # ignored where the tests run behind `&`
-    )  # fmt: skip
-
-
 def until(reached: Callable[[], Any], what: str, run: subprocess.Popen[str] | None = None) -> None:
     ends_s = time.monotonic() + PATIENCE_S
     while not reached():
@@ -141,41 +129,6 @@ def until(reached: Callable[[], Any], what: str, run: subprocess.Popen[str] | No
 def rows_in(parts: Path) -> int:
     """Rows that are on the disk."""
     return sum(pq.read_metadata(part).num_rows for part in parts.glob("[0-9]*.parquet"))
-
-
-@pytest.mark.campaign
-def test_killed_and_with_a_worker_killed_it_is_whole_in_the_end(folder: Path, tmp_path: Path) -> None:
-    output = tmp_path / "r.parquet"
-    parts = tmp_path / "r.parquet.parts"
-
-    def rows() -> int:
-        return rows_in(parts)
-
-    run = started(folder, output)
-    until(lambda: rows() >= 4, "four rows", run)
-    family = below(run.pid)
-    assert len(family) >= 4, "two workers, and a process that computes for each"
-    run.kill()
-    run.communicate()
-    until(lambda: not any(map(alive, family)), "the end of every process that the killed run had started")
-
-    kept = rows()
-    assert kept < SESSIONS
-    run = started(folder, output)
-    until(lambda: rows() >= kept + 2, "two rows more", run)
-    workers = [pid for pid in below(run.pid) if b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()]
-    assert workers
-    os.kill(workers[0], signal.SIGKILL)
-    out, err = run.communicate(timeout=PATIENCE_S)
-    assert run.returncode == 1 and f"1 of {SESSIONS + 1} records gave no result" in err.splitlines()[-1], err
-    told = json.loads(out)
-    assert unmet("cohort", told) == []
-    found = pq.read_table(output).to_pylist()
-    names = [row["name"] for row in found]
-    assert len(names) == len(set(names)) == SESSIONS + 1
-    assert (told["ok"], told["errors"], told["done_before"]) == (SESSIONS, 1, kept)
-    assert told["computed"] == SESSIONS + 1 - kept
-    assert not parts.exists()
 
 
 def test_people_are_given_words(capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path) -> None:
