@@ -236,23 +236,19 @@ class VirtualRig:
         self.clock.call_at(self.clock.now_s() + 0.165 + time_s, lambda: void(action()))
 
     def execute(self) -> RunResult:
-        """Play the test."""
         if self.angle is not None:
             self.sensor.feed(self.angle, self.clock.now_s() + self.test.longest_s + 8)
         self.cell.feed(self.receiver, self.clock.now_s() + self.test.longest_s + 8)
         return self.machine.run(self.run.execute())
 
     def recording(self) -> assembly.Recording:
-        """What its journal holds."""
         return assembly.assemble(journal.read(self.path))
 
     def seal(self) -> archive.Sealed:
-        """Its recording, sealed beside its journal."""
         return archive.seal(self.recording(), self.path.parent, self.machine.disk)
 
 
 def journal_at(path: Path) -> Journal:
-    """A new journal."""
     return Journal(Files().create(path))
 
 
@@ -268,7 +264,6 @@ def slow_work(machine: VirtualMachine, *real_s: float) -> None:
 
 
 def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:
-    """A journal's header as the rig writes it."""
     return {
         "recording_id": "0" * 32,
         "plan": run.plan.model_dump(mode="json"),
@@ -282,8 +277,7 @@ def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:
     }
 
 
-def void(*_: object) -> None:
-    """Throw values away."""
+def void(*_: object) -> None: ...
 
 
 PULSES_HZ = 40.0
@@ -306,7 +300,6 @@ def extend(rig: VirtualRig, after: int, segments: list[SegmentPlan]) -> None:
 
 
 def refusals(*requests: Callable[[], object]) -> list[RigError]:
-    """What the requests raise, in order."""
     found: list[RigError] = []
     for request in requests:
         with pytest.raises(RigError) as told:

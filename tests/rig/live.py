@@ -105,8 +105,6 @@ class MistakenBlock(Block):
 
 
 class LiveCell(FakeCell):
-    """Gives its blocks while it is open."""
-
     def __init__(self, clock: VirtualClock, stimulator: LiveStimulator) -> None:
         super().__init__(clock, stimulator)
         self.noise_nm, self.lasting_s = 0.01, 0.1
@@ -170,7 +168,6 @@ class LiveRig:
         self.ask(self.rig.open())
 
     def devices(self) -> dict[str, Any]:
-        """By their kind."""
         return {"stimulator": self.stimulator, "load_cell": self.cell}
 
     def ask(self, coroutine: Coroutine[Any, Any, T]) -> T:
@@ -187,14 +184,12 @@ class LiveRig:
         return self.ask(self.rig.start(plan, key))
 
     def play(self, test_id: str, **fields: Any) -> FinishedEvent:
-        """A test to its end."""
         self.start(self.plan(test_id, **fields))
         self.wait("ready")
         return self.finished
 
     @property
     def finished(self) -> FinishedEvent:
-        """The newest test that has ended."""
         assert self.rig.finished is not None
         return self.rig.finished
 
@@ -224,7 +219,6 @@ class LiveRig:
         )
 
     def until(self, true: Callable[[], bool]) -> None:
-        """Let time pass until something is true."""
         end_s = self.clock.now_s() + PATIENCE_S
         assert self.clock.run(self.machine.tasks, end_s, true), self.rig.status()
 
@@ -239,11 +233,9 @@ class LiveRig:
         return None if taken is None else live_event(taken)
 
     def wait_pulses(self, n: int) -> None:
-        """Until so many more pulses were sent."""
         wanted = len(self.stimulator.sent) + n
         self.until(lambda: len(self.stimulator.sent) >= wanted)
 
     @property
     def states(self) -> list[str]:
-        """Every state that was told, in order."""
         return [event.status.state for event in self.events if event.event == "state"]

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
 import pytest
 
-from stimrig.rig import archive, assembly, journal, limits, plan
+from stimrig.rig import archive, assembly, journal, limits
+from stimrig.rig.clock import utc_text
+from stimrig.rig.control.calibration import end_of_day_s
+from stimrig.rig.control.replies import previewed
 from stimrig.rig.errors import BusyError, JournalError, PlanError, RecordingError, RefusedError, RigError, TooLateError
 from stimrig.rig.journal import Kind, LaidBlock
-from stimrig.rig.messages import AHEAD, AdaptivePlan, SegmentPlan
+from stimrig.rig.messages import AHEAD, AdaptivePlan, Extended, LiveEvent, Profile, SegmentPlan, TestPlan
+from stimrig.rig.requests import EnoughRequest, ExtendRequest, PreviewRequest
 from stimrig.rig.score import MAX_CHECKED, MAX_EXTENSION_S, MAX_EXTENSION_SEGMENTS
 from stimrig.rig.signals import PulseStatus
 from tests.rig.fakes import FIXED, PULSES_HZ, VirtualRig, adaptive, extend, hold, refusals, rest, slow_work, widths_sent
+from tests.rig.live import LiveRig
 from tests.rig.test_damaged import blocks_of
 
 pytestmark = pytest.mark.slow
@@ -38,23 +46,6 @@ def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(t
     assert np.flatnonzero(planned_us)[-1] == len(planned_us) - 1 - PULSES_HZ
     assert (recording.attributes["adaptive"], recording.attributes["ended_by"]) == (1, "plan")
     assert same.recording().attributes["adaptive"] == 0
-
-
-def test_what_is_added_plays_at_its_boundary_and_the_fixed_plan_goes_on_after_it(tmp_path: Path):
-    rig = adaptive(tmp_path)
-    added = [hold("first", max_pulse_width_us=100.0), SegmentPlan(name="validate", sequence="multilevel",
-             settings={"duration_s": 1.0, "seed": 3})]  # fmt: skip
-    rig.at(0.2, lambda: extend(rig, 20, added))
-    result = rig.execute()
-    recording = rig.recording()
-    assert recording.names == ["rest", "first", "validate", "first", "ramp", "rest"], "a name may come again"
-    assert recording.columns["segments/start_s"].tolist() == [0.0, 0.5, 1.5, 2.5, 3.5, 4.5]
-    sent_us = recording.columns["pulses/sent_pulse_width_us"]
-    assert np.all(sent_us[20:60] == 100) and np.all(sent_us[100:140] == 300)
-    assert result.summary["duration_s"] == pytest.approx(len(sent_us) / PULSES_HZ)
-    times = np.array([time_s for time_s, _ in rig.stimulator.sent])
-    assert np.allclose((times - times[0]) * PULSES_HZ, np.round((times - times[0]) * PULSES_HZ))
-    assert '"by": "extension"' in recording.attributes["laid"] and '"seed": 3' in recording.attributes["laid"]
 
 
 def test_an_answer_to_an_old_boundary_is_refused_and_so_is_the_same_one_twice(tmp_path: Path):
@@ -98,22 +89,6 @@ def test_while_an_extension_is_checked_the_test_goes_on(tmp_path: Path, takes_s:
     assert rig.recording().names == ["rest", *([] if late else ["a"]), "first", "ramp", "rest"]
 
 
-@pytest.mark.parametrize(("at_once", "pulses"), [(True, 30), (False, 40)])
-def test_enough_ends_it_well(tmp_path: Path, at_once: bool, pulses: int):
-    rig = adaptive(tmp_path)
-    rig.at(0.6, lambda: extend(rig, 60, [hold("never played")]))
-    rig.at(1.21, lambda: rig.run.score.enough("P1's nurse", at_once))
-    result = rig.execute()
-    assert (result.outcome, result.summary["ended_by"], result.evidence.confirmed) == ("completed", "enough", True)
-    assert len(rig.stimulator.sent) == pulses
-    recording = rig.recording()
-    assert recording.names == ["rest", "first", "rest"]
-    assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / PULSES_HZ + 1.0)
-    assert len(recording.columns["pulses/status"]) == 20 + pulses + 40
-    told = next(event for event in recording.events if event["event"] == "ended")
-    assert (told["by"], told["reason"], told["index"]) == ("enough", "P1's nurse", 20 + pulses)
-
-
 def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
     rig = adaptive(tmp_path)
     score = rig.run.score
@@ -125,7 +100,8 @@ def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
     assert result.summary["duration_s"] == pytest.approx(0.5 + len(rig.stimulator.sent) / PULSES_HZ + 1.0)
     assert 19 <= len(rig.stimulator.sent) <= 21
     assert "is ending (enough)" in str(found[0])
-    assert [event["event"] for event in rig.recording().events].count("ended") == 2
+    told = [event for event in rig.recording().events if event["event"] == "ended"]
+    assert [(event["by"], event["reason"]) for event in told] == [("enough", "me")] * 2
 
 
 @pytest.mark.parametrize(("before_s", "pulses"), [(0.06, 40), (0.035, 40), (0.01, 41), (-0.01, 80)])
@@ -166,13 +142,6 @@ def test_a_stop_is_a_stop(tmp_path: Path, cause: Any):
     recording = rig.recording()
     assert (recording.names, recording.attributes["ended_by"]) == (["rest", "added"], cause)
     assert rig.path.stat().st_size == size
-
-
-def test_the_earliest_pulse_is_that_of_an_extension(tmp_path: Path):
-    """The rest between two tests is judged by it, although the fixed plan would begin later."""
-    rig = adaptive(tmp_path, fixed=[rest(0.5), rest(2.0), hold("first")])
-    assert rig.test.first_pulse == 20
-    assert plan.build(rig.plan.model_copy(update={"adaptive": None}), rig.table).first_pulse == 100
 
 
 def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
@@ -250,15 +219,11 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
 
 WRONG: dict[str, tuple[list[SegmentPlan], type[RigError], str]] = {
     "too many": ([rest(0.1)] * (MAX_EXTENSION_SEGMENTS + 1), PlanError, "9 segments"),
-    "ten thousand": ([rest(0.1)] * 10_000, PlanError, "10000 segments"),
     "too long": ([rest(MAX_EXTENSION_S), rest(1.0)], RefusedError, "at most 30 s an extension"),
     "an hour": ([SegmentPlan(name="x", sequence="prbs", settings={"chips": 100_000})], RefusedError, "30 s"),
     "wide": ([hold(max_pulse_width_us=281.0)], RefusedError, "hold, pulse 1: pulse_width_us 281 .*profile"),
     "NaN": ([SegmentPlan(name="x", sequence="widths", settings={"pulse_width_us": [math.nan]})], PlanError, "finite"),
-    "infinite": ([SegmentPlan(name="x", sequence="sweep", settings={"to_pulse_width_us": math.inf})], PlanError, "fin"),
     "negative": ([SegmentPlan(name="x", sequence="widths", settings={"pulse_width_us": [-1.0]})], RefusedError, "-1"),
-    "a text": ([SegmentPlan(name="x", sequence="rest", settings={"duration_s": "1"})], PlanError, "duration_s"),
-    "no such sequence": ([SegmentPlan(name="x", sequence="os", settings={})], PlanError, "unknown"),
     "no pulse": ([rest(0.001)], PlanError, "too short for one pulse"),
     "one wrong of two": ([rest(0.5), hold(max_pulse_width_us=1e9)], RefusedError, "1e\\+09"),
     "a sudden rise": (
@@ -267,7 +232,6 @@ WRONG: dict[str, tuple[list[SegmentPlan], type[RigError], str]] = {
     "no name": ([SegmentPlan(name="", sequence="rest")], PlanError, "name 1"),
     "a long name": ([SegmentPlan(name="x" * 61, sequence="rest")], PlanError, "name 1"),
     "a name with a NUL": ([SegmentPlan(name="a\0b", sequence="rest")], PlanError, "name 1"),
-    "a name with a line's end": ([SegmentPlan(name="a\nb", sequence="rest")], PlanError, "name 1"),
 }  # fmt: skip
 
 
@@ -383,7 +347,6 @@ def test_only_so_many_are_checked_for_one_boundary(tmp_path: Path):
 
 
 def mad_segment(rng: np.random.Generator) -> SegmentPlan:
-    """One of the library's segments, most of them within the limits."""
     wide = float(rng.choice([80.0, 200.0, 280.0, 280.5, 281.0, 400.0, 1e9, -1.0], p=[0.3, 0.3, 0.2, *[0.04] * 5]))
     long_s = float(rng.choice([0.001, 0.025, 0.3, 1.0, 5.0, 31.0], p=[0.05, 0.1, 0.4, 0.35, 0.05, 0.05]))
     jumps = bool(rng.random() < 0.7)
@@ -468,3 +431,154 @@ def test_patience_is_part_of_the_bounds(tmp_path: Path):
     rig = adaptive(tmp_path, max_duration_s=3.6, patience_s=3.0)
     result = rig.execute()
     assert (result.outcome, result.summary["duration_s"] <= 3.6) == ("completed", True)
+
+
+KEY = "0123456789abcdef"
+
+
+def bounded(live: LiveRig, test_id: str = "one", max_duration_s: float = 60.0, **fields: Any) -> TestPlan:
+    bounds = AdaptivePlan(max_duration_s=max_duration_s, max_torque_time_nms=1e4)
+    return live.plan(test_id, adaptive=bounds, **fields)
+
+
+def added(on_s: float = 0.5) -> list[SegmentPlan]:
+    return [hold("added", on_s, off_s=0.1)]
+
+
+def request(after: int = 20, test_id: str = "one", key: str = KEY) -> ExtendRequest:
+    return ExtendRequest(test_id=test_id, key=key, after=after, segments=added())
+
+
+def ask_more(live: LiveRig, *which: Any, **key: str) -> Extended:
+    return live.ask(live.rig.player.extend(request(*which, **key)))
+
+
+def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: Callable[..., LiveRig]):
+    live = make()
+    for short in ("", "15 characters!!"):
+        with pytest.raises(PlanError, match="at least 16 characters"):
+            live.start(bounded(live), short)
+    live.start(bounded(live, hold_s=20.0), KEY)
+    with pytest.raises(BusyError):
+        live.start(bounded(live, "two"), KEY[::-1])  # its key opens nothing
+    for wrong in ("", KEY[::-1], KEY[:-1], KEY + "0", "0123456789abcdeF", "\ud800" * 16):
+        with pytest.raises(PlanError, match="not the key"):
+            ask_more(live, 20, key=wrong)
+    for ask in (
+        lambda: ask_more(live, 20, "two"),
+        lambda: live.ask(live.rig.player.enough(EnoughRequest(test_id="two"))),
+    ):
+        with pytest.raises(TooLateError, match="test 'two' is not running"):
+            ask()
+    first = ask_more(live, 20)
+    assert (first.laid, first.boundary_s, first.ended_by) == (44, 1.1, "")
+    assert first.duration_left_s == pytest.approx(60 - 1.1)
+    live.wait("running")
+    live.wait_pulses(5)
+    assert ask_more(live, 44).laid == 68
+    event = live.event(samples=True)
+    assert event is not None and event.samples is not None and event.pulse_time_s
+    assert (event.laid, event.boundary_s, event.duration_s) == (68, 1.7, 60.0)
+    assert [(s.name, s.by) for s in event.laid_segments] == [("rest", "plan"), *[("added", "extension")] * 2]
+    assert len(event.samples.torque_nm) == len(event.samples.counter) == len(event.samples.host_time_s) > 0
+    assert np.all(np.diff(event.samples.counter) == 1)
+    told = event.outcomes
+    assert told is not None and told.index == list(range(len(told.index))) and len(told.index) > 20
+    assert (told.pulse_width_us, told.status) == (event.pulse_width_us, [1] * 20 + [0] * (len(told.index) - 20))
+    assert all(a < b for a, b in zip(told.written_time_s, told.acknowledged_time_s, strict=True) if a and b)
+    assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event, "read as it was sent"
+    live.machine.wait(0.1)
+    plain = live.event()
+    assert plain is not None
+    assert (plain.outcomes, plain.samples) == (None, None), "only who chooses pieces needs them"
+    assert live.rig.status().duration_s == 60.0
+    ending = live.ask(live.rig.player.enough(EnoughRequest(test_id="one", by="nurse")))
+    assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))
+    live.wait("ready")
+    finished = live.finished
+    assert (finished.outcome, finished.summary["ended_by"]) == ("completed", "enough")
+    assert finished.summary["torque_time_nms"] > 0.1
+    with h5py.File(str(finished.recording_path)) as file:
+        assert set(file["segments/name"].asstr()[:]) == {"rest", "added"}
+        assert KEY not in str(dict(file.attrs))
+
+
+def test_neither_before_nor_after_a_test_nor_when_it_is_stopped(make: Callable[..., LiveRig]):
+    live = make()
+
+    def refused(words: str) -> None:
+        for ask in (lambda: ask_more(live, 20), lambda: live.ask(live.rig.player.enough(EnoughRequest(test_id="one")))):
+            with pytest.raises(TooLateError, match=words):
+                ask()
+
+    refused("not running")
+    live.start(bounded(live, hold_s=20.0), KEY)
+    live.wait("running")
+    live.wait_pulses(5)
+    assert live.stop("that hurts").confirmed
+    refused("is being ended|not running")
+    live.wait("latched")
+    refused("not running")
+    count = len(live.stimulator.sent)
+    live.rearm()
+    refused("not running")
+    live.machine.wait(0.4)
+    assert len(live.stimulator.sent) == count
+
+
+def test_a_fixed_test_and_a_calibration_are_not_extended(make: Callable[..., LiveRig]):
+    live = make()
+    live.start(live.plan("one", hold_s=20.0), KEY)
+    for ask in (lambda: ask_more(live, 840), lambda: live.ask(live.rig.player.enough(EnoughRequest(test_id="one")))):
+        with pytest.raises(PlanError, match="fixed plan"):
+            ask()
+
+
+def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make: Callable[..., LiveRig]):
+    """The fixed plan would not stimulate for a minute, an extension might after half a second."""
+    live = make()
+    live.play("before", hold_s=0.5)
+    rested = Profile(rest_between_tests_s=30.0)
+    quiet = [rest(0.5), rest(60.0)]
+    assert live.start(live.plan("fixed", profile=rested, segments=[*quiet, *added()])).state == "arming"
+    live.stop("that was only to show it")
+    live.wait("latched")
+    live.rearm()
+    with pytest.raises(RefusedError, match=r"rest_between_tests_s .*wait 2\d"):
+        live.start(bounded(live, profile=rested, segments=[*quiet, *added()], max_duration_s=90.0), KEY)
+
+
+def test_the_day_must_last_as_long_as_the_bound(make: Callable[..., LiveRig]):
+    live = make()
+    midnight_s = end_of_day_s(live.clock.unix_s())
+    live.clock.set_unix_ahead(midnight_s - 10.0 - live.clock.unix_s())
+    day = Profile(
+        sensory_pulse_width_us=20.0, motor_pulse_width_us=60.0,
+        set_at_utc=utc_text(midnight_s - 3600), expires_at_utc=utc_text(midnight_s),
+    )  # fmt: skip
+    late = bounded(live, profile=day, max_duration_s=60.0)
+    with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
+        live.start(late, KEY)
+    with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
+        previewed(PreviewRequest(plan=late), live.rig.table, midnight_s - 10.0, live.clock.speed)
+    assert live.start(bounded(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
+
+
+def test_until_a_tests_clock_runs_nothing_is_told_of_it(make: Callable[..., LiveRig]):
+    """Its samples have no time on it yet, and the gate still holds what became of the last test's pulses."""
+    live = make()
+    live.play("before", hold_s=0.5)
+    live.start(live.plan("one", hold_s=2.0))
+    told = []
+    while not told or told[-1].test_id is None:
+        live.machine.wait(0.002)
+        told += [event for event in [live.event(samples=True)] if event is not None]
+        assert live.clock.now_s() < 1e5
+    assert {event.test_id for event in told[:-1]} <= {None}
+    assert all(event.outcomes is None or event.outcomes.index == [] for event in told[:-1])
+    live.wait_pulses(20)
+    live.machine.wait(0.3)
+    rest = live.event(samples=True)
+    outcomes = [event.outcomes for event in (told[-1], rest) if event is not None and event.outcomes is not None]
+    index = [number for one in outcomes for number in one.index]
+    assert index == list(range(len(index))) and len(index) >= 20, "each of its own pulses, once"

@@ -20,9 +20,9 @@ from stimrig.rig.devices import can_angle_sensor
 from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, PlanError, RefusedError, RigError
 from stimrig.rig.journal import Kind
 from stimrig.rig.limits import HARD_LIMITS
-from stimrig.rig.messages import AngleCalibration, AnglePlan, Profile, Status, TestPlan
+from stimrig.rig.messages import AngleCalibration, AnglePlan, Profile, Status
 from stimrig.rig.requests import AnglePoseRequest
-from tests.rig.fakes import FakeSensor, OpenedSensor
+from tests.rig.fakes import FakeSensor, OpenedSensor, rest
 from tests.rig.live import SPEED, LiveRig
 from tests.simulator.virtual_time import VirtualMachine
 
@@ -31,8 +31,6 @@ SETTINGS = can_angle_sensor.Settings(device="can_angle_sensor")
 
 
 class Posed:
-    """A calibration, its sensor, and a joint that a person moves."""
-
     def __init__(self, folder: Path) -> None:
         self.folder, self.machine, self.degrees = folder, VirtualMachine(), 20.0
         self.moving_deg_s = 0.0
@@ -62,7 +60,6 @@ class Posed:
 
 
 def kept(folder: Path, settings: can_angle_sensor.Settings | None = SETTINGS) -> AngleCalibration | None:
-    """What another process finds."""
     machine = VirtualMachine()
     again = AngleCalibrating(folder, settings, machine)
     machine.run(again.recall())
@@ -94,19 +91,12 @@ def test_two_poses_give_offset_direction_and_scale_kept_for_this_sensor_alone(po
     [
         {"offset": math.nan},
         {"offset": 31.0},
-        {"offset": math.inf},
         {"radians_per_unit": math.nan},
-        {"radians_per_unit": 0.0},
-        {"radians_per_unit": -math.pi / 180},
         {"radians_per_unit": 1.1 * math.pi / 180},
-        {"radians_per_unit": 1e300},
         {"direction": 1},
-        {"direction": True},
         {"poses": []},
         {"poses": [{"angle_rad": 0.4, "raw": 10.0}] * 2},
         {"poses": [{"angle_rad": 0.4, "raw": math.nan}, {"angle_rad": 1.6, "raw": 80.0}]},
-        {"by": 5},
-        {"by": "x" * 1_000_000},
     ],
 )
 def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed: Posed, change: dict[str, Any]):
@@ -121,12 +111,8 @@ def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed:
 
 
 @pytest.mark.parametrize(
-    "content",
-    [
-        "[" * 100_000, '{"sensor": 1', '{"sensor":' * 100_000, "[]", '"x"', "", "\udcff",
-        '{"sensor":' + 5_000 * "9" + "}",
-    ],
-)  # fmt: skip
+    "content", ["[" * 100_000, '{"sensor": 1', "[]", "", "\udcff", '{"sensor":' + 5_000 * "9" + "}"]
+)
 def test_a_rig_comes_up_whatever_stands_in_the_file(tmp_path: Path, content: str):
     (tmp_path / "angle-calibration.json").write_bytes(content.encode("utf-8", "surrogateescape"))
     assert kept(tmp_path) is None
@@ -148,12 +134,6 @@ def test_a_first_pose_of_long_ago_is_none(posed: Posed):
     assert posed.take(5.0, told_deg=20.0) is True
     assert posed.poses.calibration is not None
     assert [pose.angle_rad for pose in posed.poses.calibration.poses] == [math.radians(90.0), math.radians(20.0)]
-
-
-def test_who_poses_has_a_name_and_no_book():
-    assert AnglePoseRequest(angle_rad=1.0, by="n" * 200).by
-    with pytest.raises(ValueError, match="at most 200"):
-        AnglePoseRequest(angle_rad=1.0, by="n" * 201)
 
 
 def test_a_wrong_first_pose_is_taken_once_more(posed: Posed):
@@ -226,8 +206,6 @@ def test_what_cannot_be_stored_does_not_hold(posed: Posed, monkeypatch: pytest.M
 
 
 class AngledRig(LiveRig):
-    """A `LiveRig` with an angle sensor, as its rig file says."""
-
     degrees = 60.0
 
     def devices(self) -> dict[str, Any]:
@@ -316,10 +294,7 @@ def test_a_stop_does_not_wait_behind_a_start_that_waits_for_an_angle_nor_is_that
 
 def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Angled):
     live = angled(require_calibration=True)
-    passive = {"kind": "passive", "angle": AnglePlan(range_rad=(0.2, 2.0))}
-    rest = [{"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.5}}]
-    plan = live.plan("p", **passive, segments=None).model_copy(update={"segments": None})
-    plan = TestPlan.model_validate({**plan.model_dump(), "segments": rest})
+    plan = live.plan("p", kind="passive", angle=AnglePlan(range_rad=(0.2, 2.0)), segments=[rest(0.5)])
     with pytest.raises(RefusedError, match=r"the angle sensor is not calibrated; take two poses .* 28\.6°"):
         live.start(plan)
     live.pose(20.0)

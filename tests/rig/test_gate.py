@@ -24,8 +24,6 @@ from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 
 class Setup:
-    """An open gate, or one that is still shut."""
-
     def __init__(self, folder: Path, is_open: bool = True, start_s: float = 1000.0, **profile: float) -> None:
         self.machine = VirtualMachine(VirtualClock(start_s))
         self.clock, self.wait, self.halted = self.machine.clock, self.machine.wait, False
@@ -156,6 +154,8 @@ def test_acks_and_errors_are_matched_by_number(tmp_path: Path):
     setup.stimulator.on_ack(Ack(1, setup.clock.now_s(), "electrode error"))
     assert setup.gate.on_its_way is None
     assert setup.faults == ["stimulator: unknown command", "stimulator: electrode error at pulse 1"]
+    assert blocks(setup, Kind.ACKED)[-1] == jn.ACKED.pack(0, T0_S) + b"electrode error"
+    assert len(setup.events()) == 1, "neither late nor unasked for"
 
 
 def test_disconnecting_stops_first_and_never_raises(tmp_path: Path):
@@ -350,15 +350,6 @@ def test_an_ack_that_nobody_asked_for_is_written_and_told(tmp_path: Path, number
     setup.gate.shut()
     setup.stimulator.on_ack(Ack(number, 1000.6))  # after the end it is the answer to whatever was sent before
     assert len(setup.faults) == 1
-
-
-def test_the_error_of_an_ack_stands_in_the_journal_with_its_pulse(tmp_path: Path):
-    setup = Setup(tmp_path)
-    setup.stimulator.ack_delay_s = None
-    setup.fire(100)
-    setup.stimulator.on_ack(Ack(1, T0_S + 0.001, "electrode error"))
-    assert blocks(setup, Kind.ACKED) == [jn.ACKED.pack(0, T0_S + 0.001) + b"electrode error"]
-    assert len(setup.events()) == 1, "neither late nor unasked for"
 
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])

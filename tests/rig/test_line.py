@@ -19,8 +19,6 @@ PATIENCE_S = 30.0
 
 
 class Line:
-    """A port on one end of a pseudo-terminal; we have the other end."""
-
     def __init__(self) -> None:
         self.ours, theirs = os.openpty()
         tty.setraw(theirs)

@@ -168,7 +168,6 @@ def test_a_cell_that_dies_while_the_stimulator_is_asked_ends_the_test_without_a_
 
 
 def slow_to_tell(rig: VirtualRig, answers_s: float) -> None:
-    """Its state, once it plays."""
     state = rig.stimulator.state
 
     async def later() -> tuple[bool, str]:

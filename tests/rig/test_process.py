@@ -46,7 +46,6 @@ print("stopped" if pressed.is_set() else "lost", flush=True)
 
 @pytest.fixture
 def terminal() -> Iterator[tuple[int, int]]:
-    """A person's end, and the program's."""
     ends = os.openpty()
     yield ends
     for fd in ends:
@@ -156,21 +155,17 @@ def test_the_watchdog_is_fed_by_proof_alone(manager: socket.socket):
     ]  # fmt: skip
 
 
-@pytest.mark.parametrize("watchdog", [{}, {"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": "1"}])
-def test_without_a_watchdog_of_its_own_there_is_nothing_to_feed(manager: socket.socket, watchdog: dict[str, str]):
-    notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname(), **watchdog})
-    notifier.ready()
-    notifier.alive(None)
-    assert heard(manager) == ["READY=1"]
-
-
-@pytest.mark.parametrize("address", ["", "/nowhere/at/all", "@nobody-listens-here"])
-def test_without_a_manager_nothing_happens(address: str):
-    notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000000"})
-    notifier.ready()
-    notifier.alive(None)
-    notifier.alive("trouble")
-    notifier.stopping()
+def test_without_a_watchdog_of_its_own_or_a_manager_nothing_is_fed(manager: socket.socket):
+    for watchdog in ({}, {"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": "1"}):
+        notifier = Notifier({"NOTIFY_SOCKET": manager.getsockname(), **watchdog})
+        notifier.ready()
+        notifier.alive(None)
+        assert heard(manager) == ["READY=1"]
+    for address in ("", "/nowhere/at/all", "@nobody-listens-here"):
+        notifier = Notifier({"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "1000000"})
+        notifier.ready()
+        notifier.alive(None)
+        notifier.alive("trouble")
 
 
 def test_an_abstract_socket_is_found():

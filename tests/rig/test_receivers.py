@@ -68,18 +68,6 @@ def test_counts(tmp_path: Path):
     assert (counts.malformed_frames, counts.error_frames) == (1, 2)
 
 
-def test_what_is_told_of_the_newest_sample():
-    receiver = Heard()
-    clock = receiver.machine.clock
-    assert receiver.age_s(clock.now_s()) == np.inf
-    assert receiver.torque_around(1.0) is None
-    receiver.take(block([1, 2], torque_nm=3.5))
-    clock.advance(0.25)
-    assert receiver.age_s(clock.now_s()) == 0.25
-    assert receiver.torque_around(1.0) == 3.5
-    assert receiver.last_torque_nm == 3.5
-
-
 @pytest.mark.parametrize("per_block", [1, 7, 40, 1000])
 def test_the_range_does_not_depend_on_how_the_bus_cut_the_samples(tmp_path: Path, per_block: int):
     receiver = Heard()
@@ -122,8 +110,6 @@ def swinging(time_s: float) -> float:
 
 
 class HeardAngle:
-    """A sensor's receiver in virtual time."""
-
     def __init__(self) -> None:
         self.machine = VirtualMachine()
         self.clock, self.wait = self.machine.clock, self.machine.wait
@@ -157,14 +143,6 @@ def test_angle_and_velocity_of_now(heard: HeardAngle):
     assert receiver.data_age_s(clock.now_s()) < 0.02
     rows = np.concatenate(tuple(receiver.live))
     assert rows.shape[1] == 3 and len(rows) == receiver._total
-
-
-def test_an_angle_that_comes_late_is_old(heard: HeardAngle):
-    heard.feed(1.0)
-    heard.sensor.late_s = 0.25
-    receiver = heard.feed(1.0)
-    assert receiver.age_s(heard.clock.now_s()) < 0.02
-    assert receiver.data_age_s(heard.clock.now_s()) == pytest.approx(0.25, abs=0.05)
 
 
 def test_a_calibration_holds_from_now_on_and_for_what_was_just_read(heard: HeardAngle):

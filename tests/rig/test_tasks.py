@@ -18,8 +18,6 @@ PATIENCE_S = 30.0
 
 
 class Told(list[tuple[str, float]]):
-    """What tasks did, and when."""
-
     def __init__(self, machine: VirtualMachine) -> None:
         self.clock = machine.clock
 

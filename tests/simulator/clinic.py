@@ -11,8 +11,8 @@ from pydantic import ValidationError
 
 from stimrig.rig.control.replies import id_of, invalid_request, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
-from stimrig.rig.messages import Event, FinishedEvent, Reply, SegmentPlan, StateEvent, TestPlan
-from stimrig.rig.requests import EnoughRequest, ExtendRequest, RearmRequest, StartRequest, StopRequest, WithdrawRequest
+from stimrig.rig.messages import Event, FinishedEvent, Reply, StateEvent
+from stimrig.rig.requests import RearmRequest, StopRequest
 from tests.simulator.host import Process
 from tests.simulator.world import World
 
@@ -139,27 +139,9 @@ class Clinic:
             self.world.at(arrives_s, arrive)
         return asked
 
-    def start(self, plan: TestPlan, key: str) -> Asked:
-        """Ask for a test."""
-        self.tests += 1
-        return self.ask(StartRequest(id=self.tests, plan=plan, key=key), plan.test_id)
-
     def stop(self) -> Asked:
         """Press stop."""
         return self.ask(StopRequest(id=1, reason="somebody pressed", by="nurse"))
-
-    def withdraw(self, test_id: str, begun: bool) -> Asked:
-        """What a test was allowed on is no longer so."""
-        return self.ask(WithdrawRequest(id=1, test_id=test_id, reason="signed out", begun=begun), test_id)
-
-    def extend(self, test_id: str, key: str, after: int) -> Asked:
-        """Lay one more segment, as a client that chooses them."""
-        more = SegmentPlan(name="more", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1})
-        return self.ask(ExtendRequest(id=1, test_id=test_id, key=key, after=after, segments=[more]), test_id)
-
-    def enough(self, test_id: str) -> Asked:
-        """End an adaptive test."""
-        return self.ask(EnoughRequest(id=1, test_id=test_id, by="clinician"), test_id)
 
 
 async def answer(rig: Rig, line: bytes) -> Reply:

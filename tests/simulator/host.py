@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import inspect
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from stimrig.rig.machine import Bus, Disk, Port
 from stimrig.rig.tasks import Outcome, Tasks
 from tests.simulator.disk import SimulatedDisk
+from tests.simulator.virtual_time import QuietMachine
 from tests.simulator.world import World
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class Computer:
             raise DiedInAStep
 
 
-class Process:
+class Process(QuietMachine):
     """One process on the computer: its tasks run as long as it lives."""
 
     def __init__(self, computer: Computer, disk: SimulatedDisk, ports: Wires) -> None:
@@ -100,7 +100,6 @@ class Process:
         self.boot_id = f"boot-{computer.boots}"
         self.on_death: Callable[[], None] = lambda: None
         """Called as it dies by itself."""
-        self.head_start_s = 0.0
         self.works = 0
         """Pieces of work, of the disk for the most part, that are under way."""
         self._ports, self._simulated_disk = ports, disk
@@ -127,20 +126,8 @@ class Process:
     def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:  # noqa: ARG002
         return self._ports.shared_bus(self)
 
-    def hold_until(self, time_s: float) -> None: ...
-
-    def blocked_by(self, stood_s: float) -> str:  # noqa: ARG002
-        return ""
-
-    @contextlib.contextmanager
-    def undisturbed(self) -> Iterator[None]:
-        yield
-
     def new_id(self) -> str:
         return f"{self.world.chance.getrandbits(128):032x}"
-
-    def cpu_s(self) -> float:
-        return 0.0
 
     def _wake_at(self, true_s: float) -> None:
         if true_s < self._wake_s:

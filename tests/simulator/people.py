@@ -13,7 +13,11 @@ from stimrig.rig.requests import (
     CalibrateStartRequest,
     CalibrateStepRequest,
     CalibrateStoredRequest,
+    EnoughRequest,
+    ExtendRequest,
     RearmRequest,
+    StartRequest,
+    WithdrawRequest,
 )
 from tests.simulator.clinic import Asked
 
@@ -29,6 +33,7 @@ SEGMENTS = [
     SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.75, "down_s": 0.5}),
     SegmentPlan(name="steps", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1}),
 ]
+MORE = [SegmentPlan(name="more", sequence="steps", settings={"on_s": 0.5, "off_s": 0.25, "repeats": 1})]
 LONGEST_ADAPTIVE_S = 6.0
 
 
@@ -124,7 +129,8 @@ class People:
             if quiet and asked.reply is not None and asked.reply.ok:
                 self._await_end(test_id)
 
-        self.clinic.start(plan, KEY).then = then
+        self.clinic.tests += 1
+        self.clinic.ask(StartRequest(id=self.clinic.tests, plan=plan, key=KEY), test_id).then = then
         if not quiet and self.chance.random() < 0.1:  # on its way beside the start, or at any time of the test
             delay_s, begun = self.chance.choice((0.0, 0.01, 0.3, 1.0)), self.chance.random() < 0.5
             life.world.after(delay_s, lambda: self._withdraw(test_id, begun))
@@ -132,7 +138,7 @@ class People:
     def _withdraw(self, test_id: str, begun: bool) -> None:
         process = self.clinic.process
         if process is not None and process.alive:
-            self.clinic.withdraw(test_id, begun)
+            self.clinic.ask(WithdrawRequest(id=1, test_id=test_id, reason="signed out", begun=begun), test_id)
 
     def _nonsense_of_a_test(self, test_id: str) -> tuple[Profile, list[SegmentPlan], float]:
         """What a program with a mistake asks for: a list of widths that might pass but for one number, or two."""
@@ -169,10 +175,12 @@ class People:
         run = None if rig is None else rig.player.run
         if run is None:
             return
+        test_id, after = run.plan.test_id, len(run.score.laid)
         if self.chance.random() < 0.3:
-            self.clinic.enough(run.plan.test_id)
+            self.clinic.ask(EnoughRequest(id=1, test_id=test_id, by="clinician"), test_id)
         else:
-            self.clinic.extend(run.plan.test_id, KEY, len(run.score.laid))
+            more = ExtendRequest(id=1, test_id=test_id, key=KEY, after=after, segments=MORE)
+            self.clinic.ask(more, test_id)
 
     def _open_calibration(self) -> None:
         self.clinic.tests += 1

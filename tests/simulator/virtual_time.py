@@ -65,25 +65,10 @@ class VirtualClock:
         self.run(tasks, self._now_s + duration_s)
 
 
-class VirtualMachine:
-    """A machine whose work is done at once, on a disk that is given; it has no ports and no adapters of its own."""
+class QuietMachine:
+    """What neither virtual nor simulated machines do: nothing disturbs them, and they use no processor."""
 
-    def __init__(self, clock: VirtualClock | None = None, disk: Disk | None = None) -> None:
-        self.clock = clock or VirtualClock()
-        self.tasks = Tasks(self.clock, self._work)
-        self.disk: Disk = disk or Files()
-        self.boot_id = "this-boot"
-        self._ids = count(1)
-        self.head_start_s = 0.0
-
-    def port(self, path: str, **arguments: Any) -> Port:
-        raise NotImplementedError(path, arguments)
-
-    def open_bus(self, arguments: dict[str, Any], name: str) -> Bus:
-        raise NotImplementedError(arguments, name)
-
-    def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:  # noqa: ARG002
-        return None
+    head_start_s = 0.0
 
     def hold_until(self, time_s: float) -> None: ...
 
@@ -94,11 +79,31 @@ class VirtualMachine:
     def undisturbed(self) -> Iterator[None]:
         yield
 
-    def new_id(self) -> str:
-        return f"{next(self._ids):032x}"
-
     def cpu_s(self) -> float:
         return 0.0
+
+
+class VirtualMachine(QuietMachine):
+    """A machine whose work is done at once, on a disk that is given; it has no ports and no adapters of its own."""
+
+    def __init__(self, clock: VirtualClock | None = None, disk: Disk | None = None) -> None:
+        self.clock = clock or VirtualClock()
+        self.tasks = Tasks(self.clock, self._work)
+        self.disk: Disk = disk or Files()
+        self.boot_id = "this-boot"
+        self._ids = count(1)
+
+    def port(self, path: str, **arguments: Any) -> Port:
+        raise NotImplementedError(path, arguments)
+
+    def open_bus(self, arguments: dict[str, Any], name: str) -> Bus:
+        raise NotImplementedError(arguments, name)
+
+    def shared_bus(self, arguments: dict[str, Any], name: str) -> Bus | None:  # noqa: ARG002
+        return None
+
+    def new_id(self) -> str:
+        return f"{next(self._ids):032x}"
 
     def run(self, coroutine: Coroutine[Any, Any, T], within_s: float = 1e4) -> T:
         """Run a task to its end, and everything else meanwhile; gives what it returns, raises what it raises."""

@@ -15,10 +15,9 @@ def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
     """Start an emulator with options; it and its rig end with the test."""
     benches: list[Bench] = []
 
-    def make(*options: str, speed: float = 1.0) -> Bench:
-        bench = Bench(tmp_path / f"bench{len(benches)}", *options, speed=speed)
-        benches.append(bench)
-        return bench
+    def make(*options: str) -> Bench:
+        benches.append(Bench(tmp_path / f"bench{len(benches)}", *options))
+        return benches[-1]
 
     yield make
     for bench in benches:
@@ -26,20 +25,18 @@ def make_bench(tmp_path: Path) -> Iterator[Callable[..., Bench]]:
 
 
 @pytest.fixture(scope="module")
-def pair(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
-    """One emulator and one rig for a whole file."""
+def emulator(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """One emulator of the paper's patient for a whole file."""
     bench = Bench(tmp_path_factory.mktemp("shared"), "--noise-seed", "7")
-    yield bench, bench.start_rig()
+    yield bench
     bench.close()
 
 
 @pytest.fixture
-def shared(pair: tuple[Bench, RigClient]) -> tuple[Bench, RigClient]:
-    """The file's pair, ready: what one test left behind is no other test's failure."""
-    return made_ready(*pair)
-
-
-@pytest.fixture
-def bench(make_bench: Callable[..., Bench]) -> Bench:
-    """An emulator of the paper's patient."""
-    return make_bench("--noise-seed", "7")
+def shared(emulator: Bench) -> tuple[Bench, RigClient]:
+    """The file's emulator with a ready rig: what one test left behind is no other test's failure."""
+    lives = emulator.rig is not None and emulator.rig.popen.poll() is None
+    client = emulator.client() if lives else emulator.start_rig()
+    if client.status()["state"] == "uncertain":
+        client.rearm("test")
+    return made_ready(emulator, client)

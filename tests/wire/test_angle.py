@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ pytestmark = [pytest.mark.wire, pytest.mark.slow]
 
 PPM = 150.0
 MOUNTED = ("--angle-offset-deg", "31.5", "--angle-direction", "-1")
+CLOCK = ("--angle-clock-ppm", f"{PPM:g}", "--angle-jitter-us", "200")
 MOVING = {"cmd": "arm", "mode": "robot", "from_deg": 30.0, "to_deg": 100.0, "deg_s": 40.0}
 PLAN = {"kind": "moving", "angle": {"range_rad": [0.2, 2.2], "still_s": 2.0}}
 STEPS = [
@@ -29,57 +30,10 @@ STEPS = [
 REST = [{"name": "passive", "sequence": "rest", "settings": {"duration_s": 3.0}}]
 
 
-def played(bench: Bench, client: RigClient, test_id: str, **fields: Any) -> dict[str, Any]:
-    """A whole test; its finished event."""
-    client.ask("subscribe")
-    reply = client.start(default_plan(test_id, **{"segments": STEPS, **fields}))
-    assert reply["ok"], reply
-    return client.wait_finished(test_id, timeout_s=40)
-
-
-@pytest.mark.parametrize(
-    ("options", "methods"),
-    [
-        (("--angle-clock-ppm", f"{PPM:g}", "--angle-jitter-us", "200"), {"order", "stamps"}),
-        pytest.param(("--angle", "in-cell"), {"cell"}, marks=pytest.mark.campaign),
-    ],
-    ids=["socketcand", "in the cell"],
-)
-def test_angles_are_recorded_and_stand_within_a_millisecond_of_the_torque(
-    make_bench: Callable[..., Bench], options: tuple[str, ...], methods: set[str]
-):
-    bench = make_bench("--arm", "held", "--noise-seed", "7", *MOUNTED, *options)
-    client = bench.start_rig()
-    client.ask("subscribe", samples=True)
-    assert bench.fault(**MOVING)["ok"]
-    event = played(bench, client, "t", **PLAN)
-    assert event["outcome"] == "completed", event
-    live = [e for e in list(client.events.queue) if e["event"] == "live" and e["angle"]]
-    path = Path(event["recording_path"])
-    assert archive.verify(path)
-    with h5py.File(path) as file:
-        group, torque = file["angle"], file["torque"]
-        assert group.attrs["method"] in methods
-        time_s, number = group["time_s"][:], group["counter"][:]
-        assert np.degrees(group["angle_rad"][:].min()) == pytest.approx(30.0, abs=2.0)
-        assert np.degrees(group["angle_rad"][:].max()) == pytest.approx(100.0, abs=2.0)
-        assert np.percentile(np.abs(np.degrees(group["velocity_rad_s"][:])), 90) == pytest.approx(40.0, abs=2.0)
-        assert np.allclose(np.degrees(group["angle_rad"][:]), -(group["raw"][:] - 31.5), atol=1e-9)
-        if "cell" in methods:
-            assert np.isin(time_s, torque["time_s"][:]).mean() > 0.99
-        else:  # both counters began when the emulator did, and neither has wrapped
-            sampled = number * 8.0 / (1 + PPM * 1e-6)
-            true_s = np.interp(sampled, torque["counter"][:], torque["time_s"][:])
-            assert np.max(np.abs(time_s - true_s)[20:-20]) < 1e-3
-    record = identify.read(path)
-    assert record.angle_rad is not None and record.velocity_rad_s is not None
-    assert live == [] or all(len(row) == 3 for row in live[0]["angle"])
-
-
 @pytest.fixture(scope="module")
 def angled(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Bench, RigClient]]:
-    """An arm with its sensor, and a rig, for the rest of this file."""
-    bench = Bench(tmp_path_factory.mktemp("angled"), "--arm", "held", "--noise-seed", "7", *MOUNTED)
+    """An arm with its sensor, and a rig, for the whole file."""
+    bench = Bench(tmp_path_factory.mktemp("angled"), "--arm", "held", "--noise-seed", "7", *MOUNTED, *CLOCK)
     yield bench, bench.start_rig()
     bench.close()
 
@@ -105,14 +59,43 @@ def at(bench: Bench, client: RigClient, degrees: float) -> None:
         time.sleep(0.05)
 
 
+def played(client: RigClient, test_id: str, **fields: Any) -> dict[str, Any]:
+    client.ask("subscribe")
+    reply = client.start(default_plan(test_id, **{"segments": STEPS, **fields}))
+    assert reply["ok"], reply
+    event = client.wait_finished(test_id, timeout_s=40)
+    assert event["outcome"] == "completed", event
+    return event
+
+
+def test_angles_are_recorded_and_stand_within_a_millisecond_of_the_torque(ready: tuple[Bench, RigClient]):
+    bench, client = ready
+    assert bench.fault(**MOVING)["ok"]
+    path = Path(played(client, "t", **PLAN)["recording_path"])
+    assert archive.verify(path)
+    with h5py.File(path) as file:
+        group, torque = file["angle"], file["torque"]
+        assert group.attrs["method"] in ("order", "stamps")
+        time_s, number = group["time_s"][:], group["counter"][:]
+        assert np.degrees(group["angle_rad"][:].min()) == pytest.approx(30.0, abs=2.0)
+        assert np.degrees(group["angle_rad"][:].max()) == pytest.approx(100.0, abs=2.0)
+        assert np.percentile(np.abs(np.degrees(group["velocity_rad_s"][:])), 90) == pytest.approx(40.0, abs=2.0)
+        assert np.allclose(np.degrees(group["angle_rad"][:]), -(group["raw"][:] - 31.5), atol=1e-9)
+        # both counters began when the emulator did, and neither has wrapped
+        sampled = number * 8.0 / (1 + PPM * 1e-6)
+        true_s = np.interp(sampled, torque["counter"][:], torque["time_s"][:])
+        assert np.max(np.abs(time_s - true_s)[20:-20]) < 1e-3
+    record = identify.read(path)
+    assert record.angle_rad is not None and record.velocity_rad_s is not None
+
+
 def test_no_pulse_is_felt_in_a_passive_test(ready: tuple[Bench, RigClient]):
     bench, client = ready
     assert bench.fault(**MOVING)["ok"]
     before = bench.state()["pulses_received"]
     refused = client.ask("start", plan=default_plan("wide", **{**PLAN, "kind": "passive", "segments": STEPS}))
     assert "passive test" in refused["problem"]["detail"]
-    event = played(bench, client, "passive", **{**PLAN, "kind": "passive", "segments": REST})
-    assert event["outcome"] == "completed", event
+    played(client, "passive", **{**PLAN, "kind": "passive", "segments": REST})
     assert bench.state()["pulses_received"] == before
 
 

@@ -1,0 +1,410 @@
+"""The rig on the wire: a whole test, a calibration, stops and faults, and its sockets under load.
+
+Nothing that others ask, and nobody who only holds a connection, keeps out a stop.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import time
+from collections.abc import Callable, Iterator
+from itertools import groupby, pairwise
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+
+from stimrig.rig import archive
+from stimrig.rig.config import EMULATOR_WATCH
+from stimrig.rig.control.sealing import MAY_BE_FELT
+from stimrig.rig.messages import stop_socket
+from stimrig.rig.signals import PulseStatus
+from tests.harness.device_pairs import check_recording, stops_when_asked
+from tests.harness.processes import Bench, RigClient, alive, below, default_plan, kill_hard, short_plan
+
+pytestmark = pytest.mark.wire
+
+RATE_HZ = 40.0
+FAULTS = {"cell_silent": "stale", "stimulator_unplugged": "stimulator"}
+STEPS = [
+    {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.4}},
+    {"name": "steps", "sequence": "steps", "settings": {"on_s": 30.0, "off_s": 0.0}},
+]
+
+
+def start(bench: Bench, client: RigClient, test_id: str = "t") -> RigClient:
+    client.ask("subscribe")
+    before = bench.state()["pulses_received"]
+    reply = client.start(default_plan(test_id, segments=STEPS))
+    assert reply["ok"], reply
+    client.wait_state("running")
+    end = time.monotonic() + 60
+    while bench.state()["pulses_received"] < before + 30:
+        assert time.monotonic() < end, client.status()
+        time.sleep(0.02)
+    return client
+
+
+def later(bench: Bench) -> dict[str, Any]:
+    """What the emulator says half a second of its own time later."""
+    began_s = bench.state()["time_s"]
+    end = time.monotonic() + 60
+    while (state := bench.state())["time_s"] < began_s + 0.5:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return state
+
+
+def check_kept(event: dict[str, Any], outcome: str) -> None:
+    assert event["outcome"] == outcome
+    path = Path(event["recording_path"])
+    with h5py.File(path) as file:
+        assert file.attrs["outcome"] == outcome
+        assert file.attrs["reason"]
+        assert archive.verify(path) == file.attrs["content_sha256"]
+        assert np.sum(file["pulses/status"][:] == 0) >= 15
+        assert len(file["torque/time_s"]) > 1000
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], fault: str):
+    bench, client = shared
+    start(bench, client, fault)
+    injected = bench.fault(cmd="fault", name=fault, on=True)
+    assert injected["ok"], injected
+    counted = bench.state()["pulses_received"]
+    event = client.wait_finished(fault, timeout_s=60)
+    check_kept(event, "fault")
+    assert FAULTS[fault] in event["reason"]
+    # pulses are counted, not seconds: a computer that stands still sends none
+    watch_s = EMULATOR_WATCH["stale_torque_s"] if fault == "cell_silent" else 0.0
+    assert bench.state()["pulses_received"] - counted <= RATE_HZ * (watch_s + 0.25)
+    status = client.wait_state("latched")
+    assert status["reason"].startswith(event["reason"])  # what its reader finds after the end comes behind
+    refused = client.ask("start", plan=short_plan("refused"))
+    assert refused["problem"]["code"] == "latched"
+    bench.fault(cmd="fault", name=fault, on=False)
+    later(bench)
+    rearmed = client.rearm("nurse")
+    assert rearmed["ok"], rearmed
+    assert rearmed["body"]["state"] == "ready"
+
+
+@pytest.mark.parametrize("fault", ["cell_silent", "error_frames"])
+def test_a_load_cell_that_fails_before_the_start_is_told_before_the_first_pulse(
+    shared: tuple[Bench, RigClient], fault: str
+):
+    bench, client = shared
+    client.ask("subscribe")
+    before = bench.state()["pulses_received"]
+    assert bench.fault(cmd="fault", name=fault, on=True)["ok"]
+    test_id = f"{fault}-before"
+    reply = client.start(default_plan(test_id, segments=STEPS))
+    if reply["ok"]:
+        assert client.wait_finished(test_id, timeout_s=60)["outcome"] == "fault"
+    # also where the rest between two tests left the rig the time to find it silent
+    reason = client.status()["reason"] if reply["ok"] else reply["problem"]["detail"]
+    assert "load cell" in reason and "look at its plug and supply, and at the CAN adapter" in reason, reply
+    assert bench.state()["pulses_received"] == before
+    bench.fault(cmd="fault", name=fault, on=False)
+    later(bench)
+    assert client.rearm("nurse")["body"]["state"] == "ready"
+
+
+def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient]):
+    shared[1].ask("subscribe")
+    stops_when_asked(*shared)
+
+
+def test_a_killed_rig_sends_no_more_and_comes_back_uncertain(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    before, received = len(bench.felt()), bench.state()["pulses_received"]
+    start(bench, client, "killed")
+    assert bench.rig is not None
+    kill_hard(bench.rig)
+    killed_s = bench.state()["time_s"]
+    count = later(bench)["pulses_received"] - received
+    # silence is no stimulation; one command may have been on its way
+    assert sum(pulse["time_s"] > killed_s for pulse in bench.felt()) <= 1
+    client = bench.start_rig()
+    status = client.status()
+    assert status["state"] == "uncertain"
+    assert "killed" in status["reason"]
+    event = status["finished"]
+    check_kept(event, "fault")
+    with h5py.File(event["recording_path"]) as file:
+        acknowledged = int(np.sum(file["pulses/status"][:] == 0))
+        assert acknowledged >= count - 2  # the last ack may have been on its way
+        assert np.sum(np.isfinite(file["pulses/sent_pulse_width_us"][:]) & (file["pulses/status"][:] != 1)) >= count
+    felt = bench.felt()[before:]
+    felt_uc = sum(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)
+    summary = event["summary"]
+    most_uc = max(pulse["width_us"] * pulse["current_ma"] * 1e-3 for pulse in felt)
+    assert felt_uc - 1e-6 <= summary["charge_uc"] <= felt_uc + most_uc + 1e-6  # one may not have left
+    assert len(felt) <= summary["pulses"] <= len(felt) + 1
+    assert summary["duration_s"] >= felt[-1]["time_s"] - felt[0]["time_s"] > 0
+    assert summary["torque_time_nms"] > 0 and summary["torque_peak_nm"] > 0
+    assert summary["dose_is_bound"] == (summary["doubtful_pulses"] > 0)
+    assert summary["dose_is_bound"] == any(words.startswith("dose: ") for words in summary["warnings"])
+    refused = client.ask("start", plan=short_plan("next"))
+    assert refused["problem"]["code"] == "uncertain"
+    assert client.rearm("nurse")["ok"]
+
+
+def test_a_signal_stops_stimulation_first_and_seals(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    recordings = bench.data / "recordings"
+    before = set(recordings.glob("*.h5"))
+    start(bench, client)
+    assert bench.rig is not None
+    assert bench.rig.stop(signal.SIGTERM, timeout_s=120.0) == 0
+    count = bench.state()["pulses_received"]
+    assert later(bench)["pulses_received"] == count
+    (sealed,) = set(recordings.glob("*.h5")) - before
+    with h5py.File(sealed) as file:
+        assert file.attrs["outcome"] == "stopped"
+    client = bench.start_rig()  # what stopped it is remembered
+    assert client.status()["state"] == "latched"
+    assert "shutting down" in client.status()["reason"]
+
+
+def test_two_rigs_cannot_share_the_data_or_the_port(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    with pytest.raises(RuntimeError, match="another rig"):
+        bench.start_rig()
+    assert client.status()["state"] == "ready"  # the first is none the worse for it
+
+
+STOOD_S = 0.15
+"""With what a shared machine may stand still by itself less than a second in all."""
+
+
+def stand_still(bench: Bench, for_s: float) -> int:
+    """Stop the rig's process for a while; how many pulses were felt until then."""
+    assert bench.rig is not None
+    bench.rig.popen.send_signal(signal.SIGSTOP)
+    time.sleep(for_s)
+    felt = len(bench.felt())
+    bench.rig.popen.send_signal(signal.SIGCONT)
+    return felt
+
+
+@pytest.mark.campaign  # tests/rig/test_pauses.py does it in virtual time
+def test_a_rig_that_stands_still_goes_on_and_loses_no_sample_and_then_ends_its_test(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    before = len(bench.felt())
+    start(bench, client, "short")
+    for _ in range(3):
+        stand_still(bench, STOOD_S)
+        time.sleep(0.5)
+    event = client.wait_finished("short")
+    assert (event["outcome"], event["summary"]["lost_samples"]) == ("completed", 0), event["reason"]
+    pauses = event["summary"]["pauses"]
+    assert sum(pause["for_s"] for pause in pauses) >= 3 * (STOOD_S - 0.03), "two that follow one another may be one"
+    with h5py.File(Path(event["recording_path"])) as file:
+        status, sent_us = file["pulses/status"][:], file["pulses/sent_pulse_width_us"][:]
+        planned_s = file["pulses/planned_time_s"][:]
+    assert np.sum(status == PulseStatus.DROPPED) >= 3 * round(RATE_HZ * (STOOD_S - 0.03))
+    for pause in pauses:  # after each the width climbs from nothing
+        after = np.flatnonzero((planned_s > pause["at_s"]) & np.isfinite(sent_us))[:1]
+        assert len(after) and sent_us[after[0]] <= 50
+    assert all(two["time_s"] - one["time_s"] >= 0.008 for one, two in pairwise(bench.felt()[before:]))
+    start(bench, client, "long")
+    felt = stand_still(bench, 1.2 + EMULATOR_WATCH["stale_torque_s"])
+    event = client.wait_finished("long")
+    assert event["outcome"] == "fault" and "the computer was blocked for" in event["reason"]
+    assert len(bench.felt()) == felt
+    assert client.status()["state"] == "latched"
+
+
+def test_what_is_shown_and_sealed_is_what_was_felt(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    before = len(bench.felt())
+    client.ask("subscribe")
+    while client.events.get(timeout=5)["event"] != "state":
+        pass
+    live = client.events.get(timeout=5)
+    assert live["event"] == "live"
+    assert live["test_id"] is None
+    assert len(live["time_s"]) == len(live["torque_min_nm"]) == len(live["torque_max_nm"]) > 0
+    assert client.start(short_plan("whole"))["ok"]
+    events, end = [], time.monotonic() + 90
+    while not events or events[-1]["event"] != "finished":
+        events.append(client.events.get(timeout=end - time.monotonic()))
+    states = [e["status"]["state"] for e in events if e["event"] == "state"]
+    assert states[:4] == ["arming", "running", "sealing", "ready"]
+    running = [e for e in events if e["event"] == "live" and e["test_id"] == "whole" and e["elapsed_s"] > 0]
+    widths = [w for e in running for w in e["pulse_width_us"]]
+    assert len(widths) > 100
+    assert max(widths) == 300.0
+    assert {"rest", "prbs", "ramp"} <= {e["segment"] for e in running}
+    assert all(lo <= hi for e in running for lo, hi in zip(e["torque_min_nm"], e["torque_max_nm"], strict=True))
+    assert max(hi for e in running for hi in e["torque_max_nm"]) > 1.0
+    check_recording(events[-1], bench.felt()[before:])
+
+
+def test_a_calibration_from_start_to_a_test(shared: tuple[Bench, RigClient]):
+    """The electrodes feel what was asked for, and nothing between the steps."""
+    bench, client = shared
+    before = len(bench.felt())
+    asked = {"calibration_id": "cal", "participant": "P01", "by": "therapist"}
+    reply = client.ask("calibrate-start", **asked, step_us=25.0, train_s=0.5, max_pulse_width_us=80.0)
+    assert reply["ok"], reply
+    assert reply["body"]["state"] == "calibrating"
+    assert len(bench.felt()) == before  # opening sends nothing
+    assert client.ask("start", plan=short_plan("no"))["problem"]["code"] == "busy"
+    shown = {"pulse_width_us": 0}
+    for threshold, width_us in (("sensory", 25), ("motor", 50), ("comfort", 75)):
+        while shown["pulse_width_us"] < width_us:  # a train that was lost to a busy machine is sent again
+            reply = client.ask("calibrate-step", direction="up")
+            assert reply["ok"], reply
+            status = client.wait_state("calibrating", "latched")
+            assert status["state"] == "calibrating", status
+            shown = status["calibration"]
+        reply = client.ask("calibrate-mark", threshold=threshold)
+        assert reply["body"]["calibration"]["marks_us"][threshold] == shown["pulse_width_us"]
+    pulses = [round(p["width_us"]) for p in bench.felt()[before:]]
+    trains = shown["trains"]
+    assert all(t["pulses"] <= 20 for t in trains), trains
+    # one that was not felt whole is sent again; after a pause of the computer its pulses climb
+    widths_us = [width_us for width_us, _ in groupby(t["pulse_width_us"] for t in trains if t["pulses"])]
+    assert widths_us == [25, 50, 75]
+    assert set(widths_us) <= set(pulses) and max(pulses) == 75
+    result = client.ask("calibrate-finish", by="therapist")["body"]
+    waiting = client.status()["calibrated"]
+    assert waiting["result"] == result
+    assert client.ask("calibrate-stored", calibration_id=waiting["calibration_id"])["body"]["calibrated"] is None
+    profile = result["profile"]
+    assert profile["max_pulse_width_us"] == 75.0
+    acknowledged = 0
+    for train, path in zip(trains, result["recordings"], strict=True):
+        with h5py.File(path) as file:
+            assert file.attrs["kind"] == "calibration"
+            status = file["pulses/status"][:]
+        sure = int(np.sum(status == PulseStatus.ACKNOWLEDGED))
+        assert sure <= train["pulses"] == int(np.isin(status, MAY_BE_FELT).sum())  # what may be felt counts as felt
+        assert train["pulses"] - sure <= 1  # none follows one that is not acknowledged
+        acknowledged += sure
+    # one that was not acknowledged need not have been felt
+    assert acknowledged <= len(pulses) <= sum(train["pulses"] for train in trains)
+    client.ask("subscribe")
+    assert client.start(short_plan("calibrated", profile=profile))["ok"]
+    assert client.wait_finished("calibrated")["outcome"] == "completed"
+    old = profile | {"expires_at_utc": profile["set_at_utc"]}
+    assert client.ask("start", plan=short_plan("old", profile=old))["problem"]["code"] == "refused"
+
+
+LONGEST = [{"name": "x", "sequence": "multilevel", "settings": {"duration_s": 75.0, "min_hold_s": 0.02}}] * 4
+
+
+@contextlib.contextmanager
+def half_open(path: Path, number: int) -> Iterator[list[socket.socket]]:
+    """Connections on which half a request was sent; some of them the rig may have closed."""
+    held = []
+    for _ in range(number):
+        held.append(socket.socket(socket.AF_UNIX, socket.SOCK_STREAM))
+        held[-1].connect(str(path))
+        with contextlib.suppress(OSError):
+            held[-1].sendall(b'{"kind": "stop", "id"')
+    try:
+        yield held
+    finally:
+        for connection in held:
+            connection.close()
+
+
+def wait_until(met: Callable[[], bool]) -> None:
+    """Or fail, after a time that only a machine that hangs takes."""
+    end = time.monotonic() + 120
+    while not met():
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+def stop_apart(bench: Bench) -> dict[str, Any]:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as connection:
+        connection.settimeout(60)
+        connection.connect(str(stop_socket(bench.socket)))
+        connection.sendall(b'{"kind": "stop", "id": 5, "reason": "choked", "by": "test"}\n')
+        return json.loads(connection.makefile("rb").readline())
+
+
+def answer_to(bench: Bench, line: str) -> dict[str, Any]:
+    raw = bench.client()
+    replies = raw._replies[0] = type(raw.events)()
+    raw.send_raw(line)
+    return replies.get(timeout=60)
+
+
+def test_a_stop_is_heard_past_previews_and_1200_half_open_connections(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    start(bench, client, "choke")
+    assert bench.rig is not None
+    threads = [int(thread.name) for thread in Path(f"/proc/{bench.rig.popen.pid}/task").iterdir()]
+    ranks = [os.sched_getscheduler(thread) for thread in threads]
+    if ranks[threads.index(bench.rig.popen.pid)] == os.SCHED_RR:  # where a process may run before all others
+        assert ranks.count(os.SCHED_FIFO) == 1  # who sends its pulses
+    preview = json.dumps({"kind": "preview", "id": 9, "plan": default_plan("p", segments=LONGEST)})
+    with half_open(bench.socket, 600), half_open(stop_socket(bench.socket), 600):
+        for _ in range(4):
+            asker = bench.client()
+            asker._replies[9] = type(asker.events)()
+            asker.send_raw(preview)
+        reply = stop_apart(bench)
+    assert reply["ok"]
+    assert reply["id"] == 5
+    assert reply["body"]["confirmed"], reply
+    assert client.wait_state("latched")["reason"]
+
+
+def test_a_newcomer_gets_in_past_those_who_say_nothing(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    assert client.status()["state"] == "ready"
+    with half_open(bench.socket, 300) as held:
+        assert bench.client().status()["state"] == "ready"
+        held[0].setblocking(False)
+
+        def let_go() -> bool:
+            with half_open(bench.socket, 1), contextlib.suppress(BlockingIOError, ConnectionResetError):
+                return held[0].recv(1) == b""
+            return False
+
+        wait_until(let_go)  # the one that was still for longest, once somebody else comes
+    assert client.status()["state"] == "ready"  # one that speaks is kept
+
+
+def test_a_builder_that_died_is_begun_anew(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    assert bench.rig is not None
+    built = client.ask("preview", plan=default_plan("p"), timeout_s=60.0)
+    assert built["ok"], built
+    assert built["body"]["duration_s"] == pytest.approx(38.7)
+    children = below(bench.rig.popen.pid)
+    (builder,) = (pid for pid in children if b"previews" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    assert os.sched_getscheduler(builder) == os.SCHED_OTHER
+    os.kill(builder, signal.SIGKILL)
+    wait_until(lambda: not alive(builder))
+    default = client.ask("sequences")["body"]["default"]
+    assert client.ask("preview", plan=default_plan("p", segments=default), timeout_s=60.0)["body"] == built["body"]
+
+
+def test_what_is_malformed_or_too_much_at_once_is_refused_in_words(shared: tuple[Bench, RigClient]):
+    bench, client = shared
+    for line in ("not json", '{"kind": "dance"}', '{"kind": "start", "plan": {"test_id": 5}}', "[]"):
+        reply = answer_to(bench, line)
+        assert not reply["ok"] and reply["problem"]["detail"]
+    long = json.dumps({"id": 7, "kind": "start", "plan": default_plan("x", kind="x" * 70_000)})
+    assert "begin with its kind and its id" in answer_to(bench, long)["problem"]["detail"]
+    raw = bench.client()
+    raw._replies[0] = type(raw.events)()
+    with contextlib.suppress(OSError):  # let go before all of it was sent
+        raw.send_raw("x" * 2_500_000)
+    assert raw.closed.wait(60)
+    assert client.ask("preview", plan={"test_id": 5})["problem"]["code"] == "bad-plan"
+    assert client.status()["state"] == "ready"
