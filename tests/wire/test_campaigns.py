@@ -12,15 +12,24 @@ import pytest
 
 from stimrig.api.settings import Settings
 from stimrig.api.web.app import create_app
+from stimrig.hardware_sim import load_cells, stimulators
 from tests.api.conftest import TOKEN, Server, wait_done
-from tests.harness.device_pairs import CELLS, HOLD, STIMULATORS, TRANSPORTS, check_all, options
 from tests.harness.looks_first import LooksFirst
-from tests.harness.processes import Bench, kill_hard, short_plan
+from tests.harness.processes import Bench, RigClient, kill_hard, short_plan
 from tests.harness.soak import soak
+from tests.wire.test_rig import STEPS, check_recording, felt_after, start, stops_when_asked
 
 pytestmark = [pytest.mark.wire, pytest.mark.campaign]
 PATIENCE_S = 300.0
 
+STIMULATORS = tuple(stimulators.STIMULATORS)
+TRANSPORTS = tuple(load_cells.TRANSPORTS)
+CELLS = {
+    f"{name} x{count}" if count > 1 else name: ("--cell", name, "--samples-per-frame", str(count))
+    for name, cell in load_cells.CELLS.items()
+    for count in {min(cell.layouts), max(cell.layouts)}
+}
+"""Every emulated cell with its fewest and its most samples per frame, as options of the emulator."""
 MOST = {
     "align_ms": 1.0,
     "ack_ms": 10.0,
@@ -32,10 +41,62 @@ MOST = {
 """Bounds of the figures of a pair, on a machine that does nothing else."""
 
 
+def check_all(bench: Bench) -> dict[str, float]:
+    """The whole suite on one pair; a few figures."""
+    client = bench.start_rig()
+    client.ask("subscribe")
+    assert client.start(short_plan("plays"))["ok"]
+    figures = check_recording(client.wait_finished("plays"), bench.felt())
+    figures["stop_ms"] = stops_when_asked(bench, client)
+    figures["fault_ms"] = stops_when_unheard(bench, client)
+    figures["silence_ms"] = says_nothing_when_killed(bench, client)
+    return figures
+
+
+def stops_when_unheard(bench: Bench, client: RigClient) -> float:
+    """No acks: stopped, told, kept; milliseconds from the fault to the last pulse."""
+    start(bench, client, "unheard")
+    injected = bench.fault(cmd="fault", name="no_ack", on=True)
+    event = client.wait_finished("unheard")
+    assert event["outcome"] == "fault"
+    assert "not acknowledged" in event["reason"]
+    # no pulse goes out before the one ahead of it is acknowledged
+    assert felt_after(bench, injected["monotonic_s"]) <= 1
+    last_ms = 1e3 * (bench.felt()[-1]["monotonic_s"] - injected["monotonic_s"])
+    bench.fault(cmd="fault", name="no_ack", on=False)
+    client.wait_state("latched")
+    time.sleep(0.1)
+    rearmed = client.rearm("nurse")
+    assert rearmed["ok"], rearmed
+    return last_ms
+
+
+def says_nothing_when_killed(bench: Bench, client: RigClient) -> float:
+    """The host's death ends stimulation at once: each pulse was a command. Then uncertain, asked, not resumed."""
+    start(bench, client, "killed")
+    assert bench.rig is not None
+    kill_hard(bench.rig)
+    died_s = time.monotonic()
+    time.sleep(1.5 / bench.speed)  # longer than any device's own watchdog
+    after = bench.felt()
+    assert felt_after(bench, died_s) <= 1  # a command may have been on its way
+    again = bench.start_rig()
+    assert again.status()["state"] == "uncertain"
+    again.ask("subscribe")
+    assert len(bench.felt()) == len(after)
+    assert again.rearm("nurse")["ok"]
+    assert again.start(short_plan("next"))["ok"]
+    event = again.wait_finished("next")
+    assert event["outcome"] == "completed", event
+    return 1e3 * (after[-1]["monotonic_s"] - died_s)
+
+
 # at the speed of the world: a backlog of text frames is read hardly faster than twice that
 @pytest.mark.parametrize("pair", list(itertools.product(STIMULATORS, CELLS, TRANSPORTS)), ids=" ".join)
 def test_every_pair_behaves(make_bench: Callable[..., Bench], pair: tuple[str, str, str]):
-    figures = check_all(make_bench(*options(*pair)))
+    stimulator, cell, transport = pair
+    options = ["--stimulator", stimulator, "--load-cell", transport, *CELLS[cell], "--noise-seed", "7"]
+    figures = check_all(make_bench(*options))
     over = {name: figures[name] for name, most in MOST.items() if not figures[name] <= most}
     assert not over
 
@@ -46,7 +107,7 @@ def test_a_rehastim2_is_kept_alive_through_a_rest_and_lets_go_of_a_dead_host(mak
     client = bench.start_rig()
     client.ask("subscribe")
     rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": 3.0}}
-    assert client.start(short_plan("rests", segments=[rest, *HOLD[1:], rest]))["ok"]
+    assert client.start(short_plan("rests", segments=[rest, *STEPS[1:], rest]))["ok"]
     client.wait_state("running")
     while len(bench.felt()) < 20:
         time.sleep(0.02)
@@ -95,7 +156,7 @@ def test_a_test_stops_itself_and_is_identified(tmp_path: Path) -> None:
         with Server(app) as url, httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S) as client:
             client.post("/v1/participants", json={"code": "P017"})
             target = {"curve_percent": 4.0, "step_percent": 4.0}
-            document = wait_done(client, start(client, target), PATIENCE_S)
+            document = wait_done(client, begin_test(client, target), PATIENCE_S)
     finally:
         bench.close()
     told, summary = document["adaptive"], document["summary"]
@@ -113,7 +174,7 @@ def test_a_test_stops_itself_and_is_identified(tmp_path: Path) -> None:
     assert document["fit"]["fit_percent"] > 90.0
 
 
-def start(client: httpx.Client, target: dict[str, float]) -> str:
+def begin_test(client: httpx.Client, target: dict[str, float]) -> str:
     """Ask until the rest between two tests is over; the test's id. What it can reach is computed before."""
     end = time.monotonic() + PATIENCE_S
     body = {"participant": "P017", "kind": "adaptive", "target": target}

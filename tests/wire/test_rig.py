@@ -6,6 +6,7 @@ Nothing that others ask, and nobody who only holds a connection, keeps out a sto
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import signal
@@ -21,16 +22,19 @@ import numpy as np
 import pytest
 
 from stimrig.rig import archive
+from stimrig.rig.acquire.run import CLIMB
 from stimrig.rig.config import EMULATOR_WATCH
 from stimrig.rig.control.sealing import MAY_BE_FELT
 from stimrig.rig.messages import stop_socket
 from stimrig.rig.signals import PulseStatus
-from tests.harness.device_pairs import check_recording, stops_when_asked
 from tests.harness.processes import Bench, RigClient, alive, below, default_plan, kill_hard, short_plan
 
 pytestmark = pytest.mark.wire
 
 RATE_HZ = 40.0
+SAME_CLOCK_S = 2e-4
+"""Two processes read the same clock; between the device's doing and its answer is at least this."""
+WIDTHS = "pulse_width_us", "sent_pulse_width_us"
 FAULTS = {"cell_silent": "stale", "stimulator_unplugged": "stimulator"}
 STEPS = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.4}},
@@ -117,8 +121,27 @@ def test_a_load_cell_that_fails_before_the_start_is_told_before_the_first_pulse(
     assert client.rearm("nurse")["body"]["state"] == "ready"
 
 
+def felt_after(bench: Bench, time_s: float) -> int:
+    """How many pulses the emulated electrodes felt after a monotonic time."""
+    return sum(pulse["monotonic_s"] > time_s for pulse in bench.felt())
+
+
+def stops_when_asked(bench: Bench, client: RigClient) -> float:
+    """Confirmed by device and torque, latched, re-armed; milliseconds from request to last pulse."""
+    start(bench, client, "asked")
+    asked_s = time.monotonic()
+    evidence = client.ask("stop", reason="enough", by="nurse")["body"]
+    answered_s = time.monotonic()
+    assert evidence["confirmed"], evidence
+    assert client.wait_finished("asked")["outcome"] == "stopped"
+    assert client.wait_state("latched")["reason"] == "enough (by nurse)"
+    assert client.rearm("nurse")["ok"]
+    assert felt_after(bench, asked_s) <= 4  # of 25 ms each
+    assert felt_after(bench, answered_s + SAME_CLOCK_S) == 0
+    return 1e3 * (bench.felt()[-1]["monotonic_s"] - asked_s)
+
+
 def test_stop_is_confirmed_by_device_and_torque(shared: tuple[Bench, RigClient]):
-    shared[1].ask("subscribe")
     stops_when_asked(*shared)
 
 
@@ -221,6 +244,41 @@ def test_a_rig_that_stands_still_goes_on_and_loses_no_sample_and_then_ends_its_t
     assert event["outcome"] == "fault" and "the computer was blocked for" in event["reason"]
     assert len(bench.felt()) == felt
     assert client.status()["state"] == "latched"
+
+
+def check_recording(event: dict[str, Any], felt: list[dict[str, Any]]) -> dict[str, float]:
+    """A completed test's file is whole, hashed, and agrees with what the electrodes felt; a few figures."""
+    assert event["outcome"] == "completed", event
+    path, summary = Path(event["recording_path"]), event["summary"]
+    assert hashlib.sha256(path.read_bytes()).hexdigest() == event["file_sha256"]
+    with h5py.File(path) as file:
+        assert archive.verify(path) == file.attrs["content_sha256"]
+        assert json.loads(file.attrs["configuration"])["plan"]["test_id"] == event["test_id"]
+        status, planned, sent = (file[f"pulses/{name}"][:] for name in ("status", *WIDTHS))
+        torque_nm, time_s, counter = (file[f"torque/{name}"][:] for name in ("torque_nm", "time_s", "counter"))
+        ack_s = (file["pulses/acknowledged_time_s"][:] - file["pulses/written_time_s"][:])[status == 0]
+    assert [p["width_us"] for p in felt] == sent[status == 0].tolist()
+    assert {p["current_ma"] for p in felt} == {20.0}
+    assert all(p["balanced"] for p in felt)
+    assert set(np.unique(status)) <= {0, 1, 2}  # how many are dropped is the machine's doing: a figure of the bench
+    assert np.sum(status == 2) == summary["dropped_pulses"]
+    assert np.all(planned[status == 1] < 20)
+    whole, felt_at = np.trunc(planned), np.flatnonzero(status == 0)
+    dropped = np.flatnonzero(status == 2)  # after each the width may have to climb back
+    as_planned = [at for at in felt_at if not np.any((dropped < at) & (dropped >= at - 2 * CLIMB))]
+    assert len(as_planned) >= 20 and np.array_equal(sent[as_planned], whole[as_planned])
+    assert np.all(sent[felt_at] <= whole[felt_at])
+    assert 0 < np.median(ack_s) < 0.01  # one that is heard after 25 ms drops the next pulse
+    assert len(time_s) > 0.95 * 1600 * summary["duration_s"]
+    assert np.all(np.diff(time_s) > 0) and (counter[0] < 0 or np.all(np.diff(counter) == 1))
+    assert summary["lost_samples"] == 0
+    assert np.max(torque_nm) > 1.0
+    assert abs(np.median(torque_nm[time_s < 0.4])) < 0.2
+    return {
+        "align_ms": summary["alignment"]["error_ms"],
+        "ack_ms": 1e3 * float(np.median(ack_s)),
+        "dropped_percent": 100 * float(np.mean(status[status != 1] == 2)),
+    }
 
 
 def test_what_is_shown_and_sealed_is_what_was_felt(shared: tuple[Bench, RigClient]):
