@@ -254,11 +254,6 @@ def test_figures_hold_roles_and_no_colours(figures: dict[str, Any]) -> None:
         assert "var(" not in light and LIGHT["ink"] in light
 
 
-def test_compared_models_differ_in_colour_and_in_dash() -> None:
-    looks = [model_charts.style(number) for number in range(model_charts.MOST)]
-    assert len({look["colour"] for look in looks}) == len({look["dash"] for look in looks}) == len(looks) == 6
-
-
 # ---- The charts of g and h: the document's own numbers, bands where the joint was seen, dotted where it was not
 
 

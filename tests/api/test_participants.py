@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +12,7 @@ from sqlalchemy import event
 
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
-from tests.api.conftest import Service, csrf, run_test, shared_service, soon, wait_done
+from tests.api.conftest import Service, csrf, run_test, shared_service, signed_in, soon, wait_done
 
 service = shared_service()
 
@@ -253,3 +254,17 @@ def test_new_pulses_come_first() -> None:
     assert followed(crossed).where == "On parts of the recording that were left out in turn"
     alone = followed({**both, "held_out_fit_percent": None})
     assert (alone.percent, alone.ceiling_percent, alone.where) == (98.5, 99.0, "On the pulses that it was fitted to")
+
+
+def test_every_page_shows_the_same_fit(service: Service, client: httpx.Client) -> None:
+    client.post("/v1/participants", json={"code": "F1"})
+    first, second = (run_test(client, "F1")["model_id"] for _ in range(2))
+    pages = ("/", "/participants/F1", "/participants/F1/trend", f"/compare?model={first}&model={second}",
+             f"/models/{first}", f"/models/{first}/report")  # fmt: skip
+    with signed_in(service) as browser:
+        for place in pages:
+            page = browser.get(place).text
+            assert "97.9" in page and 'title="On held-out pulses (not used for fitting)"' in page, place
+            page = re.sub(r"<(script|svg)\b.*?</\1>", "", page, flags=re.DOTALL)
+            others = page.count("98.5")  # on the pulses that it was fitted to; said so where it is shown
+            assert others == page.count("Fit, fitted pulses</span><b>98.5"), place

@@ -85,6 +85,11 @@ def test_no_model_approved_says_how_to_approve(client: httpx.Client, participant
     assert found["type"] == "/problems/no-approved-model" and "approve" in found["detail"]
 
 
+def test_unknown_scope(shared_client: httpx.Client) -> None:
+    found = problem(shared_client.post("/v1/tokens", json={"name": "x", "scopes": ["everything"]}), 422)
+    assert "everything" in found["detail"] and "read-model" in found["detail"]
+
+
 def test_rig_that_is_gone_and_comes_back(client: httpx.Client, service: Service, participant: str) -> None:
     service.rig_thread.__exit__()
     soon(lambda: not client.get("/v1/rig").json()["connected"])
