@@ -153,7 +153,7 @@ def test_a_million_rows():
     assert model.quality["verdict"] == "usable"
 
 
-@settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     size=st.integers(1, 400),
     rate=st.sampled_from([40.0, 100.0, 333.0, 1600.0]),

@@ -1,7 +1,4 @@
-"""The structure of an earlier session on a new record of the same muscle: what is still needed, and what is offered.
-
-And what must not change that; and what is said where the record leaves it open.
-"""
+"""The structure of an earlier session on a new record of the same muscle: what is still needed, and what is offered."""
 
 from __future__ import annotations
 
@@ -37,31 +34,22 @@ def earlier() -> identify.Model:
 
 def test_effect_that_is_still_there_stays_in_its_form(earlier: identify.Model) -> None:
     told: list[str] = []
-    found = identify.carry(again("fatigue"), earlier, lambda _share, text: told.append(text))
+    record = again("fatigue")
+    found = identify.carry(record, earlier, lambda _share, text: told.append(text))
     assert (found.offered, found.still_needed, found.no_longer_needed) == ("carried", ("fatigue",), ())
     assert found.model.effects[0]["form"] == earlier.effects[0]["form"]
     assert found.model.extra["parent"] == found.models[0].model_id
     assert found.models[1].fit["held_out_rms_nm"] < found.models[0].fit["held_out_rms_nm"]
     assert "still needed" in str(found) and found.carried_from == earlier.model_id
     assert any("fatigue" in text for text in told)
+    with few_effects.only("fatigue", "baseline_drift", "threshold_drift"):
+        assert "fatigue" in [entry["effect"] for entry in identify.diagnose(record).missing], "without it it is missing"
 
 
 def test_effect_that_is_gone_is_dropped_and_the_plain_model_offered(earlier: identify.Model) -> None:
     found = identify.carry(again(""), earlier)
     assert (found.offered, found.why, found.still_needed) == ("plain", "nothing-needed", ())
     assert found.no_longer_needed == ("fatigue",) and found.model.effects == () and len(found.models) == 1
-
-
-def test_verdict_on_an_effect_is_that_of_the_diagnosis(earlier: identify.Model) -> None:
-    """What is still needed is missing without it, and what is dropped is not."""
-    for hidden in ("fatigue", ""):
-        record = again(hidden)
-        found = identify.carry(record, earlier)
-        with few_effects.only("fatigue", "baseline_drift", "threshold_drift"):
-            missing = [entry["effect"] for entry in identify.diagnose(record).missing]
-            further = [entry["effect"] for entry in identify.diagnose(record, found.model).missing]
-        assert ("fatigue" in missing) == ("fatigue" in found.still_needed)
-        assert "fatigue" not in further
 
 
 def test_effect_beside_something_else_that_is_missing_is_not_told_as_gone() -> None:

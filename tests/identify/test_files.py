@@ -10,7 +10,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.records import read
-from tests.harness.patients import Patient, make_record
+from tests.identify.test_felt import seal
 
 HEADER = "time_s,pulse_width_us,torque_nm,segment"
 ROWS = [f"{i / 40:.4f},{100 * (i % 3)},{0.1 * i:.3f},prbs" for i in range(20)]
@@ -109,49 +109,17 @@ def test_files_that_are_none(tmp_path):
         read(write(tmp_path, *ROWS), pulse_rate_hz=float("nan"))
 
 
-def seal(path: Path, *, drop: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """A recording as docs/recording.md lays it out, written apart from the rig; widths and clean torque."""
-    record, clean = make_record(Patient(), np.random.default_rng(0), rate_hz=1600, noise_nm=0.02)
-    widths = record.pulse_width_us[::40].copy()
-    planned = np.arange(widths.size) / 40.0
-    names = list(record.segment_names)
-    starts = record.time_s[np.searchsorted(record.segment, np.arange(len(names)))]
-    ends = np.r_[starts[1:], record.time_s[-1] + 1 / 1600]
-    status = np.where(widths > 0, 0, 1).astype(np.uint8)
-    sent = widths.copy()
-    if drop is not None:
-        sent[drop], status[drop] = np.nan, 2
-    jitter = np.random.default_rng(1).uniform(-1e-4, 1e-4, widths.size)
-    written = np.where(status == 0, planned + 0.004 + jitter, np.nan)
-    with h5py.File(path, "w") as file:
-        file.attrs.update(
-            format="stimrig-recording", format_version=1, recording_id="rec-1", pulse_rate_hz=40.0, content_sha256="ab"
-        )
-        file["/torque/time_s"] = record.time_s + 0.004
-        file["/torque/torque_nm"] = record.torque_nm
-        file["/pulses/planned_time_s"] = planned
-        file["/pulses/pulse_width_us"] = widths
-        file["/pulses/sent_pulse_width_us"] = sent
-        file["/pulses/written_time_s"] = written
-        file["/pulses/status"] = status
-        file["/segments/name"] = names
-        file["/segments/start_s"] = starts
-        file["/segments/end_s"] = ends + 0.1
-    return widths, clean
-
-
 def test_reads_a_sealed_recording(tmp_path):
-    widths, _clean = seal(tmp_path / "r.h5")
+    true = seal(tmp_path / "r.h5", rate_hz=1600, late=False)
     record = read(tmp_path / "r.h5")
     assert record.pulse_rate_hz == 40
-    assert record.source.recording_id == "rec-1"
     assert set(record.segment_names) == {"rest", "prbs", "ramp", "validate"}
-    assert np.mean(record.pulse_width_us == np.repeat(widths, 40)[: record.time_s.size]) > 0.97
+    assert np.mean(record.pulse_width_us == np.repeat(true["widths"], 40)[: record.time_s.size]) > 0.97
     model = identify.fit(record)
-    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=5e-3)
+    assert model.linear.time_constant_s == pytest.approx(0.15, rel=5e-3)
     # All pulses were late together, and so was the torque: no delay between them.
     assert model.linear.delay_s == pytest.approx(0.0, abs=1.5e-3)
-    assert model.data["recording_id"] == "rec-1"
+    assert model.data["recording_id"] == record.source.recording_id == "r"
 
 
 def test_held_out_rows_in_another_case_or_with_blanks_are_held_out_and_told(tmp_path):
@@ -172,32 +140,6 @@ def test_held_out_rows_in_another_case_or_with_blanks_are_held_out_and_told(tmp_
     assert sealed.take(sealed.held_out).notes == sealed.notes
     given = identify.Record.from_arrays(*(np.arange(3.0),) * 3, segment=["rest", "Validate", "validate "])
     assert given.held_out.tolist() == [False, True, True] and len(given.segment_names) == 2
-
-
-def test_a_dropped_pulse_counts_as_none(tmp_path):
-    widths, _ = seal(tmp_path / "r.h5")
-    drop = int(np.flatnonzero(widths > 0)[30])
-    seal(tmp_path / "r.h5", drop=drop)
-    record = read(tmp_path / "r.h5")
-    at = int(np.searchsorted(record.time_s, drop / 40 + 0.004 + 0.01))
-    assert record.pulse_width_us[at] == 0
-    assert record.pulse_width_us[at + 40] == widths[drop + 1]
-
-
-def test_gaps_in_the_torque_are_bridged(tmp_path):
-    _, clean = seal(tmp_path / "r.h5")
-    with h5py.File(tmp_path / "r.h5", "a") as file:
-        keep = np.ones(clean.size, bool)
-        keep[30_000:30_400] = False
-        keep[12_345] = False
-        for name in ("time_s", "torque_nm"):
-            kept = file[f"/torque/{name}"][:][keep]
-            del file[f"/torque/{name}"]
-            file[f"/torque/{name}"] = kept
-    record = read(tmp_path / "r.h5")
-    model = identify.fit(record)
-    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=5e-3)
-    assert np.sqrt(np.mean((identify.predict(model, record) - clean[keep][: record.time_s.size]) ** 2)) < 0.02
 
 
 @pytest.mark.parametrize(

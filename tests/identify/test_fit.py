@@ -74,18 +74,6 @@ def test_splitting_and_joining_segments_changes_nothing():
         assert np.array_equal(same, predicted)
 
 
-def test_resampling_changes_predictions_by_less_than_the_noise():
-    record, _ = make_record(Patient(delay_s=0.02), np.random.default_rng(6), rate_hz=1600, noise_nm=NOISY)
-    every = slice(None, None, 4)
-    names = np.array(record.segment_names)[record.segment]
-    coarse = Record.from_arrays(
-        record.time_s[every], record.pulse_width_us[every], record.torque_nm[every], names[every]
-    )
-    _, fine = fitted(record)
-    _, thin = fitted(coarse)
-    assert np.sqrt(np.mean((fine[every] - thin) ** 2)) < 0.2 * NOISY
-
-
 def test_held_out_rows_are_never_used():
     record, _ = make_record(Patient(), np.random.default_rng(7), noise_nm=NOISY)
     spoiled = record.with_torque(np.where(record.held_out, -50.0, record.torque_nm))
@@ -166,15 +154,6 @@ def test_steep_recruitment_leaves_no_structure(rise_us):
         used = ~record.held_out
         assert best_fit_percent(clean[used], predicted[used]) > 99.5
         assert model.noise.ar1 == 0.0
-
-
-def test_a_curve_that_falls_with_torque_of_the_other_sign():
-    record, _ = make_record(Patient(), np.random.default_rng(13), noise_nm=NOISY)
-    model = identify.fit(record.with_torque(-record.torque_nm))
-    assert model.quality["verdict"] == "usable"
-    level, width = model.recruitment.inverse()
-    assert level[-1] < -5
-    assert np.all(np.diff(width) >= 0)
 
 
 def test_fit_on_names_the_segments():

@@ -98,11 +98,3 @@ def test_rows_left_out_in_turn_are_judged_without_it_too():
     assert fitted["held_out_by"] == "cross-validation"
     assert fitted["unforeseen_nm"] == pytest.approx(HUM_NM / np.sqrt(2), rel=0.05)
     assert fitted["held_out_rms_nm"] > 4 * fitted["rms_nm"]
-
-
-def test_a_model_of_an_older_version_says_nothing_of_its_size():
-    _, _, model = of_one_record("mains_hum")
-    old = model.with_(effects=tuple({k: v for k, v in e.items() if k != "unforeseen"} for e in model.effects))
-    assert unforeseen(old) == {"mains_hum": (0.0, 0.0)}
-    other = hidden_muscles.record(seed=7)
-    np.testing.assert_allclose(old.predict(other), model.predict(other), atol=0.01)

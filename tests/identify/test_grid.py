@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 from stimrig.identify.dynamics import grid as pulse_grid
-from stimrig.identify.dynamics.grid import make_grid, runs
+from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.second_order import transition
 from stimrig.identify.dynamics.states import boundary_states
@@ -41,8 +41,7 @@ def fine_torque(widths_us: np.ndarray, time_constant_s: float, damping: float) -
     return np.array(out)
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.031])
-@pytest.mark.parametrize("rate_hz", [40, 50, 100, 200, 250, 400, 1000, 1600, 2000])
+@pytest.mark.parametrize(("rate_hz", "delay_s"), [(40, 0.0), (50, 0.031), (250, 0.0), (400, 0.031), (2000, 0.031)])
 def test_block_means_match_fine_integration(rate_hz: int, delay_s: float) -> None:
     widths_us = schedule()
     time_constant_s, damping = 0.15, 0.64
@@ -77,8 +76,7 @@ def test_a_clock_that_wanders_is_followed_at_a_bounded_price(monkeypatch: pytest
 
 
 @pytest.mark.parametrize("skipped", [0, 3])
-@pytest.mark.parametrize("damping", [0.15, 1.0, 2.0, 8.0])
-@pytest.mark.parametrize("time_constant_s", [0.012, 0.03, 0.15])
+@pytest.mark.parametrize(("time_constant_s", "damping"), [(0.15, 0.15), (0.03, 1.0), (0.012, 2.0), (0.012, 8.0)])
 def test_the_curve_is_exact_however_short_a_lag_is(time_constant_s: float, damping: float, skipped: int) -> None:
     """A second lag of 0.8 ms and more; `skipped` samples leave a first interval unlike the others."""
     patient = Patient(time_constant_s=time_constant_s, damping=damping)
@@ -133,23 +131,11 @@ def test_means_are_those_of_the_curve_at_the_samples_and_a_delay_shifts_them() -
     np.testing.assert_allclose(late[1:], at_once[:-1], atol=1e-9)
 
 
-def test_held_out_rows_are_never_fitted() -> None:
-    names = ["prbs"] * 2000 + ["validate"] * 1000 + ["rest"] * 1000
-    grid = make_grid(Record.from_arrays(np.arange(4000) / 400, np.zeros(4000), np.zeros(4000), names))
-    assert not grid.fitted[200:300].any()
-    assert grid.stretches(grid.fitted) == [slice(0, 200), slice(300, 400)]
-
-
 @pytest.mark.parametrize(("rate_hz", "size"), [(30, 900), (400, 50)])
 def test_what_cannot_be_put_on_the_grid_is_refused(rate_hz: int, size: int) -> None:
     with pytest.raises(BadRecord) as refusal:
         make_grid(Record.from_arrays(np.arange(size) / rate_hz, np.zeros(size), np.zeros(size)))
     assert refusal.value.fix
-
-
-def test_runs() -> None:
-    assert runs(np.array([1, 1, 0, 1], bool)) == [slice(0, 2), slice(3, 4)]
-    assert runs(np.zeros(3, bool)) == []
 
 
 def test_whitening_is_the_exact_likelihood() -> None:

@@ -59,16 +59,12 @@ def test_the_same_measurement_twice_is_refused_under_any_name(tmp_path):
             join([record(400, name="d", seed=4), b, again], [500.0, 100.0, None])
 
 
-@pytest.mark.parametrize("rates", [(400, 400), (400, 1600), (1000, 400)])
+@pytest.mark.parametrize("rates", [(400, 400), (1000, 400)])
 def test_either_order_gives_the_same_record(rates):
     a, b = record(rates[0], 0.01), record(rates[1], 0.004, name="b", seed=2)
     joined = join([a, b], [1000.0, 1067.0])
     assert same(joined, join([b, a], [1067.0, 1000.0]))
     assert [source.recording_id[-1] for source in joined.source.parts] == ["a", "b"]
-
-
-def test_same_begin_is_told_apart_by_what_was_recorded():
-    a, b = record(400), record(400, name="b", seed=2)
     assert same(join([a, b], [5.0, 5.0]), join([b, a], [5.0, 5.0]))
 
 
@@ -90,8 +86,7 @@ def test_parts_of_one_rate_keep_every_sample_with_its_offset():
     assert [part.first for part in joined.parts] == [0, a.time_s.size]
 
 
-@pytest.mark.parametrize("rates", [(400, 400), (400, 1600), (1600, 400), (100, 1000), (400, 500)])
-@pytest.mark.parametrize("working", [False, True])
+@pytest.mark.parametrize(("rates", "working"), [((400, 500), False), ((1600, 400), False), ((400, 1600), True)])
 def test_pulses_of_all_parts_fall_on_one_grid(rates, working):
     """Every interval of the grid has one width, and it is the one that was in force."""
     a, b = record(rates[0], 0.01), record(rates[1], 0.02, working=working, name="b", seed=2)
@@ -142,7 +137,7 @@ def test_each_pause_is_kept_and_a_long_one_folded(pause_s, kept_s):
     jump = joined.time_s[part.first] - joined.time_s[part.first - 1]
     assert jump == pytest.approx(kept_s, abs=0.03)
     grid = make_grid(joined)
-    # Empty intervals are the pause to the interval, belong to the part before it, and nothing is stimulated in them.
+    # Empty intervals are the pause, belong to the part before it, and nothing is stimulated in them.
     assert (grid.count == 0).sum() == round(part.folded_s * 40)
     assert not grid.part[grid.count == 0].any()
     assert not grid.pulse_width_us[grid.count == 0].any()
@@ -175,21 +170,11 @@ def _rows(joined: Record) -> tuple[Grid, np.ndarray]:
     return grid, grid.fitted
 
 
-def test_part_may_begin_and_end_working():
-    a, b = record(400, working=True), record(400, working=True, name="b", seed=2)
-    joined = join([a, b], [0.0, 100.0])
-    grid = make_grid(joined)
-    assert joined.pulse_width_us[joined.parts[1].first] == b.pulse_width_us[0] > 0
-    assert not grid.pulse_width_us[grid.count == 0].any()
-
-
-@pytest.mark.parametrize("rates", [(400, 400), (400, 1600)])
-def test_held_out_rows_stay_held_out(rates):
-    a, b = record(rates[0]), record(rates[1], name="b", seed=2)
+def test_held_out_rows_stay_held_out():
+    a, b = record(400), record(1600, name="b", seed=2)
     joined = join([a, b], [0.0, 50.0])
-    assert joined.held_out[joined.part == 0].sum() == a.held_out.sum()
-    assert joined.held_out[joined.part == 1].sum() == pytest.approx(b.held_out.sum() * rates[0] / rates[1], abs=1)
-    assert joined.held_out.any()
+    assert joined.held_out[joined.part == 0].sum() == a.held_out.sum() > 0
+    assert joined.held_out[joined.part == 1].sum() == pytest.approx(b.held_out.sum() / 4, abs=1)
 
 
 def test_optional_columns_are_kept_where_all_parts_have_them():
@@ -244,7 +229,7 @@ def test_parts_of_some_rows():
 
 
 @pytest.mark.parametrize("begun_s", [(1000.25, 8200.5), (None, None)])
-@pytest.mark.parametrize("rates", [(400, 400), (400, 1600), (1600, 1000)])
+@pytest.mark.parametrize("rates", [(400, 400), (1600, 1000)])
 def test_file_gives_back_the_same_record(tmp_path, begun_s, rates):
     a, b = record(rates[0], 0.01, working=True), record(rates[1], 0.004, working=True, name="b", seed=2)
     a, b = (replace(each, angle_rad=1 + 0.1 * each.time_s, pulse_rate_hz=40.0) for each in (a, b))
@@ -286,12 +271,6 @@ def test_joined_record_is_joined_again_with_its_parts(tmp_path):
         )  # fmt: skip
 
 
-def test_known_pause_of_a_joined_record_stays_beside_one_without_a_begin():
-    a, b, c = (record(400, name=name, seed=seed) for seed, name in enumerate("abc"))
-    joined = join([c, join([a, b], [0.0, 100.0])], [None, None])
-    assert [part.pause_s for part in joined.parts] == pytest.approx([0.0, 0.0, 94.0], abs=0.025)
-
-
 def test_plain_record_is_one_part():
     plain = record(400)
     assert plain.parts == (Part(),)
@@ -300,19 +279,6 @@ def test_plain_record_is_one_part():
     alone = join([plain], [7.0])
     assert same(alone, plain, but=("parts",))
     assert alone.parts == (Part(begun_s=7.0),)
-
-
-def test_file_joined_by_an_older_version_is_one_part(tmp_path):
-    a, b = record(400), record(400, name="b")
-    time_s = np.r_[a.time_s, b.time_s + 66.0]
-    width, torque = (np.r_[getattr(a, name), getattr(b, name)] for name in ("pulse_width_us", "torque_nm"))
-    width[-400:] = width[a.time_s.size - 400 : a.time_s.size] = 0.0
-    rows = [f"{t:.6f},{w:g},{y:.6f},rest" for t, w, y in zip(time_s, width, torque, strict=True)]
-    path = tmp_path / "old.csv"
-    path.write_text("time_s,pulse_width_us,torque_nm,segment\n" + "\n".join(rows) + "\n")
-    old = identify.read(path)
-    assert old.parts == (Part(),)
-    assert old.time_s[-1] == pytest.approx(time_s[-1], abs=1e-4)
 
 
 def test_column_part_of_somebody_else_is_passed_over(tmp_path):

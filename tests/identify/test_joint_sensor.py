@@ -51,15 +51,6 @@ def test_the_velocity_of_a_noisy_angle_is_found_much_better_than_by_its_slope():
     assert found.step_rad == 0.0
 
 
-def test_both_ways_are_neither_late_nor_early():
-    time_s, angle, velocity = moved()
-    read = angle + np.radians(0.3) * np.random.default_rng(1).normal(size=angle.size)
-    found = JointMotion.of(time_s, read)
-    shifts = np.arange(-4, 5)
-    errors = [rms(found.velocity_rad_s - np.interp(time_s - shift / RATE_HZ, time_s, velocity)) for shift in shifts]
-    assert abs(shifts[int(np.argmin(errors))]) <= 1
-
-
 def test_with_an_earlier_trial_nothing_later_is_looked_at():
     unseen, earlier = (
         as_record(record(arm_patient(ARM), "reaching", seed, duration_s=12.0, sensor=NOISY)) for seed in (7, 8)
@@ -143,13 +134,6 @@ def test_each_part_of_a_joined_record_is_smoothed_by_itself():
     both = JointMotion.of(np.r_[time_s, time_s + 30.0], np.r_[angle + noise[0], 0.3 + 0.1 * noise[1]], [0, time_s.size])
     assert both.angle_rad == pytest.approx(np.r_[alone[0].angle_rad, alone[1].angle_rad], abs=1e-6)
     assert both.jerk[0] > 1e3 * both.jerk[1] and both.noise_rad[0] > 5 * both.noise_rad[1]
-
-
-def test_the_recorded_velocity_is_not_believed_beside_an_angle():
-    made = as_record(record(arm_patient(ARM), "moving", 1, duration_s=10.0))
-    assert made.velocity_rad_s is not None and made.motion is not None
-    wild = replace(made, velocity_rad_s=made.velocity_rad_s + 3.0)
-    assert wild.motion is not None and np.array_equal(wild.motion.velocity_rad_s, made.motion.velocity_rad_s)
 
 
 def test_angles_of_a_trial_are_smoothed_and_a_plan_stays_as_it_is():

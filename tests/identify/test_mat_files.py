@@ -59,7 +59,6 @@ def ways(record: Record) -> dict[str, tuple[dict[str, Any], dict[str, str] | Non
         "variables": (plain, None, {}),
         "packed, in rows, beside others": (with_more, None, {"do_compression": True, "oned_as": "row"}),
         "a struct": ({"record": plain, "fs": 100.0}, None, {"do_compression": True}),
-        "a struct, unpacked": ({"x": 3, "record": plain}, None, {}),
         "names and units of their own": (
             own | {"part": rows}, {"time_s": "t:ms", "pulse_width_us": "pw:s", "torque_nm": "M:mNm", "segment": "part"},
             {"do_compression": True},
@@ -71,7 +70,7 @@ def ways(record: Record) -> dict[str, tuple[dict[str, Any], dict[str, str] | Non
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("way", range(6))
+@pytest.mark.parametrize("way", range(5))
 def test_the_same_data_give_the_same_record(tmp_path: Path, record: Record, way: int) -> None:
     content, given, how = list(ways(record).values())[way]
     found = identify.read(saved(tmp_path / "data.mat", content, **how), map=given)
@@ -237,7 +236,7 @@ def test_files_with_bytes_changed_or_cut_are_answered(tmp_path: Path, record: Re
         target = io.BytesIO()
         savemat(target, {"r": columns(record.take(np.arange(300)))}, do_compression=packed_too)
         good = target.getvalue()
-        for _ in range(150):
+        for _ in range(40):
             content = bytearray(good)
             for _ in range(rng.randrange(1, 4)):
                 content[rng.randrange(128, min(len(content), 2000))] = rng.randrange(256)

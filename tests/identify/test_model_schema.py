@@ -9,7 +9,6 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jsonschema_rs
-import numpy as np
 import pytest
 
 from stimrig import identify
@@ -62,9 +61,16 @@ def refused(document: dict[str, Any]) -> str:
     return ""
 
 
+def shortened(node: Any) -> Any:
+    """A document with the first rows of its tables alone."""
+    if isinstance(node, dict):
+        return {name: shortened(part) for name, part in node.items()}
+    return [shortened(part) for part in node[:6]] if isinstance(node, list) else node
+
+
 @pytest.fixture(scope="module")
 def document() -> dict[str, Any]:
-    """Of a fit with an effect, with short tables, so that there are not too many places."""
+    """Of a fit with an effect."""
     found = identify.fit(hidden_muscles.record(rate_hz=100), effects=["fatigue"]).to_dict()
     joint = {"reference_angle_rad": 0.1, "angle_rad": [0.0, 1.0], "velocity_rad_s": [0.0], "g": [[1.0], [1.0]]}
     joint |= {"h_nm": [[0.0], [0.0]], "inertia_nm_s2_per_rad": 0.0, "seen_g": [[1], [2]], "seen_h": [[1], [2]]}
@@ -92,6 +98,7 @@ def as_read(node: Any) -> Any:
 
 
 def test_the_reader_and_a_full_validator_refuse_the_same(document: dict[str, Any]) -> None:
+    document = shortened(document)
     strict, full = jsonschema_rs.validator_for(SCHEMA), jsonschema_rs.validator_for(as_read(SCHEMA))
     assert strict.is_valid(document) and refused(document) == ""
     tried, looser, differ = 0, 0, []
@@ -132,25 +139,12 @@ def test_what_is_only_told_may_be_unknown(document: dict[str, Any]) -> None:
         assert refused(changed(document, way, None)) == "", way
     assert refused(changed(document, one_number, 300.0)) == ""
     assert identify.Model.from_dict(changed(document, band, None)).bands["recruitment"]["lower"][0] is None
+    for name in ("time_constant_s", "damping"):
+        less = {key: value for key, value in document["linear"].items() if key != name}
+        with pytest.raises(identify.BadModel, match=rf"linear\.{name}: the key is missing"):
+            check_model(document | {"linear": less})
     for way in (("linear", "damping"), ("recruitment", "basis", "coefficients_nm", 0), ("baseline_nm",)):
         assert refused(changed(document, way, None)).startswith(f"{'.'.join(map(str, way))}: None is not a number")
-
-
-def test_a_model_of_an_older_version_is_read(document: dict[str, Any]) -> None:
-    """It has the keys without which nothing can be predicted, and parameters may be numbers alone."""
-    basis, linear = document["recruitment"]["basis"], document["linear"]
-    numbers = {name: found["value"] for name, found in document["effects"][0]["parameters"].items()}
-    effect = {"id": "fatigue", "form": document["effects"][0]["form"], "parameters": numbers}
-    discrete = {name: linear[name] for name in ("b", "a", "delay_samples")} | {"step_s": 0.025}
-    seconds = {name: linear[name] for name in ("kind", "time_constant_s", "damping")}
-    for block in (discrete, seconds):
-        old = {name: document[name] for name in SCHEMA["x-needed"]} | {"recruitment": {"basis": basis}}
-        old |= {"linear": block, "effects": [effect], "joint": {}, "uncertainty": None}
-        assert identify.Model.from_dict(old).effects == (effect,)
-        for name in [name for name in block if name != "kind"]:
-            less = {key: value for key, value in block.items() if key != name}
-            with pytest.raises(identify.BadModel, match=rf"linear\.{name}: the key is missing"):
-                check_model(old | {"linear": less})
 
 
 def test_what_the_schema_cannot_say_is_checked(document: dict[str, Any]) -> None:
@@ -166,9 +160,3 @@ def test_what_the_schema_cannot_say_is_checked(document: dict[str, Any]) -> None
     ):
         with pytest.raises(identify.BadModel, match=says):
             check_model(changed(document, way, value))
-
-
-def test_tables_of_a_model_are_numbers(document: dict[str, Any]) -> None:
-    torque_nm = np.asarray(document["recruitment"]["torque_nm"]).tolist()
-    with pytest.raises(identify.BadModel, match=r"^recruitment\.torque_nm\.3: 'x' is not a number"):
-        check_model(changed(document, ("recruitment", "torque_nm"), [*torque_nm[:3], "x"]))

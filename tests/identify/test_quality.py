@@ -33,12 +33,6 @@ def test_level_torque_has_no_best_fit(torque: list[float]) -> None:
     assert np.isnan(ceiling_percent(measured, 0.1))
 
 
-def test_torque_well_below_the_noise_has_no_best_fit() -> None:
-    measured = 0.04 * np.sin(np.arange(100.0))
-    assert best_fit_percent(measured, measured, 0.05) == 100.0
-    assert np.isnan(best_fit_percent(measured, measured, 0.1))
-
-
 @pytest.mark.parametrize("effects", [(), ("fatigue",)])
 def test_a_model_of_level_held_out_rows(record: identify.Record, effects: tuple[str, ...]) -> None:
     level = record.with_torque(np.where(record.held_out, 0.25, record.torque_nm))

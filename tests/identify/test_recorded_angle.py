@@ -88,13 +88,3 @@ def test_impossible_angles_are_one_line(tmp_path: Path, spoil: str, says: str):
     with pytest.raises(BadRecord, match=says) as error:
         sealed(tmp_path / "a.h5", spoil=spoil)
     assert "/angle" in str(error.value) and "\n" not in str(error.value)
-
-
-def test_csv_keeps_both_columns(tmp_path: Path):
-    from stimrig.api.record_files import export_csv
-
-    record = sealed(tmp_path / "a.h5")
-    export_csv(str(tmp_path / "a.h5"), lambda *_: None, str(tmp_path / "a.csv"))
-    again = identify.read(tmp_path / "a.csv")
-    assert again.angle_rad is not None and record.angle_rad is not None
-    assert np.allclose(again.angle_rad, record.angle_rad, atol=1e-6)

@@ -89,17 +89,6 @@ def test_a_copy_does_not_wait_for_what_another_thread_compiles():
     assert time.monotonic() - began < 4.0
 
 
-def test_an_error_in_a_copy_is_seen_here():
-    def failing(number: int) -> int:
-        time.sleep(0.02)
-        if number == 4:
-            raise ZeroDivisionError("four")
-        return number
-
-    with pytest.raises(ZeroDivisionError, match="four"):
-        dict(side_by_side(failing, 9, 2))
-
-
 def test_who_stops_half_way_leaves_no_copy_behind():
     before = children()
     with pytest.raises(Cancelled):

@@ -7,7 +7,6 @@ import pytest
 
 from bench.muscles.hidden_records import generate
 from stimrig import identify
-from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import fitted_with, try_effect
 from stimrig.identify.estimation.joint import predict_fitted
@@ -120,12 +119,6 @@ def test_held_out_rows_change_nothing_of_a_fit():
     np.testing.assert_array_equal(one.theta, two.theta)
 
 
-def test_warming_up_runs_to_its_end():
-    from stimrig.identify.diagnosis.warm_up import warm
-
-    warm()
-
-
 @pytest.mark.slow
 def test_an_effect_asked_for_gets_the_form_that_the_diagnosis_would_give():
     """A spring with a toe: the forms before it in the list hardly help, and must not end the search."""
@@ -154,27 +147,6 @@ def of_two_parts() -> Setup:
     """Two parts of six seconds."""
     grid, _ = prepare(join([record(400, name="a"), record(400, name="b", seed=2)], [0.0, 60.0]))
     return fit_plain(grid, grid.fitted).problem.setup
-
-
-def test_every_part_has_its_baseline_and_its_initial_state(of_two_parts: Setup):
-    problem = Problem(of_two_parts, [("sensor_clipping", find_effect("sensor_clipping").form("ceiling"))])
-    coefficients = tuple(f"recruitment_{i}_nm" for i in range(of_two_parts.basis.size))
-    assert problem.names[:-1] == (
-        "time_constant_s", "damping", "delay_s", "baseline_nm", "baseline_2_nm",
-        "initial_torque_nm", "initial_rate_nm_s", "initial_torque_2_nm", "initial_rate_2_nm_s", *coefficients,
-    )  # fmt: skip
-    assert problem.names[-1].startswith("sensor_clipping.")
-    span_nm = 6.0 * of_two_parts.scale_nm
-    table = {p.name: (p.lower, p.upper, p.scale, p.unit) for p in problem.table}
-    assert table["time_constant_s"] == (*TIME_CONSTANT_BOUNDS_S, "log", "s")
-    assert table["damping"] == (*DAMPING_BOUNDS, "log", "1")
-    assert table["delay_s"] == (*of_two_parts.delay_bounds_s, "linear", "s")
-    assert table["baseline_2_nm"] == (-span_nm, span_nm, "linear", "N·m")
-    assert table["initial_torque_2_nm"] == (-span_nm, span_nm, "linear", "N·m")
-    assert table["initial_rate_2_nm_s"] == (-10 * span_nm, 10 * span_nm, "linear", "N·m/s")
-    assert table["recruitment_0_nm"] == (-np.inf, np.inf, "linear", "N·m")
-    assert (problem.delay, problem.baselines, problem.initials) == (range(2, 3), range(3, 5), range(5, 9))
-    assert problem.chosen[0].places == range(9 + of_two_parts.basis.size, problem.size)
 
 
 @pytest.mark.parametrize("effect", ["sensor_clipping:both", "activation_dependent_speed:torque", ""])

@@ -13,7 +13,6 @@ import pytest
 from stimrig import identify
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Form, Scene
-from stimrig.identify.model_schema import SCHEMA
 from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow
@@ -79,20 +78,6 @@ def test_settings_of_an_effect_are_checked(name: str, value: float, plain):
     good = {"depth": 0.3, "onset_s": 20.0, "recovery_s": 40.0}
     with pytest.raises(identify.BadModel, match=rf"effects\.0\.settings\.{name}: .* is no"):
         identify.Model.from_dict(with_effect(plain, "fatigue", "fitness", good, **{name: value}))
-
-
-def test_a_fit_writes_the_settings_that_are_read_and_no_more(record):
-    settings = identify.fit(record, effects=["fatigue"]).effects[0]["settings"]
-    known = SCHEMA["properties"]["effects"]["items"]["properties"]["settings"]
-    joint = set(known["properties"]) - set(known["required"]) - {"angle_late_s"}  # told where it is late
-    assert set(settings) == set(SETTINGS) | (set() if record.angle_rad is None else joint)
-    still = replace(record, angle_rad=np.full(record.time_s.size, 1.2), velocity_rad_s=0 * record.time_s)
-    assert set(identify.fit(still, effects=["fatigue"]).effects[0]["settings"]) == set(SETTINGS) | joint
-
-
-def test_a_parameter_that_is_missing_is_told(plain):
-    with pytest.raises(identify.BadModel, match=r"effects\.0\.parameters\.recovery_s: the key is missing"):
-        identify.Model.from_dict(with_effect(plain, "fatigue", "fitness", {"depth": 0.3, "onset_s": 20.0}))
 
 
 def test_an_effect_that_is_not_installed_is_still_read(plain):

@@ -20,7 +20,6 @@ from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Part, Record
 from stimrig.identify.simulation.predict import predict, problem_of
-from stimrig.identify.simulation.pulses import above_rest
 from stimrig.identify.tracking import State, begin, follow, model_for_next, moved_model, passed
 from stimrig.identify.tracking.follow import rested, set_states, slow_forms
 from tests.harness.muscle import Patient
@@ -61,11 +60,6 @@ def record_of(widths_us: np.ndarray, begun_s: float | None = None, torque_nm: np
     return Record.from_arrays(time_s, np.repeat(widths_us, PER), torque_nm, names, parts=(Part(begun_s=begun_s),))
 
 
-def test_forms_with_a_state_are_those_that_wear_off_slowly() -> None:
-    assert {effect for effect, _ in FORMS} == {"fatigue", "potentiation", "catch_like"}
-    assert len(FORMS) == 8
-
-
 @pytest.mark.parametrize(("effect", "form"), FORMS)
 def test_a_record_cut_in_two_with_its_state_is_the_uncut_one(plain: Model, effect: str, form: str) -> None:
     model, cut = having(plain, effect, form), 240
@@ -100,11 +94,6 @@ def test_rested_is_bit_for_bit_as_without_a_state(plain: Model, effect: str, for
     absent = predict(having(plain, effect, form), record)
     assert np.array_equal(absent, predict(having(plain, effect, form, state=0.0), record))
     assert not np.array_equal(absent, predict(having(plain, effect, form, state=0.5), record))
-
-
-def test_a_muscle_that_is_tired_gives_less_above_rest(plain: Model) -> None:
-    torque = [np.max(above_rest(having(plain, "fatigue", "fitness", state=x), WIDTHS, 40.0)) for x in (0.0, 0.4, 0.9)]
-    assert torque[0] > torque[1] > torque[2]
 
 
 @pytest.mark.parametrize("state", [math.nan, -0.01, 1.01, math.inf, "0.5", True, None])

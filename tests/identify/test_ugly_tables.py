@@ -11,6 +11,7 @@ import pytest
 
 from stimrig.identify import read
 from stimrig.identify.errors import BadRecord
+from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
 
 HEADER = ("time_s", "pulse_width_us", "torque_nm", "segment")
@@ -70,6 +71,21 @@ READ: dict[str, tuple[str | bytes, str]] = {
     "thousands of blank lines": (table(cells()) + "\n" * 5000, ""),
     "thousands of empty rows": (table(cells()) + ",,,\n" * 5000, ""),
     "other case and blanks": (table(cells(), ("Time (s)", "PULSE WIDTH [us]", " Torque  (N·m) ", "Segment")), "in us"),
+    "lines before the header, tabs, time in ms": (
+        "Device\tBench 3\nSampling rate\t100\n\n"
+        + table(
+            cells(point(1, 1e3), torque=point(1, 1e3)), ("Zeit [ms]", "pw [us]", "Drehmoment (mNm)", "Segment"), "\t"
+        ),
+        "tabs between cells, header in line 4; time_s is 'Zeit [ms]' in ms",
+    ),
+    "aligned with blanks": (
+        "# by hand\n" + table([[cell.rjust(9) for cell in row] for row in cells()], between=" "),
+        "blanks between cells, header in line 2",
+    ),
+    "times of the calendar": (
+        table([[f"{1.7e9 + at:.4f}", *row[1:]] for at, row in zip(TIME_S, cells(), strict=True)]),
+        "time is counted from the first sample, at 1700000000.000 s",
+    ),
     "torque in Ncm": (table(cells(torque=point(2, 100)), ("time_s", "pulse_width_us", "torque_ncm", "segment")), "ncm"),
 }
 """What is read, and what its notes tell of what was taken for granted."""
@@ -82,7 +98,7 @@ def saved(folder: Path, content: str | bytes) -> Path:
 
 
 def check(record: Record) -> None:
-    np.testing.assert_allclose(record.time_s, TIME_S, atol=1e-9)
+    np.testing.assert_allclose(record.time_s, TIME_S, atol=1e-7)  # as fine as times of the calendar are
     np.testing.assert_allclose(record.pulse_width_us, WIDTH_US)
     np.testing.assert_allclose(record.torque_nm, TORQUE_NM, atol=1e-9)
 
@@ -97,21 +113,25 @@ def test_it_is_read_right_and_what_was_assumed_is_told(tmp_path: Path, what: str
         assert np.array_equal(np.array(record.segment_names)[record.segment], SEGMENT)
 
 
-def test_jittering_time_stamps_are_told(tmp_path: Path) -> None:
-    jitter_s = np.r_[0.0, RNG.uniform(-2e-3, 2e-3, SIZE - 1)]
-    rows = [[f"{at:.6f}", *row[1:]] for at, row in zip(TIME_S + jitter_s, cells(), strict=True)]
-    record = read(saved(tmp_path, table(rows)))
-    np.testing.assert_allclose(record.time_s, TIME_S, atol=2e-3)
-    np.testing.assert_allclose(record.torque_nm, TORQUE_NM, atol=1e-9)
-    assert any("jitter" in note for note in record.source.notes)
+def test_names_and_units_of_a_map(tmp_path: Path) -> None:
+    rows = [[str(k), *row] for k, row in enumerate(cells(point(0, 1e6), point(3, 1e-3), point(2, 100)))]
+    given = ["time_s=T:us", "pulse_width_us=PW: left:ms", "torque_nm=M:N·cm", "segment=what"]
+    record = read(saved(tmp_path, table(rows, ("no", "T", "PW: left", "M", "what"), ";")), map=given)
+    check(record)
+    assert np.array_equal(np.array(record.segment_names)[record.segment], SEGMENT)
 
 
-def test_a_row_without_a_number_is_left_out_and_told(tmp_path: Path) -> None:
-    rows = cells()
-    rows[60][2] = "NaN"
-    record = read(saved(tmp_path, table(rows)))
-    assert any("line 62, column torque_nm" in note for note in record.source.notes)
-    np.testing.assert_allclose(record.torque_nm, np.delete(TORQUE_NM, 60), atol=1e-9)
+def test_a_table_without_a_header_is_read_by_the_numbers_of_its_columns(tmp_path: Path) -> None:
+    given = {"time_s": "#1:s", "pulse_width_us": "#2:µs", "torque_nm": "#3:Nm", "segment": "#4"}
+    record = read(saved(tmp_path, "\n".join("|".join(row) for row in cells())), map=given)
+    check(record)
+    assert "bars between cells, no header" in record.notes
+
+
+def test_joined_records_keep_what_was_said_of_their_parts(tmp_path: Path) -> None:
+    record = read(saved(tmp_path, table(COMMAS, between=";")))
+    joined = join([record, record.with_torque(record.torque_nm[::-1].copy())], [0.0, 100.0])
+    assert joined.notes == ("ugly.csv: semicolons between cells, decimal commas",)
 
 
 ASKED = {
@@ -148,7 +168,6 @@ def test_a_number_that_may_be_two_is_refused_by_its_cell(tmp_path: Path, what: s
     with pytest.raises(BadRecord, match=r"csv, line \d+, column \w+: .*without signs between thousands") as refused:
         read(saved(tmp_path, NUMBERS[what]))
     assert "\n" not in str(refused.value)
-    check(read(saved(tmp_path, table(cells(point(1, 1e3)), MS))))
 
 
 def test_a_time_that_stands_still_is_refused_and_its_row_can_be_taken_out(tmp_path: Path) -> None:
@@ -158,14 +177,14 @@ def test_a_time_that_stands_still_is_refused_and_its_row_can_be_taken_out(tmp_pa
     check(read(saved(tmp_path, table(rows))))
 
 
-def test_a_packed_table_says_how_it_is_unpacked(tmp_path: Path) -> None:
-    packed = gzip.compress(table(cells()).encode())
-    with pytest.raises(BadRecord, match=r"ugly.csv, line 1: packed with gzip.*gunzip"):
-        read(saved(tmp_path, packed))
-    check(read(saved(tmp_path, gzip.decompress(packed))))
-
-
-@pytest.mark.parametrize("start", [b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1"])
-def test_a_workbook_is_called_one(tmp_path: Path, start: bytes) -> None:
-    with pytest.raises(BadRecord, match=r"line 1: an .*Excel workbook.*Save the sheet as CSV text"):
-        read(saved(tmp_path, start + bytes(400)))
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (gzip.compress(table(cells()).encode()), "packed with gzip.*gunzip"),
+        (b"PK\x03\x04" + bytes(400), "an .*Excel workbook.*Save the sheet as CSV text"),
+        (b"\xd0\xcf\x11\xe0\xa1\xb1" + bytes(400), "an .*Excel workbook.*Save the sheet as CSV text"),
+    ],
+)
+def test_a_packed_table_and_a_workbook_are_called_so(tmp_path: Path, content: bytes, says: str) -> None:
+    with pytest.raises(BadRecord, match=rf"ugly.csv, line 1: {says}"):
+        read(saved(tmp_path, content))

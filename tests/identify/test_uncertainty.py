@@ -12,7 +12,7 @@ import pytest
 from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.projection import ar1_or_white, best_ar1
-from stimrig.identify.estimation.residual_tests import LAGS, PaddedRows, chi_square_p, correlation_slopes
+from stimrig.identify.estimation.residual_tests import PaddedRows, chi_square_p, correlation_slopes
 from stimrig.identify.estimation.uncertainty import prediction_band, whole_factor
 from stimrig.identify.noise import NoiseLevel
 from tests.harness.patients import Patient, make_record
@@ -110,11 +110,6 @@ def test_correlations_after_a_fit_have_the_moments_that_are_told():
     assert np.allclose(covariance, [[2 * np.trace(a @ left @ b @ left) for b in forms] for a in forms])
     row = rng.standard_normal(90)
     assert np.allclose(apart.correlations(row), [row @ form @ row for form in forms])
-
-
-def test_a_sliver_between_doubted_rows_leaves_the_lags_alone():
-    assert PaddedRows(np.array([0, 610]), np.array([600, 613])).lags == LAGS
-    assert PaddedRows(np.arange(0, 1000, 10), np.arange(5, 1000, 10)).lags == 2
 
 
 def test_what_was_estimated_of_the_noise_is_known_lag_by_lag():

@@ -261,14 +261,6 @@ def test_what_is_left_is_told(made: Made):
     ]
 
 
-@pytest.mark.parametrize(
-    ("likelihood", "ratio", "doubted"), [(67.0, 12.1, True), (68.0, 12.1, False), (67.0, 12.0, False)]
-)
-def test_effects_that_explain_too_little_are_doubted(made: Made, likelihood: float, ratio: float, doubted: bool):
-    found = made.add(FIRST, 50.0, likelihood).leaves(ratio=ratio).judged().found
-    assert (found[FIRST] == 0.45) is doubted
-
-
 def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
     made.add(FIRST, 50.0, 80.0).add(SECOND, 50.0, 90.0)
     made.rises = {1}
@@ -346,13 +338,6 @@ def test_efforts_seen_nowhere_at_rest_are_less_certain(made: Made):
 def test_a_law_that_shows_nothing_at_rest_is_as_certain_as_ever(made: Made):
     made.at_rest = 0.0
     assert made.add("baseline_drift", 50.0, 90.0).judged().found["baseline_drift"] > 0.9
-
-
-def test_a_tremor_that_takes_exactly_as_much_as_is_asked_for(made: Made):
-    made.add(TREMOR, 50.0, 90.0)
-    made.work.chain[-1].noise.band = 0.5
-    found = made.leaves(ratio=60.1, busy_nm=0.06**0.5).judged()
-    assert (found.explained, found.kind) == (0.94, "effect_missing")
 
 
 def test_a_structure_that_holds_effects_is_measured_from_the_plain_one(made: Made):

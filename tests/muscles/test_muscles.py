@@ -1,0 +1,235 @@
+"""Muscles and records of benches and tests hold what they are made for: the truth about them is true."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from bench.muscles import arm_records
+from bench.muscles.arm_patient import arm_patient
+from bench.muscles.bout_records import RAMPS, Peculiar, record_of_bouts
+from bench.muscles.hidden_records import draw_noise, generate, main
+from bench.muscles.other_physics import SETS, PhysicsMuscle, draw_muscle
+from bench.muscles.physics_records import DISTURBED, record_of_physics
+from bench.muscles.recorders import COUNT_NM, KINDS, SHIFT_S, recorded
+from stimrig.hardware_sim.hidden.chain import Chain
+
+pytestmark = pytest.mark.slow
+
+COLUMNS = ("time_s", "pulse_width_us", "torque_nm", "segment", "angle_rad", "velocity_rad_s")
+RATE_HZ, HELD = 1600, 40
+"""Steps a second, and those of a pulse's period."""
+DRAWN = [(kinds, name) for kinds in SETS for name in SETS[kinds]]
+
+
+def test_the_seed_settles_everything() -> None:
+    for make in (
+        lambda seed: generate("fatigue", "middle", seed, rate_hz=100),
+        lambda seed: arm_records.record(arm_patient(4), "held", seed),
+        record_of_bouts,
+        lambda seed: record_of_physics("physics", seed),
+    ):
+        one, again, other = (make(seed)["torque_nm"] for seed in (3, 3, 4))
+        assert np.array_equal(one, again) and not np.array_equal(one[:4000], other[:4000])
+
+
+# ---- hidden effects ----------------------------------------------------------------------------------------------
+
+
+def test_a_record_is_uniform_and_holds_the_segments_of_its_design() -> None:
+    record = generate("catch_like", "weak", 302, rate_hz=400)
+    assert np.allclose(np.diff(record["time_s"]), 1.0 / 400.0)
+    assert list(dict.fromkeys(record["segment"])) == ["rest", "prbs", "ramp", "validate"]
+    held = record["pulse_width_us"].reshape(-1, 10)
+    assert np.all(held == held[:, :1])  # 40 pulses a second
+    assert np.all(record["pulse_width_us"][record["segment"] == "rest"] == 0.0)
+
+
+@pytest.mark.parametrize("rate_hz", [40, 2000])
+def test_the_rate_changes_the_samples_and_not_the_muscle(rate_hz: float) -> None:
+    usual, other = (generate("output_saturation", "strong", 303, rate_hz=rate) for rate in (400, rate_hz))
+    assert other["truth"]["parameters"] == usual["truth"]["parameters"]
+    difference = np.interp(usual["time_s"], other["time_s"], other["torque_nm"]) - usual["torque_nm"]
+    assert np.sqrt(np.mean(difference**2)) < 0.1  # two noises of 0.04, and interpolation at 40 Hz
+
+
+def test_noise_is_what_it_says() -> None:
+    rng = np.random.default_rng(9)
+    white = draw_noise("white", rng, 200_000, 400, 0.04, 0.9)
+    coloured = draw_noise("ar1", rng, 400_000, 400, 0.04, 0.9)
+    slow = draw_noise("slow", rng, 400_000, 400, 0.04, 0.9)
+    assert white.std() == pytest.approx(0.04, rel=0.02)
+    assert coloured.std() == pytest.approx(0.04, rel=0.05)
+    assert np.corrcoef(coloured[:-10], coloured[10:])[0, 1] == pytest.approx(0.9, abs=0.02)
+    assert slow.std() == pytest.approx(0.04 * np.sqrt(2), rel=0.03)
+    assert np.corrcoef(slow[:-30], slow[30:])[0, 1] == pytest.approx(0.5 / np.e, abs=0.03)
+
+
+def test_command_line_writes_records_and_the_truth(tmp_path: Path) -> None:
+    arguments = ["--out", str(tmp_path), "--seeds", "310:311", "--effects", "fatigue,none,pairs", "--strengths", "weak"]
+    assert main([*arguments, "--rate-hz", "100"]) == 0
+    truth = json.loads((tmp_path / "truth.json").read_text())
+    assert sorted(truth) == sorted(path.name for path in tmp_path.glob("*.csv"))
+    assert len(truth) == 3
+    assert truth["fatigue-weak-310.csv"]["effects"] == ["fatigue"]
+    assert len(truth["pairs-weak-310.csv"]["effects"]) == 2
+
+
+# ---- recorders ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "gap+shifted+negative", "real+gap"])
+def test_a_recorder_changes_only_what_its_kind_says(kind: str) -> None:
+    made = generate(None, seed=330, moving=True, rate_hz=200)
+    before = {name: made[name].copy() for name in COLUMNS}
+    found = recorded(made, kind, 4)
+    told = found["recorder"]
+    assert found["truth"] == made["truth"]
+    own_s = found["time_s"] - (SHIFT_S if "shifted" in told["kind"] else 0.0) + told["cut_s"]
+    rows = np.searchsorted(made["time_s"], own_s - 1e-6)
+    assert np.allclose(made["time_s"][rows], own_s)
+    for name in COLUMNS:
+        assert np.array_equal(made[name], before[name])
+        assert found[name].shape == rows.shape
+        if name not in ("time_s", "torque_nm"):
+            assert np.array_equal(found[name], made[name][rows])
+    error = np.abs(found["torque_nm"] - (told["scale"] * made["torque_nm"][rows] + told["offset_nm"])).max()
+    assert error < (0.501 * COUNT_NM if "counts" in kind or "real" in kind else 1e-9)
+    lost = np.setdiff1d(np.arange(made["time_s"].size), rows)
+    assert not np.any(made["segment"][lost] == "validate")
+    if kind in ("plain", "offset", "counts", "negative", "scaled", "shifted"):
+        assert not lost.size
+
+
+# ---- arms --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 10, 20])
+def test_g_is_one_where_the_muscle_is_described_and_everything_is_finite(seed: int) -> None:
+    patient = arm_patient(seed)
+    assert patient.g(patient.reference_rad, 0.0) == pytest.approx(1.0)
+    angle, velocity = np.meshgrid(np.linspace(*patient.range_rad, 30), np.linspace(-3.0, 3.0, 31))
+    g, h = patient.g(angle, velocity), patient.h_nm(angle, velocity)
+    assert np.all(g[15] >= 0.15) and np.all(g[15] <= 2.0)
+    assert np.all((g >= 0.0) & (g < 4.0))
+    assert np.all(np.abs(h) < 40.0)
+    assert np.all(np.diff(g, axis=0) <= 1e-12), "a flexor that shortens faster gives less torque"
+    assert np.all(np.diff(h, axis=0) < 0.0), "viscosity takes torque from whatever moves"
+
+
+@pytest.mark.parametrize("kind", arm_records.KINDS)
+def test_an_arms_torque_is_the_contracts_equation_and_white_noise(kind: str) -> None:
+    patient = next(each for each in map(arm_patient, range(50)) if "solid" not in each.truth["passive"]["law"])
+    made = arm_records.record(patient, kind, 7)
+    truth = made["truth"]
+    angle, velocity, acceleration = (truth[name] for name in ("angle_rad", "velocity_rad_s", "acceleration_rad_s2"))
+    active = patient.g(angle, velocity) * truth["isometric_nm"]
+    wanted = active + patient.h_nm(angle, velocity) - patient.inertia_kg_m2 * acceleration
+    assert truth["torque_nm"] == pytest.approx(wanted, abs=1e-9)
+    noise = made["torque_nm"] - truth["torque_nm"]
+    assert noise.std() == pytest.approx(truth["noise_sd_nm"], rel=0.05)
+    assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.05
+
+
+def test_what_each_kind_is_for() -> None:
+    patient = arm_patient(5)
+    low, high = patient.range_rad
+    passive, moving, unseen = (arm_records.record(patient, kind, 1) for kind in ("passive", "moving", "unseen"))
+    assert not passive["pulse_width_us"].any()
+    for made in (passive, moving, unseen):
+        covered = made["angle_rad"].min(), made["angle_rad"].max()
+        assert covered == pytest.approx((low, high), abs=np.radians(9.0))
+    assert len(np.unique(moving["pulse_width_us"])) > 5
+    assert set(unseen["segment"]) == {"rest", "validate"}
+    assert unseen["pulse_width_us"].max() <= patient.largest_width_us
+    held = arm_records.record(patient, "held", 3, angle_rad=low + 0.05)
+    assert np.abs(held["angle_rad"] - low - 0.05).max() < 0.06
+    assert held["pulse_width_us"].max() == patient.largest_width_us
+
+
+# ---- bouts -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_readings_are_held_and_the_last_of_four_equal_ramps_is_unseen(seed: int) -> None:
+    made = record_of_bouts(seed)
+    changes = np.flatnonzero(np.diff(made["torque_nm"])) + 1
+    read_hz = made["truth"]["rate_hz"] / np.mean(np.diff(changes))
+    assert 18.0 < read_hz < 48.0
+    assert np.median(np.abs(np.diff(made["torque_nm"], 3))) == 0.0
+    free = record_of_bouts(seed, Peculiar(held=False, jumps=False))
+    assert np.count_nonzero(np.diff(free["torque_nm"])) > 0.99 * free["torque_nm"].size
+    assert np.array_equal(free["clean_nm"], made["clean_nm"])
+    last = int(made["bout"][-1])
+    ramps = [made["pulse_width_us"][(made["bout"] == last - back)] for back in range(RAMPS)]
+    short = min(map(len, ramps))
+    assert all(np.array_equal(ramp[:short], ramps[0][:short]) for ramp in ramps)
+    assert np.array_equal(made["segment"] == "validate", made["bout"] == last)
+
+
+# ---- other physics -----------------------------------------------------------------------------------------------
+
+
+def drawn(kinds: str, name: str, round_: int = 0) -> PhysicsMuscle:
+    return draw_muscle(kinds, list(SETS[kinds]).index(name) + round_ * len(SETS[kinds]))
+
+
+def answer_of(muscle: PhysicsMuscle) -> Callable[[np.ndarray], np.ndarray]:
+    """Torque of the rested muscle at 1600 Hz to widths at 40 pulses/s."""
+
+    def answer(widths_us: np.ndarray) -> np.ndarray:
+        chain = Chain(muscle.stages(), muscle.base.largest_nm, 1.0 / RATE_HZ)
+        held, still = np.repeat(widths_us, HELD), np.zeros(widths_us.size * HELD)
+        pulse = still.copy()
+        pulse[::HELD] = widths_us > 0.0
+        return chain.run(held, pulse, still, still)
+
+    return answer
+
+
+def departure(muscle: PhysicsMuscle) -> float:
+    """How far the muscle is from every static curve before linear dynamics, over its largest torque.
+
+    Of those the answer to two trains is the sum of the answers to each, and another width gives the same shape.
+    """
+    answer, top_us = answer_of(muscle), muscle.base.largest_width_us
+    first, second = np.zeros(200), np.zeros(200)
+    first[:60], second[60:120] = top_us, top_us
+    alone, both = answer(first), answer(first + second)
+    apart = np.max(np.abs(both - alone - answer(second)))
+    weaker = answer(np.where(first > 0.0, muscle.base.rise_us()[0] + 0.4 * np.ptp(muscle.base.rise_us()), 0.0))
+    share = weaker @ alone / (alone @ alone)
+    return max(apart, np.max(np.abs(weaker - share * alone))) / np.max(both)
+
+
+@pytest.mark.parametrize(("kinds", "name"), DRAWN)
+def test_a_muscle_rests_rises_and_decays(kinds: str, name: str) -> None:
+    muscle = drawn(kinds, name)
+    answer, rest, train = answer_of(muscle), np.zeros(80), np.full(120, float(muscle.base.largest_width_us))
+    torque = answer(np.concatenate([rest, train, np.zeros(600)]))
+    assert not torque[: 80 * HELD].any()
+    assert 1.79 < np.max(torque) < 9.01
+    assert np.argmax(torque) < 205 * HELD
+    assert np.max(np.abs(torque[-10 * HELD :])) < 0.2 * np.max(torque)
+
+
+@pytest.mark.parametrize(("kinds", "name"), DRAWN)
+def test_no_muscle_is_a_static_curve_before_linear_dynamics(kinds: str, name: str) -> None:
+    assert np.median([departure(drawn(kinds, name, round_)) for round_ in range(12)]) > 0.05
+
+
+def test_the_oracle_sees_nothing_in_a_plain_muscle() -> None:
+    assert max(departure(draw_muscle("plain", seed)) for seed in range(2)) < 1e-3
+
+
+@pytest.mark.parametrize("kind", DISTURBED)
+def test_what_lies_over_a_record_is_not_in_the_unseen_one(kind: str) -> None:
+    bare, over = (record_of_physics("plain", 0, chosen) for chosen in ((), (kind,)))
+    added = over["torque_nm"] - bare["torque_nm"]
+    assert 0.01 < np.std(added) < 0.4
+    assert np.array_equal(over["unseen"]["torque_nm"], bare["unseen"]["torque_nm"])
+    assert over["truth"]["disturbed"] == [kind]
