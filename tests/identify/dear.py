@@ -1,4 +1,4 @@
-"""Records, fits and diagnoses that several files of tests look at."""
+"""A record and what improving it gives, that two files of tests look at."""
 
 from __future__ import annotations
 
@@ -6,15 +6,9 @@ from functools import cache
 
 from stimrig import identify
 from stimrig.identify.records.record import Record
-from stimrig.identify.results import Diagnosis, Improvement
+from stimrig.identify.results import Improvement
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
-
-
-@cache
-def diagnosed(hidden: str, seed: int, ar1: float = 0.0) -> Diagnosis:
-    """Of a muscle with something hidden in it, or nothing."""
-    return identify.diagnose(hidden_muscles.record(hidden, seed=seed, ar1=ar1))
 
 
 def fatigued() -> Record:

@@ -130,29 +130,6 @@ def test_numbers_that_are_none():
         identify.fit(replace(record, pulse_width_us=record.pulse_width_us - 1))
 
 
-def test_units_of_any_size():
-    record = base()
-    model = identify.fit(record)
-    for factor in (1e-9, 1e9):
-        other = identify.fit(record.with_torque(record.torque_nm * factor))
-        assert other.linear.time_constant_s == pytest.approx(model.linear.time_constant_s, rel=1e-3)
-
-
-def test_a_million_rows():
-    rate, size = 1600, 1_000_000
-    widths = np.repeat(np.random.default_rng(0).uniform(0, 300, size // 400), 10)
-    clean = Patient().torque(widths, rate)
-    record = Record.from_arrays(
-        np.arange(size) / rate,
-        np.repeat(widths, 40),
-        clean + 0.05 * np.random.default_rng(1).standard_normal(size),
-        np.full(size, "steps"),
-    )
-    model = identify.fit(record)
-    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=2e-3)
-    assert model.quality["verdict"] == "usable"
-
-
 @settings(max_examples=30, deadline=None, suppress_health_check=list(HealthCheck))
 @given(
     size=st.integers(1, 400),

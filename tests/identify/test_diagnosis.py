@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from contextlib import nullcontext
+from functools import cache
 
 import numpy as np
 import pytest
@@ -12,30 +14,53 @@ from stimrig import identify
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.errors import Cancelled
 from stimrig.identify.records.record import Record
+from stimrig.identify.results import Diagnosis
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
 from tests.harness.patients import Patient
 from tests.identify import hidden_muscles
-from tests.identify.dear import diagnosed
 
 pytestmark = pytest.mark.slow
 
-HIDDEN = ("fatigue", "electromechanical_delay", "mains_hum")
-"""Of the gain, the dynamics and the sensor. A campaign takes the others."""
 OTHERS = (
-    "output_saturation",
-    "voluntary_effort",
+    "electromechanical_delay", "mains_hum", "output_saturation", "voluntary_effort", "asymmetric_relaxation",
+    "threshold_drift", "tremor", "baseline_drift", "sensor_clipping",
+)  # fmt: skip
+FEW = (
+    "fatigue",
     "asymmetric_relaxation",
-    "threshold_drift",
-    "tremor",
+    "electromechanical_delay",
+    "mains_hum",
+    "output_saturation",
     "baseline_drift",
-    "sensor_clipping",
 )
+"""Of each stage. Where these are tried alone, a campaign tries the whole library."""
 
 
-@pytest.mark.parametrize("hidden", [*HIDDEN, *(pytest.param(name, marks=pytest.mark.campaign) for name in OTHERS)])
-def test_what_is_hidden_is_named_first_and_removed(hidden):
-    result = diagnosed(hidden, 11)
+@cache
+def diagnosed(hidden: str, seed: int, ar1: float, library: tuple[str, ...]) -> Diagnosis:
+    """Of a muscle with something hidden in it, or nothing; with the whole library if none is named."""
+    return diagnosed_with(library, hidden_muscles.record(hidden, seed=seed, ar1=ar1))
+
+
+def diagnosed_with(library: tuple[str, ...], record: Record) -> Diagnosis:
+    with few_effects.only(*library) if library else nullcontext():
+        return diagnose(record)
+
+
+both_libraries = pytest.mark.parametrize("library", [FEW, pytest.param((), marks=pytest.mark.campaign, id="whole")])
+
+
+@pytest.mark.parametrize(
+    ("hidden", "library"),
+    [
+        ("fatigue", ()),
+        *((name, FEW) for name in OTHERS[:2]),
+        *(pytest.param(name, (), marks=pytest.mark.campaign) for name in OTHERS),
+    ],
+)
+def test_what_is_hidden_is_named_first_and_removed(hidden, library):
+    result = diagnosed(hidden, 11, 0.0, library)
     json.dumps(result.to_dict(), allow_nan=False)
     assert result.verdict == "effect_missing"
     first = result.missing[0]
@@ -47,22 +72,29 @@ def test_what_is_hidden_is_named_first_and_removed(hidden):
     assert after**2 - noise**2 < 0.11 * (before**2 - noise**2) + 0.2 * noise**2
 
 
-@pytest.mark.parametrize(("seed", "ar1"), [(21, 0.0), pytest.param(22, 0.9, marks=pytest.mark.campaign), (23, 0.99)])
-def test_where_nothing_is_hidden_nothing_is_named(seed, ar1):
-    result = diagnosed("", seed, ar1)
+@pytest.mark.parametrize(
+    ("seed", "ar1", "library"),
+    [
+        (21, 0.0, ()),
+        (23, 0.99, FEW),
+        *(pytest.param(*one, (), marks=pytest.mark.campaign) for one in [(22, 0.9), (23, 0.99)]),
+    ],
+)
+def test_where_nothing_is_hidden_nothing_is_named(seed, ar1, library):
+    result = diagnosed("", seed, ar1, library)
     assert result.verdict == "nothing_missing" and result.missing == ()
     assert result.probability > 0.5
 
 
+@both_libraries
 @pytest.mark.parametrize(
     ("slow_s", "quick_s", "noise_nm", "gaps_s"),
     [
-        pytest.param(0.05, 0.002, 0.01, (), marks=pytest.mark.campaign),
         (0.05, 5e-5, 0.04, ()),
         (0.6, 0.1, 0.02, ((4.2, 5.6), (11.0, 11.6))),
     ],
 )
-def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, noise_nm, gaps_s):
+def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, noise_nm, gaps_s, library):
     rng = np.random.default_rng(1)
     widths, names = hidden_muscles.protocol(rng)
     lag_s = np.sqrt(slow_s * quick_s)
@@ -74,19 +106,18 @@ def test_a_quick_muscle_and_a_slow_one_with_gaps_lack_nothing(slow_s, quick_s, n
     record = Record.from_arrays(time_s, widths[slot], measured, names[slot])
     for begin_s, end_s in gaps_s:
         record = record.take((record.time_s < begin_s) | (record.time_s >= end_s))
-    result = diagnose(record)
+    result = diagnosed_with(library, record)
     assert result.verdict == "nothing_missing", result.missing
 
 
-@pytest.mark.parametrize("noise_nm", [5e-5, pytest.param(5e-4, marks=pytest.mark.campaign)])
-def test_a_spline_s_own_error_is_nothing_missing(noise_nm):
-    made = generate(None, "middle", 1, noise_sd_nm=noise_nm)
-    result = diagnose(as_record(made))
+@both_libraries
+def test_a_spline_s_own_error_is_nothing_missing(library):
+    result = diagnosed_with(library, as_record(generate(None, "middle", 1, noise_sd_nm=5e-5)))
     assert result.verdict == "nothing_missing", result.missing
 
 
 def test_noise_is_estimated_and_places_are_worded():
-    result = diagnosed("fatigue", 11)
+    result = diagnosed("fatigue", 11, 0.0, ())
     assert abs(result.noise_sd_nm - 0.04) < 0.004
     place = result.where[0]
     assert {"segment", "start_s", "end_s", "pulse_width_us", "direction", "share_of_excess"} <= set(place)
@@ -108,7 +139,7 @@ def test_held_out_rows_are_only_reported():
 
 
 def test_effects_of_movement_are_no_candidates_without_its_columns():
-    result = diagnosed("", 21)
+    result = diagnosed("", 21, 0.0, ())
     tried = {c["effect"] for row in result.candidates for c in row}
     assert tried and not tried & {"torque_angle", "torque_velocity", "passive_torque"}
 
@@ -121,7 +152,7 @@ def test_progress_is_told_and_can_stop_it():
         if len(heard) > 4:
             raise Cancelled("enough")
 
-    with pytest.raises(Cancelled):
+    with few_effects.only(*FEW), pytest.raises(Cancelled):
         diagnose(hidden_muscles.record(seed=71, rate_hz=100), progress=progress)
     assert all(0.0 <= share <= 1.0 and text for share, text in heard)
 
@@ -133,10 +164,11 @@ def test_a_converter_that_holds_its_readings_is_structure_not_physics():
     assert diagnose(held).verdict == "unexplained_structure"
 
 
-def test_a_gain_that_swings_is_no_effect_of_the_library():
+@both_libraries
+def test_a_gain_that_swings_is_no_effect_of_the_library(library):
     record = hidden_muscles.record(seed=91)
     clean = hidden_muscles.muscle(hidden_muscles.protocol(np.random.default_rng(91))[0])[::5]
     swing = 0.12 * np.sin(2.1 * record.time_s) * clean
-    result = diagnose(record.with_torque(record.torque_nm + swing))
+    result = diagnosed_with(library, record.with_torque(record.torque_nm + swing))
     assert result.verdict == "unexplained_structure"
     assert all(entry["probability"] < 0.5 for entry in result.missing)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import pickle
+from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,8 +13,8 @@ import pytest
 from stimrig.hardware_sim.hidden.library import EFFECTS
 from stimrig.identify import fit
 from stimrig.identify.effects import find_effect, library, registry
-from stimrig.identify.effects.base import STAGES, Scene
-from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.effects.base import STAGES, Form, Scene
+from stimrig.identify.errors import BadModel, BadRequest, NotIdentifiable
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.model import Model
@@ -145,3 +147,67 @@ def test_an_effort_is_proposed_where_it_is(name: str, size: int):
     assert form.propose is not None
     for proposed in form.propose(residual_nm, scene, {}):
         assert proposed["centre_0_s"] == pytest.approx(at_s, abs=0.2)
+
+
+# ---- impossible numbers in a model file ------------------------------------------------------------------------
+
+SETTINGS = {"scale_nm": 7.0, "noise_sd_nm": 0.04, "zero_nm": 0.0, "sign": 1.0, "reference_s": 0.0}
+SPOILED = (0.0, float("nan"), float("inf"), 1e9, -1e9, -1.0, 1e-12)
+
+
+@pytest.fixture(scope="module")
+def plain(moving: Record) -> dict[str, Any]:
+    return fit(moving).to_dict()
+
+
+def with_effect(plain: dict[str, Any], effect: str, form: str, parameters: dict[str, float], **settings: float):
+    entry = {"id": effect, "form": form, "parameters": parameters, "settings": SETTINGS | settings}
+    return plain | {"effects": [entry]}
+
+
+def started(form: Form, record: Record) -> dict[str, float]:
+    scene = Scene(record.time_s, record.pulse_width_us, 0.025, 7.0, 300.0, noise_sd_nm=0.04)
+    return {p.name: p.on(scene).start[0] for p in form.parameters}
+
+
+def spoiled(good: dict[str, float]) -> Iterator[dict[str, float]]:
+    for value in SPOILED:
+        yield dict.fromkeys(good, value)
+        yield from (good | {name: value} for name in good)
+
+
+@pytest.mark.parametrize("effect", sorted(registry()))
+def test_an_effect_with_spoiled_parameters_is_refused_or_predicts(effect: str, moving, plain):
+    for form in registry()[effect].forms:
+        good = started(form, moving)
+        if len(good) > 9:
+            continue
+        model = Model.from_dict(with_effect(plain, effect, form.name, good))
+        assert np.isfinite(model.predict(moving)).all()
+        refused = 0
+        for parameters in spoiled(good):
+            try:
+                model = Model.from_dict(with_effect(plain, effect, form.name, parameters))
+            except BadModel as error:
+                refused += 1
+                assert "\n" not in str(error) and "is not a number from" in str(error)
+            else:
+                assert np.isfinite(model.predict(moving)).all(), parameters
+        assert refused
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [("sign", 0.0), ("sign", 2.0), ("scale_nm", 0.0), ("scale_nm", -1.0), ("scale_nm", float("inf")),
+     ("noise_sd_nm", -0.1), ("noise_sd_nm", float("nan")), ("zero_nm", float("inf")), ("reference_s", float("nan"))],
+)  # fmt: skip
+def test_settings_of_an_effect_are_checked(name: str, value: float, plain):
+    good = {"depth": 0.3, "onset_s": 20.0, "recovery_s": 40.0}
+    with pytest.raises(BadModel, match=rf"effects\.0\.settings\.{name}: .* is no"):
+        Model.from_dict(with_effect(plain, "fatigue", "fitness", good, **{name: value}))
+
+
+def test_an_effect_that_is_not_installed_is_still_read(plain):
+    """Its page can be shown; only a prediction needs the effect."""
+    text = json.dumps(with_effect(plain, "of_another_house", "", {"gain": 1e9}))
+    assert Model.from_json(text).effects[0]["id"] == "of_another_house"

@@ -1,23 +1,87 @@
-"""The next experiment: playable by the rig, and one that does separate the rivals."""
+"""The experiment that decides: there where structure is left, within the limits, the same each time, and it teaches."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from bench.muscles.physics_records import further_record, record_of_physics
+from stimrig import identify
 from stimrig.identify.estimation.effect_fit import fitted_with
-from stimrig.identify.experiments import expected_log_evidence, plan
-from stimrig.identify.experiments.designs import SHAPES, designs
+from stimrig.identify.experiments import expected_log_evidence, plan, plan_further
+from stimrig.identify.experiments.designs import SHAPES, designs, held_levels
+from stimrig.identify.records.join import join
 from stimrig.rig.sequences import build
+from tests.harness import few_effects
+from tests.harness.carried_sessions import as_record
 from tests.identify import hidden_muscles
 
+SEED = 0
 
-@pytest.mark.parametrize("design", designs(300.0), ids=lambda d: d.words)
+
+@pytest.fixture(scope="module")
+def made():
+    return record_of_physics("physics", SEED, ())
+
+
+@pytest.fixture(scope="module")
+def diagnosis(made):
+    with few_effects.only("fatigue", "free_gate"):
+        return identify.diagnose(as_record(made))
+
+
+def played_us(experiment):
+    return np.concatenate([build(one["sequence"], dict(one["settings"]), 40.0) for one in experiment.segments])
+
+
+@pytest.mark.parametrize("design", [*held_levels(300.0, 80.0, 40.0), *designs(300.0)], ids=lambda one: one.words)
 def test_the_rig_plays_what_was_simulated(design):
     for segment in design.segments:
         played = build(segment.sequence, segment.settings, 40.0)
         np.testing.assert_allclose(played, SHAPES[segment.sequence](segment.settings, 40.0))
         assert played.max() <= 300.0
+
+
+def test_the_muscle_decides_which_design_is_chosen():
+    records = [as_record(record_of_physics("physics", seed, ())) for seed in (0, 3)]
+    chosen = {plan_further(record, fitted_with(record, [])).text.partition(" (")[0] for record in records}
+    assert len(chosen) == 2
+
+
+def test_a_tremor_is_no_reason_to_choose_none():
+    record = hidden_muscles.record("tremor", seed=3, rate_hz=100)
+    fitted = fitted_with(record, ["tremor"])
+    found = plan_further(record, fitted).expected_fall
+    assert fitted.noise.band > 0.0 and found is not None and 0.0 < found < 1.0
+
+
+def test_it_is_there_where_structure_is_left_and_keeps_the_limits(made, diagnosis):
+    found = identify.next_experiment(diagnosis)
+    assert diagnosis.verdict == "unexplained_structure" and found is not None and found.text in str(diagnosis)
+    assert found.duration_s <= 40.0
+    assert 0.0 < played_us(found).max() <= made["pulse_width_us"].max()
+    assert found.dose["pulses"] == np.sum(played_us(found) > 0)
+
+
+def test_there_is_none_where_nothing_is_missing():
+    with few_effects.only("fatigue", "free_gate"):
+        found = identify.diagnose(hidden_muscles.record(seed=13, rate_hz=100, validate=False))
+    assert found.verdict == "nothing_missing"
+    assert found.deciding_experiment is None and identify.next_experiment(found) is None
+
+
+def test_both_records_together_foretell_a_further_one_better_than_the_first_alone(made, diagnosis):
+    experiment = identify.next_experiment(diagnosis)
+    assert experiment is not None
+    first = as_record(made)
+    further = as_record(further_record("physics", SEED, (), played_us(experiment)))
+    both = join([first, further], [0.0, 1200.0])
+    error_nm = []
+    for record in (first, both):
+        model = identify.fit(record, effects=["free_gate"])
+        off = identify.predict(model, as_record(made["unseen"])) - made["unseen"]["torque_nm"]
+        error_nm.append(np.std(off))
+    assert error_nm[1] < error_nm[0]
 
 
 def test_hysteresis_and_drift_are_told_apart_by_another_ramp():

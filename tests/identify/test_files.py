@@ -39,17 +39,6 @@ def test_reads_csv(tmp_path):
     assert len(record.source.sha256) == 64
 
 
-def test_columns_in_any_order_with_angle_blank_lines_and_a_byte_order_mark(tmp_path):
-    path = tmp_path / "x.csv"
-    rows = [f"prbs,{0.1 * i},{i / 40},{5 * i},1.5,0.1" for i in range(12)]
-    text = "segment,torque_nm,time_s,pulse_width_us,angle_rad,velocity_rad_s\r\n" + "\r\n".join(rows) + "\r\n\r\n"
-    path.write_bytes(b"\xef\xbb\xbf" + text.encode())
-    record = read(path)
-    assert record.pulse_width_us[2] == 10
-    assert record.angle_rad is not None
-    assert record.angle_rad[0] == 1.5
-
-
 def test_rounded_times_become_even(tmp_path):
     rows = [f"{i / 1600:.4f},{100 * (i // 40 % 2)},0.5,prbs" for i in range(4000)]
     record = read(write(tmp_path, *rows))

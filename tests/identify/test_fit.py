@@ -61,19 +61,6 @@ def test_a_longer_delay_is_an_effect():
     assert model.fit["held_out_rms_nm"] < 1.05 * NOISY < plain_model.fit["held_out_rms_nm"]
 
 
-def test_splitting_and_joining_segments_changes_nothing():
-    record, _ = make_record(Patient(), np.random.default_rng(4), noise_nm=NOISY, validate=False)
-    names = np.array(record.segment_names)[record.segment]
-    whole = Record.from_arrays(record.time_s, record.pulse_width_us, record.torque_nm, ["all"] * names.size)
-    split = np.where(np.arange(names.size) % 1111 < 500, "one", "two")
-    pieces = Record.from_arrays(record.time_s, record.pulse_width_us, record.torque_nm, split)
-    model, predicted = fitted(record)
-    for other in (whole, pieces):
-        again, same = fitted(other)
-        assert again.linear.time_constant_s == model.linear.time_constant_s
-        assert np.array_equal(same, predicted)
-
-
 def test_held_out_rows_are_never_used():
     record, _ = make_record(Patient(), np.random.default_rng(7), noise_nm=NOISY)
     spoiled = record.with_torque(np.where(record.held_out, -50.0, record.torque_nm))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.uncertainty import prediction_band
 from stimrig.identify.model import Model
 from tests.harness import few_effects
@@ -47,11 +46,6 @@ def test_what_is_not_there_is_refused_with_a_reason_and_can_be_forced(improved):
     assert "on request" in result.steps[-1]["reason"]
     refusals = {row["effect"]: row["reason"] for row in result.refused}
     assert "log evidence" in refusals["electromechanical_delay"]
-
-
-def test_an_unknown_effect_is_no_effect():
-    with pytest.raises(BadRequest):
-        identify.improve(hidden_muscles.record(rate_hz=100), force=["witchcraft"])
 
 
 def held(record: identify.Record, lower: np.ndarray, upper: np.ndarray) -> float:

@@ -227,18 +227,9 @@ def test_diagnosis_stays_whichever_samples_show_the_muscle(hidden, relation):
     assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
 
 
-@pytest.mark.parametrize("hidden", whole_grid([("",), ("fatigue",), ("threshold_drift",)], {("fatigue",)}))
-def test_without_the_prbs_where_its_pulses_are_known(hidden):
-    assert said(without(PRBS, pulses=True)(record_of(hidden)))[:2] == answer(hidden)[:2]
+CUT = [("fatigue", PRBS, True), ("", RAMP, True), ("", PRBS, False), ("", RAMP, False), ("threshold_drift", PRBS, True)]
 
 
-def test_without_the_ramp_where_its_pulses_are_known():
-    assert said(without(RAMP, pulses=True)(record_of("")))[:2] == answer("")[:2]
-
-
-def test_without_the_prbs_where_nobody_knows_its_pulses():
-    assert said(without(PRBS, pulses=False)(record_of("")))[:2] == answer("")[:2]
-
-
-def test_without_the_ramp_where_nobody_knows_its_pulses():
-    assert said(without(RAMP, pulses=False)(record_of("")))[:2] == answer("")[:2]
+@pytest.mark.parametrize(("hidden", "segment", "pulses"), whole_grid(CUT, {CUT[0], CUT[3]}))
+def test_without_the_prbs_or_the_ramp_whether_or_not_its_pulses_are_known(hidden, segment, pulses):
+    assert said(without(segment, pulses=pulses)(record_of(hidden)))[:2] == answer(hidden)[:2]

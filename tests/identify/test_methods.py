@@ -11,8 +11,8 @@ from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.methods import Method, method_of, methods
-from stimrig.identify.methods.two_stage import choose_order, output_error
-from tests.harness.patients import Patient, make_record, multilevel, prbs
+from stimrig.identify.methods.two_stage import choose_order
+from tests.harness.patients import Patient, make_record, prbs
 
 ALL = ("maximum-likelihood", "narx", "ramp-deconvolution", "separable-least-squares", "two-stage")
 
@@ -163,16 +163,6 @@ def test_order_is_chosen_from_the_data():
     best, _ = choose_order(noisy, drive, np.ones(drive.size, bool), 1)
     assert len(best.a) - 1 == 1
     assert best.a[1] == pytest.approx(-0.9, abs=0.01)
-
-
-def test_output_error_recovers_known_coefficients_from_multilevel_input():
-    rng = np.random.default_rng(3)
-    drive = multilevel(40, 1.0, rng)
-    block = Discrete((0.02, 0.03), (1.0, -1.5, 0.55), 2, 1 / 40)
-    torque = block.filter(drive) + 0.01 * rng.standard_normal(drive.size)
-    found = output_error(torque, drive, np.ones(drive.size, bool), (2, 1, 2))
-    assert found.a == pytest.approx(block.a, abs=0.02)
-    assert np.sum(found.b) / np.sum(found.a) == pytest.approx(1.0, abs=0.01)
 
 
 def test_table1_rows_and_progress():

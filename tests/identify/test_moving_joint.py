@@ -37,8 +37,8 @@ ARM = 12
 @cache
 def recorded_tests() -> tuple[dict[str, Any], ...]:
     arm = arm_patient(ARM)
-    held = [record(arm, "held", place, angle_rad=x) for place, x in enumerate(np.linspace(*arm.range_rad, 5)[1:-1])]
-    return (record(arm, "isometric", 1), record(arm, "passive", 1), *held, record(arm, "moving", 1, duration_s=30.0))
+    held = record(arm, "held", 1, angle_rad=float(np.mean(arm.range_rad)))
+    return (record(arm, "isometric", 1), record(arm, "passive", 1), held, record(arm, "moving", 1, duration_s=30.0))
 
 
 def joined(made: Any, order: Any = None) -> Record:
@@ -139,7 +139,7 @@ def test_another_scale_zero_and_start_of_the_cell_change_nothing():
 @pytest.mark.campaign
 def test_another_order_of_the_recordings_changes_nothing_and_another_zero_of_the_sensor_the_angles_alone():
     moved = identify.fit(
-        joined([changed(made, angle_error_rad=0.5) for made in recorded_tests()], order=[5, 2, 0, 4, 1, 3]),
+        joined([changed(made, angle_error_rad=0.5) for made in recorded_tests()], order=[3, 2, 0, 1]),
         effects=MOVING_JOINT,
     )
     assert moved.fit["rms_nm"] == pytest.approx(model().fit["rms_nm"], rel=1e-6)

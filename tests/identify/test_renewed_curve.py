@@ -36,8 +36,7 @@ def arm() -> ArmPatient:
 
 @cache
 def whole() -> Record:
-    held = [record(arm(), "held", place, angle_rad=x) for place, x in enumerate(np.linspace(*arm().range_rad, 5)[1:-1])]
-    made = [record(arm(), "isometric", ARM), record(arm(), "passive", ARM), *held]
+    made = [record(arm(), "isometric", ARM), record(arm(), "passive", ARM)]
     return joined([*made, record(arm(), "moving", ARM, duration_s=30.0)])
 
 
@@ -65,17 +64,10 @@ def test_the_other_rows_tell_of_the_curve_too():
     assert error_of(renewed()) < 0.85 * error_of(first())
 
 
-@pytest.mark.parametrize("step", ["choose_weight", "solve"])
-def test_a_model_is_not_lost_where_no_better_curve_is_found(monkeypatch: pytest.MonkeyPatch, step: str):
+def test_a_model_is_not_lost_where_no_better_curve_is_found(monkeypatch: pytest.MonkeyPatch):
     base = first()
-    monkeypatch.setattr(f"stimrig.identify.estimation.plain.{step}", Mock(side_effect=np.linalg.LinAlgError))
+    monkeypatch.setattr("stimrig.identify.estimation.plain.solve", Mock(side_effect=np.linalg.LinAlgError))
     assert renewed_curve(base) is base
-
-
-def test_renewed_again_it_hardly_changes():
-    once = renewed()
-    twice = renewed_curve(once)
-    assert once.log_evidence <= twice.log_evidence < once.log_evidence + 5
 
 
 @pytest.mark.parametrize("effects", [(), ("passive_torque:linear",)])
@@ -101,7 +93,6 @@ def test_the_number_of_knots_that_somebody_asks_for_is_kept():
     assert asked.recruitment.to_dict()["basis"]["knots_us"] == pytest.approx(
         identify.fit(whole(), knots=25).recruitment.to_dict()["basis"]["knots_us"]
     )
-    assert not any("chosen again" in reason for reason in asked.reasons)
 
 
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():

@@ -17,7 +17,7 @@ import pytest
 from stimrig import identify
 from stimrig.identify.methods import methods
 from stimrig.identify.model_schema import SCHEMA
-from stimrig.identify.summary import Sheet, estimate, fit_words, one_line, probability, quantity, register_plotter
+from stimrig.identify.summary import estimate, quantity
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 from tests.identify.dear import fatigued, improved_with_a_delay
@@ -213,20 +213,3 @@ def test_a_number_has_three_digits_and_its_unit(value, unit, said):
 def test_an_estimate_without_a_deviation_has_no_plus_minus():
     assert estimate(0.5284, 0.0123, "s") == "0.528 ± 0.012 s" and estimate(0.64, 0.01, "1") == "0.64 ± 0.01"
     assert estimate(2.0, None, "s") == estimate(2.0, float("nan"), "s") == "2 s"
-
-
-def test_results_are_drawn_by_the_registered_plotter(results, record, monkeypatch):
-    monkeypatch.setattr("stimrig.identify.summary._plotters", [])
-    with pytest.raises(identify.BadRequest, match="no plotter is registered"):
-        results["model"].plot(record)
-    drawn = []
-    register_plotter(lambda result, measured: drawn.append((result, measured)) or "figure")
-    assert results["model"].plot(record) == results["comparison"].plot() == "figure"
-    assert drawn == [(results["model"], record), (results["comparison"], None)]
-
-
-def test_small_words():
-    assert [probability(p) for p in (0.0, 0.964, 0.9999, 1.0)] == ["0 %", "96 %", "99 %", "100 %"]
-    assert fit_words({}) == "fit –, error –" and one_line("a\tb\u202e c\n") == "a b c"
-    assert len(one_line("x" * 1000)) == 300
-    assert Sheet("T", ()).text() == "T" and Sheet("T", (("", ""),)).text() == "T\n"

@@ -269,12 +269,6 @@ def test_another_pulse_rate_is_refused(model: Model) -> None:
         follow(model, None, record)
 
 
-def test_rates_are_the_usual_ones_until_there_are_earlier_sessions(model: Model) -> None:
-    steps = followed(model, session(Changing(PATIENT), 2))
-    assert learn_rates([]) is USUAL
-    assert learn_rates([[levels_of(step.after) for step in steps]]) is USUAL
-
-
 def test_a_person_who_always_tires_is_expected_to(model: Model) -> None:
     muscle = Changing(PATIENT, gain=lambda n: 0.95**n)
     told = [[levels_of(step.after) for step in followed(model, session(muscle, 6, seed))] for seed in (11, 12, 13)]
