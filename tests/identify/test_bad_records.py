@@ -108,12 +108,6 @@ def test_a_method_says_which_segment_it_needs():
         identify.fit(cut(base(), "rest", "prbs"), method="ramp-deconvolution")
 
 
-def test_prbs_alone_says_that_the_curve_is_a_guess():
-    model = identify.fit(cut(base(), "prbs"))
-    assert model.quality["verdict"] == "usable with care"
-    assert any("pulse widths" in reason for reason in model.quality["reasons"])
-
-
 def test_numbers_that_are_none():
     record = base()
     for column in ("time_s", "pulse_width_us", "torque_nm"):

@@ -128,7 +128,7 @@ def test_the_order_of_the_effects_in_the_earlier_model_does_not_matter() -> None
     "change",
     [
         lambda r: replace(r.with_torque(-10.0 * r.torque_nm - 50.0), time_s=r.time_s + 12345.678),
-        lambda r: r.with_torque(0.1 * r.torque_nm + 37.0),
+        pytest.param(lambda r: r.with_torque(0.1 * r.torque_nm + 37.0), marks=pytest.mark.campaign),
     ],
 )
 def test_nor_does_it_how_torque_and_time_are_counted(change: Callable[[Record], Record]) -> None:

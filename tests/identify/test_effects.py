@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Iterator
 from typing import Any
 
@@ -96,12 +95,6 @@ def test_a_form_changes_something_and_stays_finite_at_its_starts(setup, effect, 
     assert slopes is not None and np.all(np.isfinite(mean)) and np.all(np.isfinite(slopes))
     if not find_effect(effect).raw or effect == "sensor_clipping":
         assert np.max(np.abs(mean - problem.run(theta)[0])) > 1e-4
-
-
-def test_a_form_of_one_function_can_be_pickled():
-    for effect, name in (("torque_angle", "smooth"), ("torque_angle", "drive"), ("passive_torque", "surface")):
-        known = find_effect(effect).form(name)
-        assert pickle.loads(pickle.dumps(known)) == known
 
 
 def test_effects_compose_fit_predict_and_serialise(moving):

@@ -23,8 +23,9 @@ HUM_NM = 0.3
 @cache
 def of_one_record(effect: str) -> tuple[identify.Record, Model, Model]:
     """A record with the effect, its plain model, and the one with the effect; read back from MODEL.json."""
-    record = hidden_muscles.record("" if effect == "mains_hum" else effect, seed=6)
-    if effect == "mains_hum":
+    hum = effect == "mains_hum"
+    record = hidden_muscles.record("" if hum else effect, seed=6, rate_hz=200 if hum else 100)
+    if hum:
         hum_nm = HUM_NM * np.sin(2 * np.pi * 50.0 * record.time_s + 1.0)
         record = record.with_torque(record.torque_nm + hum_nm)
     plain, model = identify.fit(record), identify.fit(record, effects=[effect])

@@ -6,14 +6,11 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
 
 from stimrig.identify.dynamics import grid as pulse_grid
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.second_order import transition
 from stimrig.identify.dynamics.states import boundary_states
-from stimrig.identify.errors import BadRecord
 from stimrig.identify.estimation.projection import log_likelihood, whiten
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
@@ -104,38 +101,6 @@ def test_the_pulses_are_found_wherever_the_record_starts(phase: float, rate_hz: 
     first = np.flatnonzero(grid.pulse_width_us)[0] - np.flatnonzero(widths_us)[0]
     expected = widths_us[np.arange(grid.size) - first]
     assert np.array_equal(grid.pulse_width_us[inside], expected[inside])
-
-
-@given(time_constant_s=st.floats(0.03, 1.0), damping=st.floats(0.3, 2.0))
-@settings(max_examples=30, deadline=None)
-def test_transition_is_the_solution_of_the_equation(time_constant_s: float, damping: float) -> None:
-    phi, gamma = transition(time_constant_s, damping, 0.025)
-    slope = lambda _t, x: [x[1], (2.0 - x[0] - 2 * damping * time_constant_s * x[1]) / time_constant_s**2]  # noqa: E731
-    solved = solve_ivp(slope, (0, 0.025), [1.5, -3.0], rtol=1e-10, atol=1e-12).y[:, -1]
-    np.testing.assert_allclose(phi @ [1.5, -3.0] + gamma * 2.0, solved, rtol=1e-6, atol=1e-6)
-
-
-def test_critical_damping_has_no_seam() -> None:
-    below, at, above = (transition(0.2, damping, 0.025)[0] for damping in (1 - 1e-6, 1.0, 1 + 1e-6))
-    np.testing.assert_allclose(below, at, atol=1e-5)
-    np.testing.assert_allclose(above, at, atol=1e-5)
-
-
-def test_means_are_those_of_the_curve_at_the_samples_and_a_delay_shifts_them() -> None:
-    grid = make_grid(Record.from_arrays(np.arange(4000) / 400, np.repeat(schedule()[:400], 10), np.zeros(4000)))
-    states = boundary_states(0.3, 0.8, grid.step_s, grid.pulse_width_us)
-    at_once, late = (SecondOrder(0.3, 0.8, by_s).on_grid(grid, grid.pulse_width_us) for by_s in (0.0, grid.step_s))
-    sampled = grid.at_samples(*states, 0.0).reshape(-1, 10).mean(axis=1)
-    assert np.ptp(at_once) > 100.0
-    np.testing.assert_allclose(at_once, sampled, atol=1e-9)
-    np.testing.assert_allclose(late[1:], at_once[:-1], atol=1e-9)
-
-
-@pytest.mark.parametrize(("rate_hz", "size"), [(30, 900), (400, 50)])
-def test_what_cannot_be_put_on_the_grid_is_refused(rate_hz: int, size: int) -> None:
-    with pytest.raises(BadRecord) as refusal:
-        make_grid(Record.from_arrays(np.arange(size) / rate_hz, np.zeros(size), np.zeros(size)))
-    assert refusal.value.fix
 
 
 def test_whitening_is_the_exact_likelihood() -> None:

@@ -12,13 +12,14 @@ from tests.harness import few_effects
 from tests.identify import hidden_muscles
 from tests.identify.dear import fatigued, improved_with_a_delay
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def improved():
     return fatigued(), improved_with_a_delay()
 
 
-@pytest.mark.slow
 def test_the_error_falls_towards_the_noise(improved):
     _, result = improved
     assert result.steps[0]["added"] is None and result.steps[1]["added"] == "fatigue"
@@ -27,7 +28,6 @@ def test_the_error_falls_towards_the_noise(improved):
     assert after["rms_nm"] < 1.1 * result.noise_sd_nm
 
 
-@pytest.mark.slow
 def test_each_step_is_a_model_that_predicts_what_the_step_says(improved):
     record, result = improved
     for step, made in zip(result.steps, result.models, strict=True):
@@ -39,7 +39,6 @@ def test_each_step_is_a_model_that_predicts_what_the_step_says(improved):
     assert parents == [None, *[model.model_id for model in result.models[:-1]]]
 
 
-@pytest.mark.slow
 def test_what_is_not_there_is_refused_with_a_reason_and_can_be_forced(improved):
     _, result = improved
     assert result.steps[-1]["added"] == "electromechanical_delay"
@@ -53,7 +52,6 @@ def held(record: identify.Record, lower: np.ndarray, upper: np.ndarray) -> float
     return float(np.mean((lower <= record.torque_nm) & (record.torque_nm <= upper)))
 
 
-@pytest.mark.slow
 def test_a_model_with_effects_carries_bands_and_a_verdict():
     """The band holds the muscle's own torque, and without the effect it is far wider; it grows with the noise at most.
 
@@ -83,7 +81,6 @@ def test_a_model_with_effects_carries_bands_and_a_verdict():
     assert 0.5 < widths[1] / widths[0] < 2.8
 
 
-@pytest.mark.slow
 def test_every_step_keeps_what_the_structure_held():
     record = hidden_muscles.record("fatigue", seed=15)
     record = record.with_torque(record.torque_nm + 0.3 * np.sin(2 * np.pi * 50.0 * record.time_s))
@@ -97,7 +94,6 @@ def test_every_step_keeps_what_the_structure_held():
         assert model.effects[0]["id"] == "baseline_drift"
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "hidden",
     ["threshold_drift", *(pytest.param(n, marks=pytest.mark.campaign) for n in ("fatigue", "asymmetric_relaxation"))],

@@ -96,7 +96,7 @@ def answer(hidden: str) -> tuple[str, str, float]:
 
 def said(record: Record) -> tuple[str, str, float]:
     """Verdict, what is named first, and its probability; of a library with one effect of each kind."""
-    with few_effects.only(*HIDDEN[1:], "baseline_drift", "mains_hum", "recruitment_hysteresis"):
+    with few_effects.only(*HIDDEN[1:], "baseline_drift"):
         result = diagnose(record)
     first = result.missing[0] if result.missing else {"effect": "", "probability": 0.0}
     return result.verdict, str(first["effect"]), float(first["probability"])
@@ -193,7 +193,7 @@ def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):
 EACH = [(hidden,) for hidden in HIDDEN]
 
 
-@pytest.mark.parametrize("hidden", whole_grid(EACH, {("",), ("fatigue",), ("output_saturation",)}))
+@pytest.mark.parametrize("hidden", whole_grid(EACH, {("",), ("fatigue",)}))
 def test_diagnosis_does_not_depend_on_how_torque_and_time_are_counted(hidden):
     """All at once: turned, ten times as large, 50 N·m lower, 1e4 s later."""
     record = record_of(hidden)
@@ -210,19 +210,16 @@ def test_diagnosis_does_not_depend_on_it_the_other_way_either(hidden):
     assert said(counted(record)) == (*answer(hidden)[:2], pytest.approx(answer(hidden)[2], abs=0.02))
 
 
-EACH_RELATION_ONCE = {
+IN_EVERY_RUN = {
     ("", "a gap of 0.5 s"),
-    ("", "without the last rest"),
     ("fatigue", "every second sample"),
-    ("fatigue", "without validate"),
-    ("output_saturation", "begun in the PRBS"),
     ("threshold_drift", "without the first rest"),
-    ("electromechanical_delay", "without the middle rest"),
+    ("threshold_drift", "begun in the PRBS"),
 }
 RELATIONS = [(hidden, relation) for hidden in HIDDEN for relation in SAMPLING if relation != "in 5 mN·m"]
 
 
-@pytest.mark.parametrize(("hidden", "relation"), whole_grid(RELATIONS, EACH_RELATION_ONCE))
+@pytest.mark.parametrize(("hidden", "relation"), whole_grid(RELATIONS, IN_EVERY_RUN))
 def test_diagnosis_stays_whichever_samples_show_the_muscle(hidden, relation):
     assert said(SAMPLING[relation](record_of(hidden)))[:2] == answer(hidden)[:2]
 

@@ -59,18 +59,6 @@ def test_another_implementation_of_the_muscle_follows_the_reference():
     np.testing.assert_allclose(found.predicted_nm, came, atol=0.05)
 
 
-@pytest.mark.parametrize("delay_s", [0.0, 0.011, 0.06, -0.004])
-def test_g_on_pulses_is_the_sampled_step_response(delay_s: float):
-    linear = SecondOrder(0.12, 1.3, delay_s)
-    a, b = on_pulses(linear, 40.0)
-    assert b.sum() / a.sum() == pytest.approx(1.0)
-    if delay_s >= 0.0:
-        offsets = (np.arange(120)[:, None] + np.arange(8) / 8) / 40.0
-        dense = linear.step_response(offsets).mean(axis=1)
-        inverse = np.linalg.inv(sum(np.diag(np.full(120 - i, x), -i) for i, x in enumerate(a)))
-        np.testing.assert_allclose(inverse @ np.cumsum(np.r_[b, np.zeros(120)])[:120], dense, atol=1e-8)
-
-
 def test_the_bounded_optimum_is_that_of_dense_least_squares():
     size, largest = 60, 2.0
     rng = np.random.default_rng(3)
@@ -121,10 +109,6 @@ def test_changes_faster_than_the_muscle_are_named_at_the_change():
     ramp = np.interp(np.arange(320) / 40, [0, 2, 4, 5, 5.25, 8], [0, 0, 6.5, 6.5, 0, 0])
     slow = invert(muscle(time_constant_s=0.5), Reference.of(ramp)).unreachable
     assert {one.reason for one in slow if one.begin_s < 4.0} == {"rises-too-fast"}, "a steeper fall comes, but later"
-    quick = invert(muscle(time_constant_s=0.03), Reference.of(wanted))
-    assert sum(one.end_s - one.begin_s for one in quick.unreachable) < 0.3 * (
-        up.end_s - up.begin_s + down.end_s - down.begin_s
-    )
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 0.0113])
@@ -227,20 +211,6 @@ def test_the_largest_width_and_the_rise_hold_at_every_pulse():
     )
 
 
-def test_with_a_rise_limit_pulses_under_the_threshold_prepare_a_rise():
-    model = muscle(time_constant_s=0.1)
-    wanted = np.r_[np.zeros(40), np.full(80, 3.0)]
-    free, held = (invert(model, Reference.of(wanted), rise_us=rise) for rise in (None, 25.0))
-
-    def last_start(found: Inversion) -> int:
-        return int(np.flatnonzero(found.pulse_width_us[:60] == 0.0)[-1]) + 1
-
-    first = last_start(held)
-    assert first < last_start(free) and held.pulse_width_us[first] > 10.0
-    assert np.max(held.predicted_nm[first : first + 3]) < 0.03
-    assert held.whole_fit_percent > free.whole_fit_percent - 10.0  # pyright: ignore
-
-
 @pytest.mark.parametrize("hidden", ["fatigue", "electromechanical_delay", "threshold_drift", "asymmetric_relaxation"])
 def test_with_effects_the_prediction_follows_where_the_plain_inverse_does_not(hidden: str):
     """Developed on seed 2; this is seed 5."""
@@ -329,9 +299,7 @@ def test_a_table_of_other_tools_is_read(content: bytes):
     ("content", "place"),
     [
         (b"", "r.csv"),
-        (b"\n\n", "r.csv"),
         (b"a,b\n1,2\n", "r.csv, line 1"),
-        (b"0,0\n1,2\n", "r.csv, line 1"),
         (b"time_s,torque_nm\n", "r.csv, torque_nm"),
         (b"time_s,torque_nm\n0,1\n0.1,x\n", "r.csv, line 3, column torque_nm"),
         (b"time_s,torque_nm\n0,1\n\n0.1\n", "r.csv, line 4, column torque_nm"),
@@ -339,10 +307,8 @@ def test_a_table_of_other_tools_is_read(content: bytes):
         (b"time_s,torque_nm\n0,1e999\n", "r.csv, line 2, column torque_nm"),
         (b"time_s,torque_nm,torque_nm\n0,1,1\n", "r.csv, line 1"),
         (b"time_s,torque_nm\n0,1\n0,2\n", "time_s[1]"),
-        (b"time_s,torque_nm\n0,1\n5e-324,2\n1e-323,3\n", "time_s[1]"),
         (b"torque_nm\n0,5\n1,5\n2,9\n", "r.csv, line 2"),
         (b"torque_nm\n0\n1,5\n", "r.csv, line 3"),
-        (b"torque_nm,note\n1,5,a\n", "r.csv, line 2"),
         pytest.param(b"torque_nm\n" + b"1\n" * 60_001, "r.csv, line 60002", id="too-many-rows"),
         (b"\x89HDF\r\n\x1a\n\0\0", "r.csv, line 3"),
     ],

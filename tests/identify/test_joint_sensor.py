@@ -127,15 +127,6 @@ def test_readings_that_are_missing_late_or_uneven_are_bridged():
     assert np.max(np.abs(found.angle_rad - angle[kept])[900:2100]) < 0.01
 
 
-def test_each_part_of_a_joined_record_is_smoothed_by_itself():
-    time_s, angle, _ = moved()
-    noise = 0.004 * np.random.default_rng(3).normal(size=(2, time_s.size))
-    alone = [JointMotion.of(time_s, read) for read in (angle + noise[0], 0.3 + 0.1 * noise[1])]
-    both = JointMotion.of(np.r_[time_s, time_s + 30.0], np.r_[angle + noise[0], 0.3 + 0.1 * noise[1]], [0, time_s.size])
-    assert both.angle_rad == pytest.approx(np.r_[alone[0].angle_rad, alone[1].angle_rad], abs=1e-6)
-    assert both.jerk[0] > 1e3 * both.jerk[1] and both.noise_rad[0] > 5 * both.noise_rad[1]
-
-
 def test_angles_of_a_trial_are_smoothed_and_a_plan_stays_as_it_is():
     _, angle, velocity = moved(40.0)
     planned = Motion.of(angle, 40.0)

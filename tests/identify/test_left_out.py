@@ -18,7 +18,7 @@ from stimrig.identify.diagnosis.search import required_errors
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation import left_out
-from stimrig.identify.estimation.candidates import alike_rows, words
+from stimrig.identify.estimation.candidates import alike_rows
 from stimrig.identify.estimation.effect_fit import Candidate, fitted_with
 from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, hold_out, leave_out
 from stimrig.identify.estimation.plain import fit_plain
@@ -124,13 +124,6 @@ def test_efforts_that_only_a_doubtful_likelihood_asks_for_must_not_predict_worse
     slow = replace(fitted, noise=replace(fitted.noise, ar1=0.994, share=1.0))
     asked = [required_errors(SimpleNamespace(last=one, detected=[]), effort) for one in (fitted, slow)]
     assert asked == [thresholds.NO_WORSE, 0.0]
-
-
-def test_why_a_likelihood_decides_nothing_is_told(plain_record):
-    fitted = fitted_with(plain_record, [])
-    spiked = replace(fitted, residual_nm=np.where(np.arange(fitted.residual_nm.size) % 300 == 0, 1.0, 1e-3))
-    assert not fitted.distrusted and not words(fitted, fitted.problem.setup.fitted)
-    assert spiked.distrusted and "A few jumps" in words(spiked, fitted.problem.setup.fitted)[-1]
 
 
 def test_effects_found_after_one_that_held_out_rows_speak_against_are_told(monkeypatch):

@@ -16,7 +16,6 @@ from scipy.io import loadmat, savemat
 
 from stimrig import identify
 from stimrig.identify import plain_mat
-from stimrig.identify.records.bounds import BadPiece
 from stimrig.identify.records.mat import variables
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
@@ -243,9 +242,3 @@ def test_files_with_bytes_changed_or_cut_are_answered(tmp_path: Path, record: Re
             path.write_bytes(content[: rng.choice([len(content), rng.randrange(len(content))])])
             answers.append(told(path))
     assert any(answers) and not all(answers)
-
-
-def test_what_is_declared_is_not_believed() -> None:
-    content = HEAD + matrix(6, (3, 1), b"x", struct.pack("<II", 9, 16) + bytes(16))
-    with pytest.raises(BadPiece, match="declared and not there"):
-        variables(content, "f")["x"].numbers()

@@ -7,7 +7,6 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify import paper
-from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.methods import Method, method_of, methods
@@ -175,11 +174,3 @@ def test_table1_rows_and_progress():
     assert row[0.0, "two-stage"]["ours"] >= 99.98
     assert row[0.1, "two-stage"]["ours"] >= row[0.1, "two-stage"]["ceiling"] - 0.1
     assert row[0.0, "ramp-deconvolution"]["unseen"] < row[0.0, "ramp-deconvolution"]["clean"] - 10
-
-
-def test_two_stage_works_on_the_grid_at_any_rate():
-    for rate in (100, 1000):
-        record, clean = make_record(Patient(), np.random.default_rng(9), rate_hz=rate, noise_nm=0.02)
-        assert make_grid(record).step_s == 1 / 40
-        assert scores(record, clean, "two-stage")[2] > 99.4
-        assert scores(record, clean, "two-stage", order="auto")[2] > 99.4

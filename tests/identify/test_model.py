@@ -11,7 +11,7 @@ import pytest
 from scipy.signal import lfilter
 
 from stimrig import identify
-from stimrig.identify.dynamics.linear import Discrete, SecondOrder
+from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.quality import range_warnings
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
@@ -92,28 +92,6 @@ def test_bad_models_are_refused(case):
             identify.Model.from_json(spoiled)
 
 
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"unforeseen_nm": -1.0}, r"fit\.unforeseen_nm: -1\.0 is not a number"),
-        ({"unforeseen_nm": True}, r"fit\.unforeseen_nm: True is not a number"),
-        ({"repetition": []}, r"fit\.repetition: a list is not a JSON object"),
-        (
-            {"repetition": {"found_by": "hearsay"}},
-            r"fit\.repetition\.found_by: 'hearsay' is not exact repeats or estimate or null",
-        ),
-        ({"explained_percent": 100.1}, r"fit\.repetition\.explained_percent: 100\.1 is not a number from 0 to 100"),
-        ({"rms_nm": "0.1"}, r"fit\.repetition\.rms_nm: '0\.1' is not a number"),
-    ],
-)
-def test_what_repeats_is_checked_before_it_is_told(change: dict[str, object], says: str) -> None:
-    document = fitted(40)[1].to_dict()
-    own = document["fit"]["repetition"]
-    outside = change if change.keys() <= {"unforeseen_nm", "repetition"} else {"repetition": own | change}
-    with pytest.raises(identify.BadModel, match=says):
-        identify.Model.from_dict(document | {"fit": document["fit"] | outside})
-
-
 @pytest.mark.parametrize(("damping", "delay_s"), [(0.3, 0.0), (1.0, 0.004), (1.0, 0.025), (2.5, 0.06)])
 def test_discrete_coefficients_are_exact_for_a_held_input(delay_s, damping):
     linear = SecondOrder(0.2, damping, delay_s)
@@ -124,16 +102,6 @@ def test_discrete_coefficients_are_exact_for_a_held_input(delay_s, damping):
     assert lfilter(np.r_[np.zeros(d), b], a, patient.recruitment(widths)) == pytest.approx(
         patient.torque(widths, 40), abs=1e-6
     )
-
-
-def test_step_response_of_the_discrete_block_follows_the_continuous_one():
-    linear = SecondOrder(0.3, 0.8, 0.01)
-    b, a, d = linear.discrete(40.0)
-    block = Discrete(tuple(b), tuple(a), d, 1 / 40)
-    time_s = np.arange(100) / 40
-    assert block.step_response(time_s) == pytest.approx(linear.step_response(time_s), abs=1e-6)
-    assert block.stable
-    assert not Discrete((1.0,), (1.0, -1.01), 1, 1 / 40).stable
 
 
 @pytest.mark.parametrize(
@@ -150,15 +118,6 @@ def test_every_basis_is_zero_at_zero_and_knows_its_slope(basis):
     width, torque = curve.table()
     fine = np.linspace(0, 300, 4001)
     assert np.interp(fine, width, torque) == pytest.approx(curve(fine), abs=1e-3 * np.ptp(torque))
-
-
-def test_bases_of_the_spline_span_equation_8():
-    knots = np.linspace(0, 300, 7)
-    u = np.linspace(0, 300, 400)
-    truncated = np.stack([np.abs(u - k) ** 3 for k in knots[1:-1]] + [u, u**2, u**3, np.ones_like(u)], axis=1)
-    ours = SplineBasis(knots).design(u)
-    weights = np.linalg.lstsq(truncated, ours, rcond=None)[0]
-    assert np.max(np.abs(truncated @ weights - ours)) < 1e-6
 
 
 def test_warns_and_refuses_outside_what_it_holds_for(case):

@@ -148,21 +148,6 @@ def test_another_order_of_the_recordings_changes_nothing_and_another_zero_of_the
     assert surfaces(moved).h_nm(x + 0.5, v) == pytest.approx(surfaces(model()).h_nm(x, v), abs=1e-3)
 
 
-def test_the_prediction_does_not_ask_where_a_record_begins():
-    whole = as_record(record(arm_patient(ARM), "unseen", 3, duration_s=20.0))
-    rows = whole.time_s >= 8.0
-    part = Record.from_arrays(
-        whole.time_s[rows],
-        0 * whole.pulse_width_us[rows],
-        whole.torque_nm[rows],
-        angle_rad=whole.angle_rad[rows],
-        velocity_rad_s=whole.velocity_rad_s[rows],
-    )
-    still = replace(whole, pulse_width_us=0 * whole.pulse_width_us)
-    later, own = model().predict(still)[rows], model().predict(part)
-    assert np.max(np.abs((later - own)[2400:])) < 0.03 * np.ptp(own)  # tissue has forgotten by then
-
-
 def test_a_model_of_the_joint_refuses_to_predict_without_an_angle():
     made = as_record(recorded_tests()[0])
     with pytest.raises(BadModel, match="angle_rad"):

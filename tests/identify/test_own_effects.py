@@ -57,13 +57,6 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.campaign
-def test_without_it_the_library_does_not_explain_the_record(place: Path) -> None:
-    found = json.loads(run(["diagnose", "record.csv", "--json"], place))
-    assert "sensor_gain_swing" not in [entry["effect"] for entry in found["missing"]]
-    assert found["verdict"] == "unexplained_structure"
-
-
 def test_every_command_of_the_page_does_what_it_says(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Beside two of the library; that the library does not explain the record is asked above, of all of it."""
     monkeypatch.chdir(place)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -86,12 +85,3 @@ def test_a_residual_that_is_not_noise_asks_for_care_alone(record: identify.Recor
     assert (
         found["words"] == "Check this before use: the residual is not pure noise (whiteness test): see the diagnosis."
     )
-
-
-def test_what_refuses_is_said_first(record: identify.Record, model: identify.Model) -> None:
-    grid = make_grid(record)
-    broken = model.with_(noise=replace(model.noise, block_sd_nm=100.0), residual_tests={"a": {"passed": False}})
-    found = quality(broken, grid, grid.fitted, converged=False)
-    assert found["verdict"] == "not usable"
-    assert found["words"].startswith("Do not use this model: stimulation hardly changes the torque")
-    assert len(found["reasons"]) == 3

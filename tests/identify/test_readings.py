@@ -12,6 +12,7 @@ from stimrig import identify
 from stimrig.identify.estimation.samples import inspect
 from stimrig.identify.records.readings import Readings
 from stimrig.identify.records.record import Record
+from tests.harness import few_effects
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
@@ -55,10 +56,10 @@ def found_in(record: Record) -> tuple[float, Readings]:
 
 
 @pytest.mark.parametrize("rate_hz", [40, 400, 2000])
-@pytest.mark.parametrize("seed", [71, 72])
-def test_an_ordinary_record_has_a_reading_in_each_sample(rate_hz: float, seed: int):
-    raw = inspect(made(seed, rate_hz))
-    difference = np.diff(raw.torque_nm[~made(seed, rate_hz).held_out], 4 if rate_hz < 120 else 3)
+def test_an_ordinary_record_has_a_reading_in_each_sample(rate_hz: float):
+    record = made(71, rate_hz)
+    raw = inspect(record)
+    difference = np.diff(raw.torque_nm[~record.held_out], 4 if rate_hz < 120 else 3)
     assert raw.readings is None
     assert raw.noise_sd_nm == np.sqrt(np.median(difference**2) / 0.4549 / (70.0 if rate_hz < 120 else 20.0))
     assert raw.noise_sd_nm == pytest.approx(SD_NM, rel=0.1)
@@ -69,13 +70,12 @@ def test_an_ordinary_record_has_a_reading_in_each_sample(rate_hz: float, seed: i
     ("rate_hz", "each"), [(40, 2), (100, 2), (100, 5), (400, 2), (400, 5), (400, 20), (2000, 5), (2000, 20)]
 )
 def test_the_noise_of_held_readings(rate_hz: float, each: int, sd_nm: float):
-    for seed in (73, 74):
-        noise_nm, readings = found_in(made(seed, rate_hz, sd_nm, held(each)))
-        assert readings.kind == "held"
-        assert readings.samples_each == pytest.approx(each, rel=0.01)
-        # Below 40 readings a second the torque moves between two: an upper bound.
-        most = 1.25 if rate_hz / each >= 40 else 1.7
-        assert 0.75 < noise_nm / sd_nm < most
+    noise_nm, readings = found_in(made(73, rate_hz, sd_nm, held(each)))
+    assert readings.kind == "held"
+    assert readings.samples_each == pytest.approx(each, rel=0.01)
+    # Below 40 readings a second the torque moves between two: an upper bound.
+    most = 1.25 if rate_hz / each >= 40 else 1.7
+    assert 0.75 < noise_nm / sd_nm < most
 
 
 @pytest.mark.parametrize("share", [0.5, 0.8])
@@ -129,12 +129,14 @@ def test_a_white_residual_far_above_the_noise_of_the_samples_is_not_noise():
     """Readings held for two pulses: what that spoils is white, too, and was taken for the noise that it is not."""
     record = made(82, rate_hz=200.0, change=held(10))
     found = identify.fit(record)
-    assert found.fit["noise_sd_nm"] == pytest.approx(identify.diagnose(record).noise_sd_nm, rel=0.25)
+    with few_effects.only("fatigue"):  # the noise does not depend on how many are tried
+        assert found.fit["noise_sd_nm"] == pytest.approx(identify.diagnose(record).noise_sd_nm, rel=0.25)
 
 
 def test_a_held_record_has_a_ceiling_and_nothing_missing():
     record = made(81, change=held(5))
-    found = identify.diagnose(record)
+    with few_effects.only("fatigue", "mains_hum", "recruitment_hysteresis", "tremor"):
+        found = identify.diagnose(record)
     assert found.noise_sd_nm == pytest.approx(SD_NM, rel=0.1)
     assert found.verdict == "nothing_missing"
     assert found.with_all["noise_sd_nm"] == pytest.approx(SD_NM, rel=0.1)

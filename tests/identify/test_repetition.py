@@ -114,18 +114,6 @@ def test_offset_sign_scale_and_rate_change_nothing():
         assert found["seconds"] == pytest.approx(first["seconds"], abs=0.1)
 
 
-def test_the_order_of_parts_and_their_names_change_nothing():
-    rng = np.random.default_rng(8)
-    parts = parts_of(rng, 4, "ramp")
-    record = simulated(parts, rng)
-    moved = simulated([parts[0], *parts[3:], *parts[1:3]], np.random.default_rng(9))
-    renamed = Record.from_arrays(record.time_s, record.pulse_width_us, record.torque_nm)
-    for other in (moved, renamed):
-        found = of(other)
-        assert found["repeats"] == 4.0
-        assert found["rms_nm"] == pytest.approx(of(record)["rms_nm"], rel=0.1)
-
-
 @pytest.mark.parametrize("change", ["rounded", "later"])
 def test_repeats_to_a_microsecond_and_a_pulse(change: str):
     rng = np.random.default_rng(10)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 from functools import cache
 from html.parser import HTMLParser
 from importlib import import_module
@@ -120,20 +119,16 @@ def test_the_contracts_keys_are_there(results):
 
 
 class Tags(HTMLParser):
-    """Tags and text of a piece of HTML."""
+    """Tags of a piece of HTML."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
         self.tags: list[str] = []
-        self.words: list[str] = []
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
         assert {name for name, _ in attrs} <= {"style", "scope"}
-
-    def handle_data(self, data: str) -> None:
-        self.words.append(data)
 
 
 @pytest.mark.parametrize("name", RESULTS)
@@ -146,36 +141,6 @@ def test_a_summary_is_about_ten_lines_and_prints_itself(results, name):
     assert lines[0].startswith(name.capitalize()) and repr(found) == f"<{lines[0]}>"
 
 
-def test_summaries_say_what_was_found(results):
-    assert "fatigue" in repr(results["diagnosis"]) and "probability" in repr(results["diagnosis"])
-    assert "fatigue, electromechanical_delay added" in repr(results["improvement"])
-    last = str(results["improvement"].models[-1])
-    assert re.search(r"depth [\d.e-]+ ± [\d.e-]+", last) and re.search(r"onset_s [\d.e-]+ ± [\d.e-]+ s", last)
-    assert "order 2 in steps of 25 ms" in str(results["model"].with_(linear=_discrete()))
-
-
-def _discrete():
-    from stimrig.identify.dynamics.linear import Discrete
-
-    return Discrete((0.1, 0.1), (1.0, -1.2, 0.4), 1, 0.025)
-
-
-@pytest.mark.parametrize("name", RESULTS)
-def test_the_notebooks_view_is_the_summary_as_a_table(results, name):
-    found = results[name]
-    parsed = Tags(found._repr_html_())
-    assert set(parsed.tags) == {"table", "caption", "tbody", "tr", "th", "td"}
-    assert parsed.tags.count("tr") == len(found.summary().splitlines()) - 1
-    assert parsed.words[0] == found.summary().splitlines()[0]
-
-
-def test_a_record_shows_itself_in_a_few_lines(record):
-    lines = str(record).splitlines()
-    assert len(lines) == 5 and repr(record) == f"<{lines[0]}>" and "100 samples/s, 40 pulses/s" in lines[0]
-    assert "validate" in lines[1] and "µs" in lines[3] and "N·m" in lines[4] and "<table>" in record._repr_html_()
-    assert "held out  no rows" in str(record.take(~record.held_out))
-
-
 def test_words_of_a_file_stay_words(results):
     """Whatever stands in a MODEL.json or in a recording's names: no tag, no line of its own, no escape sequence."""
     model = results["model"].with_(method=WORDS, model_id=WORDS, quality={"verdict": WORDS}, data={"name": WORDS})
@@ -186,7 +151,7 @@ def test_words_of_a_file_stay_words(results):
         dataclasses.replace(results["diagnosis"], notes=(WORDS,), verdict=WORDS),
         dataclasses.replace(results["improvement"], verdict=WORDS),
     ):
-        assert "img" not in Tags(found._repr_html_()).tags
+        assert set(Tags(found._repr_html_()).tags) == {"table", "caption", "tbody", "tr", "th", "td"}
         assert "\x1b" not in str(found) + repr(found) and "\n" not in repr(found)
         assert len(str(found).splitlines()) <= 15
 

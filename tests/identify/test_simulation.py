@@ -51,14 +51,6 @@ def test_correlation_does_not_cross_a_gap():
     np.testing.assert_allclose(both, np.c_[first, second])
 
 
-def test_noise_is_found_again():
-    rng = np.random.default_rng(7)
-    noise = NoiseLevel(0.95, 0.6, 0.03)
-    row = np.linalg.cholesky(_covariance(1500, noise)) @ rng.standard_normal(1500) * 0.03
-    found, _ = profile(row, (np.array([0]), np.array([1500])), NoiseLevel(0.5, 0.5, 1.0))
-    assert abs(found.ar1 - 0.95) < 0.04 and abs(found.share - 0.6) < 0.2 and abs(found.sd_nm - 0.03) < 0.006
-
-
 @pytest.mark.parametrize("residual", [np.nan, np.inf, 1e200])
 @pytest.mark.parametrize("wide", [True, False])
 def test_of_a_residual_beyond_numbers_no_small_noise_is_said(residual, wide):

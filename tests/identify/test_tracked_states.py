@@ -88,14 +88,6 @@ def test_a_rest_is_as_long_as_the_same_silence(plain: Model, effect: str, form: 
     assert rested(model, tired.effects, math.inf) == rested(model, tired.effects, None) == {effect: 0.0}
 
 
-@pytest.mark.parametrize(("effect", "form"), FORMS)
-def test_rested_is_bit_for_bit_as_without_a_state(plain: Model, effect: str, form: str) -> None:
-    record = record_of(WIDTHS)
-    absent = predict(having(plain, effect, form), record)
-    assert np.array_equal(absent, predict(having(plain, effect, form, state=0.0), record))
-    assert not np.array_equal(absent, predict(having(plain, effect, form, state=0.5), record))
-
-
 @pytest.mark.parametrize("state", [math.nan, -0.01, 1.01, math.inf, "0.5", True, None])
 def test_a_state_that_is_none_is_refused_with_place_and_mend(plain: Model, state: Any) -> None:
     model = having(plain, "fatigue", "fitness", state=state)

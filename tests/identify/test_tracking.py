@@ -223,14 +223,6 @@ def test_the_moved_model_is_the_muscle_as_it_is_now(model: Model) -> None:
     assert moved_model(model, Values()).to_dict()["recruitment"] == model.to_dict()["recruitment"]
 
 
-def test_a_model_with_an_effect_is_followed_too(model: Model) -> None:
-    record, _ = make_record(PATIENT, np.random.default_rng(1))
-    with_fatigue = fit(record, effects=["fatigue"])
-    still = followed(with_fatigue, session(Changing(PATIENT), 5))[-1].after
-    tired = followed(with_fatigue, session(Changing(PATIENT, gain=lambda n: 0.95**n), 5))[-1].after
-    assert tired.values.gain / still.values.gain == pytest.approx(0.95**4.5, rel=0.02)
-
-
 def test_dynamics_of_another_kind_are_refused_with_the_mend() -> None:
     record, _ = make_record(PATIENT, np.random.default_rng(1))
     other = fit(record, method="narx")

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from functools import cache
 
 import numpy as np
@@ -12,11 +10,9 @@ import pytest
 from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.plain import fit_plain
-from stimrig.identify.estimation.residual_tests import PaddedRows, chi_square_p, correlation_slopes
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.estimation.uncertainty import _below_played, _beyond, prediction_band, whole_factor
 from stimrig.identify.model import Model
-from stimrig.identify.noise import NoiseLevel
 from tests.harness.patients import Patient, make_record
 from tests.identify import hidden_muscles
 
@@ -97,32 +93,6 @@ def test_a_delay_that_the_model_does_not_hold_is_told():
     assert failed >= 3  # none where the delay counts as fitted
 
 
-def test_correlations_after_a_fit_have_the_moments_that_are_told():
-    rng = np.random.default_rng(3)
-    start, stop = np.array([0, 70]), np.array([60, 100])
-    apart = PaddedRows(start, stop)
-    basis = np.linalg.qr(rng.standard_normal((90, 12)).cumsum(axis=0))[0].T * np.linspace(0.5, 1.0, 12)[:, None]
-    left = np.eye(90) - basis.T @ basis
-    forms = [np.eye(90)]
-    for lag in range(1, apart.lags + 1):
-        one = np.diag(np.ones(90 - lag), lag)
-        one[:60, 60:] = 0.0
-        forms.append(0.5 * (one + one.T))
-    mean, covariance = apart.moments(basis)
-    assert np.allclose(mean, [np.trace(form @ left) for form in forms])
-    assert np.allclose(covariance, [[2 * np.trace(a @ left @ b @ left) for b in forms] for a in forms])
-    row = rng.standard_normal(90)
-    assert np.allclose(apart.correlations(row), [row @ form @ row for form in forms])
-
-
-def test_what_was_estimated_of_the_noise_is_known_lag_by_lag():
-    lag = np.arange(12)
-    slopes = correlation_slopes(NoiseLevel(0.7, 1.0, 1.0), 12)
-    assert np.allclose(slopes[1] / slopes[1, 0], 0.7**lag, atol=1e-3)
-    assert len(correlation_slopes(NoiseLevel(0.7, 0.0, 1.0), 12)) == 0
-    assert np.all(np.isfinite(correlation_slopes(NoiseLevel(0.7, 0.3, 1.0, 0.8, 0.99, 0.4), 12)))
-
-
 @pytest.mark.parametrize(("tired", "verdict"), [(0.1, "usable with care"), (0.3, "not usable")])
 def test_what_is_missing_is_not_silent(tired: float, verdict: str):
     """A muscle that tires: some points below the ceiling on rows not seen ask for care, many refuse the model."""
@@ -142,24 +112,6 @@ def test_correlated_noise_widens_the_bands():
         band = identify.fit(record).bands["recruitment"]
         width[ar1] = np.mean(np.asarray(band["upper"]) - band["lower"])
     assert width[0.8] > 1.6 * width[0.0]
-
-
-def test_chi_square_tail_against_scipy():
-    from scipy.stats import chi2
-
-    for freedom in (1, 3, 6, 20):
-        for p in (0.5, 0.1, 0.01, 0.001):
-            assert chi_square_p(chi2.isf(p, freedom), freedom) == pytest.approx(p, rel=0.12, abs=2e-4)
-
-
-def test_starting_is_cheap():
-    code = (
-        "import sys, stimrig.identify; assert 'numpy' not in sys.modules;"
-        "import stimrig.identify.records.csv, stimrig.identify.model;"
-        "slow = [m for m in ('scipy.signal', 'scipy.optimize', 'scipy.stats', 'scipy.interpolate', 'numba', 'h5py')"
-        " if m in sys.modules]; assert not slow, slow"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_draws_do_not_depend_on_the_signs_of_eigenvectors(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -157,17 +157,12 @@ def test_an_effect_missing(made: Made):
 
 def test_what_was_added_later_stands_on_what_was_added_before(made: Made):
     made.add(FIRST, 50.0, 40.0, rival=50.0).add(SECOND, 90.0, 90.0)
+    made.work.rounds[0].append(candidate(SECOND, 49.0))  # taken in another round, so no rival in this one
     found = made.judged()
     assert found.rivals[SECOND][SECOND] > 0.9
     assert found.found[SECOND] == found.found[FIRST] == found.rivals[FIRST][FIRST] < 0.5
     assert set(found.rivals[FIRST]) == {FIRST, "potentiation", ""}
     assert found.probability == found.found[FIRST]
-
-
-def test_what_was_taken_in_another_round_is_no_rival_here(made: Made):
-    made.add(FIRST, 50.0, 40.0).add(SECOND, 30.0, 90.0)
-    made.work.rounds[0].append(candidate(SECOND, 49.0))
-    assert SECOND not in made.judged().rivals[FIRST]
 
 
 def test_an_effect_that_was_exchanged_counts_as_half(made: Made):
@@ -306,13 +301,26 @@ def test_half_of_what_the_plain_structure_leaves_is_not_too_much(made: Made):
     assert len(made.judged().notes) == 1
 
 
-def test_efforts_seen_at_rest_are_efforts(made: Made):
-    made.at_rest = 0.15
-    found = made.add(EFFORT, 50.0, 90.0, **EFFORTS).judged()
-    assert found.kind == "effect_missing"
-    assert found.found[EFFORT] > 0.85
-    made.work.chain[1].effects[0][1].name = "resisting bumps"
-    assert made.judged().kind == "effect_missing"
+@pytest.mark.parametrize(
+    ("at_rest", "name", "kind", "probability"),
+    [
+        (0.15, "bumps", "effect_missing", 0.86),
+        (0.15, "resisting bumps", "effect_missing", 0.86),
+        (0.14, "bumps", "effect_missing", 0.85),
+        (0.14, "resisting bumps", "unexplained_structure", None),
+    ],
+)
+def test_efforts_seen_nowhere_at_rest_are_less_certain(
+    made: Made, at_rest: float, name: str, kind: str, probability: float | None
+):
+    made.at_rest = at_rest
+    made.add(EFFORT, 50.0, 90.0, **EFFORTS).work.chain[1].effects[0][1].name = name
+    found = made.judged()
+    assert found.kind == kind
+    if probability == 0.85:
+        assert found.found[EFFORT] == 0.85
+    elif probability:
+        assert found.found[EFFORT] > 0.85
 
 
 def test_efforts_are_looked_for_in_the_model_to_which_they_were_added(made: Made):
@@ -325,14 +333,6 @@ def test_an_effort_that_was_exchanged_is_looked_for_nowhere(made: Made):
     made.add(EFFORT, 50.0, 90.0)
     made.work.chain[1].effects = ()
     assert made.judged().found[EFFORT] > 0.9
-
-
-def test_efforts_seen_nowhere_at_rest_are_less_certain(made: Made):
-    made.at_rest = 0.14
-    found = made.add(EFFORT, 50.0, 90.0, **EFFORTS).judged()
-    assert (found.kind, found.found[EFFORT]) == ("effect_missing", 0.85)
-    made.work.chain[1].effects[0][1].name = "resisting bumps"
-    assert made.judged().kind == "unexplained_structure"
 
 
 def test_a_law_that_shows_nothing_at_rest_is_as_certain_as_ever(made: Made):
