@@ -157,13 +157,6 @@ def test_progress_is_told_and_can_stop_it():
     assert all(0.0 <= share <= 1.0 and text for share, text in heard)
 
 
-@pytest.mark.campaign  # of what no effect explains, the next one is run always
-def test_a_converter_that_holds_its_readings_is_structure_not_physics():
-    record = hidden_muscles.record(seed=81, rate_hz=100)
-    held = record.with_torque(record.torque_nm[(np.arange(record.time_s.size) // 6) * 6])
-    assert diagnose(held).verdict == "unexplained_structure"
-
-
 @both_libraries
 def test_a_gain_that_swings_is_no_effect_of_the_library(library):
     record = hidden_muscles.record(seed=91)

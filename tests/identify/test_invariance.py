@@ -6,9 +6,12 @@ much is stated for each relation. Relations that do not hold are here too, as st
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -17,7 +20,7 @@ from stimrig.identify import Record, fit
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Pulses
-from tests.harness import few_effects
+from tests.harness import answers, few_effects
 from tests.identify import hidden_muscles
 
 pytestmark = pytest.mark.slow
@@ -230,3 +233,43 @@ CUT = [("fatigue", PRBS, True), ("", RAMP, True), ("", PRBS, False), ("", RAMP, 
 @pytest.mark.parametrize(("hidden", "segment", "pulses"), whole_grid(CUT, {CUT[0], CUT[3]}))
 def test_without_the_prbs_or_the_ramp_whether_or_not_its_pulses_are_known(hidden, segment, pulses):
     assert said(without(segment, pulses=pulses)(record_of(hidden)))[:2] == answer(hidden)[:2]
+
+
+# ---- a nudge far below any sensor's last digit, and another processor ---------------------------------------------
+
+NUDGE = 1.0 + 1e-9
+MOST = 0.01
+"""Share of what a plain fit leaves, by which its prediction may move."""
+QUICK = ("fatigue", "arm 4 without rest")
+"""Records of every run; a campaign takes them all."""
+
+Answers = dict[str, dict[str, Any]]
+
+
+@cache
+def answered(where: str, names: tuple[str, ...]) -> Answers:
+    if where == "another processor":
+        return answers.answers_elsewhere()
+    some = {name: answers.records()[name] for name in names or answers.records()}
+    with patch.object(answers, "records", lambda: some):
+        return json.loads(json.dumps(answers.answers(NUDGE if where == "nudged" else 1.0)))
+
+
+@pytest.mark.parametrize(
+    ("where", "names"),
+    [
+        ("nudged", QUICK),
+        pytest.param("nudged", (), marks=pytest.mark.campaign),
+        pytest.param("another processor", (), marks=pytest.mark.campaign),
+    ],
+)
+def test_the_plain_fit_stays_and_the_same_effects_are_added(where: str, names: tuple[str, ...]) -> None:
+    here, again = answered("here", names), answered(where, names)
+    moved = {
+        name: np.sqrt(np.mean(np.subtract(again[name]["own_nm"], one["own_nm"]) ** 2)) / one["left_nm"]
+        for name, one in here.items()
+    }
+    assert {name: share for name, share in moved.items() if not share <= MOST} == {}
+    assert moved.keys() == set(names or answers.records())
+    added = [{name: one["added"] for name, one in each.items() if "added" in one} for each in (here, again)]
+    assert added[0] == added[1] and "fatigue" in added[0]

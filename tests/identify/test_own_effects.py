@@ -120,13 +120,10 @@ def told(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> str:
         ("(5.0,)", "(5.0,) * 10000", "10000 starts. Give 32 at most"),
         ('id="sensor_gain_swing"', 'needs="angle_rad", id="sensor_gain_swing"', "needs 'angle_rad'"),
         ("(5.0,)", "(0.2,)", "is not within 1.5 and 30.0"),
-        ("1.5, 30.0, 10.0", "0.0, 30.0, 10.0", "a logarithmic scale from 0 or below"),
-        ('id="sensor_gain_swing"', 'id="Sensor gain"', "id 'Sensor gain'"),
         ("EFFECT = Effect(", "EFFEKT = Effect(", "no EFFECT in it"),
         ("EFFECT = Effect(", "EFFECT = dict(", "EFFECT is a dict, not an Effect"),
         ("        apply=swing,\n", "", "no apply"),
         ("    return torque_nm * (1", "    return torque_nm, (1", "apply gives 160 numbers, not one for each of 80"),
-        ("apply=swing", "law=[1]", "law is a list. Give a dictionary, or leave it out."),
         ("apply=swing", 'law={"period_s": 5}', "law 'period_s': 5. Give law={parameter: (Lag, SpeedLaw)}"),
     ],
 )
