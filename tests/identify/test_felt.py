@@ -307,17 +307,6 @@ def test_held_leaves_the_drive_before_standing():
     assert np.array_equal(grid_of({10: 0.15, 20: -0.1}).held(drive[:, 1]), held[:, 1])
 
 
-@pytest.mark.parametrize("part", [-0.1, 0.3, 1.7])
-def test_held_keeps_the_sum(part):
-    drive = np.r_[np.zeros(5), np.ones(20), np.zeros(15)]
-    assert grid_of({12: part}, 100 * drive).held(drive).sum() == pytest.approx(20)
-    train = grid_of(dict.fromkeys(range(5, 25), part), 100 * drive).held(drive)
-    assert train.sum() == pytest.approx(20)
-    # All late alike is a delay of all.
-    middle = float(np.arange(40) @ train / 20) - float(np.arange(40) @ drive / 20)
-    assert middle == pytest.approx(part)
-
-
 def test_a_pulse_that_is_later_acts_whole_but_later():
     drive = np.random.default_rng(0).random(40)
     held = grid_of({10: 0.4, 20: 1.3}).held(drive)

@@ -249,7 +249,7 @@ def test_a_time_axis_of_any_rate_gives_the_means_of_the_pulses():
         ({"torque_nm": [[1.0]]}, "reference_torque_nm", "plain list"),
         ({"torque_nm": ["a"]}, "reference_torque_nm", "numbers"),
         ({"torque_nm": np.zeros(12_001)}, "reference_torque_nm", "300 s"),
-        ({"torque_nm": [1.0], "pulse_rate_hz": 1000.0}, "pulse_rate_hz", "10 to 100"),
+        ({"torque_nm": [1.0], "pulse_rate_hz": float("nan")}, "pulse_rate_hz", "10 to 100"),
         ({"torque_nm": [1.0, 2.0], "time_s": [0.0]}, "time_s", "one time for each"),
         ({"torque_nm": [1.0, 2.0], "time_s": [0.0, 0.0]}, "time_s[1]", "rise"),
         ({"torque_nm": [1.0, 2.0, 3.0], "time_s": [0.0, 0.1, 9.0]}, "time_s[2]", "at most 1 s"),

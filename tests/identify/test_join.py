@@ -293,7 +293,7 @@ def test_column_part_of_somebody_else_is_passed_over(tmp_path):
     [
         ("part", "2", "part 1 begins"),
         ("pause_s", "", "empty"),
-        ("pause_s", "-1", "is not 0 to 86400"),
+        ("pause_s", "nan", "is not 0 to 86400"),
         ("folded_s", "4000", "is not 0 to"),
         ("folded_s", "29", "longer than the jump"),
         ("begun_s", "yesterday", "is not 0 to"),

@@ -17,7 +17,7 @@ from stimrig import identify
 from stimrig.identify.estimation.uncertainty import prediction_band
 from stimrig.identify.methods import methods
 from stimrig.identify.model_schema import SCHEMA
-from stimrig.identify.summary import estimate, quantity
+from stimrig.identify.summary import quantity
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 
@@ -167,11 +167,6 @@ def test_a_model_of_another_version_with_little_in_it_still_shows_itself(results
 )  # fmt: skip
 def test_a_number_has_three_digits_and_its_unit(value, unit, said):
     assert quantity(value, unit) == said
-
-
-def test_an_estimate_without_a_deviation_has_no_plus_minus():
-    assert estimate(0.5284, 0.0123, "s") == "0.528 ± 0.012 s" and estimate(0.64, 0.01, "1") == "0.64 ± 0.01"
-    assert estimate(2.0, None, "s") == estimate(2.0, float("nan"), "s") == "2 s"
 
 
 # ---- improving: the error falls step by step, and what is not there is refused ----------------------------------

@@ -40,23 +40,6 @@ def test_the_seed_settles_everything() -> None:
 # ---- hidden effects ----------------------------------------------------------------------------------------------
 
 
-def test_a_record_is_uniform_and_holds_the_segments_of_its_design() -> None:
-    record = generate("catch_like", "weak", 302, rate_hz=400)
-    assert np.allclose(np.diff(record["time_s"]), 1.0 / 400.0)
-    assert list(dict.fromkeys(record["segment"])) == ["rest", "prbs", "ramp", "validate"]
-    held = record["pulse_width_us"].reshape(-1, 10)
-    assert np.all(held == held[:, :1])  # 40 pulses a second
-    assert np.all(record["pulse_width_us"][record["segment"] == "rest"] == 0.0)
-
-
-@pytest.mark.parametrize("rate_hz", [40, 2000])
-def test_the_rate_changes_the_samples_and_not_the_muscle(rate_hz: float) -> None:
-    usual, other = (generate("output_saturation", "strong", 303, rate_hz=rate) for rate in (400, rate_hz))
-    assert other["truth"]["parameters"] == usual["truth"]["parameters"]
-    difference = np.interp(usual["time_s"], other["time_s"], other["torque_nm"]) - usual["torque_nm"]
-    assert np.sqrt(np.mean(difference**2)) < 0.1  # two noises of 0.04, and interpolation at 40 Hz
-
-
 def test_noise_is_what_it_says() -> None:
     rng = np.random.default_rng(9)
     white = draw_noise("white", rng, 200_000, 400, 0.04, 0.9)
@@ -133,22 +116,6 @@ def test_an_arms_torque_is_the_contracts_equation_and_white_noise(kind: str) -> 
     noise = made["torque_nm"] - truth["torque_nm"]
     assert noise.std() == pytest.approx(truth["noise_sd_nm"], rel=0.05)
     assert abs(np.corrcoef(noise[1:], noise[:-1])[0, 1]) < 0.05
-
-
-def test_what_each_kind_is_for() -> None:
-    patient = arm_patient(5)
-    low, high = patient.range_rad
-    passive, moving, unseen = (arm_records.record(patient, kind, 1) for kind in ("passive", "moving", "unseen"))
-    assert not passive["pulse_width_us"].any()
-    for made in (passive, moving, unseen):
-        covered = made["angle_rad"].min(), made["angle_rad"].max()
-        assert covered == pytest.approx((low, high), abs=np.radians(9.0))
-    assert len(np.unique(moving["pulse_width_us"])) > 5
-    assert set(unseen["segment"]) == {"rest", "validate"}
-    assert unseen["pulse_width_us"].max() <= patient.largest_width_us
-    held = arm_records.record(patient, "held", 3, angle_rad=low + 0.05)
-    assert np.abs(held["angle_rad"] - low - 0.05).max() < 0.06
-    assert held["pulse_width_us"].max() == patient.largest_width_us
 
 
 # ---- bouts -------------------------------------------------------------------------------------------------------
