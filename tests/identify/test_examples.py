@@ -34,7 +34,7 @@ def test_biceps_example_on_a_simulated_muscle(tmp_path):
         pulses.write("time_s\n")
         widths = np.r_[np.full(30, 300.0), np.zeros(10)]
         clean = Patient(gain=30.0, time_constant_s=0.08, damping=0.9).torque(widths, 1000, 1 / 0.032)
-        for train in range(10):
+        for train in range(6):
             start = 5.0 + 2.1 * train
             pulses.writelines(f"{start + 0.032 * i + rng.uniform(-5e-4, 5e-4):.4f}\n" for i in range(30))
             for i, value in enumerate(clean):
@@ -46,6 +46,7 @@ def test_biceps_example_on_a_simulated_muscle(tmp_path):
     assert (tmp_path / "x.svg").stat().st_size > 1000
 
 
+@pytest.mark.campaign  # the same program is run above, on what it can be judged by
 @pytest.mark.skipif(not SHARED.exists(), reason="the measured data aren't beside this repository")
 def test_biceps_example_on_the_measured_data():
     said = run(SHARED)
