@@ -321,39 +321,3 @@ def pages(day: Day) -> None:
         day.found["page signed in"] = day.kept(http.post("/sign-in", data={"token": TOKEN, "next": "/"}))
         for path in seen:
             day.ask("GET", path, note="page", http=http)
-        decisions(day, http)
-
-
-def decisions(day: Day, http: httpx.Client) -> None:
-    """The forms of the pages."""
-    page = http.get("/participants/P1").text
-    secret = dict(re.findall(r'name="(csrf|seen)" value="([^"]+)"', page))
-    sent: tuple[tuple[str, dict[str, str]], ...] = (
-        ("/participants", {"code": "QEN", "side": "left"}), ("/participants", {"code": "two words"}),
-        ("/participants/QEN/profile", {"max_torque_nm": "20"}),
-        ("/participants/P1/profile", {"max_torque_nm": "many"}),
-        ("/participants/P1/profile", {"max_torque_nm": "24", "seen": secret.get("seen", "")}),
-        ("/participants/P1/tests", {"seen": secret.get("seen", "")}),
-        ("/participants/P1/notes", {"kind": "other", "text": "a note"}),
-        ("/participants/P1/notes", {"kind": "", "text": ""}),
-        ("/participants/QEN/muscle", {"side": "right", "muscle": "x"}),
-        ("/participants/QEN/archive", {}), ("/participants/QEN/unarchive", {}),
-        ("/tests/{test_first}/ran-by", {"ran_by": "Ada"}), ("/models/{model_first}/effects", {"effect": "tremor"}),
-        ("/models/{model_first}/approve", {"reason": "again"}), ("/models/{model_first}/reject", {}),
-        ("/models/{model_first}/undo", {}), ("/models/{model_first}/widths", {"reference": "0\n1\n2"}),
-        ("/models/{model_first}/widths.csv", {"reference": "0\n1\n2"}), ("/models/{model_first}/experiment", {}),
-        ("/participants/QEN/calibration", {"step_us": "10"}), ("/participants/QEN/calibration/step/up", {}),
-        ("/participants/QEN/calibration/mark/sensory", {}), ("/participants/QEN/calibration/finish", {}),
-        ("/participants/QEN/calibration/discard", {}), ("/rig/angle/pose", {"angle_deg": "x"}),
-        ("/administration/users", {"name": "Cy en", "role": "clinician", "password": PASSWORD}),
-        ("/administration/users/Cy en/password", {"password": "short"}),
-        ("/administration/users/Cy en/remove", {}), ("/administration/keys", {"name": "page", "days": "7"}),
-        ("/rearm", {"back": "/"}), ("/colours", {"colours": "dark"}),
-        ("/colours", {"colours": "x"}),
-        ("/lock", {}), ("/unlock", {"secret": "wrong"}), ("/sign-out", {}),
-    )  # fmt: skip
-    for path, form in sent:
-        answer = day.ask("POST", path, note="page", http=http, data={"csrf": secret["csrf"], **form})
-        day.found[f"page POST {path} {json.dumps(form | {'seen': ''})}"] = day.found.pop(list(day.found)[-1])
-        if answer.status_code == 303 and "/confirm/" in answer.headers["location"]:
-            day.found[f"page question of {path}"] = day.kept(http.get(answer.headers["location"]))
