@@ -112,12 +112,6 @@ def test_devices_belong_to_the_rigs_user_alone() -> None:
     assert 'DRIVER=="ftdi_sio", ATTR{latency_timer}="1"' in RULES
 
 
-def test_can_is_at_one_megabit() -> None:
-    settings = unit("stimrig-can@.service")
-    assert "BITRATE=1000000" in settings["Environment"][0]
-    assert settings["BindsTo"] == ["sys-subsystem-net-devices-%i.device"]
-
-
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="systemd-analyze is not installed")
 def test_systemd_knows_every_setting(tmp_path: Path) -> None:
     """Unknown settings and wrong values; that programs are not installed here is not its matter."""

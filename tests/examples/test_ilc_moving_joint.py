@@ -46,13 +46,13 @@ def along(angle_rad: np.ndarray, widths_us: np.ndarray, muscle: Any, true: bool)
 class Arm:
     """Stands where the service stands: the joint is moved out and back twice, never quite alike."""
 
-    def __init__(self, moves: bool = True) -> None:
-        self.rng, self.moves = np.random.default_rng(5), moves
+    def __init__(self) -> None:
+        self.rng = np.random.default_rng(5)
         self.angles: list[np.ndarray] = []
 
     def movement(self, late_s: float = 0.0, beside_rad: float = 0.0) -> np.ndarray:
         turn = np.clip(np.arange(SIZE) / RATE_HZ - late_s, 0.0, 10.0) * 2 * np.pi / 5.0
-        return 1.0 + beside_rad + 0.4 * self.moves * (1 - np.cos(turn))
+        return 1.0 + beside_rad + 0.4 * (1 - np.cos(turn))
 
     def play_moving(self, widths_us: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         assert np.all(np.diff(np.r_[0, widths_us]) <= 50) and widths_us.shape == (SIZE,)
@@ -82,12 +82,6 @@ def test_with_g_and_h_the_first_trial_is_far_better(ilc: ModuleType) -> None:
     assert min(without[1:]) < 0.7 * without[0], "what repeats is learnt without them, too"
     assert np.mean(with_them[-2:]) < 1.1 * np.mean(without[-2:]), (with_them, without)
     assert np.mean(with_them[1:]) < with_them[0], "and there was something left to learn"
-
-
-def test_at_rest_they_make_no_difference_that_learning_does_not_take(ilc: ModuleType) -> None:
-    """What the first trial owed to g and h was the movement: a joint that is held has none of it."""
-    with_them, without = (errors(ilc, Arm(moves=False), joint)[-1] for joint in ({"g": []}, {}))
-    assert with_them < 1.3 * without and without < 1.3 * with_them
 
 
 # ---- between controller and service ------------------------------------------------------------------------------

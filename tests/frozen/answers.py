@@ -81,10 +81,10 @@ def call(line: str) -> dict[str, Any]:
 
 
 def run(line: str) -> dict[str, Any]:
-    """Exit code, standard output and error as they are; in this process, but for code and the emulator."""
-    if line.startswith(("-c", "emulate")):  # which becomes another program
-        words = [line[:2], line[2:]] if line.startswith("-c") else ["-m", "stimrig", *line.split()]
-        done = subprocess.run([sys.executable, *words], capture_output=True, text=True, timeout=900)
+    """Exit code, standard output and error as they are; in this process, but for the emulator."""
+    if line.startswith("emulate"):  # which becomes another program
+        command = [sys.executable, "-m", "stimrig", *line.split()]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=900)
         return {"exit": done.returncode, "out": done.stdout, "error": done.stderr}
     before = os.dup(1), os.dup(2)
     with (

@@ -49,20 +49,6 @@ DONE = (
     "cohort changed fit.parquet tired.parquet", "cohort changed fit.parquet tired.parquet --json",
     "cohort figures fit.parquet -o figures.html --json",
 )  # fmt: skip
-SHAPES = ("doctor --json", "test --protocol short --json")
-"""Answers whose values are the machine's: only what stands where is kept."""
-SCRIPT = """
-import stimrig
-record = stimrig.read("plain.csv")
-model, other = stimrig.fit(record), stimrig.fit(record, effects=["fatigue"])
-found = [record, model, other, stimrig.predict(model, record), stimrig.compare(model, record), stimrig.effects()]
-found += [stimrig.diagnose(record, progress=False), stimrig.improve(record, progress=False)]
-found += [stimrig.next_experiment(record, ["threshold_drift", "recruitment_hysteresis"])]
-print(dir(stimrig), stimrig.Model.from_json(model.to_json()).to_dict() == model.to_dict())
-for one in found:
-    print(type(one).__name__, one, sorted(one.to_dict()) if hasattr(one, "to_dict") else "", sep="\\n")
-    print(one._repr_html_() if hasattr(one, "_repr_html_") else "no HTML")
-"""
 
 
 def of_record(name: str, folder: Path) -> dict[str, Any]:
@@ -102,7 +88,7 @@ def _all_of(name: str, calls: list[str], folder: Path) -> dict[str, Any]:
 
 
 def without_record(folder: Path) -> dict[str, Any]:
-    """Calls that make or take their files themselves, help, refusals, schemas, and the Python module."""
+    """Calls that make or take their files themselves, help, refusals and schemas."""
     RECORDS["plain_short"](folder).rename(folder / "plain.csv")
     RECORDS["fatigue"](folder).rename(folder / "again.csv")
     _reference(folder)
@@ -120,17 +106,7 @@ def without_record(folder: Path) -> dict[str, Any]:
         (folder / "future.json").write_text(json.dumps(json.loads(model) | {"schema_version": "9.0"}))
         schemas = [address.split(":")[-2] for address in run("schema")["out"].split()]
         more = [*(f"schema {name}" for name in schemas), *(f"{verb} --help" for verb in VERBS)]
-        answers = {line: call(line) for line in (*REFUSED, *DONE, "schema", *more)}
-        answers |= {line: shape(call(line)["out"]) for line in SHAPES}
-        return answers | {"import stimrig": call(f"-c{SCRIPT}")}
-
-
-def shape(value: Any) -> Any:
-    """A document's keys, and the kinds of its values."""
-    if isinstance(value, dict):
-        return {name: shape(one) for name, one in value.items()}
-    documents = isinstance(value, list) and bool(value) and isinstance(value[0], dict)
-    return [shape(value[0])] if documents else type(value).__name__
+        return {line: call(line) for line in (*REFUSED, *DONE, "schema", *more)}
 
 
 def _reference(folder: Path) -> None:

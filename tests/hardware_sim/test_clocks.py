@@ -57,7 +57,7 @@ def test_jitter_can_be_switched_and_leaves_the_grid_where_it_was() -> None:
 def test_three_samples_a_frame(jitter_us: float) -> None:
     made = cell(samples_per_frame=3, clock_jitter_us=jitter_us)
     made.counter = 3 * 65534
-    made.produce(8.0)
+    made.produce(2.0)
     frames = made.take_frames()
     rows = [PACKED.unpack(frame.data) for frame in frames]
     assert [row[3] for row in rows[:4]] == [65534, 65535, 0, 1]

@@ -55,12 +55,6 @@ class TestSampler:
         assert [f.time_us for f in frames] == [625 * n for n in range(len(frames))]
         assert [torque for torque, *_ in decoded(frames)] == [np.float32(n / 1600) for n in range(len(frames))]
 
-    def test_counter_wraps(self) -> None:
-        made = cell()
-        made.counter = 65534
-        made.produce(3.5 / 1600)
-        assert [counter for _, counter, _ in decoded(made.take_frames())] == [65534, 65535, 0, 1]
-
     @pytest.mark.parametrize(("pulse_s", "first"), [(0.0, 0), (1.2 / 1600, 2), (2 / 1600, 2), (2.01 / 1600, 3)])
     def test_sync_is_in_the_first_sample_at_or_after_the_pulse(self, pulse_s: float, first: int) -> None:
         made = cell()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import itertools
 import time
 
 import pytest
@@ -14,7 +13,6 @@ from science_mode_4 import (
     DeviceP24,
     LowLevelHighVoltageSource,
     LowLevelMode,
-    MidLevelChannelConfiguration,
     ResultAndError,
     SerialPortConnection,
     StimStatus,
@@ -89,30 +87,3 @@ def test_low_level() -> None:
         state = rig.ask(cmd="state")
         assert (state["unbalanced_pulses"], state["corrupt_frames"], state["mode"]) == (0, 0, "none")
         assert state["torque_nm"] > 0.5
-
-
-def test_mid_level_pulses_by_itself_and_falls_silent_after_2_s() -> None:
-    async def session(rig: Emulated) -> None:
-        connection, device = await opened(rig)
-        general, mid = device.get_layer_general(), device.get_layer_mid_level()
-        await mid.init(True)
-        await mid.update([MidLevelChannelConfiguration(True, 0, 25, shape(*PULSE))])
-        assert (await general.get_stim_status()).stim_status == StimStatus.MID_LEVEL_RUNNING
-        await asyncio.sleep(0.3)
-        before_s = rig.ask(cmd="state")["time_s"]
-        current = await mid.get_current_data()
-        after_s = rig.ask(cmd="state")["time_s"]  # the last sign of life came between the two
-        assert current.is_stimulation_active_per_channel == [True] + [False] * 7
-        wait_for(lambda: rig.ask(cmd="state")["mode"] == "mid level", seconds=4)
-        last_s = rig.ask(cmd="state")["last_pulse_time_s"]
-        assert last_s - after_s <= 2.0 < last_s - before_s + 0.026  # a period of 25 ms
-        await mid.stop()
-        assert (await general.get_stim_status()).stim_status == StimStatus.NO_LEVEL_INITIALIZED
-        connection.close()
-
-    with emulated() as rig:
-        asyncio.run(session(rig))
-        times = [p["time_s"] for p in rig.ask(cmd="pulses")["pulses"]]
-        steps = [later - earlier for earlier, later in itertools.pairwise(times)]
-        assert len(times) > 80
-        assert steps == pytest.approx([0.025] * len(steps), abs=1e-9)
