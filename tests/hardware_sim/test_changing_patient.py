@@ -65,16 +65,6 @@ def test_ten_trials_with_rests_lose_forty_percent_of_the_torque(recovery_s: floa
     assert np.all(np.diff(ends) < 0)
 
 
-def test_rest_returns_what_was_lost() -> None:
-    muscle = ChangingMuscle(Parameters(fatigue_share=0.4))
-    play(muscle, session(10))
-    lost = 1 - muscle.gain
-    muscle.torque_nm(270.0 + 200.0)
-    assert 1 - muscle.gain == pytest.approx(lost * np.exp(-1), rel=1e-3)
-    muscle.torque_nm(270.0 + 3600.0)
-    assert muscle.gain == pytest.approx(1.0, abs=1e-6)
-
-
 def test_potentiation_rises_with_use_and_fades() -> None:
     muscle = ChangingMuscle(Parameters(potentiation_share=0.3))
     torque = play(muscle, session(10))

@@ -230,9 +230,3 @@ class TestMidLevel:
         bench.ask(ML_INIT, b"\x00")
         assert bench.ask(ML_UPDATE, data).data == bytes((PARAMETER,))
         assert bench.muscle.pulses == []
-
-    def test_low_level_init_ends_mid_level(self, running: Bench) -> None:
-        running.ask(LL_INIT, b"\x00")
-        fired = len(running.muscle.pulses)
-        running.run(0.5)
-        assert len(running.muscle.pulses) == fired

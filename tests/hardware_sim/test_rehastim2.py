@@ -280,23 +280,6 @@ class TestErrors:
         assert running.sent[-1][1] == Packet(2, ERROR, bytes((error & 0xFF,)))
         assert len(running.muscle.pulses) == delivered
 
-    def test_it_does_not_resume_when_the_electrode_is_back(self, running: Host) -> None:
-        running.electrodes.attached = False
-        running.run(0.05)
-        running.electrodes.attached = True
-        running.run(0.5)
-        assert len(running.muscle.pulses) == 1
-        assert running.result(START, pulse(250, 20)) == WRONG_MODE
-
-    def test_a_failing_first_pulse_takes_its_doublet_along(self, connected: Host) -> None:
-        connected.electrodes.attached = False
-        connected.send(INIT_LIST, setup())
-        assert connected.result(START, pulse(250, 20, mode=1)) == OK
-        connected.electrodes.attached = True
-        connected.run(0.5)
-        assert len(connected.packets(ERROR)) == 1
-        assert connected.muscle.pulses == []
-
     def test_reset_forgets_everything_and_offers_a_connection_anew(self, running: Host) -> None:
         running.firmware.reset()
         fired, have = len(running.muscle.pulses), len(running.sent)

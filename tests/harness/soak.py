@@ -10,13 +10,13 @@ import os
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 
 from tests.harness.processes import CLINIC_WATCH, ROOT, Bench, default_plan
 
@@ -39,31 +39,18 @@ while True:
 
 
 @contextlib.contextmanager
-def fitting(recordings: Path, wanted: bool) -> Iterator[list[str]]:
-    """A process that fits without a pause; a line for each fit."""
-    if not wanted:
-        yield []
-        return
-    process = subprocess.Popen(
-        [sys.executable, "-c", FITTER, str(recordings)], cwd=ROOT, stdout=subprocess.PIPE, text=True
-    )
-    lines: list[str] = []
-    assert process.stdout is not None
-    stdout = process.stdout
-    threading.Thread(target=lambda: lines.extend(stdout), daemon=True).start()
+def fitting(recordings: Path, log: Path) -> Iterator[None]:
+    """A process that fits without a pause; it writes a line for each fit."""
+    command = [sys.executable, "-c", FITTER, str(recordings)]
+    with log.open("w") as out:
+        process = subprocess.Popen(command, cwd=ROOT, stdout=out)
     try:
-        yield lines
-    finally:
+        yield
         if process.poll() is not None:
             print("the fitting process ended early", file=sys.stderr)
+    finally:
         process.kill()
         process.wait()
-
-
-def memory_mb(pid: int) -> float:
-    """Resident memory of a process."""
-    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
-    return pages * os.sysconf("SC_PAGE_SIZE") / 2**20
 
 
 def soak(minutes: float, every_minutes: float, fit: bool = True, patient: bool = False, **plan: Any) -> dict[str, Any]:
@@ -72,20 +59,22 @@ def soak(minutes: float, every_minutes: float, fit: bool = True, patient: bool =
     `patient`: with a rig that does not end a test for a torque 0.1 s old. `plan`: fields of the tests' plan.
     """
     with tempfile.TemporaryDirectory(prefix="rig-soak-") as folder:
-        bench = Bench(Path(folder))
+        bench, log = Bench(Path(folder)), Path(folder) / "fits.log"
+        log.touch()
         try:
             client = bench.start_rig(watch=None if patient else CLINIC_WATCH)
             client.ask("subscribe")
-            with fitting(bench.data / "recordings", fit) as fits:
-                return _session(bench, client, minutes, every_minutes, plan) | {"fits_beside": len(fits)}
+            with fitting(bench.data / "recordings", log) if fit else contextlib.nullcontext():
+                figures = _session(bench, client, minutes, every_minutes, plan)
+            return figures | {"fits_beside": len(log.read_text().splitlines())}
         finally:
             bench.close()
 
 
 def _session(bench: Bench, client: Any, minutes: float, every_minutes: float, plan: dict[str, Any]) -> dict[str, Any]:
     assert bench.rig is not None
-    pid, began_s = bench.rig.popen.pid, time.monotonic()
-    memory, tests, oldest_ms, live = [memory_mb(pid)], [], 0.0, 0
+    rig, began_s = psutil.Process(bench.rig.popen.pid), time.monotonic()
+    memory_mb, tests, oldest_ms = [rig.memory_info().rss / 2**20], [], 0.0
     load = os.getloadavg()[0]
     while time.monotonic() - began_s < 60 * minutes:
         next_s = time.monotonic() + 60 * every_minutes
@@ -98,21 +87,18 @@ def _session(bench: Bench, client: Any, minutes: float, every_minutes: float, pl
             tests.append(client.wait_finished(name, timeout_s=120))
             if tests[-1]["outcome"] != "completed":
                 client.rearm("soak")
-        memory.append(memory_mb(pid))
+        memory_mb.append(rig.memory_info().rss / 2**20)
         while time.monotonic() < min(next_s, began_s + 60 * minutes):
             while not client.events.empty():
                 event = client.events.get_nowait()
                 if event["event"] == "live":
-                    live += 1
                     oldest_ms = max(oldest_ms, 1e3 * event["torque_age_s"])
             time.sleep(0.5)
-    felt = len(bench.felt())
-    figures = _figures(tests, felt)
     status = client.status()
-    return figures | {
+    return _figures(tests, len(bench.felt())) | {
         "minutes": round((time.monotonic() - began_s) / 60, 2),
         "load_average": [round(load, 1), round(os.getloadavg()[0], 1)],
-        "memory_mb": [round(memory[0], 1), round(memory[-1], 1)],
+        "memory_mb": [round(memory_mb[0], 1), round(memory_mb[-1], 1)],
         "oldest_torque_ms": round(oldest_ms, 1),
         "measured_rate_hz": status["load_cell"].get("measured_rate_hz"),
         "state": status["state"],
