@@ -5,22 +5,20 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.settings import Settings
-from stimrig.rig import config
 from stimrig.rig import messages as m
 from stimrig.rig import requests as r
 from stimrig.rig.control.rig import Rig
 from tests.simulator.clinic import Clinic
 from tests.simulator.disk import SimulatedDisk
 from tests.simulator.host import Computer, Process
+from tests.simulator.life import rig_file
 from tests.simulator.wires import Wires
 from tests.simulator.world import World
 
-FOLDER = Path("/rig")
 KEY = "a key of its own"
 ROBOT = "robot,from_deg=60,to_deg=110,deg_s=60,pause_s=0.2"
 
@@ -36,15 +34,7 @@ class QuietRig:
         computer = Computer(world, 0.0, 1_764_000_000.0)
         process = Process(computer, self.disk, Wires(world, devices, 0.02, lambda *_: None))
         self.clinic = Clinic(world, devices.state)
-        cell = {"device": "can_load_cell", "bus": {"interface": "simulated"}, "sample_rate_hz": 200.0}
-        content = {
-            "require_calibration": False,
-            "stimulator": {"device": settings.stimulator, "port": "/dev/simulated"},
-            "load_cell": cell | devices.load_cell.cell.rig_keys,
-            "angle_sensor": {"device": "can_angle_sensor", "offset": 30.0, "direction": -1} if arm else None,
-        }  # fmt: skip
-        checked = config.check(content, "simulated", data_dir=FOLDER, socket=FOLDER / "socket")
-        rig = Rig(checked, process, lambda event: self.clinic.hear(process, event))
+        rig = Rig(rig_file(settings, devices, arm), process, lambda event: self.clinic.hear(process, event))
         self.clinic.meet(process, rig)
         process.post(lambda: process.tasks.spawn(rig.open(), "open"))
         process.listens = True

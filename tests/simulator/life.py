@@ -8,6 +8,7 @@ from collections.abc import Collection
 from pathlib import Path
 from typing import NamedTuple
 
+from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.load_cells.cells import CELLS, WithAngle
 from stimrig.hardware_sim.settings import Settings
@@ -43,6 +44,20 @@ class Felt(NamedTuple):
     written_s: float
     true: bool
     output: tuple[int, int]  # connector and channel, from 0
+
+
+def rig_file(settings: Settings, devices: Devices, arm: str | None) -> config.RigConfig:
+    """Describe these devices as a rig file does."""
+    content = {
+        "require_calibration": False,
+        "stimulator": {"device": settings.stimulator, "port": "/dev/simulated"},
+        "load_cell": {
+            "device": "can_load_cell", "bus": {"interface": "simulated"}, "sample_rate_hz": settings.rate_hz,
+            **devices.load_cell.cell.rig_keys,
+        },
+        "angle_sensor": {"device": "can_angle_sensor", "offset": 30.0, "direction": -1} if arm else None,
+    }  # fmt: skip
+    return config.check(content, "simulated", data_dir=FOLDER, socket=FOLDER / "socket")
 
 
 class Life:
@@ -91,7 +106,7 @@ class Life:
         """Those of the deaths during which a piece of work was under way."""
         self.power_failures: list[tuple[float, float]] = []
         """When, and since when the disk was well; infinite: it was not."""
-        self._config = self._rig_file(settings)
+        self._config = rig_file(settings, self.devices, self.arm)
         self.quiet = False
         self._plan_accidents(chance, only)
         self.begin_process()
@@ -205,15 +220,3 @@ class Life:
         self.world.faults += 1
         self.befallen.append(f"{name} {words}".rstrip())
         self.world.tell("accident", f"{number} {self.befallen[-1]}")
-
-    def _rig_file(self, settings: Settings) -> config.RigConfig:
-        content = {
-            "require_calibration": False,
-            "stimulator": {"device": settings.stimulator, "port": "/dev/simulated"},
-            "load_cell": {
-                "device": "can_load_cell", "bus": {"interface": "simulated"}, "sample_rate_hz": settings.rate_hz,
-                **self.devices.load_cell.cell.rig_keys,
-            },
-            "angle_sensor": {"device": "can_angle_sensor", "offset": 30.0, "direction": -1} if self.arm else None,
-        }  # fmt: skip
-        return config.check(content, "simulated", data_dir=FOLDER, socket=FOLDER / "socket")
