@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import tomllib
 from pathlib import Path
@@ -22,27 +23,19 @@ def copy_tree(source: Path, tree: Path) -> None:
 
 def plant(tree: Path, at: str, find: str, put: str) -> None:
     """Change one place of a tree. Raises ValueError if it is not there, or not once."""
-    path = tree / at
-    lines = path.read_text("utf-8").splitlines()
-    wanted = [_bare(line) for line in find.splitlines()]
-    starts = [
-        n
-        for n in range(len(lines) - len(wanted) + 1)
-        if all(_bare(line).startswith(word) for line, word in zip(lines[n:], wanted, strict=False))
+    path, space = tree / at, re.escape(" ")
+    text = path.read_text("utf-8")
+    lines = [
+        re.escape(line.strip()).replace(space, f"{space}(?:await )?")
+        for line in find.replace("await ", "").splitlines()
     ]
-    if len(starts) != 1:
-        raise ValueError(f"{at}: {find!r} stands there {len(starts)} times")
-    first, last = starts[0], starts[0] + len(wanted) - 1
-    indent = lines[first][: len(lines[first]) - len(lines[first].lstrip())]
-    tail = _bare(lines[last]).removeprefix(wanted[-1])
-    words = put.splitlines()
-    words[-1] += tail if words[-1].endswith("(") else ""
-    lines[first : last + 1] = [indent + line for line in words]
-    path.write_text("\n".join(lines) + "\n", "utf-8")
-
-
-def _bare(line: str) -> str:
-    return line.strip().replace("await ", "")
+    pattern = re.compile("^( *)(?:await )?" + r".*\n *(?:await )?".join(lines) + "(.*)$", re.M)
+    found = pattern.findall(text)
+    if len(found) != 1:
+        raise ValueError(f"{at}: {find!r} stands there {len(found)} times")
+    indent, tail = found[0]
+    made = "\n".join(indent + line for line in put.splitlines()) + (tail if put.endswith("(") else "")
+    path.write_text(pattern.sub(lambda _: made, text), "utf-8")
 
 
 def places(fault: dict[str, Any]) -> list[tuple[str, str, str]]:
