@@ -47,8 +47,8 @@ class FakeStimulator:
         self.sent: list[tuple[float, Admitted]] = []
         self.acked_s: list[float] = []
         self.fed_s: list[float] = []
+        self.stopped_s: list[float] = []
         self.armed = False
-        self.stops = 0
         self.ack_delay_s: float | None = 0.001
         self.error: str | None = None
         self.send_error: str | None = None
@@ -58,6 +58,10 @@ class FakeStimulator:
 
     def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
         self.on_ack, self.on_lost = on_ack, on_lost
+
+    @property
+    def stops(self) -> int:
+        return len(self.stopped_s)
 
     async def open(self) -> dict[str, Any]:
         return {"device": "fake"}
@@ -89,7 +93,7 @@ class FakeStimulator:
         self.on_ack(Ack(number, self.clock.now_s(), error))
 
     async def stop(self) -> None:
-        self.stops += 1
+        self.stopped_s.append(self.clock.now_s())
         self._answer()
         self.armed = False
 

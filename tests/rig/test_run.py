@@ -71,8 +71,7 @@ def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
 def test_an_end_that_the_device_does_not_confirm_is_a_fault(tmp_path: Path):
     rig = VirtualRig(tmp_path)
 
-    async def says_nothing_of_it() -> None:
-        rig.stimulator.stops += 1
+    async def says_nothing_of_it() -> None: ...
 
     rig.stimulator.stop = says_nothing_of_it
     result = rig.execute()
@@ -261,12 +260,13 @@ def test_through_a_rest_the_device_is_fed_at_every_pulses_time(tmp_path: Path):
 
 def test_a_stop_is_confirmed_by_the_torque_falling(tmp_path: Path):
     rig = VirtualRig(tmp_path, [hold(on_s=3.0)])
-    rig.at(1.5, lambda: rig.halt.set("stopped", "enough"))
+    rig.at(1.505, lambda: rig.halt.set("stopped", "enough"))
     result = rig.execute()
     assert (result.outcome, result.reason) == ("stopped", "enough")
     assert result.evidence.confirmed
     assert "torque fell from 6.00" in result.evidence.detail
     assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
+    assert rig.stimulator.stopped_s[0] - rig.halt.time_s < 0.001, "it does not wait until the next pulse is due"
 
 
 @pytest.mark.parametrize(("said", "kept"), [("ou\0ch", "ou\N{REPLACEMENT CHARACTER}ch"), ("ou\ud800ch", "ou?ch")])
