@@ -149,7 +149,7 @@ def test_a_service_that_does_not_come_up_lets_go(tmp_path: Path) -> None:
     from stimrig.api.web.dependencies import build
 
     (tmp_path / "stimrig.db").write_bytes(b"not a database at all" * 100)
-    with pytest.raises(ApiError, match="cannot be opened"):
+    with pytest.raises(ApiError, match=r"cannot be opened.*restore the database from a backup"):
         build(Settings(data_dir=tmp_path))
     held(data_dir=tmp_path).release()
 
