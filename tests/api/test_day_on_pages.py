@@ -85,7 +85,7 @@ def test_the_page_comes_back_as_it_was_and_both_tabs_with_it(tab: Any, service: 
     unlock(tab)
     tab.wait_for_url("**/participants/V1?x=1")
     assert tab.locator("#notes").get_by_label("Note", exact=True).input_value() == "half a sentence"
-    other.wait_for_url(service.url + "/")
+    other.get_by_role("heading", name="Participants", exact=True).wait_for()
     other.close()
 
 
