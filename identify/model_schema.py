@@ -1,7 +1,7 @@
 """What a MODEL.json may contain: model.schema.json, the published JSON Schema, read by the few rules that it uses.
 
 It is checked before anything is computed from it. Keys that the schema does not know are not checked, since a later
-version may write more. Keys that it requires may be missing in a model of an older version, except those of `x-needed`.
+version may write more. Keys that it requires may be missing, except those of `x-needed`.
 """
 
 from __future__ import annotations
@@ -30,12 +30,11 @@ WITH_SD = {"type": "object", "additionalProperties": {"type": "object", "x-neede
 
 def check_model(document: dict[str, Any]) -> None:
     """Raises BadModel: the document, or what its parts have to do with one another, is not as in a MODEL.json."""
-    present = {name: part for name, part in document.items() if name != "joint" or part != {}}  # {}: an older version
-    check(present, SCHEMA, "")
+    check(document, SCHEMA, "")
     for index, effect in enumerate(document.get("effects", ())):
         _effect(effect, f"effects.{index}")
-    if "joint" in present:
-        _tables(present["joint"])
+    if "joint" in document:
+        _tables(document["joint"])
     if "narx" in document.get("extra", {}):
         _narx(document["extra"]["narx"])
 

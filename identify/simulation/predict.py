@@ -136,7 +136,7 @@ def _foreseen(model: Muscle, record: Record, problem: Problem, theta: np.ndarray
 
 def unforeseen(model: Muscle) -> dict[str, tuple[float, float]]:
     """What cannot be foreseen on another record, by effect: its mean in the fitted rows of its own, which stays as a
-    zero, and its root mean square there (a zero may also be where it began), N·m; 0 where an older version is silent.
+    zero, and its root mean square there (a zero may also be where it began), N·m.
     """
     told = {e["id"]: e.get("unforeseen", {}) for e in model.effects if not find_effect(e["id"]).predictable}
     return {effect: (said.get("mean_nm", 0.0), said.get("rms_nm", 0.0)) for effect, said in told.items()}
@@ -172,7 +172,7 @@ def problem_of(
         sign=float(settings.get("sign", 1.0)),
         reference_s=float(settings.get("reference_s", 0.0)),
         angle_late_s=float(settings.get("angle_late_s", 0.0)),
-        **_own_angles(model, own_record, settings),
+        **_own_angles(model, settings),
         states={} if own_record else states_of(model),
     )
     acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]
@@ -222,14 +222,14 @@ def sensor_cost_nm(problem: Problem, theta: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(again))))
 
 
-def _own_angles(model: Muscle, own_record: bool, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The reference angle and the range of fitted angles; a model of an older version knows them of its own record.
+def _own_angles(model: Muscle, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The reference angle and the range of fitted angles.
 
     Raises BadModel: the model depends on the joint and does not say at which angle its curve holds.
     """
     if "reference_rad" in settings:
         return {"reference_rad": settings["reference_rad"], "angle_range_rad": angle_range(settings)}
-    if depend_on_joint(entry["id"] for entry in model.effects) and not own_record:
+    if depend_on_joint(entry["id"] for entry in model.effects):
         message = "the model does not say at which angle its curve holds"
         raise BadModel(message, place="effects.0.settings.reference_rad", fix="Fit its record again with this version.")
     return {}

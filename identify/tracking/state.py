@@ -123,15 +123,15 @@ class State:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> State:
         """The state that `to_dict` wrote."""
-        odd = data.get("odd")
+        odd = data["odd"]
         return cls(
             np.array(data["mean"], float),
             np.array(data["covariance"], float),
             int(data["trials"]),
             None if odd is None else np.array(odd, float),
             int(data["unexplained"]),
-            dict(data.get("effects") or {}),  # not in rows of older versions
-            data.get("ended_s"),
+            dict(data["effects"]),
+            data["ended_s"],
         )
 
 
