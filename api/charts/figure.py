@@ -1,8 +1,8 @@
 """What all figures are made of: colours by what a line means, axes, lines, shades, words under the pointer.
 
 A figure holds `var(--name)`: a page's stills take the value from the style sheet, its scripts look it up when they
-draw, and what has no style sheet (a notebook, a printed sheet) takes `LIGHT`. `tests/api/test_colours.py` computes that
-everybody tells them apart.
+draw, and what has no style sheet (a notebook, a printed sheet) takes `LIGHT`. `tests/api/test_colours.py`
+computes their contrast.
 """
 
 from __future__ import annotations

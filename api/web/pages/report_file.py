@@ -22,20 +22,10 @@ def comparison_html(
     test: dict[str, Any] | None = None,
     comparison: dict[str, Any] | None = None,
 ) -> str:
-    """Measurement against model: where it fails, and by how much.
+    """Write measurement against model: where it fails, and by how much.
 
-    Parameters
-    ----------
-    document : dict
-        MODEL.json.
-    curves : dict
-        As `stimrig.api.workers.curves.curves` gives them.
-    name : str
-        What was measured: a file's or a test's name.
-    test : dict or None
-        The test as the service shows it.
-    comparison : dict or None
-        As `identify.compare` gives it, cleaned and thinned.
+    `document` is a MODEL.json, `curves` as `stimrig.api.workers.curves.curves` gives them, `name` a file's or a test's,
+    `test` as the service shows it, `comparison` as `identify.compare` gives it, cleaned and thinned.
     """
     judged, held = stored_model.quality(document), explanation.held_free(document)
     return _page(
@@ -64,18 +54,10 @@ def comparison_html(
 def diagnosis_html(
     diagnosis: dict[str, Any], comparison: dict[str, Any], segments: list[dict[str, Any]], name: str
 ) -> str:
-    """What the page shows of what is missing, as a file.
+    """Write what is missing, as the page shows it.
 
-    Parameters
-    ----------
-    diagnosis : dict
-        As `stimrig.api.workers.verbs.diagnosis` gives it.
-    comparison : dict
-        Of the examined model with the record, thinned.
-    segments : list of dict
-        The record's, as `stimrig.api.workers.curves.runs` gives them.
-    name : str
-        The record's.
+    `diagnosis` is as `stimrig.api.workers.verbs.diagnosis` gives it, `comparison` of the examined model with the
+    record, thinned, `segments` as `stimrig.api.workers.curves.runs` gives them.
     """
     view = explanation.view(diagnosis, comparison, [])
     return _page(
@@ -102,20 +84,10 @@ def story_html(
     told: dict[str, Any], before: dict[str, Any], after: dict[str, Any], name: str,
     refused: Sequence[dict[str, Any]] = (), structure: str = "",
 ) -> str:  # fmt: skip
-    """The story as a file.
+    """Write the story, as `stimrig.api.models.story.story` gives it.
 
-    Parameters
-    ----------
-    told : dict
-        As `stimrig.api.models.story.story` gives it.
-    before, after : dict
-        ``curves`` and ``comparison`` of the first model and of the last one.
-    name : str
-        The record's.
-    refused : sequence of dict
-        What was tried and not added.
-    structure : str
-        What it was begun with.
+    `before` and `after` are curves and comparison of the first model and of the last one, `refused` what was tried and
+    not added, `structure` what it was begun with.
     """
     figures = story_charts.story_figures(told, before, after)
     shown = {"story": told, "figures": figures, "refused": refused, "structure": structure}
