@@ -4,6 +4,7 @@ SHELL := /bin/bash
 VENV := .venv
 BIN := $(VENV)/bin
 export PYTHONUNBUFFERED = 1
+export PYTHONDONTWRITEBYTECODE = # empty: the processes of a test run share what is compiled
 
 .PHONY: docs demo test frozen check lint types serve bench soak campaigns mutation lock clean help setup setup-test simulate
 

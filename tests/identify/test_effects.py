@@ -175,12 +175,13 @@ def test_an_effect_with_spoiled_parameters_is_refused_or_predicts(effect: str, m
         good = started(form, moving)
         if len(good) > 9:
             continue
-        model = Model.from_dict(with_effect(plain, effect, form.name, good))
+        angles = {"reference_rad": 1.5, "angle_range_rad": [0.5, 2.5]} if registry()[effect].moves_with_joint else {}
+        model = Model.from_dict(with_effect(plain, effect, form.name, good, **angles))
         assert np.isfinite(model.predict(moving)).all()
         refused = 0
         for parameters in spoiled(good):
             try:
-                model = Model.from_dict(with_effect(plain, effect, form.name, parameters))
+                model = Model.from_dict(with_effect(plain, effect, form.name, parameters, **angles))
             except BadModel as error:
                 refused += 1
                 assert "\n" not in str(error) and "is not a number from" in str(error)
