@@ -86,7 +86,7 @@ def test_a_stop_gets_through_where_only_the_state_is_not_heard_of(tab: Any, serv
     expected(doubt(tab)).to_contain_text("has not answered")
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
-    assert service.rig.state == "latched"
+    soon(lambda: service.rig.state == "latched")
     service.rig.speed = 30.0
 
 
