@@ -256,3 +256,12 @@ def test_what_improving_ends_with_lacks_nothing(hidden):
         model = identify.improve(record).models[-1]
         assert [effect["id"] for effect in model.effects] == [hidden]
         assert identify.diagnose(record, model).verdict == "nothing_missing"
+
+
+def test_nothing_missing_names_no_worst_place_and_says_when_the_record_is_too_poor_to_tell(results):
+    found = dataclasses.replace(results["diagnosis"], verdict="nothing_missing", missing=(), notes=())
+    base = {**found.base, "held_out_rms_nm": found.noise_sd_nm}
+    calm = str(dataclasses.replace(found, base=base))
+    assert "error in" not in calm and "may show what is missing" not in calm
+    poor = str(dataclasses.replace(found, base={**base, "held_out_rms_nm": 20 * found.noise_sd_nm}))
+    assert "may show what is missing" in poor

@@ -423,3 +423,12 @@ def test_whatever_is_pressed(
         assert (action == "down") == (width_us < now_us) and (action == "repeat") == (width_us == now_us)
         calibration.played(width_us, 0.1, ended(20))
         now_us = width_us
+
+
+def test_fine_is_fine_wherever() -> None:
+    calibration = stepped(last=known())
+    play(calibration, UP)
+    assert calibration.next_width_us("fine") == 46
+    assert stepped(last=known()).next_width_us("fine") == 10
+    strong = stepped(step_us=25.0, current_ma=100.0)
+    assert strong.next_width_us("fine") == strong.status().step_us == 10, "and the step that is told is the one taken"

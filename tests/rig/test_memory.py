@@ -24,6 +24,19 @@ from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 from tests.simulator.world import World
 
 
+def test_the_latch_is_remembered(tmp_path: Path):
+    machine = VirtualMachine()
+    latch = LatchFile(tmp_path, machine)
+    assert machine.run(latch.read()) == (None, "")
+    machine.run(latch.write("running", "test 7"))
+    assert machine.run(LatchFile(tmp_path, machine).read()) == ("running", "test 7")
+    machine.run(latch.write("latched", "electrode"))
+    assert machine.run(LatchFile(tmp_path, machine).read()) == ("latched", "electrode")
+    machine.run(latch.clear())
+    machine.run(latch.clear())
+    assert machine.run(latch.read()) == (None, "")
+
+
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"state": "running"}', "\udcff"])
 def test_a_latch_that_cannot_be_read_counts_as_a_test_that_ran(tmp_path: Path, content: str):
     (tmp_path / "latch.json").write_bytes(content.encode("utf-8", "surrogateescape"))
@@ -40,6 +53,14 @@ def test_what_is_asked_for_first_is_written_first_however_slow_the_disk_is(tmp_p
     machine.run(machine.tasks.join(tasks[-1]))
     assert machine.clock.now_s() == pytest.approx(1000.9)
     assert '"electrode"' in (tmp_path / "latch.json").read_text()
+
+
+def test_one_rig_a_folder(tmp_path: Path):
+    held = Files().lock(tmp_path)
+    with pytest.raises(BusyError, match="another rig"):
+        Files().lock(tmp_path)
+    held.close()
+    Files().lock(tmp_path).close()
 
 
 def test_a_fast_clock_runs_faster():
@@ -65,6 +86,8 @@ PULSE_S = 900.0
 
 
 class Kept:
+    """The rest of one process on a folder."""
+
     def __init__(self, folder: Path, now_s: float = 1000.0, unix_s: float = 1_700_000_100.0, boot: str = "a") -> None:
         self.machine = VirtualMachine(VirtualClock(now_s, unix_s))
         self.machine.boot_id = boot
@@ -86,6 +109,7 @@ class Kept:
 
 @pytest.fixture
 def left(tmp_path: Path) -> Path:
+    """A folder with which a pulse was sent."""
     Kept(tmp_path, PULSE_S).pulse_at(PULSE_S)
     return tmp_path
 
@@ -105,16 +129,22 @@ def test_a_death_counts_from_now_and_anew_until_the_device_has_answered(left: Pa
 @pytest.mark.parametrize(
     "content",
     [
-        "", "[]", "{", "null", '{"boot_id": "a"}', '{"boot_id": "a", "monotonic_s": 5}',
+        "", "[]", "{", "null", '{"boot_id": "a"}', '{"boot_id": "another", "monotonic_s": 5}',
+        '{"boot_id": "", "monotonic_s": 5}', '{"boot_id": "a", "monotonic_s": NaN}',
+        '{"boot_id": "a", "monotonic_s": 1e9}', '{"boot_id": "a", "monotonic_s": -5}',
         '{"boot_id": "a", "monotonic_s": 5, "ended": false}', '{"boot_id": "another", "monotonic_s": 5, "ended": true}',
         '{"boot_id": "a", "monotonic_s": 1e9, "ended": true}', '{"boot_id": "a", "monotonic_s": NaN, "ended": true}',
-        '{"boot_id": "a", "monotonic_s": -5, "ended": true}',
     ],
 )  # fmt: skip
 def test_what_is_in_doubt_counts_from_now(tmp_path: Path, content: str):
     (tmp_path / "last-pulse.json").write_text(content)
     assert Kept(tmp_path).recalled() == 1000.0
     assert json.loads((tmp_path / "last-pulse.json").read_text())["monotonic_s"] == 1000.0
+
+
+@pytest.mark.parametrize("boot", ["", "b"])
+def test_a_machine_of_another_boot_or_one_that_does_not_tell_it_is_in_doubt(left: Path, boot: str):
+    assert Kept(left, boot=boot).recalled() == 1000.0
 
 
 def test_a_folder_of_an_older_version_is_in_doubt_and_a_fresh_one_is_not(tmp_path: Path):
