@@ -101,9 +101,7 @@ class Folder:
                     if item.is_dir(follow_symlinks=False):
                         if not item.name.startswith("."):
                             yield from self._within(item.path)
-                    elif (
-                        is_record(item.name, exported) and item.is_file()
-                    ):  # a link to a file counts; a pipe would never end
+                    elif is_record(item.name, exported) and item.is_file():  # a link counts; a pipe would never end
                         yield self._entry(Path(item.path))
         except OSError:  # opened as a record it gives the reason, as its row
             yield Entry(_sound(folder), _sound(Path(folder).name), folder, known={"origin": _sound(self.path)})

@@ -84,11 +84,11 @@ class ServiceLock:
                     self.tell(self._address)
             if self._database is not None:
                 self._database.take()
-        except SQLAlchemyError as error:
-            log.warning("the database does not answer: %s", error)
-        except (HeldError, OSError) as error:
+        except HeldError as error:
             log.critical("this service ends: %s", error)
             os.kill(os.getpid(), signal.SIGTERM)
+        except (SQLAlchemyError, OSError) as error:  # it is looked at again after `KEEP_S`
+            log.warning("whether the lock is still held cannot be seen: %s", error)
 
     def release(self) -> None:
         """Let go."""
