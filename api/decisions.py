@@ -38,8 +38,8 @@ DECISIONS = (
       for word in ("archive", "unarchive", "recordings", "calibration", "keys")),
     Decision("POST", "/v1/tests", PERSON, f"{OF_PERSON}/tests"),
     *(Decision("POST", f"{CALIBRATION}/{path}", CALIBRATION, f"{OF_PERSON}/calibration/{form}", "calibration")
-      for path, form in (("step", "step/{direction}"), ("mark", "mark/{threshold}"), ("finish", "finish"))),
-    Decision("POST", "", CALIBRATION, f"{OF_PERSON}/calibration/discard", "calibration"),
+      for path, form in (("step", "step/{direction}"), ("mark", "mark/{threshold}"), ("finish", "finish"),
+                           ("discard", "discard"))),
     Decision("POST", f"{PERSON}/notes/{{note_id}}/strike", f"{PERSON}/notes", f"{OF_PERSON}/notes/{{note_id}}/strike"),
     Decision("PUT", "/v1/tests/{test_id}/ran-by", "/v1/tests/{test_id}", "/tests/{test_id}/ran-by"),
     Decision("POST", "/v1/rearm", "/v1/rig", "/rearm", "latch"),

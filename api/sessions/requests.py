@@ -299,12 +299,6 @@ class MarkIn(Body):
     threshold: Literal["sensory", "motor", "comfort"]
 
 
-class FinishIn(Body):
-    """The end of a calibration."""
-
-    discard: bool = False
-
-
 class NoteIn(Body):
     """A note on a participant's session, on a test, or at a time in a test."""
 

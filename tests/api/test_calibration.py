@@ -47,7 +47,7 @@ def test_limits_are_the_rigs_and_discarding_keeps_the_old_profile(client: httpx.
     answers = [client.post(f"{WHERE}/step", json={"direction": "up"}) for _ in range(5)]
     assert [answer.status_code for answer in answers] == [202] * 4 + [422]
     assert "above the hard limit" in answers[-1].json()["detail"]
-    assert client.post(f"{WHERE}/finish", json={"discard": True}).json()["profile"] is None
+    assert client.post(f"{WHERE}/discard").json()["profile"] is None
     assert client.get("/v1/participants/P017").json()["profile"] == before
 
 
@@ -136,7 +136,7 @@ def test_lowered_limits_end_an_open_calibration_and_stay(client: httpx.Client, s
         client.post(WHERE, json={"current_ma": 19})
         assert up(client).status_code == 202 and client.put(PROFILE, json=asked).status_code == 200
         assert up(client).status_code == 409, asked
-        client.post(f"{WHERE}/finish", json={"discard": True})
+        client.post(f"{WHERE}/discard")
     client.post(WHERE, json={"current_ma": 19})
     mark_all(client)
     lowered = client.put(PROFILE, json=LOWER)
@@ -152,7 +152,7 @@ def test_lowered_limits_end_an_open_calibration_and_stay(client: httpx.Client, s
     assert "Discard it" in client.get(WHERE).json()["outdated"]
     kept = lowered.json()["profile"]
     assert client.get("/v1/participants/P017").json()["profile"] == kept
-    assert client.post(f"{WHERE}/finish", json={"discard": True}).status_code == 200
+    assert client.post(f"{WHERE}/discard").status_code == 200
     assert client.get("/v1/participants/P017").json()["profile"] == kept
     anew = client.post(WHERE)
     assert anew.status_code == 201 and not anew.json()["outdated"] and up(client).status_code == 202
@@ -179,7 +179,7 @@ def test_one_that_the_service_did_not_begin_is_discarded_alone(
     other = f"{stamp}-{drawn}{end.format(entry)}"
     service.rig.calibration = known.model_copy(update={"calibration_id": other})
     assert problem(up(client), 409) and problem(client.post(f"{WHERE}/finish"), 409)
-    assert client.post(f"{WHERE}/finish", json={"discard": True}).status_code == 200
+    assert client.post(f"{WHERE}/discard").status_code == 200
 
 
 def test_a_change_waits_for_the_step_on_its_way_and_the_next_one_sees_it(

@@ -30,7 +30,7 @@ def page(browser: Any, service: Service) -> Iterator[Any]:
         tab.wait_for_load_state()  # its keys are listened to from here on
         yield tab
         with service.client() as http:
-            http.post("/v1/participants/K1/calibration/finish", json={"discard": True})
+            http.post("/v1/participants/K1/calibration/discard")
 
 
 def widths(service: Service) -> list[float]:
@@ -145,7 +145,7 @@ def test_a_service_that_does_not_answer_is_told_and_no_button_works(page: Any, s
 def test_another_calibration_that_comes_under_the_hand_is_read_first(page: Any, service: Service) -> None:
     press(page, "ArrowUp", 1)
     with service.client() as http:
-        http.post("/v1/participants/K1/calibration/finish", json={"discard": True})
+        http.post("/v1/participants/K1/calibration/discard")
         http.post("/v1/participants/K1/calibration")
     page.evaluate("""() => { window.pressable = []; new MutationObserver(() => {
         const box = document.getElementById("discard"), part = document.getElementById("calibration");

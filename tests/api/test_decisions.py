@@ -183,7 +183,7 @@ CASES = {
     "finish": Case(another_train, {"discard": False}, {}, World.marked, TRAIN.page, TRAIN.words),
     "discard": Case(
         lambda world: [
-            world.colleague.post(f"/v1/participants/{world.code}/calibration/finish", json={"discard": True}),
+            world.colleague.post(f"/v1/participants/{world.code}/calibration/discard"),
             world.colleague.post(f"/v1/participants/{world.code}/calibration", json={}),
         ][-1], None, {}, TRAIN.ready, TRAIN.page, "colleague has begun another calibration"),
     "keys": Case(World.lower, {name: text if name == "name" else int(text) for name, text in KEY.items()}, KEY),
@@ -205,7 +205,7 @@ shared = shared_service()
 def world(shared: Service, request: pytest.FixtureRequest) -> Iterator[World]:
     made = World.made(shared, f"P{abs(hash(request.node.name)) % 10**9}")
     yield made
-    made.me.post(f"/v1/participants/{made.code}/calibration/finish", json={"discard": True})
+    made.me.post(f"/v1/participants/{made.code}/calibration/discard")
     shared.rig.arm.way = None
     shared.rig.become(shared.rig.state, shared.rig.reason)
 

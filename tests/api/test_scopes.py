@@ -39,6 +39,7 @@ POST   /rig/acted                                          anyone         204
 GET    /locked                                             anyone         303
 POST   /unlock                                             anyone         303
 POST   /lock                                               anyone         303
+POST   /v1/sessions/acted                                  anyone         204
 POST   /v1/sessions/lock                                   anyone         409
 POST   /v1/sessions/unlock                                 anyone         422
 GET    /v1/sequences                                       anyone         200
@@ -96,6 +97,8 @@ POST   /v1/participants/x/calibration                      run-test       428
 POST   /v1/participants/x/calibration/step                 run-test       428
 POST   /v1/participants/x/calibration/mark                 run-test       428
 POST   /v1/participants/x/calibration/finish               run-test       428
+POST   /v1/participants/x/calibration/discard              run-test       428
+DELETE /v1/participants/x/keys/x                           run-test       404
 POST   /v1/tests                                           run-test       428
 POST   /v1/tests/x/keep-plain                              run-test       404
 POST   /tests/x/keep-plain                                 run-test       404

@@ -277,7 +277,7 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         assert program.post("/v1/tests", json=start).status_code == 409
         assert program.post(calibration).status_code == 409
         seen = {"If-Match": '"C1-1.0"'}
-        assert program.post(f"{calibration}/finish", json={"discard": True}, headers=seen).status_code == 404
+        assert program.post(f"{calibration}/discard", headers=seen).status_code == 404
         assert program.post(f"{calibration}/step", json={}, headers=seen).status_code == 404
         assert program.get("/v1/rig").json()["state"] == "latched" and service.rig.starts == 0
         assert "I have checked" in browser.get("/").text

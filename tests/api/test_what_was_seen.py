@@ -122,7 +122,7 @@ def test_a_waiting_result_is_let_go_by_who_saw_it(service: Service, client: http
     missing = client.get(at)
     assert missing.status_code == 404 and missing.headers["etag"] == f'"{found["calibration_id"]}.0"'
     for tag, status in (('"C20200101T000000-000000-1.3"', 409), (missing.headers["etag"], 200)):
-        sent = client.post(f"{at}/finish", json={"discard": True}, headers={"If-Match": tag})
+        sent = client.post(f"{at}/discard", headers={"If-Match": tag})
         assert sent.status_code == status, sent.text
         assert (status == 409) == ("has begun another calibration since this page" in sent.text)
     assert service.rig.calibrated is None

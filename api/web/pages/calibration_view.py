@@ -15,7 +15,7 @@ from fastapi.responses import RedirectResponse, Response
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.questions import Question, Row
-from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
+from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
 from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
@@ -172,7 +172,7 @@ async def finish(request: Request, context: Ctx, who: Tester, code: str) -> Resp
 @router.post("/discard")
 async def discard(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Leave everything as it was; however many trains were sent."""
-    done = calibration.finish_calibration(context, who, code, FinishIn(discard=True))
+    done = calibration.discard_calibration(context, who, code)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 

@@ -15,7 +15,7 @@ from sqlalchemy.orm import Session
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.playing import refuse_archived
-from stimrig.api.sessions.requests import CalibrationIn, FinishIn, MarkIn, StepIn
+from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
 from stimrig.api.store import audit, seen
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
 from stimrig.api.web.responses.base import describe_answer
@@ -230,10 +230,19 @@ async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response:
 
 
 @router.post("/finish", **describe_answer(CalibratedOut))
-async def finish_calibration(context: Ctx, who: Tester, code: str, body: FinishIn | None = None) -> dict[str, Any]:
-    """Close it: the profile holds until the end of the day; `discard` leaves the old one."""
-    # The rig keeps what was found until it is stored here: where that fails, finishing again stores it.
-    discard = bool(body and body.discard)
+async def finish_calibration(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
+    """Close it: the profile holds until the end of the day."""
+    return await close(context, code, who.name)
+
+
+@router.post("/discard", **describe_answer(CalibratedOut))
+async def discard_calibration(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
+    """Close it and keep the profile of before; however many trains were sent."""
+    return await close(context, code, who.name, discard=True)
+
+
+async def close(context: Context, code: str, by: str, discard: bool = False) -> dict[str, Any]:
+    """Close a calibration. The rig keeps the result until it is stored here: where that fails, finish it again."""
     async with context.limits_lock:
         waits = await _waiting(context, code)
         if waits is None:
@@ -244,9 +253,9 @@ async def finish_calibration(context: Ctx, who: Tester, code: str, body: FinishI
             identity = waits.calibration_id
             if (sent := seen.sent.get()) and sent.partition(".")[0] != identity:
                 raise another_calibration(waits.by)
-        request = requests.CalibrateFinishRequest(by=who.name, discard=discard, calibration_id=identity)
+        request = requests.CalibrateFinishRequest(by=by, discard=discard, calibration_id=identity)
         result = await context.rig.ask_for(messages.CalibrationResult, request)
-        profile = await asyncio.to_thread(_store, context, code, result, who.name, identity)
+        profile = await asyncio.to_thread(_store, context, code, result, by, identity)
         with contextlib.suppress(ApiError):  # it is stored, whatever the rig says now
             await context.rig.ask(requests.CalibrateStoredRequest(calibration_id=identity))
             await context.rig.fresh_status()

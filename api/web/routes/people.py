@@ -19,7 +19,7 @@ from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import TokenIn
 from stimrig.api.store import audit, seen
 from stimrig.api.store.tables import AuditEntry, Token
-from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Approver, Context, Ctx, EvenLocked
+from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Approver, Context, Ctx, EvenLocked, Tester
 from stimrig.api.web.guards import local, same_origin, set_cookie
 from stimrig.api.web.openapi import TOO_MANY
 from stimrig.api.web.responses.base import describe_answer
@@ -160,6 +160,11 @@ async def lock(context: Ctx, who: Anyone) -> None:
     await asyncio.to_thread(context.auth.idle.lock, who.page_session.hash, who.name)
 
 
+@router.post("/sessions/acted", status_code=204)
+async def acted(_who: Anyone) -> None:
+    """Note that a person has typed or moved the pointer on a page: its session is not idle."""
+
+
 @router.post("/sessions/unlock", status_code=204)
 async def unlock(context: Ctx, who: EvenLocked, body: ConfirmIn) -> None:
     """Unlock this session by its person's password, or by the token that it was opened with."""
@@ -191,11 +196,18 @@ def participant_key(context: Ctx, who: Approver, code: str, body: KeyFor) -> dic
     """A key with which a controller plays trials of one participant until the end of the day, within a plan.
 
     Who makes it holds `run-test`, `read-live` and `read-model`, too, and answers for what it plays. Its text is shown
-    this once. The participant's page revokes it, and for an administrator `DELETE /v1/tokens/{id}`.
+    this once. `DELETE /v1/participants/{code}/keys/{id}` revokes it.
     """
     text, row = key_of(context, who, code, body)
     told = {name: getattr(row, name) for name in ("name", "prefix", "scopes", "expires_utc", "participant", "plan")}
     return {"key": text, "id": row.hash[:16], **told}
+
+
+@router.delete("/participants/{code}/keys/{key_id}", status_code=204)
+def revoke_participant_key(context: Ctx, who: Tester, code: str, key_id: str) -> None:
+    """Revoke a key of a participant; its trial ends at once."""
+    if not controllers.revoke_key(context.auth, code, key_id, who.name):
+        raise NotFoundError("key", key_id, f"The page of {code} lists its keys.")
 
 
 def key_of(context: Context, who: Principal, code: str, body: KeyFor) -> tuple[str, Token]:
