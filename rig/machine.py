@@ -119,6 +119,10 @@ class Disk(Protocol):
         """A new, locked file whose name survives a power failure. Raises OSError, also if it exists."""
         ...
 
+    def is_written(self, path: Path) -> bool:
+        """Whether a process, be it another rig's, has it open as `create` gave it."""
+        ...
+
     def read(self, path: Path) -> bytes:
         """Raises OSError."""
         ...

@@ -35,6 +35,16 @@ class Files:
     def create(self, path: Path) -> LogFile:
         return LogFile(path)
 
+    def is_written(self, path: Path) -> bool:
+        try:
+            with path.open("rb") as file:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except OSError:  # reading it tells why
+            return False
+        return False
+
     def read(self, path: Path) -> bytes:
         return path.read_bytes()
 

@@ -19,7 +19,7 @@ from stimrig.rig.acquire.run import RunResult
 from stimrig.rig.assembly import Recording
 from stimrig.rig.config import RigConfig
 from stimrig.rig.control.live import finite
-from stimrig.rig.errors import JournalError, PlanError, RecordingError
+from stimrig.rig.errors import BusyError, JournalError, PlanError, RecordingError
 from stimrig.rig.journal import Journal, JournalContents, Kind
 from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.machine import Log, Machine
@@ -320,12 +320,15 @@ class RecordingStore:
         """Seal the journals that a crash or a full disk left; a journal with nothing to seal is renamed, never deleted.
 
         `reason`: why it was left; used for journals that do not say how the test ended.
+        Raises BusyError: another rig writes one; `rig.lock` may have been removed. Then none is touched.
         """
+        names = [name for name in self._disk.names(self.journals) if name.endswith(".journal")]
+        for path in (self.journals / name for name in names):
+            if self._disk.is_written(path):
+                raise BusyError(f"journal {path}: another rig writes it; stop that rig first")
         events = []
-        for name in self._disk.names(self.journals):
+        for name in names:
             path = self.journals / name
-            if path.suffix != ".journal":
-                continue
             log.warning("recovering %s", name)
             events.append(self._seal(path, path.stem, "fault", reason, {"recovered": True}, None))
             left = name in self._disk.names(self.journals)

@@ -22,7 +22,7 @@ from stimrig.rig import archive, assembly, journal, recover
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.assembly import _Pulses
 from stimrig.rig.control.sealing import RecordingStore
-from stimrig.rig.errors import JournalError, RecordingError
+from stimrig.rig.errors import BusyError, JournalError, RecordingError
 from stimrig.rig.journal import JournalContents, Kind
 from stimrig.rig.messages import SegmentPlan
 from tests.rig.fakes import VirtualRig, header, journal_at
@@ -258,6 +258,23 @@ def died(
     again = make(disk=disk, clock=live.clock)
     assert again.rig.status().state == "uncertain"
     return felt_uc, again.finished.summary
+
+
+def test_a_second_rig_whose_lock_was_removed_does_not_touch_a_journal_that_is_written(make: Make, tmp_path: Path):
+    live = make(disk=SimulatedDisk(World(0)))
+    disk: Any = live.machine.disk
+    live.start(live.plan("one", hold_s=1.0))
+    live.wait_pulses(PULSES)
+    disk._locked = False  # somebody removed rig.lock
+    with pytest.raises(BusyError, match="another rig writes it"):
+        make(disk=disk, clock=live.clock)
+    live.wait("ready")
+    assert (live.finished.outcome, live.finished.summary["warnings"]) == ("completed", [])
+    path = tmp_path / "one.journal"
+    log = Files().create(path)
+    assert Files().is_written(path)
+    log.close()
+    assert not Files().is_written(path)
 
 
 @pytest.mark.parametrize(

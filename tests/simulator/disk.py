@@ -44,6 +44,8 @@ class SimulatedDisk:
         """Each file that was to be replaced: when, its name, and whether the disk took it."""
         self.removed: list[tuple[float, str]] = []
         self._locked = False
+        self.written: set[Path] = set()
+        """Logs that are open."""
 
     @property
     def is_well(self) -> bool:
@@ -71,13 +73,18 @@ class SimulatedDisk:
     def process_ended(self) -> None:
         """Its locks are gone."""
         self._locked = False
+        self.written.clear()
 
     def create(self, path: Path) -> SimulatedLog:
         self._may_write(path)
         if path in self.files:
             raise error_of(errno.EEXIST, path)
         self.files[path] = _File()
+        self.written.add(path)
         return SimulatedLog(self, path)
+
+    def is_written(self, path: Path) -> bool:
+        return path in self.written
 
     def read(self, path: Path) -> bytes:
         if path not in self.files:
@@ -148,4 +155,5 @@ class SimulatedLog:
         self._disk.sync(self.path)
 
     def close(self) -> None:
+        self._disk.written.discard(self.path)
         self.sync()
