@@ -39,6 +39,8 @@ class Child:
     ready: dict[str, Any] = field(default_factory=dict)
     restarts: int = 0
     started_s: float = 0.0
+    inherits: tuple[int, ...] = ()
+    """Descriptors that it keeps open."""
     _log_start: int = 0
 
     def start(self) -> dict[str, Any]:
@@ -66,6 +68,7 @@ class Child:
                     stdout=subprocess.PIPE,
                     stderr=log,
                     env={**os.environ, **self.environment},
+                    pass_fds=self.inherits,
                     start_new_session=True,  # Ctrl-C reaches the launcher only, which ends them in order
                     preexec_fn=partial(die_with_parent, os.getpid(), mask),
                 )

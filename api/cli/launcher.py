@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import os
 import shutil
 import signal
 import sys
@@ -22,7 +23,7 @@ from stimrig.api import owner_only
 from stimrig.api.cli.child import ENDINGS, Child
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.settings import Settings
-from stimrig.api.store.service_lock import HeldError, refuse_if_held
+from stimrig.api.store.service_lock import INHERITED, HeldError, reserve
 
 SEAL_S = 35.0
 """The rig may still have a test to seal."""
@@ -70,6 +71,7 @@ class Services:
         attach: Path | None = None,
     ) -> None:
         self.settings, self.attached = settings, attach is not None
+        self._folder_lock: int | None = None
         self._endings = Endings()
         owner_only.folder(owner_only.folder(settings.data_dir) / settings.logs_dir.name)
         self.runtime = Path(tempfile.mkdtemp(prefix="stimrig-"))  # a Unix socket's path holds 107 characters only
@@ -120,15 +122,19 @@ class Services:
         """Start everything, the devices first."""
         data = str(self.settings.data_dir.absolute())
         try:
-            refuse_if_held(self.settings)
+            self._folder_lock = reserve(self.settings)
         except HeldError as error:
             raise LaunchError(str(error), 2) from error
+        if self._folder_lock is not None:  # all that is started holds it, until the last of them has ended
+            for child in filter(None, (self.emulator, self.rig, self.api)):
+                child.inherits = (self._folder_lock,)
         if self.emulator is not None:
             self.emulator.start()
         if not self.attached:
             self.rig.command += [*self._source(), "--socket", str(self.socket), "--data", data]
             self._start_rig()
         self.api.environment = {
+            INHERITED: "" if self._folder_lock is None else str(self._folder_lock),
             "STIMRIG_DATA_DIR": data,
             "STIMRIG_RIG_SOCKET": str(self.socket),
             "STIMRIG_HOST": self.settings.host,
@@ -184,4 +190,7 @@ class Services:
         self.api.end()
         if self.emulator is not None:
             self.emulator.end()
+        if self._folder_lock is not None:
+            os.close(self._folder_lock)
+            self._folder_lock = None
         shutil.rmtree(self.runtime, ignore_errors=True)

@@ -1,8 +1,9 @@
 """The lock of the one service of a data folder and a database: a second start is refused with one clear line.
 
-The data folder, and a SQLite database outside of it, are locked by `flock` on a file: the kernel releases it when the
-process ends. A PostgreSQL database is locked by an advisory lock that a connection of its own holds: the server
-releases it when the connection ends.
+The data folder itself, a file in it, and a file beside a SQLite database are locked by `flock`: the kernel releases a
+lock when the last process that holds it ends. The lock of the folder holds although lock files are removed. A
+PostgreSQL database is locked by an advisory lock that a connection of its own holds: the server releases it when the
+connection ends.
 """
 
 from __future__ import annotations
@@ -31,7 +32,10 @@ log = logging.getLogger("stimrig.store")
 SERVICE_KEY = 0x5354494D52494702
 """PostgreSQL's advisory lock of the service: "STIMRIG" and 2."""
 KEEP_S = 5.0
-"""Interval at which the service checks that it still holds the advisory lock."""
+"""Interval at which the service checks that it still holds its lock files and the advisory lock."""
+INHERITED = "STIMRIG_FOLDER_LOCK"
+"""Environment variable with the descriptor of the folder's lock, which the launcher passes to what it starts."""
+OTHER_FOLDER = "stop it, or take another folder: --data, STIMRIG_DATA_DIR"
 OTHER_DATABASE = "stop it, or take another database: STIMRIG_DATABASE_URL"
 
 
@@ -46,11 +50,13 @@ class ServiceLock:
     """
 
     def __init__(self, settings: Settings) -> None:
+        self._folder: int | None = None
         self._files: dict[Path, IO[str]] = {}
         self._address = "an address not known yet"
         self._database: DatabaseLock | None = None
         self._since_utc = Clock().utc()
         try:
+            self._folder = _lock_folder(owner_only.folder(settings.data_dir))
             for place, shown, fix in _lock_places(settings):
                 self._files[place] = _take_file(place, shown, fix)
             if settings.database.startswith("postgresql"):
@@ -96,6 +102,15 @@ class ServiceLock:
             self._files.popitem()[1].close()
         if self._database is not None:
             self._database.release()
+        if self._folder is not None:
+            os.close(self._folder)
+            self._folder = None
+
+    def release_all_but_folder(self) -> int | None:
+        """Release the rest; the descriptor that holds the folder's lock, which is the caller's to close from now on."""
+        folder, self._folder = self._folder, None
+        self.release()
+        return folder
 
 
 class DatabaseLock:
@@ -131,14 +146,40 @@ class DatabaseLock:
             self._connection = None
 
 
-def refuse_if_held(settings: Settings) -> None:
-    """Say at once, before devices are started, that another service holds the place. Raises HeldError."""
-    ServiceLock(settings).release()
+def reserve(settings: Settings) -> int | None:
+    """Lock the data folder before devices are started; the descriptor to pass on, None where folders cannot be locked.
+
+    Raises HeldError: another service holds the folder or the database.
+    """
+    return ServiceLock(settings).release_all_but_folder()
+
+
+def _lock_folder(folder: Path) -> int | None:
+    """Lock a folder, or use the lock that the launcher has passed on; its descriptor."""
+    given = os.environ.get(INHERITED, "")
+    with contextlib.suppress(OSError):
+        if given and os.path.samestat(os.fstat(int(given)), folder.stat()):
+            os.set_inheritable(int(given), False)
+            return int(given)
+    try:
+        opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise HeldError(f"{folder}: {error.strerror}; set STIMRIG_DATA_DIR to a folder this user may write") from error
+    try:
+        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(opened)
+        holder = _holder(folder / "service.lock")
+        raise HeldError(f"{folder}: another service runs on it: {holder}; {OTHER_FOLDER}") from None
+    except OSError:  # a network's file system: the lock files alone have to do
+        os.close(opened)
+        return None
+    return opened
 
 
 def _lock_places(settings: Settings) -> Iterator[tuple[Path, Path, str]]:
     folder = owner_only.folder(settings.data_dir)
-    yield folder / "service.lock", folder, "stop it, or take another folder: --data, STIMRIG_DATA_DIR"
+    yield folder / "service.lock", folder, OTHER_FOLDER
     try:
         url = make_url(settings.database)
     except ArgumentError:
@@ -163,7 +204,7 @@ def _take_file(place: Path, shown: Path, fix: str) -> IO[str]:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         with file:
-            raise HeldError(f"{shown}: another service runs on it: {_holder(file)}; {fix}") from None
+            raise HeldError(f"{shown}: another service runs on it: {_holder(place)}; {fix}") from None
     except OSError as error:
         file.close()
         raise HeldError(f"{place}: cannot be locked ({error.strerror}); take a folder on a local disk") from error
@@ -171,8 +212,8 @@ def _take_file(place: Path, shown: Path, fix: str) -> IO[str]:
     return file
 
 
-def _holder(file: IO[str]) -> str:
-    with contextlib.suppress(ValueError, KeyError, TypeError):
-        said = json.loads(file.read())
-        return f"process {said['pid']} on {said['host']}, since {said['since_utc']}, at {said['address']}"
-    return "it starts just now"
+def _holder(place: Path) -> str:
+    with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+        holder = json.loads(place.read_text("utf-8"))
+        return f"process {holder['pid']} on {holder['host']}, since {holder['since_utc']}, at {holder['address']}"
+    return "it starts just now, or its lock file was removed"

@@ -18,11 +18,12 @@ import httpx
 import pytest
 
 from stimrig.api.cli import main
+from stimrig.api.cli.child import Child
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.launcher import Services
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
-from stimrig.api.store.service_lock import HeldError, ServiceLock, refuse_if_held
+from stimrig.api.store.service_lock import INHERITED, HeldError, ServiceLock, reserve
 from stimrig.api.store.tables import Participant
 from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
 from tests.harness.looks_first import LooksFirst
@@ -100,19 +101,29 @@ def test_whichever_way_leads_to_it_it_is_held_once(tmp_path: Path) -> None:
     held(data_dir=two, database_url=f"sqlite:///{one}/stimrig.db").release()
 
 
-def test_a_removed_lock_file_is_locked_anew_or_the_service_ends(
+def test_a_removed_lock_file_lets_nobody_in_and_is_locked_anew(tmp_path: Path) -> None:
+    first = held(data_dir=tmp_path)
+    for lock in tmp_path.glob("*.lock"):
+        lock.unlink()
+    for refused in (held, lambda **given: reserve(Settings(**given))):
+        with pytest.raises(HeldError, match=f"{tmp_path}: another service runs on it"):
+            refused(data_dir=tmp_path)
+    first.keep()
+    assert {lock.name for lock in tmp_path.glob("*.lock")} == {"service.lock", "stimrig.db.lock"}
+    with pytest.raises(HeldError, match=f"process {os.getpid()} on"):
+        held(data_dir=tmp_path / ".." / tmp_path.name)
+    first.release()
+
+
+def test_a_service_whose_database_another_has_locked_meanwhile_ends(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     signals: list[int] = []
     monkeypatch.setattr(os, "kill", lambda _, number: signals.append(number))
-    first = held(data_dir=tmp_path)
-    (tmp_path / "service.lock").unlink()
-    first.keep()
-    with pytest.raises(HeldError, match="another service runs on it"):
-        held(data_dir=tmp_path)
-    for name in ("service.lock", "stimrig.db.lock"):
-        (tmp_path / name).unlink()
-    second = held(data_dir=tmp_path)
+    database = {"database_url": f"sqlite:///{tmp_path}/shared.db"}
+    first = held(data_dir=tmp_path / "one", **database)
+    (tmp_path / "shared.db.lock").unlink()
+    second = held(data_dir=tmp_path / "two", **database)
     second.keep()
     assert signals == []
     first.keep()
@@ -137,11 +148,38 @@ def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
 
 def test_serve_says_so_before_it_starts_a_rig(tmp_path: Path) -> None:
     first = held(data_dir=tmp_path)
+    for lock in tmp_path.glob("*.lock"):
+        lock.unlink()
     services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
     with pytest.raises(LaunchError, match="another service runs on it") as caught, services:
         pass
     assert caught.value.exit_code == 2 and services.emulator is not None and services.emulator.process is None
     first.release()
+
+
+def test_each_process_of_serve_is_started_under_the_lock_and_the_service_takes_it_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    begun: list[str] = []
+
+    def start(child: Child) -> dict[str, Any]:
+        with pytest.raises(HeldError, match="another service runs on it"):
+            held(data_dir=tmp_path)
+        begun.append(child.name)
+        if child.name == "api":
+            monkeypatch.setenv(INHERITED, str(os.dup(child.inherits[0])))
+            held(data_dir=tmp_path).release()
+            monkeypatch.delenv(INHERITED)
+        return child.ready
+
+    monkeypatch.setattr(Child, "start", start)
+    services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
+    services.api.ready = {"port": 1}
+    with services:
+        assert begun == ["emulator", "rig", "api"]
+        with pytest.raises(HeldError):
+            held(data_dir=tmp_path)
+    held(data_dir=tmp_path).release()
 
 
 def test_a_service_that_does_not_come_up_lets_go(tmp_path: Path) -> None:
@@ -197,6 +235,6 @@ def test_the_message_names_nobody_who_is_gone(tmp_path: Path) -> None:
     first.release()
     second = held(data_dir=tmp_path)
     with pytest.raises(HeldError) as caught:
-        refuse_if_held(Settings(data_dir=tmp_path))
+        held(data_dir=tmp_path)
     assert "1234" not in str(caught.value)
     second.release()
