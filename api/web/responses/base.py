@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, cast, get_type_hints
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, WithJsonSchema, create_model
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, WithJsonSchema
 
 from stimrig.api.schemas import component_name
 from stimrig.api.sessions.requests import SETTINGS
@@ -15,16 +15,6 @@ class Document(BaseModel):
     """Base of all answers; newer versions may add fields."""
 
     model_config = ConfigDict(extra="allow")
-
-
-def fields_of(document: type, *without: str) -> type[Document]:
-    """The fields of a client's document (`stimrig.api.client.documents`), each with the text that stands beside it."""
-    fields = {
-        name: (hint, Field(description=next(iter(getattr(hint, "__metadata__", ())), None)))
-        for name, hint in get_type_hints(document, include_extras=True).items()
-        if name not in without
-    }
-    return create_model(document.__name__, __base__=Document, **cast("dict[str, Any]", fields))
 
 
 class FieldProblem(Document):

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue
 
-from stimrig.api.client import documents
-from stimrig.api.web.responses.base import Document, Problem, SegmentOut, fields_of
+from stimrig.api.web.responses.base import Document, Problem, SegmentOut
 
 
 class ParameterOut(Document):
@@ -51,19 +50,34 @@ class TrackingLimits(Document):
     time_scale_percent: float
 
 
-class VersionOut(fields_of(documents.Version)):
-    """One model version."""
+class VersionOut(Document):
+    """One model version: its errors, its verdict, and where it comes from."""
 
-    carried_from_id: str | None = Field(
-        None, description="the model of an earlier session whose structure this version has"
-    )
-    carried: CarriedOut | None = Field(None, description="what the recording said of that structure")
-    figures: dict[str, ParameterOut] = Field(
-        {}, description="threshold, plateau, dynamics and effects; empty: stored before they were"
-    )
-    tracking: TrackingLimits | None = Field(
-        None, description="how far it may be tracked; null: not approved, or before it could be"
-    )
+    id: str
+    participant: str
+    recording_id: str
+    parent_id: str | None = Field(description="the version it was made from")
+    added_effect: str | None = Field(description="what it holds more than that one")
+    carried_from_id: str | None = Field(description="the model of an earlier session whose structure this version has")
+    carried: CarriedOut | None = Field(description="what the recording said of that structure")
+    method: str
+    effects: list[str]
+    without_evidence: list[str] = Field(description="those of them that a person added without evidence")
+    fit_percent: float | None
+    ceiling_percent: float | None = Field(description="what the noise allows, %")
+    held_out_fit_percent: float | None = Field(description="null: nothing is held out, or the torque is level there")
+    rms_nm: float | None
+    held_out_rms_nm: float | None
+    noise_sd_nm: float | None
+    figures: dict[str, ParameterOut] = Field(description="threshold, plateau, dynamics and effects")
+    verdict: Literal["usable", "usable with care", "not usable", "unknown"]
+    words: str = Field(description="the verdict in one sentence")
+    reasons: list[str] = Field(description="what speaks against the model, worst first")
+    decision: Literal["approved", "rejected"] | None
+    undone: bool = Field(description="the decision is an undo")
+    tracking: TrackingLimits | None = Field(description="how far it may be tracked; null: not approved")
+    served: bool = Field(description="the controller gets this one")
+    created_utc: str
 
 
 class Place(Document):
@@ -86,16 +100,6 @@ class Part(Document):
     share_of_excess: float
 
 
-class By(Document):
-    """The error split up."""
-
-    segment: list[Part]
-    level: list[Part]
-    direction: list[Part]
-    time: list[Part]
-    frequency: list[Part]
-
-
 REPETITION = "what repeats in the recording, and how much of that the model explains; null: from an older version"
 
 
@@ -109,7 +113,9 @@ class ComparisonOut(Document):
     rms_nm: float | None
     noise_sd_nm: float | None
     repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
-    by: By | None = None
+    by: dict[Literal["segment", "level", "direction", "time", "frequency"], list[Part]] | None = Field(
+        None, description="the error split up"
+    )
     where: list[Place] = Field([])
     series: dict[str, list[JsonValue] | float | str | None] = Field(
         default={}, description="curves for drawing, thinned, by name, and `noise_band_nm`, N·m"
@@ -183,9 +189,20 @@ class ImprovementOut(Document):
     versions: list[VersionOut] = Field(description="the versions of these steps, the first one included")
 
 
-class JobOut(fields_of(documents.Job)):
-    """Long work: how far, and how long yet."""
+class JobOut(Document):
+    """Long work in the service: how far it is, how long it will take, and the address of its result."""
 
+    id: str
+    kind: str
+    model_id: str | None = Field(description="of which it is; null of `fit-recordings`")
+    participant: str | None = Field(description="of `fit-recordings`")
+    state: Literal["running", "completed", "failed", "cancelled"]
+    done: bool
+    progress: float
+    text: str
+    elapsed_s: float
+    time_left_s: float | None
+    result_url: str | None
     problem: Problem | None
 
 
@@ -197,13 +214,6 @@ class SegmentSpan(Document):
     end_s: float
 
 
-class StepResponse(Document):
-    """The linear part's answer to a unit step."""
-
-    time_s: list[float]
-    response: list[float] = Field(description="N·m for a step of 1 N·m")
-
-
 class CurvesOut(Document):
     """Curves thinned to what a screen shows, all of one length."""
 
@@ -212,7 +222,9 @@ class CurvesOut(Document):
     predicted_torque_nm: list[float | None] = Field(description="the model's free run, N·m")
     pulse_width_us: list[float] = Field(description="commanded, µs")
     segments: list[SegmentSpan]
-    step_response: StepResponse
+    step_response: dict[Literal["time_s", "response"], list[float]] = Field(
+        description="of the linear part to a step of 1 N·m, N·m"
+    )
 
 
 class PredictionOut(Document):
@@ -344,12 +356,10 @@ class LevelOut(Document):
     high: float
 
 
-class LevelsOut(Document):
-    """What is tracked, relative to the approved model."""
-
-    gain: LevelOut = Field(description="factor on the approved curve")
-    threshold_shift_us: LevelOut = Field(description="by which the curve has moved to wider pulses, µs")
-    time_scale: LevelOut = Field(description="factor on the approved time constant")
+Levels = Annotated[
+    dict[Literal["gain", "threshold_shift_us", "time_scale"], LevelOut],
+    Field(description="factors on the approved curve and time constant; shift of the curve to wider pulses, µs"),
+]
 
 
 class TrackedOut(Document):
@@ -360,8 +370,8 @@ class TrackedOut(Document):
     test_id: str | None
     at_utc: str
     moved: list[str] | None = Field(description="the quantities by which the model was moved")
-    now: LevelsOut | None = Field(description="in that trial")
-    coming: LevelsOut | None = Field(description="expected in the next one: what the model holds")
+    now: Levels | None = Field(description="in that trial")
+    coming: Levels | None = Field(description="expected in the next one: what the model holds")
     effects: dict[str, dict[str, float]] | None = Field(description="as in a trial")
     disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches to learn nothing from, s")
     limits: TrackingLimits | None
@@ -385,8 +395,8 @@ class TrialOut(Document):
     ask: str | None = Field(description="why a new test was needed after it, in a sentence")
     error_percent: float | None = Field(description="of the torque against `reference_torque_nm`, % of its rms")
     delay_s: float | None = Field(description="from its last sample to the model being served")
-    now: LevelsOut | None = Field(description="in this trial")
-    coming: LevelsOut | None = Field(description="expected in the next one")
+    now: Levels | None = Field(description="in this trial")
+    coming: Levels | None = Field(description="expected in the next one")
     effects: dict[str, dict[str, float]] | None = Field(
         description="by effect id, its slow state from 0 (rested) to 1: `now` at this trial's end, `coming` at the "
         "next one's begin; empty if the model has no such effect"
@@ -400,8 +410,16 @@ class TrialOut(Document):
     disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches that do not fit, s")
 
 
-class TrackingOut(fields_of(documents.Tracking)):
+class TrackingOut(Document):
     """What was tracked since the approval that holds."""
 
+    participant: str
+    approved_model_id: str
+    approved_utc: str
     limits: TrackingLimits | None = Field(description="null: nobody has allowed it")
+    threshold_us: float | None = Field(description="of the approved curve, µs: what the limit of the threshold is of")
+    served_utc: str | None = Field(description="since when that is known which is served")
+    served_trial: int | None = Field(description="the trial it was tracked to; 0: the approved model")
+    etag: str | None = Field(description="of what is served with `?tracked=true`")
+    ask: str | None = Field(description="why a new test is needed now, in a sentence")
     trials: list[TrialOut]

@@ -6,11 +6,10 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from stimrig.api.client import documents
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.requests import NoteKind
-from stimrig.api.web.responses.base import Document, EntryOut, fields_of
-from stimrig.rig.messages import CalibrationStatus, RigState
+from stimrig.api.web.responses.base import Document, EntryOut
+from stimrig.rig.messages import CalibrationStatus, Profile, RigState
 
 
 class UserOut(Document):
@@ -88,35 +87,36 @@ class AuditOut(Document):
     entries: list[AuditEntryOut]
 
 
-class ProfileOut(Document):
+class ProfileOut(Profile, Document):
     """A participant's limits for the day."""
 
-    current_ma: float = Field(description="fixed current of every pulse, mA")
-    max_pulse_width_us: float = Field(description="comfort maximum, µs")
-    max_torque_nm: float = Field(description="torque at which a test stops, N·m")
-    sensory_pulse_width_us: float | None = Field(None, description="width at which it is first felt, µs")
-    motor_pulse_width_us: float | None = Field(None, description="width at which the muscle first moves, µs")
-    set_at_utc: str | None = Field(None, description="when the calibration was finished")
-    expires_at_utc: str | None = Field(None, description="when the calibration expires: the end of its day")
-    rest_between_tests_s: float | None = Field(None, description="shortest rest between two tests, s")
-    angle_range_rad: list[float] | None = Field(None, description="joint angles that are comfortable today, rad")
-    angle_set_at_utc: str | None = Field(None, description="of the angle sensor: its calibration when that was said")
 
-
-class ParticipantOut(fields_of(documents.Participant)):
+class ParticipantOut(Document):
     """A participant: a code, never a name."""
 
+    code: str
     profile: ProfileOut
-    side: Literal["left", "right"] | None = Field(None, description="of the body; null: nobody has said")
-    muscle: str | None = Field(None, description="the muscle that is stimulated")
-    placement: str | None = Field(None, description="of the electrodes: with side and muscle the site")
-    archived_utc: str | None = Field(None, description="since when it is archived: no test starts, nothing is deleted")
+    created_utc: str
+    created_by: str
+    side: Literal["left", "right"] | None = Field(description="of the body; null: nobody has said")
+    muscle: str | None = Field(description="the muscle that is stimulated")
+    placement: str | None = Field(description="of the electrodes: with side and muscle the site")
+    archived_utc: str | None = Field(description="since when it is archived: no test starts, nothing is deleted")
 
 
-class NoteOut(fields_of(documents.Note)):
+class NoteOut(Document):
     """A note on a session, or at a time in a test."""
 
+    id: str
+    participant: str
+    test_id: str | None = Field(description="null: on the participant's session, not on a test")
+    at_s: float | None = Field(description="time in the test, from its start, s; null: on the whole of it")
     kind: NoteKind
+    text: str
+    by: str
+    at_utc: str
+    struck_by: str | None = Field(description="who marked it as wrong; null: it stands")
+    struck_utc: str | None
 
 
 class ChangedOut(ParticipantOut):

@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
-from stimrig.api.client import documents
-from stimrig.api.web.responses.base import Document, Holder, ReachOut, SegmentOut, fields_of
+from stimrig.api.web.responses.base import Document, Holder, ReachOut, SegmentOut
 from stimrig.api.web.responses.models import SegmentSpan, VersionOut
 from stimrig.rig.messages import (
     AngleStatus,
     Bound,
     CalibrationStatus,
+    Labels,
     LiveEvent,
     ProtocolInfo,
     RigState,
+    SequenceInfo,
     StopEvidence,
 )
 
@@ -70,37 +71,17 @@ class StoppedOut(Document):
     rig: RigOut | None = Field(None, description="not for a controller's key: another's test may be in it")
 
 
-class SettingOut(Document):
-    """One setting as JSON Schema: `type`, `default`, `minimum`, `maximum`, …"""
-
-    description: str = Field("", description="what it does, with its unit")
-
-
-class SettingsOut(Document):
-    """Settings of a sequence, as a JSON Schema that a segment's `settings` must hold to."""
-
-    type: Literal["object"]
-    properties: dict[str, SettingOut] = Field(description="by name; a name ends in its unit")
-    required: list[str] = Field([], description="settings without a default")
-
-
-class SequenceOut(Document):
+class SequenceOut(SequenceInfo, Document):
     """A sequence that the rig can play."""
 
-    id: str = Field(description="`sequence` of a segment")
-    description: str
-    settings: SettingsOut
-
-
-class ProtocolOut(ProtocolInfo, Document):
-    """A whole test by name."""
+    settings: dict[str, JsonValue] = Field(description="JSON Schema that a segment's `settings` must hold to")
 
 
 class SequencesOut(Document):
     """The sequences of this rig."""
 
     sequences: list[SequenceOut]
-    protocols: list[ProtocolOut] = Field([], description="whole tests by name; the first is the default")
+    protocols: list[ProtocolInfo] = Field([], description="whole tests by name; the first is the default")
     default: list[SegmentOut] = Field(description="the segments of a test that is given none")
 
 
@@ -145,32 +126,18 @@ class WorkOut(Document):
     time_left_s: float | None = Field(None, description="null: not known yet")
 
 
-class KnownCurveOut(Document):
-    """A recruitment curve with its 95 % band as a whole."""
-
-    pulse_width_us: list[float]
-    torque_nm: list[float]
-    lower_nm: list[float]
-    upper_nm: list[float]
-
-
-class KnownStepOut(Document):
-    """The response to a unit step with its 95 % band as a whole."""
-
-    time_s: list[float]
-    value: list[float]
-    lower: list[float]
-    upper: list[float]
-
-
 class KnowledgeOut(Document):
     """What is known of the muscle by now."""
 
     plateau_nm: float
     curve_percent: float = Field(description="largest half-width of the curve's band, % of the plateau")
     step_percent: float = Field(description="of the step response, %")
-    recruitment: KnownCurveOut
-    step_response: KnownStepOut
+    recruitment: dict[Literal["pulse_width_us", "torque_nm", "lower_nm", "upper_nm"], list[float]] = Field(
+        description="the curve with its 95 % band as a whole"
+    )
+    step_response: dict[Literal["time_s", "value", "lower", "upper"], list[float]] = Field(
+        description="the response to a unit step with its 95 % band as a whole"
+    )
 
 
 class DecisionOut(Document):
@@ -209,22 +176,32 @@ class AdaptiveOut(Document):
     decisions: list[DecisionOut]
 
 
-class LeftOut(Document):
-    """What is laid of a test that was told that enough is known."""
-
-    test_id: str
-    boundary_s: float = Field(description="where what is laid ends on the test's clock, s")
-    ended_by: str
-
-
-class TestOut(fields_of(documents.SessionTest, "fit")):
-    """A test."""
+class TestOut(Labels, Document):
+    """A test: how far it is; when `done`, its recording, its model and its summary."""
 
     __test__ = False
+    id: str
+    state: Literal[
+        "requested", "running", "sealing", "identifying", "completed", "refused", "stopped", "fault", "failed"
+    ]
+    done: bool = Field(description="true in every final state")
+    reason: str = Field(description="why it ended other than completed")
+    segment: str | None = Field(description="what is played now")
+    elapsed_s: float
+    duration_s: float
+    time_left_s: float
+    progress: float = Field(description="share that is done, 0 to 1")
     identification: WorkOut | None
+    requested_by: str
+    ran_by: str = Field(description="who ran it at the rig")
+    side: Literal["left", "right"] | None = Field(description="of the body, when it was begun; null: nobody has said")
+    muscle: str | None = Field(description="the muscle that was stimulated, as it was called when the test was begun")
+    requested_utc: str
+    finished_utc: str | None
     planned: PlannedOut
     recording_id: str | None
     recording_url: str | None
+    joins: str | None = Field(description="the model whose recording this one is joined to")
     model_id: str | None
     model_url: str | None
     summary: TestSummary
@@ -248,10 +225,6 @@ class HealthOut(Document):
     database: Literal["ok"]
     rig: RigHealth
     uptime_s: float
-
-
-class AngleOut(AngleStatus, Document):
-    """The joint's angle now, and how its sensor was calibrated."""
 
 
 class StretchOut(Document):

@@ -20,7 +20,7 @@ from stimrig.api.store.tables import Model, Participant
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import VersionOut
-from stimrig.api.web.responses.rig import AngleOut, JointOverviewOut
+from stimrig.api.web.responses.rig import JointOverviewOut
 from stimrig.api.web.routes import participants
 from stimrig.api.web.routes.criticism import LATER, Wait, later
 from stimrig.api.workers.jobs import FIT_TOGETHER, Job
@@ -88,7 +88,7 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
     return context.jobs.start(FIT_TOGETHER, code, by, work)
 
 
-@router.get("/rig/angle", **describe_answer(AngleOut))
+@router.get("/rig/angle", **describe_answer(AngleStatus))
 async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
     about = seen.poses()
@@ -96,7 +96,7 @@ async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str,
     return (await context.rig.fresh_status()).angle.model_dump()
 
 
-@router.post("/rig/angle/pose", **describe_answer(AngleOut))
+@router.post("/rig/angle/pose", **describe_answer(AngleStatus))
 async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
     """Tell the angle that a goniometer shows, at two poses at least 0.5 rad apart; a third one begins anew."""
     sensor(context)

@@ -21,7 +21,8 @@ from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, context_of
 from stimrig.api.web.guards import refuse_outside, same_origin
 from stimrig.api.web.responses.base import describe_answer
-from stimrig.api.web.responses.rig import LeftOut, TestOut
+from stimrig.api.web.responses.rig import TestOut
+from stimrig.rig.messages import Extended
 
 log = logging.getLogger("stimrig.live")
 LOOK_S = 1.0
@@ -83,7 +84,7 @@ async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]
     return await asyncio.to_thread(context.runner.document, row)
 
 
-@router.post("/{test_id}/enough", **describe_answer(LeftOut))
+@router.post("/{test_id}/enough", **describe_answer(Extended))
 async def enough(context: Ctx, who: Tester, test_id: str) -> dict[str, Any]:
     """End a running adaptive, passive or moving test well, at the next pulse: what was measured is used."""
     row = await asyncio.to_thread(find, context, test_id)
