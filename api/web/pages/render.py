@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Awaitable, Callable
+from functools import partial
 from typing import Any
 from urllib.parse import quote
 
@@ -64,10 +65,18 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     bar = {**bar_of(context, principal), "right": stop_right(request, looking), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
     shown["signed"] = signed(principal)
+    shown["version_of"] = partial(version_of, context)
+    shown["csrf"] = (looking.csrf if looking else None) or ""
     kept = request.cookies.get(COLOURS, "")
     shown["colours"] = kept if kept in MEDIA else "system"
     html = environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
+
+
+def version_of(context: Context, document: str) -> str:
+    """Version of a document when this request began: what its page shows is not older. For `data-if-match`."""
+    known = seen.looked.get() or context.store.seen(context.clock)
+    return known.etag(document).strip('"')
 
 
 def signed(principal: Principal | None) -> Markup:

@@ -15,7 +15,7 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import local_day
-from stimrig.api.errors import ApiError, require_found
+from stimrig.api.errors import ApiError, Change, require_confirmation, require_found
 from stimrig.api.models.places import Site, in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions import notes, profiles
@@ -31,6 +31,8 @@ from stimrig.rig.messages import Status
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
 MayVoid = Annotated[bool, Query(description="the change may void the calibration of the day")]
+Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
+Ask = Annotated[bool, Query(description="a person decides: ask before what deserves a second look (409, `confirm`)")]
 
 
 def create(context: Context, body: ParticipantIn, by: str) -> Participant:
@@ -65,8 +67,9 @@ def within(session: Session, code: str) -> Participant:
 
 @under_limits_lock
 def change_profile(
-    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False
-) -> tuple[Participant, Seen]:
+    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False, confirm: str = "",
+    ask: bool = False,
+) -> tuple[Participant, Seen]:  # fmt: skip
     """New limits for a participant: those that are asked for, the rest stays; and the place in the trail.
 
     Raises ApiError: 404 no such participant; 422 beyond what the rig takes, or the first ones are not whole; 409
@@ -79,11 +82,7 @@ def change_profile(
         before = row.profile
         check_asked(context, before, asked)
         profile, voids = profiles.changed(before, add_calibration_time(context, asked))
-        if voids and not may_void:
-            detail = (
-                f"{voids[0].upper()}{voids[1:]}. To set it and make the calibration invalid: ?void_calibration=true."
-            )
-            raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
+        confirm_profile(context, code, before, profile, "" if may_void else voids, confirm, ask)
         if profile != before:
             row.profile = profile
             audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
@@ -91,6 +90,34 @@ def change_profile(
         if shown is not None and seen.since(session, shown, seen.decisions(code), seen.poses()):
             return row, shown  # limits are answered, not what was decided on models, nor where the angle's zero is
         return row, seen.newest(session, local_day(context.clock.utc()))
+
+
+def confirm_profile(
+    context: Context, code: str, before: dict[str, Any], profile: dict[str, Any], voids: str, confirm: str, ask: bool
+) -> None:
+    """Ask before limits that void the calibration; a person, with `ask`, also before a jump."""
+    warnings = profiles.jumps(before, profile) if ask else []
+    if voids:
+        required = context.rig.status is None or context.rig.status.require_calibration is not False
+        then = " Until the participant is calibrated anew, no test starts." if required else ""
+        warnings = [*warnings, f"The calibration is lost with it: {voids}.{then}"]
+    if not warnings:
+        return
+    changes = [
+        Change(
+            limit.words.capitalize(),
+            f"{profile[name]:g} {limit.unit}",
+            f"{before.get(name, profile[name]):g} {limit.unit}",
+        )
+        for name, limit in profiles.LIMITS.items()
+    ]
+    button = f"Yes, set {', '.join(change.now for change in changes)}"
+    if (range_rad := profiles.range_of(profile)) is not None:
+        was_rad = profiles.range_of(before)
+        was = profiles.range_words(was_rad) if was_rad else ""
+        changes.append(Change("Joint angles", profiles.range_words(range_rad), was))
+    refusal = "voids-calibration" if voids else "confirm"
+    require_confirmation(confirm, f"Set these limits for {code}?", button, changes, warnings, refusal)
 
 
 def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]) -> None:
@@ -170,13 +197,15 @@ async def set_profile(
     body: ProfileIn,
     response: Response,
     void_calibration: MayVoid = False,
+    confirm: Confirm = "",
+    ask: Ask = False,
 ) -> dict[str, Any]:
     """Change limits: those that are sent; the others keep their values, and so does what a calibration found.
 
-    A limit wider than at the calibration voids it: 409, unless `void_calibration`. `meanwhile` says what it means for a
-    test that runs, or a calibration that is open.
+    A limit wider than at the calibration voids it: 409, unless `void_calibration` or `confirm`. `meanwhile` says what
+    it means for a test that runs, or a calibration that is open.
     """
-    row, place = await change_profile(context, code, body.sent(), who.name, void_calibration)
+    row, place = await change_profile(context, code, body.sent(), who.name, void_calibration, confirm, ask)
     response.headers["ETag"] = place.etag(f"/v1/participants/{code}")
     return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
 
@@ -201,24 +230,30 @@ def site_in(body: MuscleIn) -> Site:
 
 
 @under_limits_lock
-def change_site(context: Context, code: str, body: MuscleIn, by: str, voids: bool = False) -> Participant:
+def change_site(
+    context: Context, code: str, body: MuscleIn, by: str, voids: bool = False, confirm: str = "", ask: bool = False
+) -> Participant:
     """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
     Raises ApiError: 404 no such participant; 409 a test or calibration of it is under way, or the calibration would be
     lost and that was not allowed.
     """
     refuse_busy(context, code)
-    now = context.clock.utc()
+    now, has_model = context.clock.utc(), ask and context.versions.approved(code) is not None
     with context.store.write() as session:
         row = within(session, code)
         seen.check(session, seen.participant(code))
         lost, here = loses_calibration(row, body), site_of(row)
+        before, after = in_words(here), in_words(site_in(body))
+        warnings = []
         if lost and not voids:
-            detail = (
-                f"The thresholds of {code} were found at {in_words(here)}. To change it and make the "
-                "calibration invalid: ?void_calibration=true."
-            )
-            raise ApiError(409, "voids-calibration", "This would make the calibration invalid", detail)
+            warnings.append(f"The calibration is lost with it: its thresholds were found at {before}.")
+        if ask and here != site_in(body) and has_model:
+            warnings.append(f"The approved model and its keys are of {before}. Here there is none.")
+        if warnings:
+            title, refusal = f"Change side and muscle of {code}?", "voids-calibration" if lost else "confirm"
+            changes = [Change("Side and muscle", after, before)]
+            require_confirmation(confirm, title, f"Yes, it is {after}", changes, warnings, refusal)
         if here != site_in(body):
             if lost:
                 row.profile = {**row.profile, **dict.fromkeys(profiles.FOUND)}
@@ -234,13 +269,15 @@ async def set_muscle(
     code: str,
     body: MuscleIn,
     void_calibration: MayVoid = False,
+    confirm: Confirm = "",
+    ask: Ask = False,
 ) -> dict[str, Any]:
     """Say the site. Another one than before voids the calibration: 409, unless allowed.
 
     A model belongs to the site at which it was measured: at another one there is no approved model, and no key of a
     controller, until it has its own. Tests keep the site that they were begun with.
     """
-    return (await change_site(context, code, body, who.name, void_calibration)).as_dict()
+    return (await change_site(context, code, body, who.name, void_calibration, confirm, ask)).as_dict()
 
 
 def refuse_busy(context: Context, code: str) -> None:

@@ -1,0 +1,131 @@
+"""The script that calls REST for every form: sent, refused at the field or at the top, asked, overtaken, unanswered."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from tests.api.browser import UNCOVERED, expected
+from tests.api.conftest import Service, shared_service
+from tests.api.test_profiles import calibrate
+
+pytestmark = pytest.mark.browser
+service = shared_service()
+SITE = "/v1/participants/{}/muscle*"
+
+
+def opened(tab: Any, service: Service, code: str) -> Any:
+    """The page of a participant; the form of side and muscle."""
+    with service.client() as client:
+        client.post("/v1/participants", json={"code": code})
+        if code == "P017":
+            client.put(f"/v1/participants/{code}/muscle", json={"side": "left"})
+            calibrate(client)
+    tab.goto(f"{service.url}/participants/{code}")
+    return tab.locator("#about form").first
+
+
+def save(form: Any) -> None:
+    form.get_by_role("button", name="Save side and muscle").click()
+
+
+def site(service: Service, code: str) -> tuple[Any, Any]:
+    with service.client() as client:
+        row = client.get(f"/v1/participants/{code}").json()
+    return row["side"], row["muscle"]
+
+
+def test_fields_are_sent_and_the_page_shows_them(tab: Any, service: Service) -> None:
+    form = opened(tab, service, "A1")
+    form.get_by_label("Side").select_option("left")
+    form.get_by_label("Muscle").fill("biceps brachii")
+    save(form)
+    tab.get_by_text("left, biceps brachii").first.wait_for()
+    assert site(service, "A1") == ("left", "biceps brachii") and tab.errors == []
+
+
+def test_a_field_that_does_not_hold_says_so_beside_it(tab: Any, service: Service) -> None:
+    form = opened(tab, service, "A2")
+    form.get_by_label("Muscle").fill("biceps\u200e")
+    save(form)
+    field = form.get_by_label("Muscle")
+    expected(field).to_have_attribute("aria-invalid", "true")
+    expected(field).to_be_focused()
+    expected(tab.locator("#muscle-error")).to_contain_text("U+200E")
+    expected(tab.get_by_role("alert").filter(has_text="See beside the field.")).to_be_visible()
+    assert site(service, "A2") == (None, None) and field.input_value() == "biceps\u200e"
+    field.fill("biceps")
+    save(form)
+    expected(tab.get_by_text("biceps").first).to_be_visible()
+
+
+def test_what_is_refused_as_a_whole_is_said_at_the_top(tab: Any, service: Service) -> None:
+    form = opened(tab, service, "A4")
+    with service.client() as client:
+        client.post("/v1/participants/A4/calibration")
+        save(form)
+        expected(tab.locator("#refused")).to_contain_text("A calibration of A4 is open.")
+        expected(tab.locator("#refused")).to_have_attribute("role", "alert")
+        client.post("/v1/participants/A4/calibration/finish", json={"discard": True})
+
+
+def test_what_deserves_a_second_look_is_asked_with_stop_in_reach(tab: Any, service: Service) -> None:
+    form = opened(tab, service, "P017")
+    form.get_by_label("Side").select_option("right")
+    save(form)
+    question = tab.get_by_role("dialog", name="Change side and muscle of P017?")
+    expected(question).to_contain_text("The calibration is lost with it")
+    expected(question.get_by_role("row", name="Side and muscle left right")).to_be_visible()
+    assert tab.evaluate(UNCOVERED) and site(service, "P017")[0] == "left"
+    question.get_by_role("button", name="No, go back").click()
+    expected(question).to_have_count(0)
+    save(form)
+    question.get_by_role("button", name="Yes, it is right").click()
+    tab.get_by_text("Not calibrated").first.wait_for()
+    assert site(service, "P017") == ("right", None)
+
+
+def test_what_was_changed_meanwhile_is_shown_and_can_be_done_all_the_same(tab: Any, service: Service) -> None:
+    """Until the service answers 412 itself the answer is made up here."""
+    form = opened(tab, service, "A5")
+    versions: list[str] = []
+    change = {"who": "Eve", "at_utc": "2026-11-30T09:00:00.000Z", "action": "set muscle", "old": "left", "new": "right"}
+    problem = {"type": "/problems/changed-meanwhile", "title": "This was changed since you saw it", "status": 412}
+
+    def answer(route: Any) -> None:
+        versions.append(route.request.headers["if-match"])
+        if len(versions) == 1:
+            body = json.dumps({**problem, "detail": "", "changes": [change]})
+            head = {"ETag": '"7"', "Content-Type": "application/problem+json"}
+            route.fulfill(status=412, headers=head, body=body)
+        else:
+            route.fulfill(status=200, json={})
+
+    tab.route("**" + SITE.format("A5"), answer)
+    save(form)
+    question = tab.get_by_role("dialog", name="This was changed since you saw it")
+    expected(question.get_by_role("row")).to_have_count(2)
+    expected(question).to_contain_text("Eve")
+    again = question.get_by_role("button", name="Save side and muscle all the same")
+    expected(again).to_be_disabled()  # it is read first
+    again.click()
+    expected(question).to_have_count(0)
+    tab.wait_for_load_state()
+    assert len(versions) == 2 and versions[0] != '"7"' and versions[1] == '"7"'
+
+
+def test_without_an_answer_it_says_that_nothing_was_written_and_keeps_what_was_typed(
+    tab: Any, service: Service
+) -> None:
+    form = opened(tab, service, "A6")
+    form.get_by_label("Muscle").fill("triceps")
+    tab.route("**" + SITE.format("A6"), lambda route: route.abort())
+    save(form)
+    expected(tab.locator("#refused")).to_contain_text("Not written: the service does not answer.")
+    assert form.get_by_label("Muscle").input_value() == "triceps"
+    tab.unroute("**" + SITE.format("A6"))
+    save(form)
+    tab.get_by_text("triceps").first.wait_for()
+    assert site(service, "A6") == (None, "triceps")
