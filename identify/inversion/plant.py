@@ -108,16 +108,16 @@ class Plant:
         A fitted curve waves below its threshold. A wave must not keep the train there, so from the pulse that is taken
         one rise leads to more than the largest of the shares.
         """
-        ready_us = 0.0
         for share in QUIET:
             quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= share * self.largest_nm)
             ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
+            ready_us = ready_us if ready_us >= self.shortest_us else 0.0  # it would not be sent
             if self.level(ready_us + (self.rise_us or np.inf)) > QUIET[-1] * self.largest_nm:
-                break
-        else:  # it waves more than that: the torque on the way, of some pulses, cannot be helped
-            before_top = self.level_nm[: np.argmax(self.level_nm) + 1]
-            ready_us = float(self.width_us[np.flatnonzero(before_top <= QUIET[-1] * self.largest_nm)[-1]])
-        return ready_us if ready_us >= self.shortest_us else 0.0
+                return ready_us
+        # it waves more than that: the torque on the way, of some pulses, cannot be helped
+        before_top = self.level_nm[: np.argmax(self.level_nm) + 1]
+        ready_us = float(self.width_us[np.flatnonzero(before_top <= QUIET[-1] * self.largest_nm)[-1]])
+        return max(ready_us, self.shortest_us)
 
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:
         """f⁻¹ of a demand, µs, shape (K,); what rounding and the rise limit take, the pulses after give back."""

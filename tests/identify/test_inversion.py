@@ -327,3 +327,13 @@ def test_a_curve_that_waves_below_its_threshold_does_not_keep_a_train_with_a_ris
     found = invert(model, Reference.of(wanted), rise_us=50.0)
     assert np.max(np.diff(np.r_[0.0, found.pulse_width_us])) <= 50.0
     assert found.whole_fit_percent is not None and found.whole_fit_percent > (95.0 if wave == 1.0 else 80.0)
+
+
+def test_a_wave_and_a_shortest_pulse_do_not_keep_a_train_at_0():
+    """The pulse that the rise would begin with is below the shortest, and one rise from 0 leads into the wave."""
+    knots_us = np.r_[0.0:241.0:20.0]
+    values = np.array([0.0, 0.02, 0.05, -0.05, 0.3, 0.6, 1.0, 1.6, 2.7, 3.2, 3.4, 3.5, 3.5])
+    basis = SplineBasis(knots_us)
+    model = muscle().with_(recruitment=Curve(basis, np.linalg.lstsq(basis.design(knots_us), values)[0]))
+    found = invert(model, Reference.of(smooth(2.5)), rise_us=60.0, shortest_us=20.0)
+    assert found.whole_fit_percent is not None and found.whole_fit_percent > 80.0
