@@ -6,13 +6,12 @@ import asyncio
 import hashlib
 import json
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import explanation, stored_model
-from stimrig.api.models.carried_structure import CarriedStructure, OnCall
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
@@ -21,6 +20,8 @@ from stimrig.api.workers.pool import Call, Pool
 from stimrig.identify.conclusion import asked_for
 
 log = logging.getLogger("stimrig.analyses")
+OnCall = Callable[[Call], None]
+"""Takes the job of a worker that begins: a page shows its progress."""
 DIAGNOSIS, OWN_DIAGNOSIS = "diagnosis", "diagnosis of its structure"
 """The names under which those of the plain structure and of another are kept."""
 IMPROVEMENT = "improvement"
@@ -35,16 +36,14 @@ def is_plain(model: Model) -> bool:
 
 
 class Analyses:
-    """Asks the workers once for each finding; a second asker shares the first one's call."""
+    """Asks the workers once for each finding; a second asker shares the job of the first."""
 
     def __init__(self, store: Store, clock: Clock, pool: Pool, versions: Versions, settings: Settings) -> None:
         self.store, self.clock, self.pool, self.versions = store, clock, pool, versions
         self.settings = settings
-        self.carried_structure = CarriedStructure(versions, pool, settings)
         self.running: dict[tuple[str, str], Call] = {}
         """Begun and not kept yet."""
-        self._kept_count = 0
-        self._ids: list[str] | None = None
+        self._library: list[str] | None = None
 
     def path(self, recording_id: str) -> str:
         """Where a recording lies."""
@@ -52,21 +51,23 @@ class Analyses:
         return require_found(recording, "recording", recording_id, "A model's document names its recording.").path
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
-        """Measurement against model; with another recording's id, the model against that one."""
+        """Measurement against model; with the id of another recording, the model against that one."""
         given = {"model_json": stored_model.text(model)}
         if recording_id in (None, model.recording_id):
-            return await self._kept(model, "comparison", given)
+            return await self._find(model, "comparison", given)
         digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
-        return await self._kept(model, f"comparison {digest}", given, verb="comparison", recording_id=recording_id)
+        return await self._find(model, f"comparison {digest}", given, verb="comparison", recording_id=recording_id)
 
     async def curves(self, model: Model) -> dict[str, Any]:
         """Measured, predicted and commanded curves, thinned to what a screen shows."""
-        return await self._kept(model, "curves", {"model_json": stored_model.text(model)})
+        return await self._find(model, "curves", {"model_json": stored_model.text(model)})
 
-    async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
-        """What is missing in the model's own structure; that of the plain one is shared by all that have it."""
+    async def diagnosis(
+        self, model: Model, on_call: OnCall | None = None, *, background: bool = False
+    ) -> dict[str, Any]:
+        """What is missing in the structure of a model; that of the plain one is shared by all that have it."""
         place, kind, given = await asyncio.to_thread(self._criticised, model)
-        found = await self._kept(place, kind, given, verb="diagnosis", on_call=on_call)
+        found = await self._find(place, kind, given, verb="diagnosis", background=background, on_call=on_call)
         return explanation.remaining(found, model.effects, model.fit)
 
     def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
@@ -101,13 +102,12 @@ class Analyses:
         return (before or {}).get("experiment")
 
     async def diagnose_ahead(self, model: Model) -> None:
-        """Diagnose before anybody asks, with low priority; a new test ends it, and nobody is told."""
+        """Diagnose before anybody asks, with low priority; a new test ends it, and only the log says so."""
         try:
-            place, kind, given = await asyncio.to_thread(self._criticised, model)
-            await self._kept(place, kind, given, verb="diagnosis", background=True)
+            await self.diagnosis(model, background=True)
         except ApiError as error:
             log.info("diagnosis of %s in the background: %s", model.id, error.title)
-        except Exception:  # nobody waits for it: the log is where it is told
+        except Exception:
             log.exception("diagnosis of %s in the background", model.id)
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
@@ -115,7 +115,7 @@ class Analyses:
         row = self.store.get(Analysis, (model_id, kind))
         return row.document if row else None
 
-    async def _kept(
+    async def _find(
         self,
         model: Model,
         kind: str,
@@ -126,54 +126,36 @@ class Analyses:
         background: bool = False,
         on_call: OnCall | None = None,
     ) -> dict[str, Any]:
+        key = (model.id, kind)
         path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
-        known = await self._known_now(model.id, kind)
-        if known is not None:
+        if key not in self.running and (known := await asyncio.to_thread(self.known, *key)) is not None:
             return known
-        key = (model.id, kind)  # nothing is awaited from here to the call: two askers make one
         call = self.running.get(key)
         if call is not None and call.background and not background and call.progress < HALF_DONE:
             self.pool.cancel(call)  # somebody waits now: on a busy machine low priority could take minutes
             call = None
         if call is None:
-            call = self._begin(key, verb or kind, background, {"data": path, **given})
+            call = self.running[key] = self.pool.submit(verb or kind, background=background, data=path, **given)
         if on_call is not None:
             on_call(call)
-        found = await asyncio.shield(call.result)
-        await asyncio.to_thread(self._keep, model.id, kind, found)
-        self._kept_count += 1
-        if self.running.get(key) is call:  # only now: who asks meanwhile shares it
-            del self.running[key]
+        try:
+            found = await asyncio.shield(call.result)
+            await asyncio.to_thread(self._keep, *key, found)
+        finally:
+            if call.result.done() and self.running.get(key) is call:
+                del self.running[key]
         return found
 
-    async def _known_now(self, model_id: str, kind: str) -> dict[str, Any] | None:
-        """The finding if it has been made, by the time of the answer: what is kept while it is read is read again."""
-        while True:
-            before = self._kept_count
-            known = await asyncio.to_thread(self.known, model_id, kind)
-            if known is not None or self._kept_count == before:
-                return known
-
-    def _begin(self, key: tuple[str, str], verb: str, background: bool, arguments: dict[str, Any]) -> Call:
-        call = self.running[key] = self.pool.submit(verb, background=background, **arguments)
-
-        def failed(result: asyncio.Future[dict[str, Any]]) -> None:
-            if (result.cancelled() or result.exception()) and self.running.get(key) is call:
-                del self.running[key]
-
-        call.result.add_done_callback(failed)
-        return call
-
     def _keep(self, model_id: str, kind: str, found: dict[str, Any]) -> None:
-        parts = {kind: found}
+        parts = {kind: {name: part for name, part in found.items() if name != IMPROVEMENT}}
         if IMPROVEMENT in found:
-            parts[f"{IMPROVEMENT} of {kind}"] = found.pop(IMPROVEMENT)
+            parts[f"{IMPROVEMENT} of {kind}"] = found[IMPROVEMENT]
         with self.store.write() as session:
             for name, document in parts.items():
                 session.merge(Analysis(model_id=model_id, kind=name, document=document, created_utc=self.clock.utc()))
 
-    async def asked(self, verb: str, on_call: OnCall | None = None, **arguments: Any) -> dict[str, Any]:
-        """What a worker answers; who asked may go away meanwhile."""
+    async def run(self, verb: str, on_call: OnCall | None = None, **arguments: Any) -> dict[str, Any]:
+        """Have a worker do a verb; it goes on if the caller is cancelled."""
         call = self.pool.submit(verb, **arguments)
         if on_call is not None:
             on_call(call)
@@ -191,14 +173,13 @@ class Analyses:
         reason: str = "",
         on_call: OnCall | None = None,
     ) -> Model:
-        """A new version: the model's effects and these, fitted together anew.
+        """Fit the effects of the model and these together anew, as a new version.
 
         Raises ApiError: 409 an effect is in it already, or the recording does not ask for it and nobody forces it; 422
         no such effect, or the data do not allow the fit.
         """
         added = list(dict.fromkeys(added))
-        twice = [effect for effect in added if effect in model.effects]
-        if twice:
+        if twice := [effect for effect in added if effect in model.effects]:
             detail = f"{', '.join(twice)} is in {model.id} already. Name effects it does not hold."
             raise ApiError(409, "effect-present", "The effect is in the model", detail)
         await self.check_known(added)
@@ -206,55 +187,58 @@ class Analyses:
         same = await asyncio.to_thread(self.versions.child_with, model, effects, [] if force else added)
         if same is not None:
             return same
-        if force and not reason.strip():
-            detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
-            raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
         forced: list[str] = []
         if force:
+            if not reason.strip():
+                detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
+                raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
             diagnosis = await asyncio.to_thread(self.known_diagnosis, model)
-            forced = added if diagnosis is None else list(explanation.refusals(diagnosis, model.effects, added))
+            forced = added if diagnosis is None else list(explanation.refusals(diagnosis, added))
         else:
             diagnosis = await self.diagnosis(model, on_call)
-            explanation.require_evidence(diagnosis, model.effects, added)
-        found_free = (diagnosis or {}).get("free") or []
-        free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in found_free}
+            explanation.require_evidence(diagnosis, added)
+        free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in (diagnosis or {}).get("free") or []}
         path = await asyncio.to_thread(self.path, model.recording_id)
         held = stored_model.structure(stored_model.read(model))
-        asked = [held.get(effect, free.get(effect, effect)) for effect in effects]
-        found = await self.asked("fit", on_call, data=path, method=model.method, effects=asked)
-        return await asyncio.to_thread(self._store_added, found["json"], model, added, by, forced, reason)
+        wanted = [held.get(effect, free.get(effect, effect)) for effect in effects]
+        found = await self.run("fit", on_call, data=path, method=model.method, effects=wanted)
+
+        def store() -> Model:
+            row = self._child(model, added, json.loads(found["json"]), by, forced)
+            if forced or reason:
+                action = "force effect" if forced else "add effect"
+                self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
+            return row
+
+        return await asyncio.to_thread(store)
 
     async def check_known(self, effects: list[str]) -> None:
         """Refuse effects that are not in the library."""
-        if self._ids is None:
-            found = await self.asked("effects")
-            self._ids = sorted(entry["id"] for entry in found["effects"])
-        unknown = [effect for effect in effects if effect not in self._ids]
-        if unknown:
-            detail = f"There is no effect {', '.join(unknown)}. Take one of {', '.join(self._ids)}."
+        if self._library is None:
+            self._library = sorted(entry["id"] for entry in (await self.run("effects"))["effects"])
+        if unknown := [effect for effect in effects if effect not in self._library]:
+            detail = f"There is no effect {', '.join(unknown)}. Take one of {', '.join(self._library)}."
             raise ApiError(422, "unknown-effect", "No such effect", detail)
 
-    def _store_added(
-        self, model_json: str, model: Model, added: list[str], by: str, forced: list[str], reason: str
-    ) -> Model:
-        row = self._child(model, added, json.loads(model_json), by, forced)
-        if forced or reason:
-            action = "force effect" if forced else "add effect"
-            self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
-        return row
-
     async def improve(self, model: Model, by: str, on_call: OnCall | None = None) -> tuple[dict[str, Any], list[Model]]:
-        """Effects added to the model's structure one by one while the evidence lasts, each step a version.
+        """Add effects to the structure of a model one by one while the evidence lasts, each step a version.
 
         They descend from the version whose diagnosis names them.
         """
         place, kind, given = await asyncio.to_thread(self._criticised, model)
-        await self._kept(place, kind, given, verb="diagnosis", on_call=on_call)
+        await self._find(place, kind, given, verb="diagnosis", on_call=on_call)
         found = await asyncio.to_thread(self.known, place.id, f"{IMPROVEMENT} of {kind}")
-        if found is None:  # the diagnosis is of an older version
-            path = await asyncio.to_thread(self.path, model.recording_id)
-            found = (await self.asked("diagnosis", on_call, data=path, **given))[IMPROVEMENT]
-        rows = await asyncio.to_thread(lambda: self._store_steps(found, self._begun_from(model, place, kind), by))
+        assert found is not None, "kept with the diagnosis"
+
+        def store() -> list[Model]:
+            rows = [self._begun_from(model, place, kind)]
+            for step, document in zip(found["steps"], found["models"], strict=True):
+                if step["added"] is not None:
+                    rows.append(self._child(rows[-1], [step["added"]], document, by))
+                step["model_id"] = rows[-1].id
+            return rows
+
+        rows = await asyncio.to_thread(store)
         return {key: value for key, value in found.items() if key != "models"}, rows
 
     def _begun_from(self, model: Model, place: Model, kind: str) -> Model:
@@ -262,15 +246,6 @@ class Analyses:
         if kind == OWN_DIAGNOSIS:
             return place
         return next((row for row in [place, *self.versions.ancestry(model)] if is_plain(row)), model)
-
-    def _store_steps(self, found: dict[str, Any], first: Model, by: str) -> list[Model]:
-        """Each step that adds something as a version; what they begin with is there already."""
-        rows = [first]
-        for step, document in zip(found["steps"], found["models"], strict=True):
-            if step["added"] is not None:
-                rows.append(self._child(rows[-1], [step["added"]], document, by))
-            step["model_id"] = rows[-1].id
-        return rows
 
     def _child(
         self, parent: Model, added: list[str], document: dict[str, Any], by: str, forced: Sequence[str] = ()

@@ -8,94 +8,81 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
 from typing import Any
 
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
+from stimrig.api.models.analyses import Analyses, OnCall
 from stimrig.api.models.explanation import name_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Model
 from stimrig.api.structure import in_words
-from stimrig.api.workers.pool import Call, Pool
+from stimrig.api.workers.pool import Pool
 from stimrig.api.workers.process import WORKER, Places
 from stimrig.identify.conclusion import asked_for
 
-OnCall = Callable[[Call], None]
 
+async def fit(
+    analyses: Analyses, participant: str, path: str, on_call: OnCall | None = None, **how: Any
+) -> tuple[dict[str, Any], str]:
+    """Fit the first model of a recording; also returns what had to be left out of its structure, empty for nothing.
 
-class CarriedStructure:
-    """The fit after a test or an upload, in the structure that the participant has so far."""
+    It is plain where a structure is carried over after it, and where nothing in the recording looks like an effect of
+    the site's: a test that a person went through gives a model.
 
-    def __init__(self, versions: Versions, pool: Pool, settings: Settings) -> None:
-        self.versions, self.pool, self.settings = versions, pool, settings
-
-    async def fit(
-        self, participant: str, path: str, on_call: OnCall | None = None, **how: Any
-    ) -> tuple[dict[str, Any], str]:
-        """The first model of a recording, and what had to be left out of its structure (empty where nothing had).
-
-        It is plain where a structure is carried over after it, and where nothing in the recording looks like an effect
-        of the site's: a test that a person went through gives a model.
-
-        Raises ApiError: the recording gives no model in the plain structure either.
-        """
-        earlier = await asyncio.to_thread(self.versions.last_approved, participant)
-        effects, warning = list(self.settings.structure) if earlier is None else [], ""
-        if effects:
-            try:
-                return await self._begun("fit", path, on_call, effects=effects, **how), ""
-            except ApiError as error:
-                if error.code != "data":
-                    raise
-                why = error.detail
-                warning = f"Fitted in the plain structure, not with {in_words(effects).replace('_', ' ')}: {why}"
-        return await self._begun("fit", path, on_call, **how), warning
-
-    async def carry(self, plain: Model, path: str, on_call: OnCall | None = None, **how: Any) -> Model:
-        """The version that is offered: the plain one, or its child in the structure of the last approved model.
-
-        Whatever becomes of the carried structure, the plain model stays; what was found is kept with it, and with the
-        child.
-        """
-        earlier = await asyncio.to_thread(self.versions.last_approved, plain.participant)
-        if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
-            return plain
+    Raises ApiError: the recording gives no model in the plain structure either.
+    """
+    earlier = await asyncio.to_thread(analyses.versions.last_approved, participant)
+    effects, warning = list(analyses.settings.structure) if earlier is None else [], ""
+    if effects:
         try:
-            found = await self._begun("carry", path, on_call, model_json=stored_model.text(earlier), **how)
-        except (ApiError, OSError, ValueError) as error:  # all that a call can end with
-            found = {"json": None, "found": _not_carried(error)}
-        return await asyncio.to_thread(self._store, found, plain, earlier)
+            return await analyses.run("fit", on_call, data=path, effects=effects, **how), ""
+        except ApiError as error:
+            if error.code != "data":
+                raise
+            names = in_words(effects).replace("_", " ")
+            warning = f"Fitted in the plain structure, not with {names}: {error.detail}"
+    return await analyses.run("fit", on_call, data=path, **how), warning
 
-    async def _begun(self, verb: str, path: str, on_call: OnCall | None, **arguments: Any) -> dict[str, Any]:
-        call = self.pool.submit(verb, data=path, **arguments)
-        if on_call is not None:
-            on_call(call)
-        return await call.result
 
-    def _store(self, found: dict[str, Any], plain: Model, earlier: Model) -> Model:
-        """The finding kept with the plain version; the child, where there is one; and which of them is offered."""
-        finding = {**found["found"], "from_model_id": earlier.id}
-        finding.pop("carried_from", None)
-        self.versions.note_carried(plain.id, finding, earlier.id if finding["why"] == "plain-before" else None)
-        if found["json"] is None:
-            return self.versions.get(plain.id)
-        document = json.loads(found["json"])
-        document["extra"] = {**(document.get("extra") or {}), "parent": plain.id}
-        child = self.versions.add(
-            json.dumps(document), plain.participant, plain.recording_id, plain.created_by, plain.id,
-            ",".join(effect["id"] for effect in document["effects"]), carried_from_id=earlier.id, carried=finding,
-        )  # fmt: skip
-        return child if finding["offered"] == "carried" else self.versions.get(plain.id)
+async def carry(analyses: Analyses, plain: Model, path: str, on_call: OnCall | None = None, **how: Any) -> Model:
+    """Return the version that is offered: the plain one, or its child in the structure of the last approved model.
+
+    Whatever becomes of the carried structure, the plain model stays; what was found is kept with it, and with the
+    child.
+    """
+    earlier = await asyncio.to_thread(analyses.versions.last_approved, plain.participant)
+    if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
+        return plain
+    try:
+        found = await analyses.run("carry", on_call, data=path, model_json=stored_model.text(earlier), **how)
+    except (ApiError, OSError, ValueError) as error:  # all that a call can end with
+        found = {"json": None, "found": _not_carried(error)}
+    return await asyncio.to_thread(_store, analyses.versions, found, plain, earlier)
+
+
+def _store(versions: Versions, found: dict[str, Any], plain: Model, earlier: Model) -> Model:
+    """Keep the finding with the plain version, and the child, where there is one; return which of them is offered."""
+    finding = {key: value for key, value in found["found"].items() if key != "carried_from"}
+    finding["from_model_id"] = earlier.id
+    versions.note_carried(plain.id, finding, earlier.id if finding["why"] == "plain-before" else None)
+    if found["json"] is None:
+        return versions.get(plain.id)
+    document = json.loads(found["json"])
+    document["extra"] = {**(document.get("extra") or {}), "parent": plain.id}
+    child = versions.add(
+        json.dumps(document), plain.participant, plain.recording_id, plain.created_by, plain.id,
+        ",".join(effect["id"] for effect in document["effects"]), carried_from_id=earlier.id, carried=finding,
+    )  # fmt: skip
+    return child if finding["offered"] == "carried" else versions.get(plain.id)
 
 
 def _not_carried(error: Exception) -> dict[str, Any]:
     """The finding where the structure could not be fitted."""
-    why, told = "failed", [str(error)]
-    if isinstance(error, ApiError):
-        why, told = error.code, [part for part in (error.title, error.detail) if part]
-    reason = "The structure of the last session was not fitted. " + " ".join(f"{part.rstrip('.')}." for part in told)
+    why, parts = (error.code, [error.title, error.detail]) if isinstance(error, ApiError) else ("failed", [str(error)])
+    sentences = ["The structure of the last session was not fitted", *filter(None, parts)]
+    reason = " ".join(f"{part.rstrip('.')}." for part in sentences)
     lists = ("still_needed", "no_longer_needed", "undecided", "effects", "figures")
     return {"offered": "plain", "why": why, "reason": reason, **{name: [] for name in lists}}
 

@@ -60,60 +60,33 @@ def is_plain(document: Mapping[str, Any]) -> bool:
 
 UNDEFINED = "not defined: the torque is level there"
 """What stands where a model has an error but no best-fit %."""
-VERDICTS = ("usable", "usable with care", "not usable")
-"""Best first."""
-DEFAULTS = {
-    "usable": "Nothing speaks against it.",
-    "usable with care": "Look at where it fails before relying on it.",
-    "not usable": "Do not rely on it.",
-}
+NO_VERDICT = {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
 FIT = (
     "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
     "rms_nm", "held_out_rms_nm", "held_out_by", "noise_sd_nm",
 )  # fmt: skip
 
 
-def repetition(document: dict[str, Any]) -> dict[str, Any]:
+def repetition(document: Mapping[str, Any]) -> dict[str, Any]:
     """What repeats in the record of a MODEL.json, with `sentences`; None for each where it is not known."""
-    fit = document.get("fit") or {}
-    found = fit.get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
-    return {**found, "sentences": repetition_sentences(fit)}
+    found = document["fit"].get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
+    return {**found, "sentences": repetition_sentences(document["fit"])}
 
 
-def figures(document: dict[str, Any]) -> dict[str, Any]:
-    """The few numbers of a MODEL.json a person looks at first."""
-    fit = document.get("fit") or {}
-    return {name: fit.get(name) for name in FIT}
+def figures(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The few numbers of a MODEL.json that a person looks at first."""
+    return {name: document["fit"].get(name) for name in FIT}
 
 
-def quality(document: dict[str, Any]) -> dict[str, Any]:
-    """identify's verdict on a model, as its MODEL.json stores it: nothing is judged here.
-
-    A model is no better than its gates, whatever is stored; without words, the first reason; "unknown" without a
-    verdict.
-
-    ``verdict`` (usable, usable with care, not usable, unknown), ``words`` (a sentence), ``reasons`` (a list).
-    """
-    stored = document.get("quality") or {}
-    gates = stored.get("gates") or {}
-    verdict = stored.get("verdict")
-    if verdict == "usable" and not gates:  # only identify writes gates
-        verdict = "usable with care"
-    if verdict not in VERDICTS:
-        return {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
-    refused = [gate.get("severity") == "refuse" for gate in gates.values() if not gate.get("passed", True)]
-    allowed = "not usable" if any(refused) else "usable with care" if refused else "usable"
-    worse = max(verdict, allowed, key=VERDICTS.index)
-    reasons = list(stored.get("reasons") or [])
-    words = stored.get("words") if worse == verdict else None
-    first = f"{reasons[0][:1].upper()}{reasons[0][1:].rstrip('.')}." if reasons else DEFAULTS[worse]
-    return {"verdict": worse, "words": words or first, "reasons": reasons}
+def quality(document: Mapping[str, Any]) -> dict[str, Any]:
+    """The verdict of identify on a model: `verdict`, `words` (a sentence) and `reasons`; "unknown" without one."""
+    stored = document.get("quality") or NO_VERDICT
+    return {name: stored[name] for name in NO_VERDICT}
 
 
 def without_evidence(document: Mapping[str, Any]) -> list[str]:
     """The effects of a model that a person added although the recording did not ask for them."""
-    gates = (document.get("quality") or {}).get("gates") or {}
-    return (gates.get("evidence") or {}).get("effects") or []
+    return (document.get("quality") or {}).get("gates", {}).get("evidence", {}).get("effects", [])
 
 
 def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> None:
@@ -123,7 +96,8 @@ def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> N
     judged, says = document["quality"], f"added without evidence: {', '.join(effects)}"
     judged["gates"]["evidence"] = {"passed": False, "severity": "care", "says": says, "effects": list(effects)}
     judged["reasons"] = [*judged["reasons"], says]
-    document["quality"] |= quality(document)
+    if judged["verdict"] == "usable":
+        judged |= {"verdict": "usable with care", "words": f"{says.capitalize()}."}
 
 
 @dataclass(frozen=True)
@@ -154,35 +128,17 @@ def followed(fit: Mapping[str, Any]) -> Followed:
 
 # ---- curve and dynamics -------------------------------------------------------------------------------------------
 
-THRESHOLD_SHARE = 0.05
-"""The threshold is where the recruitment curve has gone this share of its way to the plateau."""
 
-
-def recruitment(document: dict[str, Any]) -> dict[str, float | None]:
+def recruitment(document: Mapping[str, Any]) -> dict[str, float | None]:
     """Threshold (µs), plateau (N·m) and the width at which 95 % of it is reached (µs).
 
-    Where stimulation lowers the record's torque the curve falls, and its plateau is below zero.
+    Where stimulation lowers the torque of the record the curve falls, and its plateau is below zero.
     """
-    width_us, torque_nm = document["recruitment"]["pulse_width_us"], document["recruitment"]["torque_nm"]
-    low, high = torque_nm[0], max(torque_nm, key=lambda torque: abs(torque - torque_nm[0]))
-    way = [(torque - low) / (high - low) if high != low else 0.0 for torque in torque_nm]
-    return {
-        "threshold_us": _crossing(width_us, way, THRESHOLD_SHARE),
-        "plateau_nm": high,
-        "saturation_us": _crossing(width_us, way, 1 - THRESHOLD_SHARE),
-    }
+    stored = document["uncertainty"]["figures"]
+    return {name: stored[name]["value"] for name in ("threshold_us", "plateau_nm", "saturation_us")}
 
 
-def _crossing(width_us: list[float], way: list[float], level: float) -> float | None:
-    for index in range(1, len(width_us)):
-        before, after = way[index - 1], way[index]
-        if before < level <= after:
-            share = (level - before) / (after - before)
-            return width_us[index - 1] + share * (width_us[index] - width_us[index - 1])
-    return None
-
-
-def dynamics(document: dict[str, Any]) -> dict[str, Any]:
+def dynamics(document: Mapping[str, Any]) -> dict[str, Any]:
     """Tω (s), ζ and delay (s) where the linear part is of second order; its poles (1/s) besides.
 
     Tω and ζ are those of eq. (31) with damping: 1 / (Tω² s² + 2 ζ Tω s + 1).
@@ -212,7 +168,7 @@ def _poles(a: list[float], step_s: float) -> list[complex]:
     return [cmath.log(root) / step_s for root in roots if root != 0]
 
 
-def validity(document: dict[str, Any]) -> str | None:
+def validity(document: Mapping[str, Any]) -> str | None:
     """What the model holds for, in one sentence; None where it does not say."""
     known = document.get("valid_for") or {}
     named = []
@@ -233,23 +189,23 @@ Figure = dict[str, Any]
 UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "damping": "1", "delay_s": "s"}
 
 
-def muscle_figures(document: dict[str, Any]) -> dict[str, Figure]:
-    """Threshold, plateau, time constant, damping, delay, and each effect's main parameter as `effect.parameter`.
-
-    A model without standard deviations of its figures has their values alone.
-    """
-    stored = (document.get("uncertainty") or {}).get("figures") or {}
-    values = {**recruitment(document), **dynamics(document)}
+def muscle_figures(document: Mapping[str, Any]) -> dict[str, Figure]:
+    """Threshold, plateau, dynamics, and the main parameter of each effect as `effect.parameter`."""
+    stored, read_off = document["uncertainty"]["figures"], dynamics(document)
     found = {
-        name: stored.get(name) or {"value": values.get(name), "sd": None, "unit": unit} for name, unit in UNITS.items()
+        name: stored.get(name) or {"value": read_off.get(name), "sd": None, "unit": unit}
+        for name, unit in UNITS.items()
     }
     for effect in document.get("effects") or []:
         known = effect.get("parameters") or {}
-        wanted = [name for name in fact_of(effect["id"], "main", ()) if name in known] or list(known)[:1]
-        for name in wanted[:1]:
-            given = known[name] if isinstance(known[name], dict) else {"value": known[name]}
-            figure = {"value": given.get("value"), "sd": given.get("sd"), "unit": given.get("unit") or "1"}
-            found[f"{effect['id']}.{name}"] = {**figure, "form": effect.get("form") or ""}
+        for name in [*(name for name in fact_of(effect["id"], "main", ()) if name in known), *known][:1]:
+            figure = {"unit": "1", **known[name]}
+            found[f"{effect['id']}.{name}"] = {
+                "value": figure["value"],
+                "sd": figure["sd"],
+                "unit": figure["unit"],
+                "form": effect.get("form") or "",
+            }
     return found
 
 

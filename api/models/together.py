@@ -47,7 +47,7 @@ async def fit(
     await analyses.check_known(ids)
     needs = [ANGLE] if {*ids} & {*_ids(JOINT_EFFECTS)} else []
     whole = rows[0] if len(rows) == 1 else await _joined(analyses, rows, participant, needs)
-    found = await analyses.asked("fit", on_call, data=whole.path, effects=list(effects))
+    found = await analyses.run("fit", on_call, data=whole.path, effects=list(effects))
     return await asyncio.to_thread(_store, analyses, found["json"], participant, whole, by, recordings)
 
 
@@ -101,7 +101,7 @@ async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs
     made = settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"  # all that a worker may write to
     kept = settings.recordings_dir / made.name
     try:
-        found = await analyses.asked("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
+        found = await analyses.run("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
         await asyncio.to_thread(made.replace, uploads.part_of(kept))
     except BaseException:
         made.unlink(missing_ok=True)

@@ -10,7 +10,7 @@ from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.models import together
+from stimrig.api.models import carried_structure, together
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.kinds import Kinds
@@ -143,7 +143,7 @@ class Lifecycle:
         how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.on_progress(test_id)}
         try:
             model = await self._first_version(row, recording, parent, take, dict(how))
-            model = await self.analyses.carried_structure.carry(model, recording.path, take, **how)
+            model = await carried_structure.carry(self.analyses, model, recording.path, take, **how)
         except ApiError as error:
             reason = f"identification: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
@@ -163,7 +163,7 @@ class Lifecycle:
         if row.model_id is not None:
             return await asyncio.to_thread(self.versions.get, row.model_id)
         how |= await asyncio.to_thread(self.kinds[row.kind].fit_options, row)
-        found, warning = await self.analyses.carried_structure.fit(row.participant, recording.path, take, **how)
+        found, warning = await carried_structure.fit(self.analyses, row.participant, recording.path, take, **how)
         by = f"test {row.id}"
         model = await asyncio.to_thread(self.versions.add, found["json"], row.participant, recording.id, by, parent)
         summary = dict(row.summary)

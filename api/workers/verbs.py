@@ -82,6 +82,7 @@ def finding_of(record: Any, diagnosis: Any, improvement: Any, structure: Sequenc
     """A diagnosis as it is kept, with the improvement that was found by the way."""
     found = with_experiment(record, diagnosis, structure)
     found["signatures"] = signatures(record, improvement)
+    found["refused"] = list(improvement.refused)
     found["improvement"] = {**improvement.to_dict(), "structure": list(structure)}
     return json_value(found)
 

@@ -20,6 +20,12 @@ COMMAND = (sys.executable, "-m", "tests.api.stub_worker")
 Pause = Callable[[float], Any]
 
 
+FIGURES = {
+    name: {"value": value, "sd": None, "unit": unit}
+    for name, value, unit in (("threshold_us", 72.0, "µs"), ("plateau_nm", 6.0, "N·m"), ("saturation_us", 288.0, "µs"))
+}
+
+
 def model(effects: list[str]) -> dict[str, Any]:
     widths = list(range(0, 301, 5))
     torque = [max(0.0, (w - 60) / 40) if w < 300 else 6.0 for w in widths]
@@ -34,7 +40,8 @@ def model(effects: list[str]) -> dict[str, Any]:
                 "ceiling_percent": 98.6, "noise_sd_nm": 0.04},
         "quality": {"verdict": "usable", "words": "Little is left to explain.", "reasons": [],
                     "gates": {"stable": {"passed": True, "severity": "refuse", "says": ""}}},
-        "effects": [{"id": effect} for effect in effects], "uncertainty": {}, "data": {}, "software": {},
+        "effects": [{"id": effect} for effect in effects], "uncertainty": {"figures": FIGURES},
+        "data": {}, "software": {},
         **({"joint": joint()} if set(effects) & set(JOINT) else {}),
     }  # fmt: skip
 
@@ -87,7 +94,9 @@ def diagnosis(model_json: str | None = None) -> dict[str, Any]:
         "parameters": {"depth": {"value": 0.4, "sd": 0.05, "unit": "1"}},
     }  # fmt: skip
     tried = [{"effect": name, "log_evidence_gain": gain} for name, gain in (("fatigue", 90.0), ("tremor", -4.0))]
+    against = "The evidence is against it: log evidence changes by -4.0."
     found = {
+        "refused": [{"effect": "tremor", "log_evidence_gain": -4.0, "reason": against}],
         "structure": held, "verdict": "effect_missing", "noise_sd_nm": 0.04, "base": {}, "missing": [missing],
         "where": WHERE, "candidates": [tried], "experiment": EXPERIMENT, "signatures": SIGNATURES, "library": {},
         "notes": [],

@@ -16,7 +16,7 @@ import pytest
 
 from stimrig.api.cli import main
 from stimrig.api.cli.terminal import carried_lines
-from stimrig.api.models.carried_structure import CarriedStructure
+from stimrig.api.models import carried_structure
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Approval
 from tests.api.conftest import STUB, Service, csrf, play_test, run_service, run_test, signed_in, soon, wait_done
@@ -190,8 +190,8 @@ def test_a_damaged_approved_model_leaves_the_plain_one(document: bytes) -> None:
         get=lambda _: plain,
         note_carried=lambda _id, finding, _from: kept.append(finding),
     )
-    nothing: Any = None
-    offered = asyncio.run(CarriedStructure(versions, nothing, nothing).carry(cast("Any", plain), "data.h5"))
+    analyses: Any = SimpleNamespace(versions=versions, run=None)
+    offered = asyncio.run(carried_structure.carry(analyses, cast("Any", plain), "data.h5"))
     assert (offered, kept[0]["offered"], kept[0]["why"]) == (plain, "plain", "model-damaged")
 
 

@@ -10,7 +10,7 @@ from tests.api.conftest import Service, play_test, shared_service, signed_in, so
 PLAIN = {
     "sample_rate_hz": 40.0,
     "linear": {"b": [0.0, 0.002], "a": [1.0, -1.93, 0.934], "delay_samples": 0},
-    "recruitment": {"pulse_width_us": [0.0, 100.0, 300.0], "torque_nm": [0.0, 1.0, 2.0]},
+    "uncertainty": {"figures": {}},
 }
 
 
@@ -24,7 +24,7 @@ def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -
         assert (said["name"], said["muscle"], said["main"]) == (known.name, known.muscle, known.main)
         assert all(parameter_words(parameter) == words for parameter, words in known.main.items()), effect
         for form in known.forms:
-            held = {"id": effect, "parameters": {one.name: 1.0 for one in form.parameters}}
+            held = {"id": effect, "parameters": {one.name: {"value": 1.0, "sd": None} for one in form.parameters}}
             (figure,) = [name for name in stored_model.muscle_figures(PLAIN | {"effects": [held]}) if "." in name]
             assert figure.partition(".")[2] in known.main, figure
     assert set(library()) == set(effects.registry())

@@ -41,7 +41,7 @@ def diagnosis() -> dict[str, Any]:
 
 
 def test_a_picture_has_each_curve_with_its_band_and_axes_that_are_no_links() -> None:
-    view = explanation.view(diagnosis(), None, [])
+    view = explanation.view(diagnosis(), None)
     drawn = diagnosis_charts.diagnosis_figures(None, [], view, {}, [])["free-free_gate"]
     assert [trace["y"] for trace in drawn["data"] if trace.get("name") in LINES] == [[0.0, 1.0], [0.0, 0.5]]
     assert all(any(trace["y"] == one["lower"] for trace in drawn["data"]) for one in list(LINES.values())[1:])
@@ -63,14 +63,14 @@ def test_a_model_that_holds_it_shows_it_and_the_diagnosis_does_not_offer_it_agai
     drawn = Figures(diagnosis_charts.pictures([card]))
     shown = environment.get_template("why.html").module.free(card, drawn)  # pyright: ignore[reportAttributeAccessIssue]
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
-    assert explanation.view(diagnosis(), None, ["free_gate"])["free"] == []
+    assert explanation.remaining(diagnosis(), ["free_gate"], {})["free"] == []
     assert explanation.held_free({"effects": [{"id": "fatigue"}]}) == []
 
 
 def test_what_was_found_freely_can_be_added_and_nothing_else() -> None:
-    explanation.require_evidence(diagnosis(), [], ["free_gate"])
+    explanation.require_evidence(diagnosis(), ["free_gate"])
     with pytest.raises(ApiError, match="free_ways"):
-        explanation.require_evidence(diagnosis(), [], ["free_ways"])
+        explanation.require_evidence(diagnosis(), ["free_ways"])
 
 
 def test_a_notebook_draws_what_a_diagnosis_found_freely() -> None:

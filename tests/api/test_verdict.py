@@ -41,9 +41,6 @@ def test_the_report_names_the_hash_of_the_file_and_that_of_its_contents(
     assert ">c0ffeec0ffeec0ff…</span>" in text
 
 
-GATE = {"passed": False, "severity": "refuse", "says": "the dynamics are unstable"}
-
-
 def record_csv(path: Path, *, follows: bool, level: bool = False) -> Path:
     """A made-up record; the torque does not follow the pulses, or the held-out torque is level."""
     rng = np.random.default_rng(3)
@@ -121,22 +118,20 @@ def test_level_held_out_torque_has_no_percent(tmp_path: Path, short_dir: Path, c
 
 
 @pytest.mark.parametrize(
-    ("stored", "verdict", "words"),
+    ("before", "after", "words"),
     [
-        (None, "unknown", "No verdict was stored"),
-        ({"verdict": "splendid"}, "unknown", "No verdict was stored"),
-        ({"verdict": "usable", "gates": {"stable": {"passed": True}}}, "usable", "Nothing speaks against it."),
-        ({"verdict": "usable", "words": "Fits well.", "gates": {"a": {"passed": True}}}, "usable", "Fits well."),
-        ({"verdict": "usable with care", "reasons": ["it jumps"]}, "usable with care", "It jumps."),
-        ({"verdict": "usable"}, "usable with care", "Look at where it fails"),
-        ({"verdict": "not usable"}, "not usable", "Do not rely on it."),
-        ({"verdict": "usable", "words": "Fits well.", "gates": {"stable": GATE}}, "not usable", "Do not rely on it."),
+        ("usable", "usable with care", "Added without evidence: fatigue, tremor."),
+        ("usable with care", "usable with care", "As it was."),
+        ("not usable", "not usable", "As it was."),
     ],
 )
-def test_a_verdict_is_no_better_than_its_gates(stored: dict[str, Any] | None, verdict: str, words: str) -> None:
-    document = {"fit": {}} | ({} if stored is None else {"quality": stored})
-    found = stored_model.quality(document)
-    assert found["verdict"] == verdict and found["words"].startswith(words)
+def test_effects_without_evidence_make_a_verdict_no_better(before: str, after: str, words: str) -> None:
+    document = {"quality": {"verdict": before, "words": "As it was.", "reasons": ["a"], "gates": {}}}
+    stored_model.mark_without_evidence(document, ["fatigue", "tremor"])
+    says = "added without evidence: fatigue, tremor"
+    assert stored_model.quality(document) == {"verdict": after, "words": words, "reasons": ["a", says]}
+    assert stored_model.without_evidence(document) == ["fatigue", "tremor"]
+    assert stored_model.quality({})["verdict"] == "unknown"
 
 
 # ---- A model that is not usable reaches a controller only with a reason that is one; a usable one with none

@@ -89,7 +89,7 @@ def test_effect_that_is_not_there_is_refused_with_the_reason(
 ) -> None:
     refused = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"]})
     assert refused.status_code == 409 and refused.json()["type"] == "/problems/effect-not-there"
-    assert "log evidence -4.0" in refused.json()["reasons"]["tremor"]
+    assert "log evidence changes by -4.0" in refused.json()["reasons"]["tremor"]
     silent = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"], "force": True})
     assert silent.status_code == 422 and "Give a reason" in silent.json()["detail"]
     body = {"effects": ["tremor"], "force": True, "reason": "seen with the eye"}
@@ -183,20 +183,12 @@ def test_improving_a_version_adds_to_what_it_holds(client: httpx.Client, model: 
     assert rows[-1]["effects"] == ["fatigue", "threshold_drift"]
 
 
-def refusal(missing: list[dict[str, Any]], gains: list[list[tuple[str, float]]], effect: str) -> str | None:
-    rounds = [[{"effect": name, "log_evidence_gain": gain} for name, gain in found] for found in gains]
-    return explanation.refusal({"missing": missing, "candidates": rounds}, [], effect)
-
-
 def test_reasons_against_an_effect() -> None:
-    fatigue = {"effect": "fatigue", "name": "Fatigue", "confused_with": []}
-    assert refusal([fatigue], [[("fatigue", 90)]], "fatigue") is None
-    rival = {**fatigue, "confused_with": ["drift"]}
-    assert refusal([rival], [[("fatigue", 90), ("drift", 50)]], "drift") is None, "it cannot be told apart"
-    assert "explains the same error better" in str(refusal([fatigue], [[("drift", 50)], [("drift", 2)]], "drift"))
-    assert "speaks against" in str(refusal([], [[("drift", -3)]], "drift"))
-    assert "too weak" in str(refusal([], [[("drift", 3)]], "drift"))
-    assert "not tested" in str(refusal([], [], "torque_angle"))
+    fatigue, against = {"effect": "fatigue", "confused_with": ["drift"]}, "The evidence is against it."
+    free = [{"effect": "free_level"}]
+    found = {"missing": [fatigue], "free": free, "refused": [{"effect": "tremor", "reason": against}]}
+    asked = ["fatigue", "drift", "free_level", "tremor", "torque_angle"]  # drift cannot be told apart from fatigue
+    assert explanation.refusals(found, asked) == {"tremor": against, "torque_angle": explanation.NOT_TESTED}
 
 
 # ---- the next experiment ------------------------------------------------------------------------------------
@@ -266,9 +258,9 @@ PLACE = {
 FATIGUE = {"effect": "fatigue", "name": "Fatigue", "probability": 0.97, "rms_before_nm": 0.2, "rms_after_nm": 0.05}
 
 
-def shown(verdict: str, missing: list[dict[str, Any]], effects: list[str], times: float) -> dict[str, Any]:
+def shown(verdict: str, missing: list[dict[str, Any]], times: float) -> dict[str, Any]:
     diagnosis = {"verdict": verdict, "missing": missing, "where": [PLACE], "noise_sd_nm": 0.04}
-    return explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04 * times}, effects)
+    return explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04 * times})
 
 
 @pytest.mark.parametrize(
@@ -282,18 +274,18 @@ def shown(verdict: str, missing: list[dict[str, Any]], effects: list[str], times
 )
 def test_what_may_be_more_than_noise_is_not_called_noise(more: dict[str, Any], kind: str) -> None:
     diagnosis = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": [], **more}
-    assert explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04}, [])["kind"] == kind
+    assert explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04})["kind"] == kind
     assert ("left is noise" in conclude(diagnosis).title) == (kind == "nothing")
 
 
 def test_effects_are_advised_in_the_order_in_which_improve_adds_them() -> None:
     rows = [{**FATIGUE, "effect": name, "name": name.title()} for name in ("tremor", "fatigue", "potentiation")]
     diagnosis = {"verdict": "effect_missing", "missing": rows, "noise_sd_nm": 0.04, "add": ["fatigue", "tremor"]}
-    view = explanation.view(diagnosis, None, [])
+    view = explanation.view(diagnosis, None)
     assert [entry["id"] for entry in view["missing"]] == ["fatigue", "tremor", "potentiation"]
     assert view["advice"] == "Add “Fatigue”, then “Tremor” to the model."
     nothing = diagnosis | {"add": [], "missing": [{**FATIGUE, "next_experiment": "The ramp again."}]}
-    said = explanation.view(nothing, None, [])["advice"]
+    said = explanation.view(nothing, None)["advice"]
     assert said.startswith("Add nothing yet") and said.endswith("The ramp again.")
     assert why_ended(nothing).startswith("Nothing more can be learnt"), "there is nothing to be done with this record"
 
@@ -377,7 +369,7 @@ def test_where_something_is_left_its_places_are_shown() -> None:
     rows = [{"label": "ramp", "share_of_excess": 1.0}]
     comparison = {"noise_sd_nm": 0.04, "rms_nm": 0.04, "where": [PLACE], "by": {"segment": rows}}
     for check, count in ((True, 0), (False, 1)):
-        view = explanation.view({**found, "residual_check": check}, comparison, [])
+        view = explanation.view({**found, "residual_check": check}, comparison)
         shown = missing_parts(view, comparison)
         assert len(shown["places"]) == len(shown["splits"]) == count
     for passed, count in ((True, 0), (False, 1)):  # before a diagnosis is there
@@ -402,17 +394,12 @@ def test_a_further_test_is_told_what_it_decided() -> None:
 
 
 def test_what_left_out_or_held_out_rows_say_is_the_reason_at_every_door() -> None:
-    """Of an effect with log evidence 87 the page said that the evidence was too weak, and it added what rows of
-    `validate` objected to."""
-    tried = {"effect": "tremor", "log_evidence_gain": 86.8, "refusal": "The error rises."}
+    """The page added what rows of `validate` objected to."""
     objected = {**FATIGUE, "objection": "On held-out pulses the error would rise."}
-    diagnosis = {"missing": [objected], "candidates": [[tried]]}
-    assert explanation.refusal(diagnosis, [], "tremor") == "The error rises."
-    assert explanation.refusal(diagnosis, [], "fatigue") == "On held-out pulses the error would rise."
     with pytest.raises(ApiError) as refused:
-        explanation.require_evidence(diagnosis, [], ["fatigue"])
+        explanation.require_evidence({"missing": [objected]}, ["fatigue"])
     assert refused.value.detail.startswith("fatigue: On held-out pulses the error would rise.")
-    assert explanation.refusal({"missing": [FATIGUE], "candidates": [[tried]]}, [], "fatigue") is None
+    assert explanation.refusals({"missing": [FATIGUE]}, ["fatigue"]) == {}
 
 
 def test_an_error_that_is_shown_of_a_model_is_its_own() -> None:
@@ -421,7 +408,7 @@ def test_an_error_that_is_shown_of_a_model_is_its_own() -> None:
     second = {**FATIGUE, "effect": "tremor", "held_out_rms_before_nm": 0.102, "held_out_rms_after_nm": 0.057}
     base = {"held_out_rms_nm": 0.0555, "rms_nm": 0.2}
     diagnosis = {"verdict": "effect_missing", "missing": [first, second], "noise_sd_nm": 0.04, "base": base, "add": []}
-    view = explanation.view(diagnosis, None, [])
+    view = explanation.view(diagnosis, None)
     assert [error[1] for error in view["missing"][0]["errors"]] == [0.2, 0.056]
     assert [error[1] for error in view["missing"][1]["errors"]] == [0.2] and view["to_add"] == []
 
@@ -429,9 +416,9 @@ def test_an_error_that_is_shown_of_a_model_is_its_own() -> None:
 def test_only_what_is_likely_missing_is_advised() -> None:
     """A person who adds whatever is possible ends with a model that is no better on new pulses."""
     sure, perhaps = FATIGUE, {**FATIGUE, "effect": "tremor", "name": "Tremor", "probability": 0.45}
-    both = shown("effect_missing", [sure, perhaps], [], 6)
+    both = shown("effect_missing", [sure, perhaps], 6)
     assert both["likely"] == ["Fatigue"] and both["title"] == "An effect is missing in this model"
-    found = shown("effect_missing", [perhaps], [], 6)
+    found = shown("effect_missing", [perhaps], 6)
     assert found["likely"] == [] and "possibly missing" in found["title"] and len(found["missing"]) == 1
 
 
@@ -480,7 +467,7 @@ def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path)
     compared = comparison(path, lambda *_: None, model["json"])
     ComparisonOut.model_validate(compared)
     assert 1000 < len(compared["series"]["time_s"]) <= 2400
-    view = explanation.view(found, compared, [])
+    view = explanation.view(found, compared)
     assert [entry["effect"] for entry in view["missing"]] == ["asymmetric_relaxation"]
     assert {split["title"] for split in explanation.splits(compared)} == {
         str(title) for title in explanation.SPLITS.values()

@@ -70,7 +70,7 @@ async def figures_of(context: Context, row: Model) -> Figures:
 
     def draw() -> Figures:
         found = context.analyses.known_diagnosis(row)
-        view = explanation.view(found, measured["comparison"], row.effects) if found else None
+        view = explanation.view(found, measured["comparison"]) if found else None
         return _figures(row, measured, found, view, versions_of(context, row))
 
     return await asyncio.to_thread(draw)
@@ -137,7 +137,7 @@ async def looked_at(context: Context, row: Model, by: str, diagnose: int) -> dic
 def gather(context: Context, row: Model, measured: dict[str, Any], diagnosis: dict[str, Any]) -> dict[str, Any]:
     """What is missing, and where the error sits."""
     found, comparison, job = diagnosis["found"], measured["comparison"], diagnosis["job"]
-    view = explanation.view(found, comparison, row.effects) if found else None
+    view = explanation.view(found, comparison) if found else None
     lineage = context.versions.lineage(row)
     rows = versions_of(context, row, lineage)
     later = rows[[each["id"] for each in rows].index(row.id) + 1 :]

@@ -59,7 +59,7 @@ def diagnosis_html(
     `diagnosis` is as `stimrig.api.workers.verbs.diagnosis` gives it, `comparison` of the examined model with the
     record, thinned, `segments` as `stimrig.api.workers.curves.runs` gives them.
     """
-    view = explanation.view(diagnosis, comparison, [])
+    view = explanation.view(diagnosis, comparison)
     return _page(
         "report_diagnosis.html",
         title=f"{name}: what is missing",

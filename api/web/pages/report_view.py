@@ -49,7 +49,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
         **await facts(context, row, document),
         drawn=drawn,
         problem=measured["problem"],
-        why=explanation.view(found, measured["comparison"], row.effects) if found else None,
+        why=explanation.view(found, measured["comparison"]) if found else None,
         versions=await asyncio.to_thread(versions_of, context, row),
         recording=recording,
         session=await asyncio.to_thread(session_of, context, recording),

@@ -15,6 +15,7 @@ from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
 from stimrig.api.errors import ApiError, require_found
+from stimrig.api.models import carried_structure
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.store import audit, seen, uploads
@@ -131,7 +132,7 @@ async def take_in(
     warnings = [note for note in (*assumed, *found["notes"], warning) if note]
     row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, who.name, warnings, of))
     plain = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, who.name)
-    return row, await asyncio.shield(context.analyses.carried_structure.carry(plain, row.path)), warnings
+    return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), warnings
 
 
 def _whose(context: Context, code: str, who: Principal, says: str, data: bytes, of: str) -> str:
@@ -167,7 +168,7 @@ async def _rename_columns(context: Context, path: Path, columns: Sequence[str], 
 async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
     """The model of an upload, and what was left out of its structure."""
     with _about_the_upload(path):
-        return await context.analyses.carried_structure.fit(code, str(path))
+        return await carried_structure.fit(context.analyses, code, str(path))
 
 
 @contextlib.contextmanager
