@@ -22,30 +22,17 @@ SAME_CURRENT = 0.01
 """Currents that differ by at most this share are the same."""
 OF_THE_CURVE = ("threshold_us", "plateau_nm")
 """What changes with the current alone: not compared across two currents."""
-
-
-@dataclass(frozen=True)
-class Floor:
-    """The least uncertainty of a difference: a share of the value, or an amount in the figure's unit."""
-
-    share: float = 0.0
-    amount: float = 0.0
-
-    def at(self, value: float) -> float:
-        """In the figure's unit."""
-        return max(self.share * abs(value), self.amount)
-
-
 FLOORS = {
-    "threshold_us": (Floor(amount=2.5), Floor(amount=10.0)),
-    "plateau_nm": (Floor(share=0.02), Floor(share=0.15)),
-    "time_constant_s": (Floor(share=0.02), Floor(share=0.2)),
-    "damping": (Floor(share=0.025), Floor(share=0.35)),
-    "delay_s": (Floor(amount=0.001), Floor(amount=0.005)),
+    "threshold_us": ((0.0, 2.5), (0.0, 10.0)),
+    "plateau_nm": ((0.02, 0.0), (0.15, 0.0)),
+    "time_constant_s": ((0.02, 0.0), (0.2, 0.0)),
+    "damping": ((0.025, 0.0), (0.35, 0.0)),
+    "delay_s": ((0.0, 0.001), (0.0, 0.005)),
 }
-"""In the same structure, and where method or effects differ: fatigue in a model raises its plateau."""
-OF_EFFECT = (Floor(share=0.1), Floor(share=0.3))
-"""The same of an effect's parameter."""
+"""The least uncertainty of a difference, a share of the value and an amount in the unit of the figure: in the same
+structure, and where method or effects differ (fatigue in a model raises its plateau)."""
+OF_EFFECT = ((0.1, 0.0), (0.3, 0.0))
+"""The same of the parameter of an effect."""
 
 
 @dataclass(frozen=True)
@@ -84,25 +71,34 @@ def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
     first, second = old.get("value"), new.get("value")
     if first is None or second is None:
         return None
-    found = {"figure": name, "unit": new.get("unit") or "1", "before": first, "now": second}
-    found |= {"difference": second - first, "percent": 100 * (second - first) / abs(first) if first else None}
-    if old.get("sd") is None or new.get("sd") is None:
-        return found | {"uncertainty": None, "times": None, "beyond": False}
-    floor = _floor(name, before.same_structure(now))
-    uncertainty = math.hypot(old["sd"], new["sd"], max(floor.at(first), floor.at(second)))
-    times = abs(second - first) / uncertainty if uncertainty > 0 else 0.0
-    return found | {"uncertainty": uncertainty, "times": times, "beyond": times > BEYOND}
+    spread, times = None, None
+    if old.get("sd") is not None and new.get("sd") is not None:
+        same = before.same_structure(now)
+        spread = math.hypot(old["sd"], new["sd"], max(_floor(name, same, first), _floor(name, same, second)))
+        times = abs(second - first) / spread if spread > 0 else 0.0
+    return {
+        "figure": name,
+        "unit": new.get("unit") or "1",
+        "before": first,
+        "now": second,
+        "difference": second - first,
+        "percent": 100 * (second - first) / abs(first) if first else None,
+        "uncertainty": spread,
+        "times": times,
+        "beyond": times is not None and times > BEYOND,
+    }
 
 
 def uncertainty(name: str, figure: Figure) -> float | None:
-    """A figure's own uncertainty, in its unit, such that of two alike they add up to that of their difference."""
+    """The uncertainty of a figure, in its unit, such that of two alike they add up to that of their difference."""
     if figure.get("value") is None or figure.get("sd") is None:
         return None
-    return math.hypot(figure["sd"], _floor(name, True).at(figure["value"]) / math.sqrt(2))
+    return math.hypot(figure["sd"], _floor(name, True, figure["value"]) / math.sqrt(2))
 
 
-def _floor(name: str, same: bool) -> Floor:
-    return (OF_EFFECT if "." in name else FLOORS[name])[0 if same else 1]
+def _floor(name: str, same: bool, value: float) -> float:
+    share, amount = (OF_EFFECT if "." in name else FLOORS[name])[0 if same else 1]
+    return max(share * abs(value), amount)
 
 
 def comparable(before: State, now: State) -> list[str]:
@@ -127,23 +123,6 @@ def changed(before: State, now: State) -> list[dict[str, Any]]:
     """The differences beyond twice their uncertainty, the surest first."""
     found = [difference(name, before, now) for name in comparable(before, now)]
     return sorted((one for one in found if one and one["beyond"]), key=lambda one: -one["times"])
-
-
-def doubts(before: State, now: State) -> list[dict[str, Any]]:
-    """What differs in the conditions, each `kind` with `before` and `now`."""
-    found: list[tuple[str, Any, Any]] = []
-    if not same_current(before, now):
-        found.append(("current", before.current_ma, now.current_ma))
-    elif before.current_ma is None or now.current_ma is None:
-        found.append(("current unknown", before.current_ma, now.current_ma))
-    if before.method != now.method:
-        found.append(("method", before.method, now.method))
-    if sorted(before.structure) != sorted(now.structure):
-        found.append(("effects", list(before.structure), list(now.structure)))
-    old, new = dict(before.notes), dict(now.notes)
-    noted = [(kind, old.get(kind, ""), new.get(kind, "")) for kind in sorted(old.keys() | new.keys())]
-    found += [(kind, first, second) for kind, first, second in noted if first.split() != second.split()]
-    return [{"kind": kind, "before": first, "now": second} for kind, first, second in found]
 
 
 # ---- in words -----------------------------------------------------------------------------------------------------
@@ -224,43 +203,41 @@ def _digits(value: float) -> int:
 def sentences(before: State, now: State, since_utc: str) -> list[str]:
     """What changed beyond its uncertainty, a sentence each; one that says so where nothing did."""
     day = local_time.day(since_utc)
-    moved = [_sentence(one, day) for one in changed(before, now)]
+    moved = [_sentence(each, day) for each in changed(before, now)]
     return moved or [f"Nothing changed beyond its uncertainty since {day}."]
 
 
-def _sentence(one: dict[str, Any], day: str) -> str:
+def _sentence(change: dict[str, Any], day: str) -> str:
     """A change, and how sure it is. Of a falling curve the plateau's size is compared."""
-    name = name_of(one["figure"], one["unit"])
-    if one["before"] * one["now"] < 0:
-        amounts = {"before": value_words(one["before"], name), "now": value_words(one["now"], name)}
-        return "{figure}: {now}, it was {before} on {day}.".format(figure=name.words, day=day, **amounts)
-    if name.in_percent and one["percent"] is not None:
-        amount = f"{abs(one['percent']):.{1 if abs(one['percent']) < 9.95 else 0}f}{UNBROKEN}%"
-    else:
-        amount = value_words(abs(one["difference"]), name)
-    given = {"figure": name.words, "amount": amount, "day": day}
-    if abs(one["now"]) < abs(one["before"]):
-        return "{figure} {amount} lower than on {day}, more than twice its uncertainty.".format(**given)
-    return "{figure} {amount} higher than on {day}, more than twice its uncertainty.".format(**given)
+    name, first, second = name_of(change["figure"], change["unit"]), change["before"], change["now"]
+    if first * second < 0:
+        return f"{name.words}: {value_words(second, name)}, it was {value_words(first, name)} on {day}."
+    amount = value_words(abs(change["difference"]), name)
+    if name.in_percent and change["percent"] is not None:
+        percent = abs(change["percent"])
+        amount = f"{percent:.{1 if percent < 9.95 else 0}f}{UNBROKEN}%"
+    which = "lower" if abs(second) < abs(first) else "higher"
+    return f"{name.words} {amount} {which} than on {day}, more than twice its uncertainty."
 
 
 def doubt_sentences(before: State, now: State) -> list[str]:
-    """What puts the comparison in doubt, a sentence each."""
-    return [_doubt(one["kind"], one["before"], one["now"]) for one in doubts(before, now)]
-
-
-def _doubt(kind: str, before: Any, now: Any) -> str:
-    if kind == "current unknown":
-        return "The current of a recording is not known: threshold and plateau compare only at the same current."
-    if kind == "current":
-        given = {name: value_words(value, NAMES["current_ma"]) for name, value in (("before", before), ("now", now))}
-        return "The current was {before}, now it is {now}: threshold and plateau are not compared.".format(**given)
-    if kind == "effects":
-        given = {name: effects_words(value) or "none" for name, value in (("before", before), ("now", now))}
-        if given["before"] == given["now"]:
-            return "The models describe {now} in different ways: only large differences are told.".format(**given)
-        return "The models' effects differ ({before}, then {now}): only large differences are told.".format(**given)
-    given = {"before": str(before or "–")[:80], "now": str(now or "–")[:80]}
-    if kind == "method":
-        return "The methods differ ({before}, then {now}): only large differences are told.".format(**given)
-    return "The notes on {kind} differ: “{before}”, then “{now}”.".format(kind=KINDS.get(kind, kind), **given)
+    """What puts the comparison in doubt, a sentence each: current, method, effects and noted conditions that differ."""
+    found = []
+    if before.current_ma is None or now.current_ma is None:
+        found.append("The current of a recording is not known: threshold and plateau compare only at the same current.")
+    elif not same_current(before, now):
+        was, now_is = (value_words(state.current_ma, NAMES["current_ma"]) for state in (before, now))
+        found.append(f"The current was {was}, now it is {now_is}: threshold and plateau are not compared.")
+    large = "only large differences are told"
+    if before.method != now.method:
+        found.append(f"The methods differ ({before.method}, then {now.method}): {large}.")
+    if sorted(before.structure) != sorted(now.structure):
+        old, new = (effects_words(state.structure) or "none" for state in (before, now))
+        differ = f"The models' effects differ ({old}, then {new})"
+        ways = f"The models describe {new} in different ways"
+        found.append(f"{ways if old == new else differ}: {large}.")
+    noted = [(kind, dict(before.notes).get(kind, ""), dict(now.notes).get(kind, "")) for kind in KINDS]
+    for kind, first, second in noted:
+        if first.split() != second.split():
+            found.append(f"The notes on {KINDS[kind]} differ: “{first[:80] or '–'}”, then “{second[:80] or '–'}”.")
+    return found

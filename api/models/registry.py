@@ -232,7 +232,7 @@ class Versions:
         with self.store.write() as session:
             if approved or self._brings_back(row):
                 seen.check(session, seen.decisions(row.participant))
-            return self._decide(session, row, approved, by, reason, tracking.to_dict() if tracking else None)
+            return self._decide(session, row, approved, by, reason, tracking.model_dump() if tracking else None)
 
     def _brings_back(self, row: Model) -> bool:
         """Whether without this version another one is served; else a rejection only takes away."""

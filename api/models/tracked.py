@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from sqlalchemy.orm import defer
@@ -22,44 +22,43 @@ from stimrig.api.store.tables import Approval, Model, Test, Tracked
 log = logging.getLogger("stimrig.tracking")
 MOST_EARLIER = 20
 """Approvals before this one from which it is learnt how fast a person changes."""
-TOLD = ("now", "coming", "moved", "effects", "disturbed_s")
+OF_STEP = ("now", "coming", "moved", "effects", "disturbed_s")
 """What of a step is served with the model."""
 SUPERSEDED = "Another model was approved, or this approval ended, before the trial was followed."
 
 
-@dataclass(frozen=True)
+@dataclass
 class Trial:
     """A trial that is to be followed, with its test's recording."""
 
     test: Test
     approval: Approval
     """The one under which it was begun."""
-    model_json: str
-    """The approved MODEL.json."""
-    bounds: Bounds
-    """What a person allowed."""
-    alarms: Bounds
-    """Beyond what they are asked."""
-    problem: str
-    """Why the approved model cannot be followed; empty where it can."""
     number: int
     """Of the approval's trials, from 1."""
-    state: dict[str, Any] | None
-    """What is known from the last trial that was followed; None: there is none."""
-    missed: int
-    """Trials since then that were not followed."""
     earlier: list[list[dict[str, Any]]]
     """The levels of the trials under earlier approvals of this person, oldest first: how fast they change."""
+    missed: int
+    """Trials that were not followed since the last one that was."""
     since: str
     """Id of the recording that `state` was found from; without one, of the approved model's."""
+    state: dict[str, Any] | None = None
+    """What is known from the last trial that was followed; None: there is none."""
+    model_json: str = ""
+    """The approved MODEL.json."""
+    bounds: Bounds = field(default_factory=dict)
+    """What a person allowed."""
+    alarms: Bounds = field(default_factory=dict)
+    """Beyond what they are asked."""
+    problem: str = ""
+    """Why the approved model cannot be followed; empty where it can."""
 
 
 class TrackedVersions:
-    """What was tracked under each approval; bytes that were served are kept in memory, and never change."""
+    """What was tracked under each approval."""
 
     def __init__(self, store: Store, clock: Clock, versions: Versions) -> None:
         self.store, self.clock, self.versions = store, clock, versions
-        self._served: dict[str, Served] = {}
         self._earlier: dict[int, list[list[dict[str, Any]]]] = {}
 
     # ---- a trial -----------------------------------------------------------------------------------------------
@@ -77,20 +76,19 @@ class TrackedVersions:
         approval: Approval | None = self.store.get(Approval, test.plan.get("approval_id") or 0)
         if approval is None or approval.tracking is None:
             return None
-        rows = self.rows(approval.id)
-        followed = [row for row in rows if row.step is not None]
-        model, text, bounds, alarms, problem = self.versions.get(approval.model_id), "", Bounds(), Bounds(), ""
+        rows, model = self.rows(approval.id), self.versions.get(approval.model_id)
+        trial = Trial(test, approval, len(rows) + 1, self.earlier(approval), len(rows), model.recording_id)
+        for row in rows:
+            if row.step is not None:
+                trial.state, trial.missed = row.step["state"], len(rows) - row.number
+                trial.since = row.recording_id or model.recording_id
         try:
             limits, threshold_us = Limits(**approval.tracking), stored_model.threshold_us(model)
-            text, bounds, alarms = stored_model.text(model), limits.bounds(threshold_us), limits.alarms(threshold_us)
+            trial.model_json = stored_model.text(model)
+            trial.bounds, trial.alarms = limits.bounds(threshold_us), limits.alarms(threshold_us)
         except ApiError as error:
-            problem = error.detail
-        return Trial(
-            test, approval, text, bounds, alarms, problem, len(rows) + 1,
-            followed[-1].step["state"] if followed and followed[-1].step else None,
-            len(rows) - followed[-1].number if followed else len(rows), self.earlier(approval),
-            (followed[-1].recording_id if followed else None) or model.recording_id,
-        )  # fmt: skip
+            trial.problem = error.detail
+        return trial
 
     def earlier(self, approval: Approval) -> list[list[dict[str, Any]]]:
         """The levels of the trials under this person's earlier approvals, oldest first; read once for an approval.
@@ -172,22 +170,18 @@ class TrackedVersions:
 
     def _document(self, trial: Trial, row: Tracked, model_json: str) -> bytes:
         """What is served from now on: the moved model, or where a person is asked the last one within the limits."""
-        approval, step = trial.approval, row.step
+        approval, step = trial.approval, row.step or {}
+        told = {
+            "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id, "at_utc": row.at_utc,
+            **{key: step.get(key) for key in OF_STEP}, "limits": approval.tracking, "outcome": row.outcome,
+        }  # fmt: skip
         if row.ask is None:
-            assert step is not None
             document = json.loads(model_json)
-            told = {
-                "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id,
-                "at_utc": row.at_utc, **{key: step.get(key) for key in TOLD},
-                "limits": approval.tracking, "outcome": row.outcome,
-            }  # fmt: skip
         else:
             before = self.newest(approval.id)
-            document = json.loads(before.document if before is not None and before.document else trial.model_json)
-            told = document.get("tracking") or {
-                "approved_model_id": approval.model_id, "trial": 0, "test_id": None, "at_utc": approval.at_utc,
-                **dict.fromkeys(TOLD), "limits": approval.tracking, "outcome": None,
-            }  # fmt: skip
+            document = json.loads(trial.model_json if before is None or before.document is None else before.document)
+            none = {"trial": 0, "test_id": None, "at_utc": approval.at_utc, **dict.fromkeys((*OF_STEP, "outcome"))}
+            told = document.get("tracking") or told | none
         document["model_id"] = f"{approval.model_id}.{approval.id}.{told['trial']}"
         document["tracking"] = {**told, "ask": row.ask}
         return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
@@ -212,31 +206,27 @@ class TrackedVersions:
         approved = self.versions.served(participant)
         if approved is None:
             return None
-        conditions = (Tracked.approval_id == approved.approval_id, Tracked.etag.is_not(None))
-        newest = self.store.first(Tracked.etag, *conditions, order=Tracked.number.desc())
-        if newest is None:
+        row = self.newest(approved.approval_id)
+        if row is None or row.document is None:
             return approved
-        found = self._served.get(participant)
-        if found is None or (found.approval_id, found.etag) != (approved.approval_id, f'"{newest}"'):
-            row = self.newest(approved.approval_id)
-            assert row is not None
-            found = self._served[participant] = _served(row)
-        return found
+        document = json.loads(row.document)
+        return Served(
+            document["model_id"], row.document, f'"{row.etag}"', row.approval_id, document["tracking"]["at_utc"]
+        )
 
     def text_of(self, model_id: str) -> str:
         """MODEL.json of a version, or of one that was tracked from it. Raises ApiError (404, 500)."""
-        base, approval, number = parts(model_id)
-        if number == 0 and base != model_id:  # served before any trial moved it: the version itself, if it was approved
-            decision = self.store.get(Approval, approval)
-            known = decision is not None and decision.approved and decision.model_id == base
-            base = base if known else model_id
+        base, approval_id, number = parts(model_id)
         if number:
-            conditions = (Tracked.model_id == base, Tracked.approval_id == approval, Tracked.number == number)
-            for row in self.store.all(Tracked, *conditions):
-                if row.document is not None:
-                    return row.document.decode()
-            base = model_id
-        return stored_model.text(self.versions.get(base))
+            place = (Tracked.model_id == base, Tracked.approval_id == approval_id, Tracked.number == number)
+            row = self.store.first(Tracked, *place, Tracked.document.is_not(None), order=Tracked.number)
+            if row is not None and row.document is not None:
+                return row.document.decode()
+        elif base != model_id:  # served before any trial moved it: the version itself, if it was approved
+            decision = self.store.get(Approval, approval_id)
+            if decision is not None and decision.approved and decision.model_id == base:
+                return stored_model.text(self.versions.get(base))
+        return stored_model.text(self.versions.get(model_id))
 
     def version_of(self, model_id: str) -> Model:
         """The version itself, or the one from which it was tracked. Raises ApiError (404)."""
@@ -249,22 +239,20 @@ class TrackedVersions:
 
     def document(self, participant: str) -> dict[str, Any] | None:
         """The trials of the approval that holds, as clients see them; None where none holds."""
-        approval = self.versions.approved(participant)
-        if approval is None:
+        approval, served = self.versions.approved(participant), self.served(participant)
+        if approval is None or served is None:
             return None
-        rows, served = self.rows(approval.id), self.served(participant)
-        model = self.versions.get(approval.model_id)
         return {
             "participant": participant,
             "approved_model_id": approval.model_id,
             "approved_utc": approval.at_utc,
             "limits": approval.tracking,
-            "threshold_us": stored_model.threshold_us(model),
-            "served_utc": served.at_utc if served else None,
-            "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0) if served else None,
-            "etag": served.etag if served else None,
+            "threshold_us": stored_model.threshold_us(self.versions.get(approval.model_id)),
+            "served_utc": served.at_utc,
+            "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0),
+            "etag": served.etag,
             "ask": self.asks(approval.id),
-            "trials": [trial_document(row) for row in rows],
+            "trials": [trial_document(row) for row in self.rows(approval.id)],
         }
 
 
@@ -282,9 +270,3 @@ def parts(model_id: str) -> tuple[str, int, int]:
     if base and len(places) == 2 and all(part.isascii() and part.isdigit() and len(part) < 10 for part in places):
         return base, int(places[0]), int(places[1])
     return model_id, 0, 0
-
-
-def _served(row: Tracked) -> Served:
-    assert row.document is not None
-    told = json.loads(row.document)
-    return Served(told["model_id"], row.document, f'"{row.etag}"', row.approval_id, told["tracking"]["at_utc"])

@@ -20,7 +20,7 @@ from pydantic import (
 
 from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.errors import ApiError
-from stimrig.api.models.tracking import USUAL_PERCENT, Limits
+from stimrig.api.models.tracking import Limits
 from stimrig.api.people import accounts
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
@@ -357,24 +357,10 @@ class DecisionIn(Body):
     reason: Annotated[str, StringConstraints(max_length=500)] = ""
 
 
-class TrackingIn(Body):
-    """How far a tracked model may move from the approved one, either way, 0 to 60 %; 0: this stays as approved."""
-
-    gain_percent: FiniteFloat = Field(default=USUAL_PERCENT, description="of the gain")
-    threshold_percent: FiniteFloat = Field(
-        default=USUAL_PERCENT, description="of the threshold: the width at which the curve has gone 5 % of its way"
-    )
-    time_scale_percent: FiniteFloat = Field(default=USUAL_PERCENT, description="of the time scale")
-
-    def limits(self) -> Limits:
-        """As the registry takes them."""
-        return Limits(**self.model_dump())
-
-
 class ApprovalIn(DecisionIn):
     """Why a model is approved, and how far it may be tracked from trial to trial."""
 
-    tracking: TrackingIn = Field(default=TrackingIn())
+    tracking: Limits = Field(default=Limits())
 
 
 EffectName = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}$")]

@@ -2,23 +2,198 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import httpx
 import pytest
+from pydantic import ValidationError
 
-from stimrig.api.errors import ApiError
+from stimrig.api.clock import Clock
 from stimrig.api.models import tracking
+from stimrig.api.models.registry import Versions
+from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.models.tracking import NEW_TEST, Limits
-from stimrig.api.store.tables import Model, Test, Tracked
+from stimrig.api.store import Store
+from stimrig.api.store.tables import Model, Participant, Recording, Test, Tracked
 from stimrig.rig.messages import FinishedEvent
-from tests.api.conftest import STUB, Service, run_test, serving, soon, wait_done
+from tests.api import stub_worker
+from tests.api.conftest import STUB, Service, put_database, run_test, serving, soon, wait_done
 
 WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 40}}]
 MODEL, TRACKING = "/v1/participants/P017/model", "/v1/participants/P017/tracking"
+
+
+def gain(document: dict[str, Any], approved: dict[str, Any]) -> float:
+    return document["recruitment"]["torque_nm"][-1] / approved["recruitment"]["torque_nm"][-1]
+
+
+# ---- what is kept and served, on the database alone -----------------------------------------------------------------
+
+
+class Clinic:
+    """One participant in a database, and trials that are followed as the stub says."""
+
+    def __init__(self, folder: Path) -> None:
+        put_database(folder)
+        self.folder, self.store, clock = folder, Store(f"sqlite:///{folder}/stimrig.db"), Clock()
+        self.clock, self.versions = clock, Versions(self.store, clock)
+        self.tracked = TrackedVersions(self.store, clock, self.versions)
+        self.count = 0
+        with self.store.write() as session:
+            session.add(Participant(code="P017", profile={}, created_utc=clock.utc(), created_by="Ada"))
+
+    def test(self, **plan: Any) -> str:
+        """A test that was played, with its recording."""
+        self.count += 1
+        test_id, now = f"T{self.count}", self.clock.utc()
+        plan = {"profile": {"current_ma": 20.0}, "side": None, "muscle": None, "placement": None, **plan}
+        given = {"plan": plan, "summary": {}, "requested_by": "Ada", "requested_utc": now}
+        with self.store.write() as session:
+            session.add(Test(id=test_id, participant="P017", kind="sequence", state="completed", **given))
+            session.flush()
+            session.add(Recording(id=f"R{test_id}", participant="P017", test_id=test_id, path="", file_sha256="",
+                                  created_utc=now))  # fmt: skip
+            session.get_one(Test, test_id).recording_id = f"R{test_id}"
+        return test_id
+
+    def approve(self, model_id: str = "", limits: Limits = Limits(), **plan: Any) -> str:  # noqa: B008
+        """A model that a person approves, of a new test without an id."""
+        if not model_id:
+            text = json.dumps(stub_worker.model([]))
+            model_id = self.versions.add(text, "P017", f"R{self.test(**plan)}", "Ada").id
+        self.approval = self.versions.decide(model_id, True, "Ada", "", limits)
+        return model_id
+
+    def follow(self, test_id: str = "", **wanted: Any) -> Tracked | None:
+        """A trial is played under the approval and followed; `wanted`: what the worker says of it."""
+        trial = self.tracked.open_trial(test_id or self.test(approval_id=self.approval.id))
+        if trial is None:
+            return None
+        (self.folder / "track.json").write_text(json.dumps(wanted))
+        given = {name: getattr(trial, name) for name in ("state", "missed", "bounds", "model_json")}
+        data = {"data": str(self.folder / "trial.h5"), "reference_torque_nm": None, "between": []}
+        if not trial.problem:
+            return self.tracked.keep(trial, stub_worker.tracked({**data, **given}, lambda _: None))
+        return self.tracked.keep(trial, {"reason": trial.problem})
+
+    def served(self) -> dict[str, Any]:
+        """What the controller is served."""
+        found = self.tracked.served("P017")
+        assert found is not None
+        return json.loads(found.body)
+
+    def plain(self) -> dict[str, Any]:
+        """The approved model."""
+        found = self.versions.served("P017")
+        assert found is not None
+        return json.loads(found.body)
+
+
+@pytest.fixture
+def clinic(tmp_path: Path) -> Iterator[Clinic]:
+    made = Clinic(tmp_path)
+    yield made
+    made.store.close()
+
+
+GOOD: dict[str, Any] = {}
+SHORT = {"reason": "the record is too short"}
+ODD = {"outcome": "contradicts", "error_nm": 0.4}
+STILL = Limits(gain_percent=0.0)
+
+
+@pytest.mark.parametrize(
+    ("limits", "trials", "trial", "share", "words"),
+    [
+        (Limits(time_scale_percent=5.0), [GOOD, {"values": {"time_scale": 1.06}}], 1, 0.98, "scale is expected to be"),
+        (Limits(), [{"values": {"gain": 1.5}}], 0, 1.0, "the gain is expected to be 150.0 % of the approved one"),
+        (Limits(), [GOOD, ODD], 1, 0.98, "Trial 2 contradicts the structure"),
+        (Limits(), [GOOD, ODD, GOOD], 3, 0.98**3, None),
+        (Limits(), [GOOD, SHORT], 1, 0.98, None),
+        (Limits(), [GOOD, SHORT, SHORT], 1, 0.98, "Trials 2 and 3 could not be followed"),
+        (Limits(), [GOOD, SHORT, SHORT, GOOD], 4, 0.98**2, None),
+        (STILL, [{"values": {"gain": 0.85}}], 1, 1.0, None),
+        (STILL, [GOOD, {"values": {"gain": 0.79}}], 1, 1.0, "the gain is expected to be 79.0 % of the approved one"),
+    ],
+)
+def test_beyond_the_limits_the_last_version_within_stays_and_a_person_is_asked(
+    clinic: Clinic, limits: Limits, trials: list[dict[str, Any]], trial: int, share: float, words: str | None
+) -> None:
+    """Which words for which limit: below."""
+    clinic.approve(limits=limits)
+    before, rows = clinic.served(), []
+    for wanted in trials:
+        before = clinic.served()
+        rows.append(clinic.follow(**wanted))
+    document, told = clinic.served(), clinic.tracked.document("P017")
+    tracking = document["tracking"]
+    assert (tracking["trial"], gain(document, clinic.plain())) == (trial, pytest.approx(share))
+    assert told and told["ask"] == told["trials"][-1]["ask"] == tracking["ask"]
+    assert (tracking["ask"] is None) if words is None else (words in tracking["ask"] and NEW_TEST in tracking["ask"])
+    if words and "tracking" in before:
+        assert document["recruitment"] == before["recruitment"]
+        assert {**tracking, "ask": None} == {**before["tracking"], "ask": None}, "levels and age of what is served"
+    if trials[-2:] == [SHORT, GOOD]:
+        assert rows[-1].step["state"]["missed"] == 2, "what is known has become less certain"
+
+
+def test_where_nothing_is_tracked_no_trial_is_followed(clinic: Clinic) -> None:
+    clinic.approve(limits=Limits(gain_percent=0, threshold_percent=0, time_scale_percent=0))
+    assert clinic.tracked.allowing("P017") is None and clinic.served() == clinic.plain()
+
+
+def test_a_new_approval_starts_anew_and_a_rejected_one_serves_nothing(clinic: Clinic) -> None:
+    model = clinic.approve()
+    clinic.follow()
+    begun = clinic.test(approval_id=clinic.approval.id)
+    clinic.approve(model)
+    assert clinic.served() == clinic.plain()
+    row = clinic.follow(begun)
+    assert row and row.outcome == "not-followed" and clinic.served() == clinic.plain(), "begun under the older one"
+    clinic.follow()
+    assert gain(clinic.served(), clinic.plain()) == pytest.approx(0.98)
+    clinic.versions.decide(model, False, "Ada", "no")
+    assert clinic.tracked.served("P017") is None is clinic.tracked.document("P017")
+
+
+def test_undo_ends_what_was_tracked_and_keeps_the_limits(clinic: Clinic) -> None:
+    first = clinic.versions.get(clinic.approve())
+    text = json.dumps(stub_worker.model(["fatigue"]))
+    child = clinic.versions.add(text, "P017", first.recording_id, "Ada", first.id).id
+    clinic.approve(child, Limits(gain_percent=15.0))
+    clinic.follow()
+    assert clinic.served()["tracking"]["approved_model_id"] == child
+    clinic.versions.undo(child, "Ada", "")
+    told = clinic.tracked.document("P017")
+    assert clinic.served() == clinic.plain() and clinic.plain()["model_id"] == first.id
+    assert told and told["limits"]["gain_percent"] == 15.0 and told["trials"] == []
+
+
+def test_rates_are_learnt_from_the_same_place(clinic: Clinic) -> None:
+    model = clinic.approve()
+    clinic.follow()
+    assert clinic.tracked.earlier(clinic.approval) == []
+    clinic.approve(model)
+    assert len(clinic.tracked.earlier(clinic.approval)) == 1, "the approval before this one"
+    clinic.approve(profile={"current_ma": 15.0})
+    assert clinic.tracked.earlier(clinic.approval) == [], "none at this current"
+
+
+def test_a_damaged_model_is_not_followed(clinic: Clinic) -> None:
+    model = clinic.approve()
+    with clinic.store.write() as session:
+        row = session.get_one(Model, model)
+        row.document, row.etag = row.document.replace(b"1", b"2", 1), hashlib.sha256(row.document).hexdigest()
+    tracked = clinic.follow()
+    assert tracked and tracked.outcome == "not-followed" and "no longer what was stored" in tracked.reason
+
+
+# ---- through the service --------------------------------------------------------------------------------------------
 
 
 def play(client: httpx.Client, **more: Any) -> dict[str, Any]:
@@ -43,20 +218,13 @@ def say(service: Service, **wanted: Any) -> None:
     (service.data / "recordings" / "track.json").write_text(json.dumps(wanted))
 
 
-def gain(document: dict[str, Any], approved: dict[str, Any]) -> float:
-    return document["recruitment"]["torque_nm"][-1] / approved["recruitment"]["torque_nm"][-1]
-
-
-# ---- what is served ---------------------------------------------------------------------------------------------
-
-
 def test_each_trial_moves_it_and_the_approved_one_never_changes(client: httpx.Client, approved: str) -> None:
     before, followed = client.get(MODEL), tracked(client)
     assert followed.content == before.content and followed.headers["etag"] == before.headers["etag"], "no trial yet"
     assert "last-modified" in followed.headers and "last-modified" not in before.headers
     assert trials(client) == [] and client.get(TRACKING).json()["served_trial"] == 0
     tags = {before.headers["etag"]}
-    for number in (1, 2, 3):
+    for number in (1, 2):
         test = play(client)
         answer = tracked(client)  # at once: a trial that has just ended is waited for
         document = answer.json()
@@ -68,13 +236,12 @@ def test_each_trial_moves_it_and_the_approved_one_never_changes(client: httpx.Cl
         assert document["model_id"].startswith(f"{approved}.") and document["model_id"].endswith(f".{number}")
         assert tracked(client, **{"If-None-Match": answer.headers["etag"]}).status_code == 304
         tags.add(answer.headers["etag"])
-    assert len(tags) == 4
+    assert len(tags) == 3
     after = client.get(MODEL)
     assert after.content == before.content and dict(after.headers) | {"date": ""} == dict(before.headers) | {"date": ""}
-    assert [row["number"] for row in trials(client)] == [1, 2, 3]
+    assert [row["number"] for row in trials(client)] == [1, 2]
     entries = [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "track model"]
-    assert len(entries) == 3 and all(entry["subject"] == approved for entry in entries)
-    assert client.get("/v1/audit").json()["whole"]
+    assert len(entries) == 2 and all(entry["subject"] == approved for entry in entries)
 
 
 def test_without_an_approval_nothing_is_served_or_noted(client: httpx.Client, participant: str) -> None:
@@ -86,198 +253,42 @@ def test_without_an_approval_nothing_is_served_or_noted(client: httpx.Client, pa
 
 def test_a_tracked_version_foretells_a_trial(client: httpx.Client, approved: str) -> None:
     play(client)
-    tracked_id, body = tracked(client).json()["model_id"], {"pulse_width_us": [100.0]}
-    for model_id in (approved, tracked_id, f"{approved}.1.0"):
-        told = client.post(f"/v1/models/{model_id}/prediction", json=body)
-        assert told.status_code == 200 and told.json()["model_id"] == model_id
-        wanted = client.post(f"/v1/models/{model_id}/widths", json={"reference_torque_nm": [0.0, 1.0]})
-        assert wanted.status_code == 200 and wanted.json()["model_id"] == model_id
+    tracked_id = tracked(client).json()["model_id"]
     unknown = (f"{approved}.99.0", f"{approved}.0.0", "none.1.0")  # no such approval of that model
-    for model_id in (f"{approved}.1.2", f"{approved}.2.1", "none.1.1", f"{approved}.1.{'9' * 30}", ".1.1", *unknown):
-        assert client.post(f"/v1/models/{model_id}/prediction", json=body).status_code == 404
-        wanted = {"reference_torque_nm": [1.0]}
-        assert client.post(f"/v1/models/{model_id}/widths", json=wanted).status_code == 404
+    never = (f"{approved}.1.2", f"{approved}.2.1", "none.1.1", f"{approved}.1.{'9' * 30}", ".1.1", *unknown)
+    for verb, body in (("prediction", {"pulse_width_us": [100.0]}), ("widths", {"reference_torque_nm": [0.0, 1.0]})):
+        for model_id in (approved, tracked_id, f"{approved}.1.0"):
+            assert client.post(f"/v1/models/{model_id}/{verb}", json=body).json()["model_id"] == model_id
+        for model_id in never:
+            assert client.post(f"/v1/models/{model_id}/{verb}", json=body).status_code == 404
 
 
-# ---- within what a person allowed -------------------------------------------------------------------------------
-
-
-def test_beyond_a_limit_the_last_version_within_stays_and_asks(service: Service, client: httpx.Client, approved: str):
-    """Which words for which limit: below."""
-    client.post(f"/v1/models/{approved}/approve", json={"tracking": {"time_scale_percent": 5.0}})
-    play(client)
-    good, words = tracked(client), "the time scale is expected to be 106.0 %"
-    say(service, values={"time_scale": 1.06})
-    play(client)
-    asked = tracked(client)
-    document, told = asked.json(), asked.json()["tracking"]
-    assert asked.headers["etag"] != good.headers["etag"] and words in told["ask"] and NEW_TEST in told["ask"]
-    assert {**document, "tracking": None} == {**good.json(), "tracking": None}
-    assert {**told, "ask": None} == good.json()["tracking"], "trial, levels and age are those of what is served"
-    assert asked.headers["last-modified"] == good.headers["last-modified"]
-    row = trials(client)[-1]
-    assert row["outcome"] == "followed" and words in row["ask"] and client.get(TRACKING).json()["ask"] == row["ask"]
-
-
-def test_beyond_it_at_the_first_trial_the_approved_model_asks(service: Service, client: httpx.Client, approved: str):
-    say(service, values={"gain": 1.5})
-    play(client)
-    document = tracked(client).json()
-    plain = client.get(MODEL).json()
-    assert document["tracking"]["ask"] and document["tracking"]["trial"] == 0
-    assert document["recruitment"] == plain["recruitment"] and "tracking" not in plain
-
-
-def test_a_trial_that_contradicts_the_structure_asks_and_the_next_good_one_goes_on(
-    service: Service, client: httpx.Client, approved: str
-) -> None:
-    play(client)
-    say(service, outcome="contradicts", error_nm=0.4)
-    play(client)
-    document = tracked(client).json()
-    assert "Trial 2 contradicts the structure" in document["tracking"]["ask"] and document["tracking"]["trial"] == 1
-    play(client)
-    document = tracked(client).json()
-    assert document["tracking"]["ask"] is None and document["tracking"]["trial"] == 3
-
-
-def test_two_trials_running_that_cannot_be_followed_ask(service: Service, client: httpx.Client, approved: str) -> None:
-    play(client)
-    good = tracked(client)
-    for number in (2, 3):
-        say(service, reason="the record is too short")
-        play(client)
-        assert bool(tracked(client).json()["tracking"]["ask"]) is (number == 3)
-    document, before = tracked(client).json(), good.json()
-    assert document["tracking"]["ask"].startswith("Trials 2 and 3 could not be followed")
-    assert document["recruitment"] == before["recruitment"] and document["tracking"]["trial"] == 1
-    assert client.get(TRACKING).json()["ask"] == document["tracking"]["ask"]
-    play(client)
-    assert tracked(client).json()["tracking"]["ask"] is None, "the next one is followed again"
-
-
-def test_limits_that_are_none_are_refused_and_nothing_is_approved(client: httpx.Client, participant: str) -> None:
+def test_limits_are_refused_or_kept_audited_and_shown(client: httpx.Client, participant: str) -> None:
     model, head = run_test(client, participant)["model_id"], {"Content-Type": "application/json"}
     for percent in ("-1", "60.5", '"20"', "null", "true", "1e400"):
         body = f'{{"tracking": {{"gain_percent": {percent}}}}}'
         refused = client.post(f"/v1/models/{model}/approve", content=body, headers=head)
         assert refused.status_code in (400, 422) and client.get(MODEL).status_code == 404, percent
-
-
-def test_limits_are_kept_audited_and_shown(client: httpx.Client, approved: str) -> None:
     limits = {"gain_percent": 10.0, "threshold_percent": 0.0, "time_scale_percent": 60.0}
-    shown = client.post(f"/v1/models/{approved}/approve", json={"tracking": limits}).json()
+    shown = client.post(f"/v1/models/{model}/approve", json={"tracking": limits}).json()
     assert shown["tracking"] == limits and client.get(TRACKING).json()["limits"] == limits
+    client.post(f"/v1/models/{model}/approve")
     entries = [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "approve"]
     usual = dict.fromkeys(limits, 20.0)
-    assert [entry["detail"]["tracking"] for entry in entries] == [usual, limits]
+    assert sorted(str(entry["detail"]["tracking"]) for entry in entries) == sorted(map(str, (limits, usual)))
 
 
-def test_what_is_not_tracked_stays_and_nothing_tracked_means_no_trial(
+def test_a_worker_that_dies_or_another_current_costs_the_trial_only(
     service: Service, client: httpx.Client, approved: str
 ) -> None:
-    client.post(f"/v1/models/{approved}/approve", json={"tracking": {"gain_percent": 0}})
-    say(service, values={"gain": 0.85})
-    play(client)
-    document = tracked(client).json()
-    assert document["tracking"]["trial"] == 1 and document["tracking"]["ask"] is None
-    assert gain(document, client.get(MODEL).json()) == 1.0
-    say(service, values={"gain": 0.79})
-    play(client)
-    document = tracked(client).json()
-    assert "the gain is expected to be 79.0 % of the approved one" in document["tracking"]["ask"], "asked all the same"
-    assert gain(document, client.get(MODEL).json()) == 1.0
-    nothing = dict.fromkeys(("gain_percent", "threshold_percent", "time_scale_percent"), 0)
-    client.post(f"/v1/models/{approved}/approve", json={"tracking": nothing})
-    play(client)
-    assert trials(client) == [] and tracked(client).content == client.get(MODEL).content
-
-
-# ---- approvals come and go ----------------------------------------------------------------------------------------
-
-
-def test_a_new_approval_starts_anew_and_a_rejected_one_serves_nothing(client: httpx.Client, approved: str) -> None:
-    play(client)
-    assert tracked(client).json()["tracking"]["trial"] == 1
-    client.post(f"/v1/models/{approved}/approve")
-    assert tracked(client).content == client.get(MODEL).content and trials(client) == []
-    play(client)
-    document = tracked(client).json()
-    assert gain(document, client.get(MODEL).json()) == pytest.approx(0.98)
-    client.post(f"/v1/models/{approved}/reject", json={"reason": "no"})
-    assert tracked(client).status_code == client.get(MODEL).status_code == 404
-
-
-def test_undo_ends_what_was_tracked_and_keeps_the_limits(client: httpx.Client, approved: str) -> None:
-    child = client.post(f"/v1/models/{approved}/effects", json={"effects": ["fatigue"]}).json()["id"]
-    client.post(f"/v1/models/{child}/approve", json={"tracking": {"gain_percent": 15}})
-    play(client)
-    assert tracked(client).json()["tracking"]["approved_model_id"] == child
-    client.post(f"/v1/models/{child}/undo")
-    assert tracked(client).content == client.get(MODEL).content
-    assert client.get(TRACKING).json()["limits"]["gain_percent"] == 15.0 and trials(client) == []
-
-
-def test_a_trial_begun_under_an_older_approval_moves_nothing(client: httpx.Client, approved: str) -> None:
-    body = {"participant": "P017", "kind": "sequence", "segments": WIDTHS}
-    test = client.post("/v1/tests", json=body).json()["id"]
-    client.post(f"/v1/models/{approved}/approve")
-    wait_done(client, test)
-    assert tracked(client).content == client.get(MODEL).content and trials(client) == []
-
-
-# ---- what goes wrong ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("wanted", "words"),
-    [({"reason": "the model holds for 40 pulses"}, "40 pulses"), ({"die": True}, "while it did the track")],
-)
-def test_a_trial_that_cannot_be_followed_is_noted_and_nothing_is_lost(
-    service: Service, client: httpx.Client, approved: str, wanted: Any, words: str
-) -> None:
-    play(client)
-    before = tracked(client)
-    say(service, **wanted)
+    say(service, die=True)
     assert play(client)["state"] == "completed"
-    assert tracked(client).content == before.content
-    row = soon(lambda: trials(client)[1:])[0]
-    assert row["outcome"] == "not-followed" and words in row["reason"] and row["now"] is None
-    play(client)
-    document = tracked(client).json()
-    assert document["tracking"]["trial"] == 3 and gain(document, client.get(MODEL).json()) == pytest.approx(0.98**2)
-    state = service.context.tracked.rows(1)[-1].step["state"]
-    assert state["missed"] == 1, "what is known has become less certain by the trial in between"
-
-
-def test_a_trial_at_another_current_moves_nothing(service: Service, client: httpx.Client, approved: str) -> None:
+    assert tracked(client).content == client.get(MODEL).content
     client.put("/v1/participants/P017/profile", json={"current_ma": 15.0})
     play(client)
-    (row,) = soon(lambda: trials(client))
-    assert row["outcome"] == "not-followed" and "another side, muscle or current" in row["reason"]
-
-
-def test_rates_are_learnt_from_the_same_place(service: Service, client: httpx.Client, approved: str) -> None:
-    def sessions() -> int:
-        tracked = service.context.tracked
-        return len(tracked.earlier(tracked.allowing("P017")))
-
-    play(client)
-    assert sessions() == 0
-    client.post(f"/v1/models/{approved}/approve")
-    assert sessions() == 1, "the approval before this one"
-    client.put("/v1/participants/P017/profile", json={"current_ma": 15.0})
-    other = run_test(client, "P017")["model_id"]
-    assert client.post(f"/v1/models/{other}/approve").status_code == 200
-    assert sessions() == 0, "none at this current"
-
-
-def test_a_damaged_model_is_not_followed(service: Service, client: httpx.Client, approved: str) -> None:
-    service.change(Model, approved, document=lambda old: old.replace(b"1", b"2", 1))
-    play(client)
-    (row,) = soon(lambda: service.context.tracked.rows(1))
-    assert row.outcome == "not-followed" and "no longer what was stored" in row.reason
-    assert tracked(client).status_code == 500
+    rows = soon(lambda: len(found := trials(client)) == 2 and found)
+    assert [row["outcome"] for row in rows] == ["not-followed"] * 2 and rows[0]["now"] is None
+    assert "while it did the track" in rows[0]["reason"] and "another side, muscle or current" in rows[1]["reason"]
 
 
 def test_a_trial_that_is_told_twice_moves_nothing_twice(service: Service, client: httpx.Client, approved: str) -> None:
@@ -355,22 +366,17 @@ def step(outcome: str = "followed", **coming: float) -> dict[str, Any]:
 @pytest.mark.parametrize("percent", [-0.001, 60.001, math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("name", ["gain_percent", "threshold_percent", "time_scale_percent"])
 def test_what_is_not_from_0_to_60_is_refused(name: str, percent: float) -> None:
-    with pytest.raises(ApiError, match=name) as refused:
+    with pytest.raises(ValidationError, match=name):
         Limits(**{name: percent})
-    assert refused.value.status == 422
-
-
-@pytest.mark.parametrize("percent", [0.0, 20.0, 60.0])
-def test_the_ends_hold(percent: float) -> None:
-    assert Limits(percent, percent, percent).allows == (percent > 0.0)
 
 
 def test_bounds_are_in_the_quantities_units() -> None:
-    assert Limits(20.0, 10.0, 50.0).bounds(80.0) == {
+    assert Limits(threshold_percent=10.0, time_scale_percent=50.0).bounds(80.0) == {
         "gain": (0.8, 1.2), "threshold_shift_us": (-8.0, 8.0), "time_scale": (0.5, 1.5),
     }  # fmt: skip
-    assert Limits(0.0, 10.0, 0.0).bounds(80.0) == {"threshold_shift_us": (-8.0, 8.0)}
-    assert Limits(0.0, 10.0, 0.0).alarms(80.0) == {
+    threshold_alone = Limits(gain_percent=0.0, threshold_percent=10.0, time_scale_percent=0.0)
+    assert threshold_alone.bounds(80.0) == {"threshold_shift_us": (-8.0, 8.0)}
+    assert threshold_alone.alarms(80.0) == {
         "gain": (0.8, 1.2), "threshold_shift_us": (-8.0, 8.0), "time_scale": (0.8, 1.2),
     }  # fmt: skip
     for without in (None, 0.0, -3.0):
@@ -407,10 +413,6 @@ def test_a_number_that_json_has_not_is_beyond_every_bound() -> None:
     without = step()
     without["coming"] = {**without["coming"], "gain": {"value": None}}
     assert "unknown what to expect of the gain" in str(tracking.ask(1, without, Limits().bounds(80.0)))
-
-
-def test_what_is_not_tracked_asks_nobody() -> None:
-    assert tracking.ask(1, step(gain=0.1), Limits(gain_percent=0.0).bounds(80.0)) is None
 
 
 def test_next_to_no_torque_asks_for_a_look_at_the_electrodes_first() -> None:

@@ -28,7 +28,7 @@ from tests.harness.sessions import Planned, record
 pytestmark = pytest.mark.slow
 
 RATE_HZ = 400
-WIDE = Limits(60.0, 60.0, 60.0).bounds(80.0)
+WIDE = Limits(gain_percent=60.0, threshold_percent=60.0, time_scale_percent=60.0).bounds(80.0)
 WIDTHS = np.concatenate([
     np.zeros(40), np.linspace(0.0, 200.0, 80), np.full(60, 200.0), np.linspace(200.0, 120.0, 60), np.full(80, 120.0),
     np.linspace(120.0, 0.0, 120), np.zeros(40),

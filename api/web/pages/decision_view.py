@@ -92,17 +92,17 @@ def read_tracking(sent: FormData) -> Limits:
     Raises ApiError: 422 what was typed is no percentage from 0 to 60.
     """
     found: dict[str, float] = {}
-    for name in Limits().to_dict():
+    for name in Limits.model_fields:
         text = sent.get(name)
         if text is None:
             continue
         found[name] = typed.wanted(str(text), lambda error, name=name: f"{name}: {error}. Nothing was decided.")
-    return Limits(**found)
+    return typed.checked(Limits, **found)
 
 
 def tracking_fields(sent: Mapping[str, Any] | None = None) -> list[dict[str, Any]]:
     """The form's fields, with what was typed in them."""
-    given = {name: typed.number_text(percent) for name, percent in Limits().to_dict().items()} | dict(sent or {})
+    given = {name: typed.number_text(percent) for name, percent in Limits().model_dump().items()} | dict(sent or {})
     return [{"name": name, "label": str(label), "text": str(given[name])[:5]} for name, label in LABELS.items()]
 
 
@@ -121,7 +121,7 @@ def tracking_words(limits: Mapping[str, Any] | None, threshold_us: float | None)
         return "The model does not follow the muscle from trial to trial: all stays as approved."
     said = {
         quantity: f"±{typed.number_text(percent)}\u00a0%" if quantity in bounds else "as approved"
-        for quantity, percent in zip(QUANTITIES, allowed.to_dict().values(), strict=True)
+        for quantity, percent in zip(QUANTITIES, allowed.model_dump().values(), strict=True)
     }
     if shift_us := bounds.get("threshold_shift_us", (0.0, 0.0))[1]:
         said["threshold_shift_us"] += f" (±{shift_us:.3g}\u00a0µs)"

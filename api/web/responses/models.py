@@ -6,6 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, JsonValue
 
+from stimrig.api.models.tracking import Limits
 from stimrig.api.web.responses.base import Document, Problem, SegmentOut
 
 
@@ -42,14 +43,6 @@ class CarriedOut(Document):
     effects: list[CarriedEffect]
 
 
-class TrackingLimits(Document):
-    """How far a tracked model may move from the approved one, either way, %; 0: this is not tracked."""
-
-    gain_percent: float
-    threshold_percent: float = Field(description="of the threshold: where the curve has gone 5 % of its way")
-    time_scale_percent: float
-
-
 class VersionOut(Document):
     """One model version: its errors, its verdict, and where it comes from."""
 
@@ -75,7 +68,7 @@ class VersionOut(Document):
     reasons: list[str] = Field(description="what speaks against the model, worst first")
     decision: Literal["approved", "rejected"] | None
     undone: bool = Field(description="the decision is an undo")
-    tracking: TrackingLimits | None = Field(description="how far it may be tracked; null: not approved")
+    tracking: Limits | None = Field(description="how far it may be tracked; null: not approved")
     served: bool = Field(description="the controller gets this one")
     created_utc: str
 
@@ -374,7 +367,7 @@ class TrackedOut(Document):
     coming: Levels | None = Field(description="expected in the next one: what the model holds")
     effects: dict[str, dict[str, float]] | None = Field(description="as in a trial")
     disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches to learn nothing from, s")
-    limits: TrackingLimits | None
+    limits: Limits | None
     outcome: str | None
     ask: str | None = Field(description="null, or why a person has to look: then end")
 
@@ -416,7 +409,7 @@ class TrackingOut(Document):
     participant: str
     approved_model_id: str
     approved_utc: str
-    limits: TrackingLimits | None = Field(description="null: nobody has allowed it")
+    limits: Limits | None = Field(description="null: nobody has allowed it")
     threshold_us: float | None = Field(description="of the approved curve, µs: what the limit of the threshold is of")
     served_utc: str | None = Field(description="since when that is known which is served")
     served_trial: int | None = Field(description="the trial it was tracked to; 0: the approved model")

@@ -116,7 +116,7 @@ async def approve(context: Ctx, who: Approver, model_id: str, body: ApprovalIn |
     """Let the controller have this version, and what is tracked from it within limits, until the day ends."""
     given = body or ApprovalIn()
     row = await asyncio.to_thread(context.versions.get, model_id)
-    await let_have(context, row, who.name, given.reason, given.tracking.limits())
+    await let_have(context, row, who.name, given.reason, given.tracking)
     return await asyncio.to_thread(context.versions.document, row)
 
 
