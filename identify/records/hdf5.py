@@ -1,97 +1,28 @@
 """The strict reader of HDF5 files: numbers and names that stand in the file itself, and nothing else.
 
 An HDF5 file may name other files (external storage, external and soft links, virtual datasets), declare a terabyte in a
-few bytes, or carry code's input in unusual types. So libhdf5 is asked only how a dataset is laid out, of a copy in
-memory. The numbers are then taken from the file's own bytes, each bound checked before memory is taken for it."""
+few bytes, or hold unusual types. So each dataset is asked where its values are and how large they are before h5py reads
+it, of a copy in memory."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import h5py
 import numpy as np
-from h5py import h5a, h5d, h5f, h5g, h5l, h5o, h5s, h5t, h5z  # pyright: ignore[reportAttributeAccessIssue]
 
 from stimrig.identify.errors import BadRecord
-from stimrig.identify.records.bounds import LARGEST_ROWS, LONGEST_PLAN, LONGEST_TEXT, MOST_SEGMENTS, BadPiece, inflated
+from stimrig.identify.records.bounds import LARGEST_ROWS, LONGEST_PLAN, LONGEST_TEXT, MOST_SEGMENTS
 
-LARGEST_CHUNK_BYTES = 16 * 2**20
+LARGEST_CHUNK_BYTES = 2**20
+"""Packed it may be a thousandth of it, and libhdf5 unpacks it whole, whatever it was declared to be."""
 MOST_CHUNKS = 100_000
 OVERHEAD_BYTES = 4096
 """What a filter may add to what cannot be packed."""
-
-
-class BadChunk(BadPiece):
-    """A piece of a dataset that is not what it is declared to be."""
-
-
-def file_piece(content: bytes, offset: int | None, size: int) -> memoryview:
-    """A stretch of the file. Raises BadChunk: it was never written, or lies outside."""
-    if offset is None:
-        raise BadChunk("values are declared and were never written")
-    if not (offset >= 0 and offset + size <= len(content)):
-        raise BadChunk("values are declared beyond the file's end")
-    return memoryview(content)[offset : offset + size]
-
-
-def read_chunks(
-    content: bytes, dataset: Any, length: int, filters: Sequence[int], dtype: np.dtype, size: int
-) -> np.ndarray:
-    """The values of a dataset in chunks of `length` values, each chunk written.
-
-    Raises BadChunk: too large, too many, not written, or not what was declared.
-    """
-    full = length * dtype.itemsize
-    count = -(-size // length)
-    if not (0 < full <= LARGEST_CHUNK_BYTES):
-        raise BadChunk(f"chunks of {full} bytes, at most {LARGEST_CHUNK_BYTES} are read")
-    if count > MOST_CHUNKS:
-        raise BadChunk(f"{count} chunks, at most {MOST_CHUNKS} are read")
-    values = np.empty(size, dtype)
-    for start in range(0, size, length):
-        stored = dataset.get_chunk_info_by_coord((start,))
-        if stored.size > full + OVERHEAD_BYTES:
-            raise BadChunk("a chunk that is larger than what it holds")
-        packed = file_piece(content, stored.byte_offset, stored.size)
-        chunk = np.frombuffer(unpacked(packed, filters, stored.filter_mask, dtype.itemsize, full), dtype)
-        values[start : start + length] = chunk[: size - start]
-    return values
-
-
-def unpacked(data: Any, filters: Sequence[int], skipped: int, itemsize: int, full: int) -> Any:
-    """A chunk's bytes with its filters undone, the last one first.
-
-    Raises BadChunk: they do not give the chunk's size, or a checksum does not hold.
-    """
-    for index in reversed(range(len(filters))):
-        if skipped >> index & 1:
-            continue
-        if filters[index] == h5z.FILTER_DEFLATE:
-            data = inflated(data, full + OVERHEAD_BYTES, "packed data that are damaged, or longer than declared")
-        elif filters[index] == h5z.FILTER_SHUFFLE:
-            data = np.frombuffer(data, np.uint8, len(data) // itemsize * itemsize).reshape(itemsize, -1).T.tobytes()
-        else:
-            data, stored = data[:-4], np.frombuffer(bytes(data[-4:]).ljust(4, b"\0"), "<u2")
-            if fletcher32(data) != (int(stored[0]) % 65535, int(stored[1]) % 65535):
-                raise BadChunk("a checksum does not hold; the file was damaged")
-    if len(data) != full:
-        raise BadChunk("a chunk that does not unpack to its size")
-    return data
-
-
-def fletcher32(data: Any) -> tuple[int, int]:
-    """Both sums of HDF5's checksum over words of two bytes, modulo 65535."""
-    even = bytes(data) + b"\0" * (len(data) % 2)
-    words = np.frombuffer(even, ">u2").astype(np.uint64)
-    second = int(np.sum(words * np.arange(words.size, 0, -1, dtype=np.uint64))) if words.size else 0
-    return int(words.sum()) % 65535, second % 65535
-
-
 FIX = "Give a sealed recording, as written by the rig at the end of a test."
-ELSEWHERE = object()
-FILTERS = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32)
 
 
 class StrictFile:
@@ -101,10 +32,9 @@ class StrictFile:
     """
 
     def __init__(self, content: bytes, name: str) -> None:
-        self.content, self.name = content, name
+        self.name = name
         with self._asking(""):
-            self._file = h5f.open_file_image(content)
-            self._root = h5g.open(self._file, b"/")
+            self._file = h5py.File(io.BytesIO(content), "r")
 
     def text(self, name: str, default: str | None = None, longest: int = LONGEST_TEXT) -> str:
         """A text attribute of the root. Raises BadRecord: not there and no default, no text, or longer."""
@@ -120,33 +50,19 @@ class StrictFile:
 
     def has(self, path: str) -> bool:
         """Whether something is called so; what it is, `numbers` says."""
-        return self._find(path) is not None
-
-    def _find(self, path: str) -> Any:
-        """What hard links alone lead to: None where nothing is called so, `ELSEWHERE` at another kind of link."""
-        here: Any = self._root
         with self._asking(path):
-            for part in path.strip("/").encode().split(b"/"):
-                if not isinstance(here, h5g.GroupID) or not here.links.exists(part):
-                    return None
-                if here.links.get_info(part).type != h5l.TYPE_HARD:
-                    return ELSEWHERE
-                here = h5o.open(here, part)
-        return here
+            return path in self._file
 
     def numbers(self, path: str) -> np.ndarray:
         """A dataset of one dimension as float64.
 
         Raises BadRecord: not there, not inside the file, not plain numbers, or longer than any record.
         """
-        dataset = self._dataset(path)
+        dataset = self._dataset(path, LARGEST_ROWS)
         with self._asking(path):
-            kind = dataset.get_type()
-            plain = kind.get_class() in (h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= 8
-            if not plain or h5t.py_create(kind.dtype) != kind:
+            if h5py.check_enum_dtype(dataset.dtype) or dataset.dtype.kind not in "iuf" or dataset.dtype.itemsize > 8:
                 raise self.bad("no plain numbers", path)
-            size = self._size(dataset, path, LARGEST_ROWS)
-            return np.asarray(self._values(dataset, path, kind.dtype, size), float)
+            return dataset[:].astype(float)
 
     def columns(self, group: str, names: Sequence[str], unequal: str) -> list[np.ndarray]:
         """The datasets of a group, equally long, as float64. Raises BadRecord: as for `numbers`, or `unequal`."""
@@ -157,83 +73,71 @@ class StrictFile:
 
     def names(self, path: str) -> list[str]:
         """A dataset of one dimension of texts. Raises BadRecord: as for `numbers`."""
-        dataset = self._dataset(path)
+        dataset = self._dataset(path, MOST_SEGMENTS)
         with self._asking(path):
-            kind = dataset.get_type()
-            if kind.get_class() != h5t.STRING:
+            kind = h5py.check_string_dtype(dataset.dtype)
+            if kind is None:
                 raise self.bad("no texts", path)
-            size = self._size(dataset, path, MOST_SEGMENTS)
-            if not kind.is_variable_str():
-                if kind.get_size() > LONGEST_TEXT:
-                    raise self.bad("texts without an end", path)
-                values = self._values(dataset, path, np.dtype(f"S{kind.get_size()}"), size)
-                return [_sound(bytes(value)) for value in values]
-            if dataset.get_create_plist().get_nfilters():
-                raise self.bad("compressed texts", path)
-            return [self._variable_text(dataset, index, path) for index in range(size)]
-
-    def _variable_text(self, dataset: Any, index: int, path: str) -> str:
-        """One text by itself: many elements may point to one long text, which is then read once and refused."""
-        selection = dataset.get_space()
-        selection.select_hyperslab((index,), (1,))
-        found = np.empty(1, h5py.string_dtype())
-        dataset.read(h5s.create_simple((1,)), selection, found)
-        if len(found[0]) > LONGEST_TEXT:
-            raise self.bad("a text without an end", path)
-        return _sound(found[0])
+            if (kind.length or 0) > LONGEST_TEXT:
+                raise self.bad("texts without an end", path)
+            found = []
+            for index in range(dataset.size):  # many may point to one long text, which is then read once and refused
+                text = dataset[index]
+                if len(text) > LONGEST_TEXT:
+                    raise self.bad("a text without an end", path)
+                found.append(_sound(text))
+            return found
 
     def _attribute(self, name: str, default: Any) -> Any:
         with self._asking(f"attribute {name}"):
-            if not h5a.exists(self._file, name.encode()):
+            attributes = self._file.attrs
+            if name not in attributes:
                 if default is None:
                     raise self.bad("is missing", f"attribute {name}")
                 return default
-            attribute = h5a.open(self._file, name.encode())
-            kind = attribute.get_type()
-            known = kind.get_class() in (h5t.STRING, h5t.INTEGER, h5t.FLOAT) and kind.get_size() <= LONGEST_PLAN
-            if not known or attribute.get_space().get_simple_extent_type() != h5s.SCALAR:
+            attribute = attributes.get_id(name)
+            known = h5py.check_string_dtype(attribute.dtype) is not None or attribute.dtype.kind in "iufS"
+            if not known or attribute.shape != () or attribute.dtype.itemsize > LONGEST_PLAN:
                 raise self.bad("no single number or text", f"attribute {name}")
-            return h5py.File(self._file).attrs[name]
+            return attributes[name]
 
-    def _dataset(self, path: str) -> Any:
-        """The dataset of a path, its data inside this file."""
-        here = self._find(path)
-        if here is None:
-            raise self.bad(f"incomplete recording (no {path})")
-        if here is ELSEWHERE:
-            raise self.bad("a link to somewhere else", path)
+    def _dataset(self, path: str, most: int) -> h5py.Dataset:
+        """The dataset of a path, all of its values written, and in this file."""
+        here: Any = self._file
         with self._asking(path):
-            if not isinstance(here, h5d.DatasetID):
+            for part in path.strip("/").split("/"):
+                link = here.get(part, getlink=True) if isinstance(here, h5py.Group) else None
+                if link is None:
+                    raise self.bad(f"incomplete recording (no {path})")
+                if not isinstance(link, h5py.HardLink):
+                    raise self.bad("a link to somewhere else", path)
+                here = here[part]
+            if not isinstance(here, h5py.Dataset):
                 raise self.bad("no dataset", path)
-            plan = here.get_create_plist()
-            if plan.get_layout() not in (h5d.CONTIGUOUS, h5d.CHUNKED) or plan.get_external_count():
+            if here.is_virtual or here.external:
                 raise self.bad("data that are not plainly in this file (virtual or external)", path)
-            return here
+            if here.shape is None or len(here.shape) != 1:
+                raise self.bad("not of one dimension", path)
+            if here.size > most:
+                raise self.bad(f"{here.size} values are declared, at most {most} are read", path)
+            self._check_written(here, path)
+        return here
 
-    def _size(self, dataset: Any, path: str, most: int) -> int:
-        space = dataset.get_space()
-        if space.get_simple_extent_type() != h5s.SIMPLE or space.get_simple_extent_ndims() != 1:
-            raise self.bad("not of one dimension", path)
-        (size,) = space.get_simple_extent_dims()
-        if not (0 <= size <= most):
-            raise self.bad(f"{size} values are declared, at most {most} are read", path)
-        return int(size)
-
-    def _values(self, dataset: Any, path: str, dtype: np.dtype, size: int) -> np.ndarray:
-        """The values, from the file's own bytes."""
-        if size == 0:
-            return np.empty(0, dtype)
-        plan = dataset.get_create_plist()
-        try:
-            if plan.get_layout() == h5d.CONTIGUOUS:
-                piece = file_piece(self.content, dataset.get_offset(), size * dtype.itemsize)
-                return np.frombuffer(piece, dtype)
-            filters = [plan.get_filter(index)[0] for index in range(plan.get_nfilters())]
-            if unknown := [number for number in filters if number not in FILTERS]:
-                raise self.bad(f"a filter (number {unknown[0]}) other than gzip, shuffle and fletcher32", path)
-            return read_chunks(self.content, dataset, plan.get_chunk()[0], filters, dtype, size)
-        except BadPiece as error:
-            raise self.bad(str(error), path) from error
+    def _check_written(self, dataset: h5py.Dataset, path: str) -> None:
+        """Refuse values that are declared and were never written: libhdf5 gives the fill value for them."""
+        if dataset.chunks is None:
+            if dataset.id.get_storage_size() < dataset.size * dataset.dtype.itemsize:
+                raise self.bad("values are declared and were never written", path)
+            return
+        (length,) = dataset.chunks
+        full, count = length * dataset.dtype.itemsize, -(-dataset.size // length)
+        if full > LARGEST_CHUNK_BYTES or count > MOST_CHUNKS:
+            raise self.bad(f"{count} chunks of {full} bytes: too many, or too large", path)
+        written = [dataset.id.get_chunk_info(index).size for index in range(dataset.id.get_num_chunks())]
+        if max(written, default=0) > full + OVERHEAD_BYTES:
+            raise self.bad("a chunk that is larger than what it holds", path)
+        if len(written) < count:
+            raise self.bad("values are declared and were never written", path)
 
     @contextmanager
     def _asking(self, path: str) -> Iterator[None]:

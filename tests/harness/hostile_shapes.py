@@ -181,8 +181,6 @@ def hdf5_shapes(folder: Path, only: Collection[str] = ()) -> Iterator[Hostile]:
         "soft link to a dataset inside": link("torque/torque_nm", lambda _: h5py.SoftLink("/torque/time_s")),
         "gzip bomb": put(torque, shape=(4_000_000,), dtype="f8", chunks=(4_000_000,), compression="gzip"),
         "chunks of one": put(torque, data=np.ones(200_000), chunks=(1,)),
-        "a lzf filter": put(torque, data=ones, chunks=(1600,), compression="lzf"),
-        "a scale-offset filter": put(torque, data=ones.astype("i4"), chunks=(1600,), scaleoffset=0),
         "other lengths": put(torque, data=np.ones(1599)),
         "no samples": lambda file, at: [put(p, data=np.ones(0))(file, at) for p in (torque, times)],
         "names of a megabyte": put("segments/name", data=["x" * 2**20] * 3, dtype=h5py.string_dtype()),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 import tracemalloc
+import zlib
 from pathlib import Path
 
 import h5py
@@ -113,14 +114,12 @@ def test_a_damaged_checksum_and_a_bomb_in_a_chunk_are_found(tmp_path: Path) -> N
     with h5py.File(path, "w") as file:
         file.create_dataset("sum", data=np.arange(1000.0), chunks=(1000,), fletcher32=True)
         bomb = file.create_dataset("bomb", shape=(1000,), dtype="f8", chunks=(1000,), compression="gzip")
-        import zlib
-
-        bomb.id.write_direct_chunk((0,), zlib.compress(bytes(10_000_000)))
+        bomb.id.write_direct_chunk((0,), zlib.compress(bytes(20_000_000)))
         place = file["sum"].id.get_chunk_info(0).byte_offset
     content = bytearray(path.read_bytes())
     content[place + 100] ^= 1
     strict = StrictFile(bytes(content), "f")
-    for name, says in (("sum", "checksum"), ("bomb", "longer than declared|larger than what it holds")):
+    for name, says in (("sum", "unreadable or half-written"), ("bomb", "larger than what it holds")):
         with pytest.raises(identify.BadRecord, match=says):
             strict.numbers(name)
 
