@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import zlib
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -66,25 +64,6 @@ def content_of(path: Path) -> bytes:
         fix = "Cut the record, or give the sealed recording."
         raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), fix=fix)
     return b"".join(pieces)
-
-
-class BadPiece(Exception):
-    """A piece of a file that is not what it is declared to be."""
-
-
-DAMAGED = "packed data that are damaged, or longer than any record"
-
-
-def inflated(data: Any, most: int, damaged: str = DAMAGED, whole: bool = True) -> bytes:
-    """What zlib packed, at most so many bytes. Raises BadPiece: no zlib, or with `whole` not all of it."""
-    packer = zlib.decompressobj()
-    try:
-        found = packer.decompress(data, most)
-    except zlib.error as error:
-        raise BadPiece("packed data that do not unpack") from error
-    if whole and not packer.eof:
-        raise BadPiece(damaged)
-    return found
 
 
 def wrong_rows(column: str, values: np.ndarray) -> np.ndarray:

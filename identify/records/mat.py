@@ -1,13 +1,14 @@
 """A record from a MAT file (versions 5 to 7): variables, or the fields of one struct, named as the columns of a table.
 
 A MAT file may declare a terabyte in a few bytes, unpack to one, and hold objects and function handles. `scipy.io` takes
-memory for what is declared before it looks whether it is there; here each bound is checked first, and only variables
-that are asked for are unpacked."""
+memory for what is declared before it looks whether it is there, and ends the process at some damaged files; here each
+bound is checked first, and only variables that are asked for are unpacked."""
 
 from __future__ import annotations
 
 import math
 import struct
+import zlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ import numpy as np
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns
 from stimrig.identify.records.assemble import record_of
-from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, LONGEST_TEXT, BadPiece, inflated
+from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, LONGEST_TEXT
 from stimrig.identify.records.columns import Given
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
 from stimrig.identify.records.record import Record
@@ -36,6 +37,22 @@ KINDS = {3: "an object", 5: "a sparse matrix", 16: "a function handle", 17: "an 
 MOST_VARIABLES = 10_000
 FIX = "Save plain columns of numbers from MATLAB: save('record.mat', 'time_s', 'pulse_width_us', 'torque_nm', '-v7')."
 OBJECTS = "Turn it into plain numbers or texts first: seconds(t), cellstr(s), table2struct(T, 'ToScalar', true)."
+
+
+class BadPiece(Exception):
+    """A piece of a file that is not what it is declared to be."""
+
+
+def inflated(data: memoryview, most: int, whole: bool = True) -> bytes:
+    """What zlib packed, at most so many bytes. Raises BadPiece: no zlib, or with `whole` not all of it."""
+    packer = zlib.decompressobj()
+    try:
+        found = packer.decompress(data, most)
+    except zlib.error as error:
+        raise BadPiece("packed data that do not unpack") from error
+    if whole and not packer.eof:
+        raise BadPiece("packed data that are damaged, or longer than any record")
+    return found
 
 
 @dataclass(frozen=True)

@@ -147,7 +147,6 @@ def hdf5_shapes(folder: Path, only: Collection[str] = ()) -> Iterator[Hostile]:
     many = 10**12
     values = columns()
     torque, times = "torque/torque_nm", "torque/time_s"
-    ones = np.ones(1600)
     everywhere = (torque, times, "pulses/sent_pulse_width_us", "pulses/status", "segments/start_s", "segments/name")
     shapes: dict[str, Change] = {"virtual over raw storage": virtual_over_raw}
     for path in everywhere:
