@@ -8,11 +8,11 @@ from typing import Any
 
 from stimrig.api.cli.errors import CommandError
 from stimrig.api.cli.terminal import carried_lines, model_report, number
-from stimrig.api.client.documents import SessionTest
 from stimrig.api.client.errors import Unreachable
 from stimrig.api.client.rest import Client
 from stimrig.api.clinical_words import label_rows, words
 from stimrig.api.models.changes import dose_words
+from stimrig.api.web.responses.rig import TestOut
 
 
 def run_test(
@@ -21,7 +21,7 @@ def run_test(
     events: Callable[[], list[str]] = list,
     over: Callable[[], object] = list,
     **more: Any,
-) -> SessionTest:
+) -> TestOut:
     """Run a test, the default pre-session test unless `more` says otherwise, and show its progress.
 
     The participant is made unless it is there. `events` says which processes of the service have ended; one is enough
@@ -31,7 +31,7 @@ def run_test(
     """
     show = Progress()
 
-    def watch(test: SessionTest) -> None:
+    def watch(test: TestOut) -> None:
         for event in events():
             raise CommandError(event)
         if test["state"] not in ("requested", "running"):
@@ -54,7 +54,7 @@ class Progress:
         self.terminal = sys.stderr.isatty()
         self.last = ""
 
-    def __call__(self, document: SessionTest) -> None:
+    def __call__(self, document: TestOut) -> None:
         """Show where the test stands."""
         if document["state"] == "identifying":
             segment = (document.get("identification") or {}).get("text") or "identifying"

@@ -1,9 +1,9 @@
-"""One connection to a service: requests, their errors, and the live channel."""
+"""One connection to a service: requests with the version of what they decide on, their errors, and the live channel."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Generator, Iterator
+from collections.abc import Iterator
 from typing import Any, Self
 
 import httpx
@@ -13,83 +13,12 @@ from websockets.sync.client import connect
 from stimrig.api import decisions
 from stimrig.api.client.errors import Unreachable, refused
 
-MOST_OWN = 200
-"""Entries of one's own that are told, the newest; of older ones one is told as of another's."""
-
-
-class SendsVersions(httpx.Auth):
-    """Sends with each decision the version of what it is made on: the one that was last seen, or that of now.
-
-    A program that has read a participant, a model or the rig, and decides on it, is so refused (409) if that has
-    changed meanwhile by anybody else. One that has not read it decides on what is there now.
-
-    Parameters
-    ----------
-    headers : dict
-        Sent with each request.
-    """
-
-    requires_response_body = False
-
-    def __init__(self, headers: dict[str, str]) -> None:
-        self._headers, self.seen, self.own = headers, dict[str, str](), list[str]()
-
-    def auth_flow(self, request: httpx.Request) -> Generator[httpx.Request, httpx.Response, None]:
-        """As httpx asks for it."""
-        request.headers.update(self._headers)
-        for document in [] if "if-match" in request.headers else self._documents(request):
-            if document not in self.seen:
-                looking = httpx.Request("GET", request.url.copy_with(path=document, query=None), headers=self._headers)
-                found = yield looking
-                self._keep(document, found)
-                if found.status_code == httpx.codes.NOT_FOUND and document not in self.seen:
-                    return  # there is nothing to decide on: that is the answer
-            if tag := self.seen.get(document):
-                request.headers["if-match"] = tag
-                request.headers["trail-own"] = ", ".join(self.own[-MOST_OWN:])
-                break
-        answer = yield request
-        self._keep(request.url.path, answer)
-
-    def _documents(self, request: httpx.Request) -> list[str]:
-        """Whose version may be sent with a request; none: it decides nothing.
-
-        A test is begun on its participant. A controller's key cannot read that: its trials are planned with the model.
-        """
-        found = decisions.find(request.method, request.url.path)
-        if found is None:
-            return []
-        decision, names = found
-        if decision.path != "/v1/tests":
-            return [decision.document.format(**names)]
-        try:
-            body = json.loads(request.read())
-            person = decision.document.format(code=body["participant"])
-        except (ValueError, KeyError, TypeError):  # the service says what is wrong with it
-            return []
-        return [person, f"{person}/model"]
-
-    def _keep(self, path: str, answer: httpx.Response) -> None:
-        if answer.request.method == "GET":
-            self.seen.pop(path, None)
-            if answer.status_code == httpx.codes.FORBIDDEN:
-                self.seen[path] = ""  # a controller's key reads no participant
-            if "etag" in answer.headers:  # of a calibration that waits to be stored with a 404, too
-                self.seen[path] = answer.headers["etag"]
-        elif answer.is_success and path == "/v1/stop":
-            self._forget("/v1/rig")
-        elif answer.is_success and (found := decisions.find(answer.request.method, path)):
-            decision, names = found
-            # of what the rig keeps there is another version now; the rest stays as seen, but for one's own entries
-            self._forget(decision.document.format(**names) if decision.field in decisions.OF_RIG else path)
-            self.own += [entry for entry in answer.headers.get("trail-entries", "").split(", ") if entry]
-
-    def _forget(self, about: str) -> None:
-        self.seen = {kept: tag for kept, tag in self.seen.items() if not kept.startswith(about)}
-
 
 class Connection:
     """Requests to one service with one token. Use it in a `with` statement, or call `close`.
+
+    A decision is sent with the `ETag` that was last read of what it is made on, as `If-Match`; it is refused if anybody
+    else has changed that since. A program that has not read it decides on what is there now.
 
     Parameters
     ----------
@@ -103,8 +32,10 @@ class Connection:
 
     def __init__(self, url: str, token: str = "", timeout_s: float = 60.0) -> None:
         self.url, self._headers = url.rstrip("/"), {"Authorization": f"Bearer {token}"} if token else {}
+        self._etags: dict[str, str] = {}
+        self._own: list[str] = []
         try:
-            self.http = httpx.Client(base_url=self.url, auth=SendsVersions(self._headers), timeout=timeout_s)
+            self.http = httpx.Client(base_url=self.url, headers=self._headers, timeout=timeout_s)
         except httpx.InvalidURL as error:
             raise self._unreachable(error) from error
 
@@ -124,10 +55,19 @@ class Connection:
         The answer has a status of success, or 304. Raises Unreachable: there was no answer. Raises Refused: the answer
         is a problem; its class tells the status: `NotFound`, `Conflict`, `Invalid`, …
         """
+        headers, document = httpx.Headers(more.pop("headers", None)), _document(method, path, more.get("json"))
+        if document and "if-match" not in headers and (etag := self._etag(document, path)):
+            headers.update({"if-match": etag, "trail-own": ", ".join(self._own[-200:])})
+        answer = self._send(method, path, headers=headers, **more)
+        if answer.is_success and (document or path == "/v1/stop"):
+            self._take_etag(document, headers.get("if-match"), answer)
+        if answer.is_success or answer.status_code == httpx.codes.NOT_MODIFIED:
+            return answer
         try:
-            return _accepted(self.http.request(method, path, **more))
-        except (httpx.RequestError, httpx.InvalidURL) as error:
-            raise self._unreachable(error) from error
+            problem = answer.json()
+        except ValueError:
+            problem = None
+        raise refused(f"{method} {answer.request.url.path}", answer.status_code, problem, answer.text)
 
     def get(self, path: str, **more: Any) -> Any:
         """The JSON document at a path, as "/v1/rig"."""
@@ -150,17 +90,53 @@ class Connection:
         except (OSError, WebSocketException) as error:
             raise self._unreachable(error) from error
 
+    def _send(self, method: str, path: str, **more: Any) -> httpx.Response:
+        try:
+            answer = self.http.request(method, path, **more)
+        except (httpx.RequestError, httpx.InvalidURL) as error:
+            raise self._unreachable(error) from error
+        if method == "GET":  # a calibration that waits to be stored has a version with its 404
+            self._etags[answer.request.url.path] = answer.headers.get("etag", "")
+        return answer
+
+    def _etag(self, document: str, path: str) -> str:
+        """Return the version of what is decided on; it is read now if it was not before.
+
+        A controller's key cannot read the participant of a test: its trials are planned with the model.
+        """
+        for place in (document, f"{document}/model") if path == "/v1/tests" else (document,):
+            missing = place not in self._etags and self._send("GET", place).status_code == httpx.codes.NOT_FOUND
+            if missing or self._etags[place]:
+                return self._etags[place]
+        return ""
+
+    def _take_etag(self, document: str, sent: str | None, answer: httpx.Response) -> None:
+        """Take over the version to which a decision has led; what else had the version before it is read anew.
+
+        A participant has one version with its models. Where an answer says no version, everything is read anew.
+        """
+        self._own += [entry for entry in answer.headers.get("trail-entries", "").split(", ") if entry]
+        of_rig = document or "/v1/rig"
+        if of_rig.startswith("/v1/rig") or of_rig.endswith("/calibration"):  # there is another version now
+            self._etags = {place: etag for place, etag in self._etags.items() if not place.startswith(of_rig)}
+        if "etag" not in answer.headers:
+            return
+        home = f"/v1/participants/{answer.json().get('participant')}"
+        led = [place for place in (document, home) if self._etags.get(place) == sent]
+        others = {place: etag for place, etag in self._etags.items() if etag != sent}
+        self._etags = others | dict.fromkeys(led, answer.headers["etag"])
+
     def _unreachable(self, error: Exception) -> Unreachable:
         why = str(error) or type(error).__name__
         return Unreachable(self.url, "the service cannot be reached", f"{why}. Is `stimrig serve` running there?")
 
 
-def _accepted(answer: httpx.Response) -> httpx.Response:
-    """An answer that is read, if it is none of a problem. Raises Refused."""
-    if answer.is_success or answer.status_code == httpx.codes.NOT_MODIFIED:
-        return answer
-    try:
-        problem = answer.json()
-    except ValueError:
-        problem = None
-    raise refused(f"{answer.request.method} {answer.request.url.path}", answer.status_code, problem, answer.text)
+def _document(method: str, path: str, body: Any) -> str:
+    """Return the document whose version a request must name; empty where it decides nothing.
+
+    A test is begun on its participant; without one the service says what is wrong with the request.
+    """
+    decision, names = decisions.find(method, path.partition("?")[0]) or (None, {})
+    if decision and decision.path == "/v1/tests":
+        names = {"code": body["participant"]} if isinstance(body, dict) and "participant" in body else None
+    return decision.document.format(**names) if decision and names is not None else ""

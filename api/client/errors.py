@@ -73,14 +73,12 @@ class Unavailable(Refused):
     """5xx: the service or its rig cannot do it."""
 
 
-BY_STATUS: dict[int, type[Refused]] = {
-    400: Invalid, 401: Unauthorized, 403: Forbidden, 404: NotFound, 409: Conflict, 410: NotFound, 412: Conflict,
-    413: Invalid, 422: Invalid, 429: TooManyRequests,
-}  # fmt: skip
+BY_STATUS = {400: Invalid, 401: Unauthorized, 403: Forbidden, 404: NotFound, 409: Conflict, 410: NotFound}
+BY_STATUS |= {412: Conflict, 413: Invalid, 422: Invalid, 429: TooManyRequests}
 
 
 def refused(request: str, status: int, problem: Any, text: str = "") -> Refused:
-    """The error for a problem; `text` stands for an answer that is none, e.g. the page of a proxy."""
+    """Make the error of a problem; `text` stands for an answer that is none, e.g. the page of a proxy."""
     kind = BY_STATUS.get(status, Unavailable if status >= 500 else Refused)
     if isinstance(problem, dict) and "title" in problem:
         return kind(request, str(problem["title"]), str(problem.get("detail") or ""), status, problem)

@@ -8,7 +8,6 @@ import threading
 from collections import OrderedDict
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import partial
 from typing import Any
 
@@ -19,6 +18,7 @@ from starlette.requests import HTTPConnection
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.people.pace import Guesses, place_of
+from stimrig.api.schemas.shared import Scope
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import Confirmation, PageSession, Token
@@ -27,21 +27,6 @@ LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
 MOST_SEEN = 1000
 """So many tokens and sessions are remembered for a stop while the database is gone."""
-
-
-class Scope(StrEnum):
-    """What a token may be used for.
-
-    ``rearm`` is in no role and no controller's key: after a stop a person looks first. Who signed in with a password
-    and may run tests holds it for the session; a program holds it only if it was asked for by name.
-    """
-
-    READ_LIVE = "read-live"
-    RUN_TEST = "run-test"
-    REARM = "rearm"
-    APPROVE_MODEL = "approve-model"
-    READ_MODEL = "read-model"
-    ADMINISTER = "administer"
 
 
 ROLES = {

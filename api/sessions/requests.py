@@ -22,6 +22,7 @@ from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.errors import ApiError
 from stimrig.api.models.tracking import Limits
 from stimrig.api.people import accounts
+from stimrig.api.schemas.shared import SETTINGS, NoteKind
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, PULSE_RATES_HZ, Labels, Profile
@@ -29,7 +30,6 @@ from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, PULSE_RATES_HZ, 
 LONGEST_NOTE = 500
 RateHz = Annotated[FiniteFloat, Field(ge=PULSE_RATES_HZ[0], le=PULSE_RATES_HZ[1], description="pulses a second, Hz")]
 Side = Literal["left", "right"]
-NoteKind = Literal["electrodes", "side", "posture", "medication", "spasm", "other"]
 
 
 def _plain(text: str) -> str:
@@ -115,14 +115,6 @@ class ProfileIn(Body):
         if (own := sent.get(profiles.RANGE)) is not None:
             sent[profiles.RANGE] = list(own)
         return sent
-
-
-SETTINGS = {
-    "type": "object",
-    "description": "with the units and ranges that `GET /v1/sequences` gives for the sequence; the rig checks them",
-    "additionalProperties": {"type": ["number", "boolean", "array", "null"], "items": {"type": "number"}},
-    "examples": [{"max_pulse_width_us": 250.0, "bits": 7}],
-}
 
 
 class SegmentIn(Body):

@@ -2,19 +2,51 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, WithJsonSchema
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, ValidationError, WithJsonSchema
 
 from stimrig.api.schemas import component_name
-from stimrig.api.sessions.requests import SETTINGS
+from stimrig.api.schemas.shared import SETTINGS
 from stimrig.rig.messages import StopEvidence
 
 
 class Document(BaseModel):
-    """Base of all answers; newer versions may add fields."""
+    """Base of all answers; newer versions may add fields.
+
+    A field is read as `answer.state` or as `answer["state"]`.
+    """
 
     model_config = ConfigDict(extra="allow")
+
+    @classmethod
+    def read(cls, answer: dict[str, Any]) -> Self:
+        """Make it of a service's answer; one that a newer service has changed is kept as it came."""
+        try:
+            return cls.model_validate(answer)
+        except ValidationError:
+            return cls.model_construct(**answer)
+
+    def keys(self) -> list[str]:
+        """Names of all fields."""
+        return [*self._fields()]
+
+    def get(self, name: str, default: Any = None) -> Any:
+        """Value of a field; `default` where there is none."""
+        return self._fields().get(name, default)
+
+    def __getitem__(self, name: str) -> Any:
+        return self._fields()[name]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._fields()
+
+    def _fields(self) -> dict[str, Any]:
+        return {**self.__dict__, **(self.model_extra or {})}
+
+    def to_dict(self) -> dict[str, Any]:
+        """As it was sent, for `json.dumps`."""
+        return self.model_dump(mode="json", by_alias=True, exclude_unset=True, warnings=False)
 
 
 class FieldProblem(Document):

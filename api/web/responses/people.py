@@ -6,8 +6,7 @@ from typing import Literal
 
 from pydantic import Field, JsonValue
 
-from stimrig.api.people.auth import Scope
-from stimrig.api.sessions.requests import NoteKind
+from stimrig.api.schemas.shared import NoteKind, Scope
 from stimrig.api.web.responses.base import Document, EntryOut
 from stimrig.rig.messages import CalibrationStatus, Profile, RigState
 
