@@ -1,4 +1,4 @@
-"""g and h of a joint that moves, over the angle: a curve for each way to move, its band where the joint was seen there.
+"""Figures of g and h of a moving joint over its angle: a curve for each way to move, its band where it was seen.
 
 MODEL.json has both as tables over angle and velocity, with how often each cell was seen (`joint`). A curve is one
 column of such a table, as it stands.
@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 from stimrig.api.charts import figure as fig
-from stimrig.api.charts.figure import axis, filled, line, role
+from stimrig.api.charts.figure import Axis, Band, Curve, Figure, Value
 
 STILL_RAD_S, FAST_RAD_S = 0.15, 0.7
 """The ways to move, as the coverage of the guided tests divides them (`api.sessions.joint_plan`)."""
 NEAR_RAD = math.radians(3) + 1e-9
 """An angle counts as seen if the joint was this near to it: the table is finer than any movement."""
+MARK_EVERY = 6
 
 
 @dataclass(frozen=True)
@@ -29,23 +31,21 @@ class Way:
     high: float
     colour: str
     width: float
-    symbol: str
+    marker: str
 
 
 WAYS = (
-    Way("still", -STILL_RAD_S, STILL_RAD_S, role("series-6"), 1.8, "circle"),
-    Way("flexion", STILL_RAD_S, FAST_RAD_S, role("series-1"), 1.4, "triangle-up"),
-    Way("flexion", FAST_RAD_S, math.inf, role("series-3"), 2.6, "triangle-up"),
-    Way("extension", -FAST_RAD_S, -STILL_RAD_S, role("series-2"), 1.4, "triangle-down"),
-    Way("extension", -math.inf, -FAST_RAD_S, role("series-4"), 2.6, "triangle-down"),
+    Way("still", -STILL_RAD_S, STILL_RAD_S, "series-6", 1.8, "circle"),
+    Way("flexion", STILL_RAD_S, FAST_RAD_S, "series-1", 1.4, "up"),
+    Way("flexion", FAST_RAD_S, math.inf, "series-3", 2.6, "up"),
+    Way("extension", -FAST_RAD_S, -STILL_RAD_S, "series-2", 1.4, "down"),
+    Way("extension", -math.inf, -FAST_RAD_S, "series-4", 2.6, "down"),
 )
 """Told apart by more than their colours: up is bending, and the thick line is the quick one."""
-EVERY = 6
-"""So many angles from one marker of a line to the next."""
 
 
-def joint_figures(document: dict[str, Any]) -> dict[str, Any]:
-    """Both figures of a model with a moving joint; none of another one, nor where it is not known what was seen."""
+def joint_figures(document: dict[str, Any]) -> dict[str, Figure]:
+    """Return both figures of a model with a moving joint; none of another one, nor where the coverage is not known."""
     joint = document.get("joint") or {}
     if not (joint.get("seen_h") and joint.get("seen_g")):
         return {}
@@ -56,14 +56,14 @@ def joint_figures(document: dict[str, Any]) -> dict[str, Any]:
 
 
 def columns(joint: dict[str, Any], table: str) -> list[tuple[Way, int, list[bool]]]:
-    """The columns that are drawn of `g` or `h`, and at which angles the joint was seen to move so.
+    """Return the columns that are drawn of `g` or `h`, and at which angles the joint was seen to move so.
 
     For each way to move the velocity that was seen most: both tables show the same velocities. A way that was seen at
     no angle is left out.
     """
     velocity, angle_rad = joint["velocity_rad_s"], joint["angle_rad"]
-    often = [sum(row[k] for name in ("seen_g", "seen_h") for row in joint[name]) for k in range(len(velocity))]
-    found = []
+    counts = [sum(row[k] for name in ("seen_g", "seen_h") for row in joint[name]) for k in range(len(velocity))]
+    drawn = []
     for way in WAYS:
         inside = [k for k, value in enumerate(velocity) if way.low <= value < way.high]
         there = [
@@ -72,57 +72,47 @@ def columns(joint: dict[str, Any], table: str) -> list[tuple[Way, int, list[bool
         if not there:
             continue
         still = way.name == "still"
-        column = min(inside, key=lambda k: abs(velocity[k])) if still else max(inside, key=often.__getitem__)
-        found.append((way, column, [any(abs(angle - other) <= NEAR_RAD for other in there) for angle in angle_rad]))
-    return found
+        column = min(inside, key=lambda k: abs(velocity[k])) if still else max(inside, key=counts.__getitem__)
+        drawn.append((way, column, [any(abs(angle - other) <= NEAR_RAD for other in there) for angle in angle_rad]))
+    return drawn
 
 
-def _figure(joint: dict[str, Any], name: str, unit: str, value: str, title: str) -> dict[str, Any]:
+def _figure(joint: dict[str, Any], name: str, unit: str, value: Value, title: str) -> Figure:
     angle_deg = [round(math.degrees(angle), 3) for angle in joint["angle_rad"]]
-    bands: list[dict[str, Any]] = []
-    dotted: list[dict[str, Any]] = []
-    lines: list[dict[str, Any]] = []
+    bands: list[Band] = []
+    dotted: list[Curve] = []
+    lines: list[Curve] = []
     for way, column, seen in columns(joint, name):
         y = [row[column] for row in joint[name + unit]]
-        halves: list[float] = []
+        notes: list[str] = []
         if f"{name}_lower{unit}" in joint:
             lower, upper = ([row[column] for row in joint[f"{name}_{edge}{unit}"]] for edge in ("lower", "upper"))
-            bands += _bands(angle_deg, seen, lower, upper, first=not bands)
-            halves = fig.halves_of(lower, upper)
+            whole = Band(angle_deg, lower, upper, colour="series-band", listed=not bands)
+            bands += _seen_parts(whole, seen)
+            notes = fig.half_widths(whole, angle_deg)
         if not all(seen):
-            dots: dict[str, Any] = {"line": {"dash": "dot"}, "showlegend": False, **fig.QUIET}
-            dotted.append(line(angle_deg, y, "", way.colour, 1.2, **dots))
-        words = _words(way, joint["velocity_rad_s"][column])
+            label = "" if dotted else "dotted: not seen"
+            dotted.append(Curve(angle_deg, y, label, way.colour, 1.2, "dot", listed=not dotted))
         solid = [at if there else None for at, there in zip(y, seen, strict=True)]
-        sizes = [0 if row % EVERY else 7 for row in range(len(angle_deg))]
-        marked: dict[str, Any] = {"mode": "lines+markers", "marker": {"symbol": way.symbol, "size": sizes}}
-        marked |= fig.hover_halves(words, value, halves)
-        lines.append(line(angle_deg, solid, words, way.colour, way.width, **marked))
-    if dotted:  # an entry of the legend, without a line
-        dots = {"line": {"dash": "dot"}, **fig.QUIET}
-        lines.append(line(angle_deg[:1], [None], "dotted: not seen", role("mark"), 1.2, **dots))
-    x = axis("Joint angle (°)", range=[angle_deg[0], angle_deg[-1]], **fig.AT_ANGLE)
-    return fig.figure([*bands, *dotted, *lines], height=430, xaxis=x, yaxis=axis(title))
+        lines.append(Curve(angle_deg, solid, _label(way, joint["velocity_rad_s"][column]), way.colour, way.width,
+                           marker=way.marker, size=7, every=MARK_EVERY, value=value, notes=notes))  # fmt: skip
+    x = Axis("Joint angle (°)", fig.AT_ANGLE, (angle_deg[0], angle_deg[-1]))
+    return Figure(x, (Axis(title),), (*dotted, *lines), tuple(bands), height=430)
 
 
-def _bands(
-    angle_deg: Sequence[float], seen: Sequence[bool], lower: Sequence[float], upper: Sequence[float], first: bool
-) -> list[dict[str, Any]]:
-    """The band of each stretch of two angles or more that was seen; the first of all is the legend's."""
-    data: list[dict[str, Any]] = []
-    edges = [row for row, (one, other) in enumerate(zip([*seen, False], [False, *seen], strict=True)) if one != other]
+def _seen_parts(band: Band, seen: Sequence[bool]) -> list[Band]:
+    """Return the band of each stretch of two angles or more that was seen; the legend names the first of all."""
+    edges = [row for row, (before, now) in enumerate(pairwise([False, *seen, False])) if before != now]
+    parts = []
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
-        if end - begin < 2:
-            continue
-        part = slice(begin, end)
-        pair = filled(angle_deg[part], lower[part], upper[part], "95 % band", role("series-band"))
-        if data or not first:
-            pair[1] |= {"name": "", "showlegend": False}
-        data += pair
-    return data
+        if end - begin >= 2:
+            part = slice(begin, end)
+            parts.append(Band(band.x[part], band.lower[part], band.upper[part], colour=band.colour,
+                              listed=band.listed and not parts))  # fmt: skip
+    return parts
 
 
-def _words(way: Way, velocity_rad_s: float) -> str:
+def _label(way: Way, velocity_rad_s: float) -> str:
     speed = f"{abs(math.degrees(velocity_rad_s)):.0f}"
     if way.name == "still":
         return "not moving"

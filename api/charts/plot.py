@@ -1,4 +1,4 @@
-"""Figures for programs and notebooks, drawn by the functions that draw the page's."""
+"""Figures for programs and notebooks: the page's figures as plotly objects."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from typing import Any
 import plotly.graph_objects as go
 
 from stimrig.api.charts import diagnosis_charts, model_charts
-from stimrig.api.charts.figure import CHART_CONFIG, in_light
+from stimrig.api.charts.figure import LIGHT, Figure
+from stimrig.api.charts.interactive import CHART_CONFIG, plotly_figure
 from stimrig.api.models import explanation
 from stimrig.api.workers.curves import curves, rounded, runs
 from stimrig.identify import BadRequest, Comparison, Diagnosis, Improvement, Model, Record, compare
@@ -21,7 +22,7 @@ def _with(config: dict[str, Any] | None) -> dict[str, Any]:
 
 
 class LocalFigure(go.Figure):
-    """A figure that has no button to upload it, and whose HTML loads nothing from elsewhere."""
+    """A plotly figure without a button to upload it, whose HTML loads nothing from elsewhere."""
 
     def show(self, *args: Any, config: dict[str, Any] | None = None, **kwargs: Any) -> None:
         """Show it."""
@@ -52,7 +53,7 @@ class LocalFigure(go.Figure):
 
 
 def plot(what: Any, record: Record | None = None) -> LocalFigure:
-    """Draw a model beside its measurement, what a comparison left over, how the error fell, or what a free effect does.
+    """Draw a model beside its measurement, a comparison's residual, how the error fell, or what a free effect does.
 
     Parameters
     ----------
@@ -72,17 +73,15 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
         It is none of these, a model without a record, or a diagnosis without a free effect.
     """
     if isinstance(what, Model) and record is not None:
-        return LocalFigure(in_light(_model(what, record)))
+        return _model(what, record)
     if isinstance(what, Comparison):
-        found = what.to_dict()
-        segments = runs(found["series"]["segment"], found["series"]["time_s"])
-        residual = diagnosis_charts.residual(rounded(found), segments, diagnosis_charts.places_of(found))
-        return LocalFigure(in_light(residual))
+        result = what.to_dict()
+        segments = runs(result["series"]["segment"], result["series"]["time_s"])
+        return _show(diagnosis_charts.residual(rounded(result), segments, diagnosis_charts.places_of(result)))
     if isinstance(what, Improvement):
-        rows = explanation.step_versions({**what.to_dict(), "models": []})
-        return LocalFigure(in_light(diagnosis_charts.falling(rows)))
+        return _show(diagnosis_charts.falling(explanation.step_versions({**what.to_dict(), "models": []})))
     if isinstance(what, Diagnosis) and what.free:
-        return LocalFigure(in_light(diagnosis_charts.picture(dict(what.free[0]))))
+        return _show(diagnosis_charts.free_effect(dict(what.free[0])))
     message = (
         "plot takes a model and its record, a comparison, what improve found, or a diagnosis with a free effect: "
         "plot(model, record)"
@@ -90,14 +89,18 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
     raise BadRequest(message, place="plot")
 
 
-def _model(model: Model, record: Record) -> dict[str, Any]:
-    """Measurement and model with the residual and the pulse widths; the recruitment curve beside them."""
-    document, drawn = model.to_dict(), curves(model, record)
+def _show(figure: Figure) -> LocalFigure:
+    return LocalFigure(plotly_figure(figure, LIGHT.__getitem__))
+
+
+def _model(model: Model, record: Record) -> LocalFigure:
+    """Draw measurement and model with residual and pulse widths, and the recruitment curve beside them."""
+    drawn = curves(model, record)
     series = rounded(compare(model, record).to_dict())["series"]
-    figure = model_charts.measurement(drawn, model.fit.get("noise_sd_nm"), series)
-    curve = model_charts.recruitment(document, drawn)
-    figure["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in curve["data"]]
-    figure["layout"]["xaxis"]["domain"] = BESIDE
-    figure["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": ALONE, "anchor": "y4"}
-    figure["layout"]["yaxis4"] = {**curve["layout"]["yaxis"], "anchor": "x2"}
-    return figure
+    large = plotly_figure(model_charts.measurement(drawn, model.fit.get("noise_sd_nm"), series), LIGHT.__getitem__)
+    curve = plotly_figure(model_charts.recruitment(model.to_dict(), drawn), LIGHT.__getitem__)
+    large["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in curve["data"]]
+    large["layout"]["xaxis"]["domain"] = BESIDE
+    large["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": ALONE, "anchor": "y4"}
+    large["layout"]["yaxis4"] = {**curve["layout"]["yaxis"], "anchor": "x2"}
+    return LocalFigure(large)

@@ -8,7 +8,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from stimrig.api.charts.figure import axis, in_light, layout, role, unlinked
+from stimrig.api.charts.figure import LIGHT
 from stimrig.api.charts.model_charts import COLOURS
 from stimrig.api.charts.plot import LocalFigure
 from stimrig.api.cohort.statistics import PROBABLE, Statistics, wilson
@@ -38,13 +38,13 @@ def prevalence(found: Statistics) -> Figure | None:
         "mode": "markers",
         "x": shares,
         "y": [_plain(effect) for effect, _ in counts],
-        "marker": {"color": role("model"), "size": 9},
+        "marker": {"color": LIGHT["model"], "size": 9},
         "error_x": {
             "type": "data",
             "symmetric": False,
             "array": [high - share for share, (_, high) in zip(shares, ends, strict=True)],
             "arrayminus": [share - low for share, (low, _) in zip(shares, ends, strict=True)],
-            "color": role("model"),
+            "color": LIGHT["model"],
         },
         "text": [f"{count} of {total} {of_what}" for _, count in counts],
         "hovertemplate": "%{y}: %{x:.1f} %<br>%{text}<extra></extra>",
@@ -67,7 +67,7 @@ def errors(found: Statistics) -> Figure | None:
         "orientation": "h",
         "x": [count for _, count in counts],
         "y": [unlinked(kind) for kind, _ in counts],
-        "marker": {"color": role("worst")},
+        "marker": {"color": LIGHT["worst"]},
         "hovertemplate": "%{y}: %{x} records<extra></extra>",
     }
     title = f"records without a result (number, of {found.records})"
@@ -89,7 +89,7 @@ def over_sessions(found: Statistics, key: tuple[str, str]) -> Figure | None:
     drawn = sorted(people, key=lambda who: (-len(people[who]), who))[:MOST_LINES]
     traces = []
     for number, who in enumerate(drawn):
-        points, colour = people[who], COLOURS[number % len(COLOURS)]
+        points, colour = people[who], LIGHT[COLOURS[number % len(COLOURS)]]
         sds = [0.0 if math.isnan(sd) else sd for _, _, sd in points]
         traces.append({
             "type": "scatter",
@@ -129,8 +129,18 @@ def _plain(name: str) -> str:
     return unlinked(name.replace("_", " "))
 
 
+def unlinked(words: str) -> str:
+    """Return words in which plotly sees no link."""
+    return words.replace("<", "‹").replace(">", "›")
+
+
+def axis(title: str, **more: Any) -> dict[str, Any]:
+    """Return an axis with its quantity and unit."""
+    return {"title": {"text": title, "standoff": 8}, "automargin": True, **more}
+
+
 def _figure(data: list[dict[str, Any]], height: int, **axes: Any) -> Figure:
-    return {"data": data, "layout": layout(height=height, hovermode="closest", showlegend=len(data) > 1, **axes)}
+    return {"data": data, "layout": {"height": height, "hovermode": "closest", "showlegend": len(data) > 1, **axes}}
 
 
 STYLE = """
@@ -172,7 +182,7 @@ class _Pictures:
         self.loaded = False
 
     def __call__(self, figure: Figure) -> str:
-        part = LocalFigure(in_light(figure)).to_html(full_html=False, include_plotlyjs=not self.loaded)
+        part = LocalFigure(figure).to_html(full_html=False, include_plotlyjs=not self.loaded)
         self.loaded = True
         return part
 

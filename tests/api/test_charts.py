@@ -1,13 +1,14 @@
-"""What is taken away is what was there: CSV of a recording, the report's pictures, the ramp's two directions."""
+"""Charts: their data (values, bands, units), how they are drawn, and the CSV of a recording."""
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,11 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
+from stimrig.api.charts import diagnosis_charts, drawing, joint_charts, model_charts
 from stimrig.api.charts import figure as fig
-from stimrig.api.charts.figure import LIGHT, in_light, interpolate
-from stimrig.api.charts.strokes import ticks
-from stimrig.api.charts.svg import svg
+from stimrig.api.charts.drawing import Figures, decimate, svg
+from stimrig.api.charts.figure import LIGHT, Axis, Band, Curve, Figure, Label
+from stimrig.api.charts.interactive import plotly_figure
 from stimrig.api.sessions import joint_plan
 from stimrig.api.workers.curves import curves
 from tests.api import made_up_joint
@@ -85,12 +86,16 @@ def distance(found: dict[str, Any]) -> float:
     return float(np.mean(falling - np.interp(at, up["pulse_width_us"], up["torque_nm"])))
 
 
+# ---- data ------------------------------------------------------------------------------------------------------------
+
+
 def test_both_directions_of_the_ramp_lie_on_the_curve_of_a_muscle_without_hysteresis() -> None:
     document, drawn = measured()
     found = model_charts.ramp_points(document, drawn)
     known = document["recruitment"]
+    assert set(found) == {"rising", "falling"}
     for points in found.values():
-        curve = [interpolate(width, known["pulse_width_us"], known["torque_nm"]) for width in points["pulse_width_us"]]
+        curve = np.interp(points["pulse_width_us"], known["pulse_width_us"], known["torque_nm"])
         assert np.abs(np.array(points["torque_nm"]) - curve).max() < 0.12
     assert abs(distance(found)) < 0.06
 
@@ -107,155 +112,107 @@ def test_a_muscle_with_hysteresis_shows_two_curves() -> None:
     found = model_charts.ramp_points(document, drawn)
     assert distance(found) > 0.2, "less than the 0.8 N·m put in: the fitted lag takes a part of it upon itself"
     figure = model_charts.recruitment(document, drawn)
-    assert {"ramp up", "ramp down"} <= {trace["name"] for trace in figure["data"]}
+    assert {"ramp up", "ramp down"} <= {curve.label for curve in figure.curves}
 
 
 def test_a_recording_without_a_ramp_has_no_directions() -> None:
     document, drawn = measured()
-    still = {**drawn, "pulse_width_us": [0.0, 200.0] * (len(drawn["time_s"]) // 2), "time_s": drawn["time_s"]}
+    still = {**drawn, "pulse_width_us": [0.0, 200.0] * (len(drawn["time_s"]) // 2)}
     assert model_charts.ramp_points(document, still) == {}
-    assert model_charts.ramp_points(document, {**drawn, "time_s": [0.0]}) == {}
+    short = {name: drawn[name][:1] for name in ("time_s", "pulse_width_us", "torque_nm", "predicted_torque_nm")}
+    assert model_charts.ramp_points(document, short) == {}
 
 
-def test_still_pictures_are_whole_svg_with_the_values_in_their_place() -> None:
-    document, drawn = measured()
-    for name, figure in model_charts.model_figures(document, drawn).items():
-        picture = ElementTree.fromstring(str(svg(figure, 600.0, label=f"<{name}> & more")))
-        texts = {text.text for text in picture.iter("{http://www.w3.org/2000/svg}text")}
-        assert figure["layout"]["xaxis"]["title"]["text"] in texts
-        assert picture.attrib["aria-label"] == f"<{name}> & more"
-    line = {"type": "scatter", "x": [0, 10], "y": [0.0, 1.0], "name": "a", "line": {"color": "#000", "width": 1}}
-    figure = {"data": [line], "layout": {"height": 200, "xaxis": {}, "yaxis": {}}}
-    (path,) = ElementTree.fromstring(str(svg(figure, 300.0))).iter("{http://www.w3.org/2000/svg}path")
-    start, end = points(path.attrib["d"])
-    assert start[0] < end[0] <= 300 and start[1] > end[1] >= 0, "up is up"
+NAMES = ("recruitment", "comparison", "overview", "step", "residual", "signature", "falling", "joint_g", "joint_h")
 
 
-def points(way: str) -> list[tuple[float, float]]:
-    """The corners of a still's path without a gap, px."""
-    found: list[tuple[float, float]] = []
-    for step in way.removeprefix("M").split("l"):
-        dx, dy = (float(part) for part in re.findall(r"-?[\d.]+", step))
-        x, y = found[-1] if found else (0.0, 0.0)
-        found.append((x + dx, y + dy))
-    return found
-
-
-def test_a_still_is_as_small_as_what_a_screen_shows_and_loses_no_peak() -> None:
-    """A line of 20 000 points, and one peak of a single point in it."""
-    y = [math.sin(0.9 * k) for k in range(20_000)]
-    y[7_777] = 5.0
-    line = {"type": "scatter", "x": list(range(20_000)), "y": y, "name": "a", "line": {"color": "#000", "width": 1}}
-    figure = {"data": [line], "layout": {"height": 200, "xaxis": {}, "yaxis": {}}}
-    picture = str(svg(figure, 300.0))
-    (path,) = ElementTree.fromstring(picture).iter("{http://www.w3.org/2000/svg}path")
-    corners = points(path.attrib["d"])
-    assert len(corners) <= 2 * 300 and len(picture) < 12_000
-    highest = min(corners, key=lambda corner: corner[1])
-    others = sorted(y for x, y in corners if abs(x - highest[0]) > 1)
-    assert highest[1] < others[0] - 50 and abs((highest[0] - 62) / (300 - 62 - 14) - 7_777 / 20_000) < 0.01
-    assert max(x for x, _y in corners) <= 300 - 14 + 0.1, "rounding does not add up"
-
-
-def test_a_still_has_stairs_gaps_dashes_and_markers_as_the_chart_has() -> None:
-    stairs = {"x": [0, 1, 2], "y": [1.0, 3.0, 3.0], "name": "a", "line": {"color": "#000", "width": 1, "shape": "hv"}}
-    dashed = {"x": [0, 1, 2], "y": [1.0, None, 2.0], "name": "b", "mode": "lines+markers",
-              "line": {"color": "#111", "width": 1, "dash": "longdash"},
-              "marker": {"symbol": "diamond", "size": 6}}  # fmt: skip
-    picture = str(svg({"data": [stairs, dashed], "layout": {"height": 200, "xaxis": {}, "yaxis": {}}}, 300.0))
-    first, second, *diamonds = re.findall(r'<path d="(M[^"]*)"', picture)
-    (x0, y0), (x1, y1), (x2, y2), (_x3, y3) = points(first)
-    assert x0 < x1 and x1 == pytest.approx(x2) and y0 == pytest.approx(y1) and y1 > y2 and y2 == pytest.approx(y3)
-    assert second.count("M") == 2 and picture.count('stroke-dasharray="11 4"') == 2, "in the legend, too"
-    assert len(diamonds) == 3 and all(way.endswith("Z") for way in diamonds)
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.0, 1.0), (-3.2, 7.9), (0.001, 0.004), (0.0, 47.7)])
-def test_ticks_are_round_and_within(low: float, high: float) -> None:
-    found = ticks(low, high, 5)
-    assert 2 <= len(found) <= 11 and low - 1e-9 <= found[0] and found[-1] <= high + 1e-9
-    assert np.ptp(np.diff(found)) < 1e-9
-
-
-# ---- What charts say under the pointer, in which colours, and that one time axis carries the measurement
-
-
-@pytest.fixture(scope="module")
-def figures() -> dict[str, Any]:
+@cache
+def figures() -> dict[str, Figure]:
     """All figures of a made-up muscle's model page."""
     document, drawn = measured()
-    found = model_charts.model_figures(document, drawn)
     rows = [{"label": label, "rms_nm": rms, "held_out_rms_nm": rms, "noise_sd_nm": 0.04, "current": False}
             for label, rms in (("base", 0.12), ("+ fatigue", 0.05))]  # fmt: skip
-    signatures = {"seen_nm": [0.1, 0.2], "expected_nm": [0.1, 0.1]}
+    effect = {"seen_nm": [0.1, 0.2], "expected_nm": [0.1, 0.1]}
     series = {"time_s": [0.0, 1.0], "residual_nm": [0.01, 0.02], "noise_band_nm": 0.08}
     segments = [{"name": "prbs", "start_s": 0.0, "end_s": 1.0}]
     return {
-        **found,
+        **model_charts.model_figures(document, drawn),
         "residual": diagnosis_charts.residual({"series": series}, segments, []),
-        "signature": diagnosis_charts.signature([0.0, 1.0], signatures),
+        "signature": diagnosis_charts.signature([0.0, 1.0], effect),
         "falling": diagnosis_charts.falling(rows),
+        **joint_charts.joint_figures({"joint": made_up_joint.joint()}),
     }
 
 
-def said(figure: dict[str, Any]) -> dict[str, str]:
-    """Hover text of each trace that has one."""
-    return {line["name"]: line["hovertemplate"] for line in figure["data"] if "hovertemplate" in line}
+def test_the_measurement_is_torque_residual_and_pulse_width_on_one_axis() -> None:
+    document, drawn = measured()
+    large, overview = figures()["comparison"], figures()["overview"]
+    torque, predicted, left, width = large.curves
+    assert torque.y == drawn["torque_nm"] and predicted.y == drawn["predicted_torque_nm"]
+    assert np.allclose(np.subtract(torque.y, predicted.y), left.y, atol=1e-5) and width.y == drawn["pulse_width_us"]
+    assert [curve.panel for curve in large.curves] == [0, 0, 1, 2] and width.step
+    noise = next(shade for shade in large.shades if shade.low is not None)
+    assert noise.panel == 1 and noise.high == pytest.approx(2 * document["fit"]["noise_sd_nm"])
+    assert overview.curves == large.curves[:3] and overview.height <= 260
+    assert [label.text for label in large.labels][-1].startswith("Check")
 
 
 def test_no_line_goes_through_the_pause_between_two_recordings() -> None:
-    document, drawn = measured()
+    _document, drawn = measured()
     assert model_charts.broken_at_pauses(drawn) is drawn, "one recording has no pause"
     half = len(drawn["time_s"]) // 2
-    slow_s = [t if place < half else drawn["time_s"][half] + 1.0 * (place - half)
-              for place, t in enumerate(drawn["time_s"])]  # fmt: skip
-    assert model_charts.broken_at_pauses({**drawn, "time_s": slow_s})["time_s"] == slow_s
-    paused = {**drawn, "time_s": [t + 600.0 * (place >= half) for place, t in enumerate(drawn["time_s"])]}
-    figure = model_charts.model_figures(document, paused)["comparison"]
-    for trace in figure["data"]:
-        assert len(trace["x"]) == len(trace["y"]) == len(drawn["time_s"]) + 1
-        middle_s = sum(paused["time_s"][half - 1 : half + 1]) / 2
-        assert trace["y"][half] is None and trace["x"][half] == pytest.approx(middle_s)
-        assert len(trace.get("customdata", trace["x"])) == len(trace["x"])
-    assert "NaN" not in svg(figure)
+    first, second = drawn["time_s"][:half], drawn["time_s"][half:]
+    slow = {**drawn, "time_s": [*first, *(second[0] + place for place in range(len(second)))]}
+    assert model_charts.broken_at_pauses(slow) is slow, "slower sampling is no pause"
+    paused = {**drawn, "time_s": [*first, *(moment_s + 600.0 for moment_s in second)]}
+    figure = model_charts.measurement(paused, None)
+    for curve in figure.curves:
+        assert len(curve.x) == len(curve.y) == len(drawn["time_s"]) + 1 and curve.y[half] is None
+        assert curve.x[half] == pytest.approx((paused["time_s"][half - 1] + paused["time_s"][half]) / 2)
+        assert len(curve.notes) in (0, len(curve.x))
+    assert "nan" not in svg(figure).lower()
 
 
-def test_every_line_that_is_seen_says_its_unit(figures: dict[str, Any]) -> None:
-    for name, figure in figures.items():
-        for line in figure["data"]:
-            if line.get("hoverinfo") == "skip":
-                continue
-            unit = "" if name == "step" else "µs" if line["name"] == "pulse width" else "N·m"
-            assert unit in line["hovertemplate"] and "<extra></extra>" in line["hovertemplate"], (name, line["name"])
-    directions = said(figures["recruitment"])
-    assert directions["ramp up"].startswith("ramp up %{y:.2f} N·m") and "ramp down" in directions
-    assert "± %{customdata}" in directions["model"] and "± %{customdata}" in said(figures["step"])["model"]
+@pytest.mark.parametrize("name", NAMES)
+def test_every_axis_and_every_value_has_its_unit_and_every_colour_its_role(name: str) -> None:
+    figure = figures()[name]
+    axes = [figure.x, *figure.panels]
+    assert all(re.search(r" \(.+\)$", axis.label) or axis.ticks for axis in axes), [axis.label for axis in axes]
+    for curve in figure.curves:
+        unit = {"joint_g": "", "step": ""}.get(name, "µs" if curve.label == "pulse width" else "N·m")
+        assert curve.value is None or curve.value.unit.strip() == unit
+        assert len(curve.x) == len(curve.y) and curve.colour in LIGHT
+    assert {part.colour for part in (*figure.bands, *figure.shades, *figure.rules)} <= set(LIGHT)
 
 
-def test_a_curves_band_is_said_at_the_curves_own_points() -> None:
-    band = {"at": [0.0, 10.0], "whole_lower": [1.0, 2.0], "whole_upper": [1.2, 2.6]}
-    found = fig.hover_band("model", fig.TORQUE, [0.0, 5.0, 10.0, 12.0], band, "at")
-    assert found["customdata"] == ["0.10", "0.20", "0.30", "0.30"]
-    assert "±" not in fig.hover_band("model", fig.TORQUE, [0.0], {}, "at")["hovertemplate"]
+def test_the_error_falls_to_the_noise() -> None:
+    figure = figures()["falling"]
+    fitted, _current, held_out, _ = figure.curves
+    assert (fitted.y, held_out.y) == ([0.12, 0.05], [0.12, 0.05]) and figure.rules[0].at == 0.04
+    assert [words for _at, words in figure.x.ticks] == ["1. base", "2. + fatigue"]
+
+
+def test_the_band_of_a_curve_is_that_of_the_document() -> None:
+    document, _drawn = measured()
+    known = document["uncertainty"]["bands"]["recruitment"]
+    (band,) = figures()["recruitment"].bands
+    assert (band.x, band.lower, band.upper) == tuple(known[key] for key in
+                                                     ("pulse_width_us", "whole_lower", "whole_upper"))  # fmt: skip
+    assert fig.half_widths(Band([0.0, 10.0], [1.0, 2.0], [1.2, 2.6]), [0.0, 5.0, 12.0]) == [
+        "± 0.10",
+        "± 0.20",
+        "± 0.30",
+    ]
+    assert fig.half_widths(None, [0.0]) == []
 
 
 def test_each_time_has_the_segment_it_lies_in() -> None:
     segments = [{"name": name, "start_s": start} for name, start in (("a", 0.0), ("b", 1.0), ("c", 2.0))]
-    assert fig.name_segments([0.0, 0.9, 1.0, 1.5, 2.0, 9.0], segments, str.upper) == ["A", "A", "B", "B", "C", "C"]
-    assert fig.name_segments([0.0], [], str.upper) == [""]
+    assert fig.segment_names([0.0, 0.9, 1.0, 2.0, 9.0], segments) == ["· a", "· a", "· b", "· c", "· c"]
+    assert fig.segment_names([0.0], []) == [""]
 
 
-def test_figures_hold_roles_and_no_colours(figures: dict[str, Any]) -> None:
-    """A colour in a figure would stay light in the dark."""
-    for name, figure in figures.items():
-        kept = json.dumps({**figure, "data": [{**line, "x": [], "y": []} for line in figure["data"]]})
-        assert re.findall(r'"#[0-9a-fA-F]{3,8}"|"rgba?\((?!0,0,0,0)[^"]*"', kept) == [], name
-        light = json.dumps(in_light(figure))
-        assert "var(" not in light and LIGHT["ink"] in light
-
-
-# ---- The charts of g and h: the document's own numbers, bands where the joint was seen, dotted where it was not
-
+# ---- g and h: the document's own numbers, bands where the joint was seen, dotted where it was not
 
 JOINT = made_up_joint.joint()
 ANGLES_DEG = [20 + 1.5 * k for k in range(61)]
@@ -263,18 +220,6 @@ SPEEDS = {"not moving": 0.0, "bending 23°/s": 0.4, "bending 46°/s": 0.8,
           "straightening 23°/s": -0.4, "straightening 46°/s": -0.8}  # fmt: skip
 """What the legend says, and the velocity it stands for, rad/s: of each way the one that was seen most."""
 NEAR_DEG = 3.0
-
-
-@pytest.fixture(scope="module")
-def of_joint() -> dict[str, Any]:
-    return joint_charts.joint_figures({"joint": JOINT})
-
-
-def drawn(figure: dict[str, Any]) -> dict[str, list[float | None]]:
-    """The solid lines."""
-    lines = [each for each in figure["data"] if "hovertemplate" in each]
-    assert all(each["x"] == pytest.approx(ANGLES_DEG) for each in lines)
-    return {each["name"]: each["y"] for each in lines}
 
 
 def was_seen(name: str, angle_deg: float, velocity_rad_s: float) -> bool:
@@ -285,68 +230,118 @@ def was_seen(name: str, angle_deg: float, velocity_rad_s: float) -> bool:
 
 
 @pytest.mark.parametrize("name", ["g", "h"])
-def test_lines_are_the_documents_numbers_where_the_joint_was_seen(of_joint: dict[str, Any], name: str) -> None:
-    law = made_up_joint.g if name == "g" else made_up_joint.h_nm
-    lines = drawn(of_joint[f"joint_{name}"])
-    wanted = set(SPEEDS) - ({"straightening 46°/s"} if name == "g" else set())
-    assert set(lines) == wanted, "a way that was never seen is left out"
-    for words, y in lines.items():
-        for angle_deg, value in zip(ANGLES_DEG, y, strict=True):
-            there = was_seen(name, angle_deg, SPEEDS[words])
-            assert (value is not None) == there, (words, angle_deg)
+def test_lines_and_bands_are_the_documents_where_the_joint_was_seen_and_dotted_elsewhere(name: str) -> None:
+    law, figure = made_up_joint.g if name == "g" else made_up_joint.h_nm, figures()[f"joint_{name}"]
+    lines = {curve.label: curve for curve in figure.curves if curve.value}
+    assert set(lines) == set(SPEEDS) - ({"straightening 46°/s"} if name == "g" else set()), "never seen is left out"
+    for words, curve in lines.items():
+        assert curve.x == pytest.approx(ANGLES_DEG) and any(value is not None for value in curve.y)
+        for angle_deg, value in zip(ANGLES_DEG, curve.y, strict=True):
+            assert (value is not None) == was_seen(name, angle_deg, SPEEDS[words]), (words, angle_deg)
             assert value is None or value == pytest.approx(law(math.radians(angle_deg), SPEEDS[words]))
-        assert any(value is not None for value in y)
-
-
-def test_bands_are_the_documents_and_nowhere_else(of_joint: dict[str, Any]) -> None:
-    for name, figure in of_joint.items():
-        edges = [each for each in figure["data"] if each["line"]["width"] == 0]
-        assert [each.get("fill") for each in edges] == [None, "tonexty"] * (len(edges) // 2)
-        lines = drawn(figure)
-        count = 0
-        for upper, lower in zip(edges[::2], edges[1::2], strict=True):
-            assert upper["x"] == lower["x"]
-            for angle_deg, high, low in zip(upper["x"], upper["y"], lower["y"], strict=True):
-                half = made_up_joint.half(math.radians(angle_deg))
-                assert high - low == pytest.approx(2 * half), (name, angle_deg)
-                row = ANGLES_DEG.index(pytest.approx(angle_deg))
-                middles = [y[row] for y in lines.values() if y[row] is not None]
-                assert any(value == pytest.approx((high + low) / 2) for value in middles), (name, angle_deg)
-                count += 1
-        assert count == sum(value is not None for y in lines.values() for value in y), "each seen point has its band"
-
-
-def test_the_rest_of_a_line_is_dotted_and_the_legend_says_so(of_joint: dict[str, Any]) -> None:
-    for name, figure in of_joint.items():
-        dotted = [each for each in figure["data"] if each["line"].get("dash") == "dot"]
-        *whole, told = dotted
-        assert told["name"] == "dotted: not seen" and told["y"] == [None]
-        part = [y for y in drawn(figure).values() if None in y]
-        assert len(whole) == len(part) > 0, name
-        assert all(each["hoverinfo"] == "skip" and len(each["y"]) == len(ANGLES_DEG) for each in whole)
-        shown = [each["name"] for each in figure["data"] if each.get("showlegend", True)]
-        assert shown == ["95 % band", *drawn(figure), "dotted: not seen"], "each once"
+    count = 0
+    for band in figure.bands:
+        for angle_deg, low, high in zip(band.x, band.lower, band.upper, strict=True):
+            assert high - low == pytest.approx(2 * made_up_joint.half(math.radians(angle_deg)))
+            row = ANGLES_DEG.index(pytest.approx(angle_deg))
+            assert any(curve.y[row] == pytest.approx((low + high) / 2) for curve in lines.values())
+            count += 1
+    assert count == sum(value is not None for curve in lines.values() for value in curve.y)
+    dotted = [curve for curve in figure.curves if curve.dash == "dot"]
+    assert len(dotted) == sum(None in curve.y for curve in lines.values()) > 0
+    assert [entry.label for entry in figure.entries()] == ["95 % band", "dotted: not seen", *lines], "each once"
 
 
 def test_all_seen_needs_no_dots_and_no_band_none_of_it() -> None:
     bare = {key: value for key, value in JOINT.items() if "lower" not in key and "upper" not in key}
     ones = [[1] * len(row) for row in JOINT["seen_g"]]
-    found = joint_charts.joint_figures({"joint": {**bare, "seen_g": ones, "seen_h": ones}})
-    for figure in found.values():
-        assert len(figure["data"]) == 5 and "dash" not in str(figure["data"])
-        assert all("±" not in each["hovertemplate"] for each in figure["data"])
-
-
-@pytest.mark.parametrize("document", [{}, {"joint": {}}, {"joint": {"g": [[1.0]]}}])
-def test_a_model_of_a_joint_at_rest_has_none(document: dict[str, Any]) -> None:
-    assert joint_charts.joint_figures(document) == {}
-
-
-def test_ways_to_move_are_those_of_the_guided_tests() -> None:
+    for figure in joint_charts.joint_figures({"joint": {**bare, "seen_g": ones, "seen_h": ones}}).values():
+        assert len(figure.curves) == 5 and not figure.bands
+        assert all(curve.dash == "solid" and not curve.notes for curve in figure.curves)
+    for document in ({}, {"joint": {}}, {"joint": {"g": [[1.0]]}}):
+        assert joint_charts.joint_figures(document) == {}
     assert (joint_charts.STILL_RAD_S, joint_charts.FAST_RAD_S) == (joint_plan.SLOW_RAD_S, joint_plan.FAST_RAD_S)
 
 
-# ---- the page ----------------------------------------------------------------------------------------------------
+# ---- drawn -----------------------------------------------------------------------------------------------------------
+
+LINE = Figure(
+    Axis("Time (s)"), (Axis("Torque (N·m)"), Axis("Width (µs)")),
+    (Curve([0.0, 10.0, 20.0], [0.0, 1.0, None], "<a> & $b$", "model"),
+     Curve([0.0, 10.0], [1.0, 2.0], "b", "width", panel=1)),
+    labels=(Label(5.0, "<i>&"), Label(6.0, "1", "worst")),
+)  # fmt: skip
+
+
+def words_of(picture: str) -> set[str | None]:
+    return {text.text for text in ElementTree.fromstring(picture).iter("{http://www.w3.org/2000/svg}text")}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_still_is_whole_svg_with_its_axes_in_colours_of_the_page(name: str) -> None:
+    picture = str(svg(figures()[name], 760.0, label="<x> & more"))
+    root = ElementTree.fromstring(picture)
+    assert root.attrib["aria-label"] == "<x> & more" and root.attrib["viewBox"].startswith("0 0 760 ")
+    words = " ".join(filter(None, words_of(picture)))
+    assert all(
+        part in words for axis in (figures()[name].x, *figures()[name].panels) for part in axis.label.split(" (")
+    )
+    assert "style=" not in picture and " id=" not in re.sub(r"<(clipPath|path) id=", "", picture)
+    assert not re.search(r"#[0-9a-f]{6}\b", picture) and "var(--" in picture, "a colour would stay light in the dark"
+    assert "var(--" not in svg(figures()[name], 760.0, light=True)
+
+
+def test_words_of_a_recording_are_words() -> None:
+    words = words_of(str(svg(LINE)))
+    assert {"<i>&", "<a> & $b$", "1"} <= words
+    assert "<i>&" not in words_of(str(svg(LINE, 300.0))), "a narrow chart has no room for names"
+    data = plotly_figure(LINE)
+    assert data["data"][0]["name"] == "‹a› & $b$" and data["layout"]["annotations"][0]["text"] == "‹i›&"
+
+
+def test_files_open_and_hold_their_caption() -> None:
+    drawn = Figures({"line": LINE}, captions={"line": "A caption"})
+    assert b'aria-label="A caption"' in drawn.file("line", "svg")
+    assert drawn.file("line", "png").startswith(b"\x89PNG")
+    plain = Figures({"line": LINE}).file("line", "pdf")
+    assert plain.startswith(b"%PDF") and len(drawn.file("line", "pdf")) > len(plain)
+
+
+def test_a_still_is_as_small_as_what_a_screen_shows_and_loses_no_peak() -> None:
+    y = [math.sin(0.9 * k) for k in range(20_000)]
+    y[7_777] = 5.0
+    at, value = decimate(range(20_000), y)
+    assert len(at) <= 2000 and 5.0 in value and at[list(value).index(5.0)] == 7_777
+    at, value = decimate(range(20_000), [None if k == 500 else 1.0 for k in range(20_000)])
+    assert list(at[np.isnan(value)]) == [500.0], "a gap stays"
+    curve = Curve(list(range(20_000)), y, "a", "model")
+    assert len(svg(replace(LINE, curves=(curve,), labels=()), 300.0)) < 20_000
+
+
+def test_a_picture_is_drawn_once_and_few_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing, "_cache", {})
+    monkeypatch.setattr(drawing, "CACHE_SIZE", 2)
+    drawn: list[float] = []
+    monkeypatch.setattr(drawing, "_draw", lambda _kind, _figure, width, *_: (drawn.append(width), b">")[1])
+    for width in (300.0, 300.0, 400.0, 500.0, 500.0, 300.0):
+        svg(LINE, width)
+    assert drawn == [300.0, 400.0, 500.0, 300.0] and len(drawing._cache) == 2
+
+
+def test_plotly_gets_values_units_and_bands() -> None:
+    made = plotly_figure(figures()["recruitment"], LIGHT.__getitem__)
+    upper, lower, model, *ramps = made["data"]
+    assert (upper["line"]["width"], lower["fill"]) == (0, "tonexty")
+    assert model["hovertemplate"] == "model %{y:.2f} N·m %{customdata}<extra></extra>"
+    assert model["customdata"][0].startswith("± ") and len(ramps) == 2
+    assert made["layout"]["xaxis"]["title"]["text"] == "Pulse width (µs)" and "var(" not in str(made["layout"])
+    large = plotly_figure(figures()["comparison"])["layout"]
+    domains = [large[name]["domain"] for name in ("yaxis", "yaxis2", "yaxis3")]
+    assert domains[0][1] == 1.0 and domains[2][0] >= 0.0
+    assert all(above[0] > below[1] for above, below in pairwise(domains))
+
+
+# ---- pages -----------------------------------------------------------------------------------------------------------
 
 
 service = shared_service()
@@ -362,7 +357,7 @@ def models(service: Service) -> tuple[str, str]:
         return test["model_id"], both.json()["id"]
 
 
-def test_reports_have_them_and_pages_of_other_models_do_not(client: httpx.Client, models: tuple[str, str]) -> None:
+def test_reports_have_the_joint_and_pages_of_other_models_do_not(client: httpx.Client, models: tuple[str, str]) -> None:
     at_rest, moving = models
     for path, count in ((f"/models/{moving}", 2), (f"/models/{at_rest}", 0)):
         page = client.get(path).text

@@ -363,10 +363,10 @@ def test_explain_tells_how_the_error_falls_and_agrees_with_the_other_verbs(tired
     text = page.read_text()
     assert text.count('class="still"') == 3 and found["ended"].split(". ")[0] in text
     assert "The held-out error fell from" in text
-    names = {f"{name}.{kind}" for name in ("story-torque", "story-place", "falling") for kind in ("svg", "pdf")}
+    names = {f"{name}.{kind}" for name in ("story-torque", "story-place", "falling") for kind in ("svg", "pdf", "png")}
     assert {path.name for path in figures.iterdir()} == names
     for path in figures.iterdir():
-        assert path.read_bytes().startswith({".svg": b"<svg", ".pdf": b"%PDF"}[path.suffix])
+        assert path.read_bytes().startswith({".svg": b"<svg", ".pdf": b"%PDF", ".png": b"\x89PNG"}[path.suffix])
         assert b"rgba(" not in path.read_bytes() and b"var(--" not in path.read_bytes()
 
 

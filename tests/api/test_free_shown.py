@@ -10,8 +10,9 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.charts import diagnosis_charts
+from stimrig.api.charts.drawing import Figures
+from stimrig.api.charts.interactive import plotly_figure
 from stimrig.api.charts.plot import plot
-from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.web.pages.environment import environment
@@ -43,9 +44,9 @@ def diagnosis() -> dict[str, Any]:
 def test_a_picture_has_each_curve_with_its_band_and_axes_that_are_no_links() -> None:
     view = explanation.view(diagnosis(), None)
     drawn = diagnosis_charts.diagnosis_figures(None, [], view, {}, [])["free-free_gate"]
-    assert [trace["y"] for trace in drawn["data"] if trace.get("name") in LINES] == [[0.0, 1.0], [0.0, 0.5]]
-    assert all(any(trace["y"] == one["lower"] for trace in drawn["data"]) for one in list(LINES.values())[1:])
-    layout = drawn["layout"]
+    assert [curve.y for curve in drawn.curves if curve.label in LINES] == [[0.0, 1.0], [0.0, 0.5]]
+    assert [band.lower for band in drawn.bands] == [curve["lower"] for curve in LINES.values()]
+    layout = plotly_figure(drawn)["layout"]
     assert layout["xaxis"]["title"]["text"] == "time (s)" and "<" not in layout["yaxis"]["title"]["text"]
 
 
@@ -59,8 +60,8 @@ def test_a_model_that_holds_it_shows_it_and_the_diagnosis_does_not_offer_it_agai
     document = json.loads(with_gate(tmp_path / "MODEL.json", shape=SHAPE).read_text("utf-8"))
     (card,) = explanation.held_free(document)
     assert card["words"] == "Pulses open a gate." and card["axis"] == SHAPE["effect"]
-    assert list(diagnosis_charts.pictures([card])) == ["free-free_gate"]
-    drawn = Figures(diagnosis_charts.pictures([card]))
+    assert list(diagnosis_charts.free_effects([card])) == ["free-free_gate"]
+    drawn = Figures(diagnosis_charts.free_effects([card]))
     shown = environment.get_template("why.html").module.free(card, drawn)  # pyright: ignore[reportAttributeAccessIssue]
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
     assert explanation.remaining(diagnosis(), ["free_gate"], {})["free"] == []

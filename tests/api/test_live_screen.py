@@ -11,7 +11,6 @@ import h5py
 import numpy as np
 import pytest
 
-from stimrig.api.charts import figure as fig
 from stimrig.api.charts import model_charts
 from stimrig.api.store.tables import Test
 from stimrig.api.web.pages.views import limits_of
@@ -173,7 +172,7 @@ def test_what_was_not_played_begins_where_the_pulses_end(tmp_path: Path, sent_us
     found = recorded(str(made_up(tmp_path / "r.h5", sent_us, 1.2 if sent_us else 0.0)), lambda *_: None)
     plan_us = [100.0] * 400
     figure = model_charts.recorded(found, plan_us, 40.0, "stopped")
-    (faint,) = [trace for trace in figure["data"] if trace["name"] == "planned, not played"]
-    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == fig.FAINT
+    (faint,) = [curve for curve in figure.curves if curve.label == "planned, not played"]
+    assert faint.x[0] == pytest.approx(len(sent_us) / 40) and faint.colour == "plan"
     whole = model_charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
-    assert not [trace for trace in whole["data"] if trace["name"] == "planned, not played"]
+    assert not [curve for curve in whole.curves if curve.label == "planned, not played"]

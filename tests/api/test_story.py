@@ -35,7 +35,7 @@ def test_story_begins_with_what_is_missing_and_ends_with_the_falling_error(
         )
         file = page.get(f"/models/{last}/story.html")
         assert file.headers["content-disposition"] == "attachment" and "The held-out error did not fall" in file.text
-        for kind, start in (("svg", b"<svg"), ("pdf", b"%PDF")):
+        for kind, start in (("svg", b"<svg"), ("pdf", b"%PDF"), ("png", b"\x89PNG")):
             assert page.get(f"/models/{last}/story/figures/falling.{kind}").content.startswith(start)
         for name in ("falling.exe", "nothing.svg"):
             assert page.get(f"/models/{last}/story/figures/{name}").status_code == 404

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from stimrig import identify
-from stimrig.api.charts.trend_charts import WIDE
+from stimrig.api.charts.trend_charts import WIDE_PX
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from tests.api.conftest import Service, shared_service
@@ -145,11 +145,11 @@ def test_nobody_and_no_session(service: Service, client: httpx.Client) -> None:
     assert client.get("/v1/participants/P999/trend").status_code == 404
     assert trend(client, participant) == {"participant": participant, "sessions": [], "changes": None}
     page = client.get(f"/participants/{participant}/trend")
-    assert "No session with a model yet." in page.text and '<svg class="trend"' not in page.text
+    assert "No session with a model yet." in page.text and 'class="panel"' not in page.text
     made(service, "FIRST", three()[:1])
     first = client.get("/participants/FIRST/trend").text
     assert "A delay may be below zero by up to one sample" in first
-    assert "The trend begins with the second one." in first and first.count('<svg class="trend"') == 9
+    assert "The trend begins with the second one." in first and first.count('class="panel"') == 9
 
 
 @pytest.mark.parametrize(
@@ -234,8 +234,10 @@ def test_the_models_page_says_what_changed(client: httpx.Client, days: list[str]
 def at(tab: Any, picture: Any, number: int) -> None:
     """The pointer at a session of a picture."""
     box = picture.bounding_box()
-    x = tab.evaluate("(number) => JSON.parse(document.getElementById('told').textContent)[number][0]", number)
-    tab.mouse.move(box["x"] + x * box["width"] / WIDE, box["y"] + box["height"] / 2)
+    day = tab.evaluate("(number) => JSON.parse(document.getElementById('told').textContent)[number][0]", number)
+    first, left, each = map(float, picture.get_attribute("data-x").split())
+    x = left + (day - first) * each
+    tab.mouse.move(box["x"] + x * box["width"] / WIDE_PX, box["y"] + box["height"] / 2)
 
 
 @pytest.mark.browser
@@ -244,7 +246,7 @@ def test_a_session_is_told_as_text_and_leads_to_its_model(tab: Any, service: Ser
     planned = [Planned(Patient(), 0.0), Planned(replace(Patient(), gain=5.0), 3.0, notes={"electrodes": evil})]
     ids = made(service, "EVIL", planned)
     tab.goto(service.url + "/participants/EVIL/trend")
-    at(tab, tab.locator("svg.trend").first, 1)
+    at(tab, tab.locator(".panel svg.still").first, 1)
     assert "<script>" in tab.locator("#tip").inner_text()
     assert tab.title() == "Trend of EVIL · stimrig" and tab.locator("main img").count() == 0
     tab.mouse.down()

@@ -83,7 +83,7 @@ sys.meta_path.insert(0, Hidden())
 
 
 USE = """
-import contextlib, fpdf, importlib, io, json, stimrig
+import contextlib, importlib, io, json, matplotlib, stimrig
 from stimrig.api.cli import main
 assert main.run(["fit", "data.csv", "-o", "M.json"]) == 0
 assert main.run(["compare", "M.json", "data.csv", "--html", "c.html"]) == 0

@@ -32,7 +32,9 @@ NAMES = {
     "Client", "emulate", "explain", "export", "invert", "join", "recover", "save", "schema",
     "table1", "track",
 }  # fmt: skip
-HEAVY = {"numpy", "scipy", "numba", "h5py", "plotly", "httpx", "tqdm", "pydantic", "fastapi", "sqlalchemy"}
+HEAVY = {
+    "numpy", "scipy", "numba", "h5py", "plotly", "matplotlib", "httpx", "tqdm", "pydantic", "fastapi", "sqlalchemy",
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +81,8 @@ def test_a_model_shows_itself_in_a_notebook(model: stimrig.Model) -> None:
 def test_a_model_draws_itself_beside_its_record(model: stimrig.Model, record: stimrig.Record) -> None:
     figure = model.plot(record)
     names = [trace.name for trace in figure.data]
-    assert names[:3] == ["measured", "", "95 % band of the model"] and {"model, free run", "pulse width"} <= set(names)
-    measured = figure.data[0]
+    assert names[:3] == ["", "95 % band of the model", "measured"] and {"model, free run", "pulse width"} <= set(names)
+    measured = figure.data[2]
     assert measured.x[0] == record.time_s[0] and max(measured.y) == pytest.approx(record.torque_nm.max(), abs=1e-4)
     curve = next(trace for trace in figure.data if trace.xaxis == "x2" and trace.name == "model")
     assert list(curve.y) == pytest.approx(list(model.recruitment.table()[1]))

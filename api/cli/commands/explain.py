@@ -31,7 +31,7 @@ def explain(
     data: SeveralData,
     model_json: HeldModel = None,
     html: Annotated[Path | None, typer.Option(help="write the story with its figures here, one file")] = None,
-    figures: Annotated[Path | None, typer.Option(help="write each figure as SVG and PDF into this folder")] = None,
+    figures: Annotated[Path | None, typer.Option(help="write each figure as SVG, PDF and PNG into this folder")] = None,
     output: LastModel = None,
     columns: ColumnMap = None,
     as_json: Json = False,
@@ -58,14 +58,13 @@ def explain(
 
 
 def _write_figures(folder: Path, shown: dict[str, Any]) -> None:
-    from stimrig.api.charts.pdf import paper
     from stimrig.api.charts.story_charts import story_figures
 
     folder.mkdir(parents=True, exist_ok=True)
     figures = story_figures(shown["story"], shown["before"], shown["after"])
     for name in figures:
-        for kind in ("svg", "pdf"):
-            write(folder / f"{name}.{kind}", paper(figures, name, kind))
+        for kind in ("svg", "pdf", "png"):
+            write(folder / f"{name}.{kind}", figures.file(name, kind))
 
 
 def story_lines(shown: dict[str, Any]) -> list[str]:

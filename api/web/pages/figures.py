@@ -1,4 +1,4 @@
-"""A page's charts, each by itself: a still for the page, the same to keep or print, and the lines to look closer."""
+"""A page's charts, each by itself: a still for the page, files to keep or print, and what plotly takes."""
 
 from __future__ import annotations
 
@@ -6,22 +6,26 @@ import asyncio
 import gzip
 import hashlib
 import json
-from typing import Annotated, Any
+from typing import Annotated
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from stimrig.api.charts.figure import PAGE_CONFIG
-from stimrig.api.charts.pdf import paper
-from stimrig.api.charts.svg import Figures
+from stimrig.api.charts.drawing import Figures
+from stimrig.api.charts.interactive import page_figure
 from stimrig.api.errors import NotFoundError
 from stimrig.api.web.dependencies import Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.pages import model_view, trend_view
 
 router = APIRouter(include_in_schema=False)
-KINDS = {"html": "text/html; charset=utf-8", "svg": "image/svg+xml", "json": "application/json",
-         "pdf": "application/pdf"}  # fmt: skip
+KINDS = {
+    "html": "text/html; charset=utf-8",
+    "json": "application/json",
+    "svg": "image/svg+xml",
+    "pdf": "application/pdf",
+    "png": "image/png",
+}
 Width = Annotated[int, Query(ge=240, le=2400)]
 
 
@@ -29,7 +33,7 @@ Width = Annotated[int, Query(ge=240, le=2400)]
 async def of_model(
     request: Request, context: Ctx, _who: ModelReader, row: Version, name: str, width: Width = 720
 ) -> Response:
-    """One of the charts of a model's page, its kind at the end of its name."""
+    """Return one of the charts of a model's page, its kind at the end of its name."""
     figures = await model_view.figures_of(context, row)
     return await asyncio.to_thread(answer, request, figures, name, width)
 
@@ -39,33 +43,27 @@ async def compared(
     request: Request, context: Ctx, _who: ModelReader, name: str,
     model: Annotated[list[str] | None, Query()] = None, width: Width = 720,
 ) -> Response:  # fmt: skip
-    """One of the charts of models side by side."""
+    """Return one of the charts of models side by side."""
     rows = await trend_view.chosen(context, model)
     figures = await trend_view.figures_of(context, rows)
     return await asyncio.to_thread(answer, request, figures, name, width)
 
 
 def answer(request: Request, figures: Figures, name: str, width: int) -> Response:
-    """A figure as `name` asks for it: a part of a page, a picture of its own, or what the plot library takes."""
+    """Return a figure as `name` asks for it: a part of a page, a file to keep, or what plotly takes."""
     stem, _dot, kind = name.rpartition(".")
     if stem not in figures or kind not in KINDS:
         raise NotFoundError("chart", name)
     if kind == "json":
-        name = f"{request.path_params.get('model_id', 'compare')}-{stem}"
-        body = json.dumps(lines(figures[stem], name)).encode()
+        file_name = f"{request.path_params.get('model_id', 'compare')}-{stem}"
+        body = json.dumps(page_figure(figures[stem], file_name)).encode()
     else:
-        body = figures.still(stem, width).encode() if kind == "html" else paper(figures, stem, kind, width)
+        body = figures.still(stem, width).encode() if kind == "html" else figures.file(stem, kind, width)
     return to_keep(request, body, KINDS[kind])
 
 
-def lines(figure: dict[str, Any], file_name: str) -> dict[str, Any]:
-    """A figure as the plot library takes it."""
-    config = {**PAGE_CONFIG, "toImageButtonOptions": {"filename": file_name, "scale": 2}}
-    return {**figure, "layout": {**figure["layout"], "separators": ". "}, "config": config}
-
-
 def to_keep(request: Request, body: bytes, kind: str) -> Response:
-    """An answer that browsers keep, and ask about each time."""
+    """Return an answer that browsers keep, and ask about each time."""
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
     headers = {"Cache-Control": "private, no-cache", "ETag": tag, "Vary": "Accept-Encoding"}
     if tag in entity_tags(request.headers.get("if-none-match", "")):

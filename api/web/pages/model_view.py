@@ -10,7 +10,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
-from stimrig.api.charts.svg import Figures
+from stimrig.api.charts.drawing import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import advice, carried_structure, explanation, stored_model
 from stimrig.api.people.auth import Principal, Scope
@@ -93,9 +93,8 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
 def draw_own(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
     """The model's own figures; the first one low enough for the first screen."""
     figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
-    first = {"overview": model_charts.overview(figures[model_charts.LARGE])} if model_charts.LARGE in figures else {}
-    held = diagnosis_charts.pictures(explanation.held_free(document))
-    return figures | first | held | joint_charts.joint_figures(document)
+    held = diagnosis_charts.free_effects(explanation.held_free(document))
+    return figures | held | joint_charts.joint_figures(document)
 
 
 async def next_step_of(context: Context, row: Model, version: dict[str, Any], who: Principal) -> next_view.Step | None:

@@ -8,7 +8,7 @@ from typing import Any
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
 
-from stimrig.api.charts.svg import svg
+from stimrig.api.charts.drawing import svg
 from stimrig.api.clock import local_day
 from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.places import site_of, site_of_recording
@@ -41,7 +41,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
         "joint_g": "Share of the muscle's torque over the angle of the joint",
         "joint_h": "Passive torque over the angle of the joint",
     }
-    drawn = {name: svg(figures[name], *SIZES[name], words[name], on_paper=True) for name in words if name in figures}
+    drawn = {name: svg(figures[name], *SIZES[name], words[name], light=True) for name in words if name in figures}
     return page(
         request,
         "report_sheet.html",

@@ -12,8 +12,8 @@ from fastapi.responses import Response
 
 from stimrig.api import local_time
 from stimrig.api.charts import model_charts, trend_charts
+from stimrig.api.charts.drawing import Figures
 from stimrig.api.charts.model_charts import MOST
-from stimrig.api.charts.svg import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.trend import Session
@@ -156,7 +156,7 @@ async def trend(request: Request, context: Ctx, _who: ModelReader, code: str) ->
         sessions=[row(one) for one in documents[::-1][: rows_shown(request)]],
         more=len(documents) > (rows_shown(request) or len(documents)),
         panels=trend_charts.panels(documents),
-        told=trend_charts.sessions_told(documents),
+        told=trend_charts.session_rows(documents),
         changes=rest.newest(found),
         columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(changes.name_of, COLUMNS)],
         most=MOST,

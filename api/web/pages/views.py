@@ -10,7 +10,7 @@ from fastapi.responses import RedirectResponse, Response
 from markupsafe import Markup
 
 from stimrig.api.charts import model_charts
-from stimrig.api.charts.svg import svg
+from stimrig.api.charts.drawing import svg
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, File, Form, Request, UploadFile
 from fastapi.responses import PlainTextResponse, Response
 
+from stimrig.api.charts.drawing import svg
 from stimrig.api.charts.model_charts import inversion
-from stimrig.api.charts.svg import svg
 from stimrig.api.errors import ApiError
 from stimrig.api.models import inverted as words
 from stimrig.api.store.tables import Model
