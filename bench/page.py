@@ -20,8 +20,8 @@ from playwright.sync_api import sync_playwright
 from sqlalchemy import select
 
 from bench.common import parser
+from stimrig.api.jobs.worker import Worker
 from stimrig.api.store.tables import Analysis, Approval, Model, Note, Participant, Recording, Test
-from stimrig.api.workers.pool import WORKER
 from tests.api.browser import ARGUMENTS, CHROMIUM, NAME, PASSWORD
 from tests.api.conftest import Service, run_service, run_test
 
@@ -136,7 +136,7 @@ def main() -> None:
     made.add_argument("--looks", type=int, default=20, help="at each page of the participant with many sessions")
     options = made.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-page-") as folder:
-        for service in run_service(Path(folder), Path(folder), WORKER):
+        for service in run_service(Path(folder), Path(folder), Worker):
             with service.client() as http:
                 http.timeout = httpx.Timeout(120)
                 http.post("/v1/participants", json={"code": "P1"})

@@ -9,8 +9,8 @@ import plotly.graph_objects as go
 from stimrig.api.charts import diagnosis_charts, model_charts
 from stimrig.api.charts.figure import LIGHT, Figure
 from stimrig.api.charts.interactive import CHART_CONFIG, plotly_figure
+from stimrig.api.jobs.curves import curves, rounded, runs
 from stimrig.api.models import explanation
-from stimrig.api.workers.curves import curves, rounded, runs
 from stimrig.identify import BadRequest, Comparison, Diagnosis, Improvement, Model, Record, compare
 
 BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]

@@ -81,7 +81,7 @@ class Services:
             arguments = ["--die-with-parent", *(emulator_arguments or [])]
             self.emulator = self._child("emulator", ["stimrig.hardware_sim", *arguments])
         self.rig = self._child("rig", ["stimrig.rig"])
-        self.api = self._child("api", ["stimrig.api.web.server"])
+        self.api = self._child("api", ["stimrig.api.web"])
         self.admin_token = admin_token
 
     def _child(self, name: str, module: list[str]) -> Child:

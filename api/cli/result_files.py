@@ -71,8 +71,8 @@ def write_model(path: Path, model: identify.Model) -> None:
 
 def report(what: Any, record: identify.Record | None, name: str, found: identify.Comparison | None = None) -> str:
     """A model or an explanation beside its record, as one HTML file that works offline; `found`: compared already."""
+    from stimrig.api.jobs.curves import curves, rounded
     from stimrig.api.web.pages.report_file import comparison_html
-    from stimrig.api.workers.curves import curves, rounded
     from stimrig.identify.json_text import json_value
 
     if record is not None and isinstance(what, identify.Explanation):
@@ -86,10 +86,10 @@ def report(what: Any, record: identify.Record | None, name: str, found: identify
 
 def told(record: Any, explained: Any, structure: Sequence[str]) -> dict[str, Any]:
     """The story of a record, and what its figures are drawn from."""
+    from stimrig.api.jobs.curves import curves, rounded
+    from stimrig.api.jobs.verbs import with_experiment
     from stimrig.api.models.explanation import step_versions
     from stimrig.api.models.story import story
-    from stimrig.api.workers.curves import curves, rounded
-    from stimrig.api.workers.verbs import with_experiment
     from stimrig.identify.conclusion import only_open
 
     models = explained.improvement.models

@@ -11,16 +11,17 @@ from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
+from stimrig.api.jobs.job import Job
+from stimrig.api.jobs.pool import Pool
 from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Model, Recording
-from stimrig.api.workers.pool import Call, Pool
 from stimrig.identify.conclusion import asked_for
 
 log = logging.getLogger("stimrig.analyses")
-OnCall = Callable[[Call], None]
+OnCall = Callable[[Job], None]
 """Takes the job of a worker that begins: a page shows its progress."""
 DIAGNOSIS, OWN_DIAGNOSIS = "diagnosis", "diagnosis of its structure"
 """The names under which those of the plain structure and of another are kept."""
@@ -41,7 +42,7 @@ class Analyses:
     def __init__(self, store: Store, clock: Clock, pool: Pool, versions: Versions, settings: Settings) -> None:
         self.store, self.clock, self.pool, self.versions = store, clock, pool, versions
         self.settings = settings
-        self.running: dict[tuple[str, str], Call] = {}
+        self.running: dict[tuple[str, str], Job] = {}
         """Begun and not kept yet."""
         self._library: list[str] | None = None
 

@@ -8,9 +8,12 @@ from __future__ import annotations
 
 import asyncio
 import json
+from collections.abc import Callable
 from typing import Any
 
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.pool import Pool
+from stimrig.api.jobs.worker import Worker
 from stimrig.api.models import stored_model
 from stimrig.api.models.analyses import Analyses, OnCall
 from stimrig.api.models.explanation import name_of
@@ -18,8 +21,6 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Model
 from stimrig.api.structure import in_words
-from stimrig.api.workers.pool import Pool
-from stimrig.api.workers.process import WORKER, Places
 from stimrig.identify.conclusion import asked_for
 
 
@@ -87,7 +88,7 @@ def _not_carried(error: Exception) -> dict[str, Any]:
     return {"offered": "plain", "why": why, "reason": reason, **{name: [] for name in lists}}
 
 
-async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -> None:
+async def refuse_unknown(settings: Settings, worker: Callable[..., Worker] = Worker) -> None:
     """Refuse effects of the site's own that cannot be used, and a structure that names what is not in the library.
 
     A worker reads the library.
@@ -96,8 +97,7 @@ async def refuse_unknown(settings: Settings, worker: tuple[str, ...] = WORKER) -
     """
     if not settings.structure and not settings.effects_dir:
         return
-    reads = [settings.effects_dir] if settings.effects_dir else []
-    pool = Pool(1, worker, Places(reads))
+    pool = Pool(1, worker)
     try:
         found = await pool.submit("effects").result
     except ApiError as error:

@@ -132,7 +132,7 @@ class TrackedVersions:
         trial : Trial
             The trial.
         found : dict
-            `step` and `model` (`stimrig.api.workers.tracking_verbs`), or the `reason` why it was not followed.
+            `step` and `model` (`stimrig.api.jobs.tracking_verbs`), or the `reason` why it was not followed.
         last_sample_unix_s : float, optional
             When its last sample came.
 

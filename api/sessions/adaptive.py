@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.pool import Pool
 from stimrig.api.models import stored_model
 from stimrig.api.models.places import Place, differ, place_of, site_of
 from stimrig.api.models.registry import Versions
@@ -23,7 +24,6 @@ from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Tell, Watc
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Participant, Test
-from stimrig.api.workers.pool import Adviser
 from stimrig.identify.records.record import HELD_OUT
 from stimrig.rig.messages import SAFE_END_S, AdaptivePlan, FinishedEvent, SegmentPlan, TestPlan
 from stimrig.rig.requests import PreviewRequest
@@ -50,7 +50,7 @@ class AdaptiveTests(Watched):
     names, part = (ADAPTIVE,), "adaptive"
     ends: ClassVar[Mapping[str, str]] = {"torque_time": "torque-time", "plan": "fixed-rest"}
 
-    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, adviser: Adviser, tell: Tell) -> None:
+    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, adviser: Pool, tell: Tell) -> None:
         super().__init__(clock, rig, versions, tell)
         self.adviser = adviser
         self._outlooks: OrderedDict[str, dict[str, Any]] = OrderedDict()
@@ -95,7 +95,7 @@ class AdaptiveTests(Watched):
                 if self.watching:
                     detail = "What a test can reach is computed once the one that runs has ended."
                     raise ApiError(409, "rig-busy", "Another test is running", detail)
-                self._outlooks[name] = await self.adviser.ask("adaptive_outlook", **wanted)
+                self._outlooks[name] = await self.adviser.submit("adaptive_outlook", **wanted).result
                 while len(self._outlooks) > KEPT:
                     self._outlooks.popitem(last=False)
             return self._outlooks[name]

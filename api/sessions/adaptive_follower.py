@@ -19,9 +19,9 @@ from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.pool import Pool
 from stimrig.api.sessions.kinds import SERVICE, Watcher
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.workers.pool import Adviser
 from stimrig.rig.messages import AHEAD, SAFE_END_S, LiveEvent, SegmentPlan, TestPlan
 from stimrig.rig.requests import EnoughRequest, ExtendRequest
 
@@ -100,7 +100,7 @@ class Follower(Watcher):
     log = log
 
     def __init__(
-        self, plan: TestPlan, how: dict[str, Any], reach: dict[str, Any], rig: RigClient, adviser: Adviser,
+        self, plan: TestPlan, how: dict[str, Any], reach: dict[str, Any], rig: RigClient, adviser: Pool,
         clock: Clock, tell: Callable[[], None],
     ) -> None:  # fmt: skip
         super().__init__(plan, Told(how["target"], reach), rig, clock, tell)
@@ -120,7 +120,7 @@ class Follower(Watcher):
         await super()._listen(path)
 
     async def _begin(self) -> None:
-        await self.adviser.ask("adaptive_begin", **self.how)
+        await self.adviser.submit("adaptive_begin", **self.how).result
 
     def problem(self, why: str) -> str:
         """As `Watcher`."""
@@ -181,10 +181,11 @@ class Follower(Watcher):
         event, heard_s, news, self._new = self._newest, self._heard_s, self._new, News()
         assert event is not None
         widths, segments = self._played_so_far(event)
-        said = await self.adviser.ask(
+        advice = self.adviser.submit(
             "adaptive_advise", samples=news.samples, outcomes=news.outcomes, laid_us=widths, segments=segments,
             torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
         )  # fmt: skip
+        said = await advice.result
         self._took_s = self.clock.monotonic_s() - heard_s
         answer = self._take(said, event, heard_s)
         if turn is not self._turn or turn.sent:

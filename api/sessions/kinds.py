@@ -12,11 +12,11 @@ from typing import Any, ClassVar
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient, samples_of
 from stimrig.api.store.tables import Test
-from stimrig.api.workers.pool import Tasks
 from stimrig.rig.messages import AnglePlan, FinishedEvent, LiveEvent, TestPlan
 
 SERVICE = "stimrig"

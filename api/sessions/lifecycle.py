@@ -10,6 +10,9 @@ from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.job import Job
+from stimrig.api.jobs.pool import Pool
+from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.models import carried_structure, together
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
@@ -17,7 +20,6 @@ from stimrig.api.sessions.kinds import Kinds
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store, audit
 from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
-from stimrig.api.workers.pool import Call, Pool, Tasks
 from stimrig.rig.messages import LABEL_TITLES, FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
@@ -41,7 +43,7 @@ class Lifecycle:
         self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
         self.kinds = kinds
-        self.calls: dict[str, Call] = {}
+        self.jobs: dict[str, Job] = {}
         self._ahead = Tasks(log)
 
     def document(
@@ -56,7 +58,7 @@ class Lifecycle:
         lasted_s = row.summary.get("duration_s", 0.0)
         there = (position or (0.0, planned.get("duration_s", 0.0), None)) if running else (lasted_s, lasted_s, None)
         elapsed_s, duration_s, segment = there
-        call, rig = self.calls.get(row.id), self.rig.status
+        job, rig = self.jobs.get(row.id), self.rig.status
         sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
         if fits is None and row.model_id:
             fits = {row.model_id: self.versions.document(self.versions.get(row.model_id))}
@@ -69,7 +71,7 @@ class Lifecycle:
             "duration_s": duration_s,
             "time_left_s": max(0.0, duration_s - elapsed_s),
             "progress": min(1.0, elapsed_s / duration_s) if duration_s else 0.0,
-            "identification": call.document() if call else None,
+            "identification": {"verb": job.kind, **job.progress_document()} if job else None,
             "ran_by": row.ran_by or row.requested_by,
             **{name: row.plan.get(name) for name in ("side", "muscle", "joins", *LABEL_TITLES)},
             "planned": planned,
@@ -137,8 +139,8 @@ class Lifecycle:
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
             return
 
-        def take(call: Call) -> None:
-            self.calls[test_id] = call
+        def take(job: Job) -> None:
+            self.jobs[test_id] = job
 
         how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.on_progress(test_id)}
         try:
@@ -149,7 +151,7 @@ class Lifecycle:
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
             return
         finally:
-            self.calls.pop(test_id, None)
+            self.jobs.pop(test_id, None)
         summary = dict((await asyncio.to_thread(self.store.get, Test, test_id)).summary)
         if last_sample_unix_s is not None:
             summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
@@ -157,7 +159,7 @@ class Lifecycle:
         self._ahead.begin(self.analyses.diagnose_ahead(model))
 
     async def _first_version(
-        self, row: Test, recording: Recording, parent: str | None, take: Callable[[Call], None], how: dict[str, Any]
+        self, row: Test, recording: Recording, parent: str | None, take: Callable[[Job], None], how: dict[str, Any]
     ) -> Model:
         """The first version of a test's recording, named by the test at once: it is there whatever comes after it."""
         if row.model_id is not None:
@@ -174,10 +176,10 @@ class Lifecycle:
 
     def keep_plain(self, test_id: str) -> bool:
         """End the fit of the last session's structure after a test; whether one was under way."""
-        call = self.calls.get(test_id)
-        if call is None or call.verb != "carry":
+        job = self.jobs.get(test_id)
+        if job is None or job.kind != "carry":
             return False
-        self.pool.cancel(call)
+        self.pool.cancel(job)
         return True
 
     async def _record_of(self, row: Test) -> tuple[Recording, str | None]:
@@ -207,9 +209,9 @@ class Lifecycle:
         return event.model_copy(update=found)
 
     async def _find_recording(self, test_id: str) -> dict[str, Any]:
-        call = self.pool.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
+        job = self.pool.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
         try:
-            return (await call.result).get("found") or {}
+            return (await job.result).get("found") or {}
         except ApiError as error:
             log.warning("looking for the recording of %s: %s", test_id, error)
             return {}

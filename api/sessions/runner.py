@@ -16,6 +16,8 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.clock import Clock, asked_s
 from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.jobs.pool import Pool
+from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.logs import current_test
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.places import in_words, site_of
@@ -33,7 +35,6 @@ from stimrig.api.sessions.stop_counter import StopCounter
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.store import Store, audit, seen
 from stimrig.api.store.tables import OPEN_STATES, Participant, Test, Token
-from stimrig.api.workers.pool import Adviser, Pool, Tasks
 from stimrig.rig import messages, requests
 
 log = logging.getLogger("stimrig.trials")
@@ -63,7 +64,7 @@ class Runner(Playing):
 
     def __init__(
         self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions, analyses: Analyses,
-        adviser: Adviser, trials: Trials, recordings_dir: Path, limits_lock: asyncio.Lock,
+        adviser: Pool, trials: Trials, recordings_dir: Path, limits_lock: asyncio.Lock,
     ) -> None:  # fmt: skip
         super().__init__(store, clock, rig)
         self.versions, self.pool, self.trials, self.limits_lock = versions, pool, trials, limits_lock

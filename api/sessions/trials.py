@@ -14,6 +14,8 @@ from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.pool import Pool
+from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.models.places import differ, place_of
 from stimrig.api.models.tracked import TrackedVersions, Trial
 from stimrig.api.sessions.kinds import Kind
@@ -21,7 +23,6 @@ from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
-from stimrig.api.workers.pool import Adviser, Tasks
 
 log = logging.getLogger("stimrig.tracking")
 SEQUENCE = "sequence"
@@ -38,7 +39,7 @@ class Trials(Kind):
 
     names, fitted = (SEQUENCE,), False
 
-    def __init__(self, rig: RigClient, store: Store, clock: Clock, tracked: TrackedVersions, tracker: Adviser) -> None:
+    def __init__(self, rig: RigClient, store: Store, clock: Clock, tracked: TrackedVersions, tracker: Pool) -> None:
         super().__init__(rig)
         self.store, self.clock, self.tracked, self.tracker = store, clock, tracked, tracker
         self._turn = asyncio.Lock()
@@ -69,7 +70,7 @@ class Trials(Kind):
         try:
             text = await asyncio.to_thread(self.tracked.text, approval)
             await asyncio.to_thread(self.tracked.earlier, approval)
-            await self.tracker.ask("track_warm", model_json=text)
+            await self.tracker.submit("track_warm", model_json=text).result
         except ApiError as error:
             log.warning("the worker of trials could not be warmed: %s", error)
 
@@ -116,12 +117,13 @@ class Trials(Kind):
         if await asyncio.to_thread(self.tracked.elsewhere, trial.approval, [place_of(trial.test)]):
             return {"reason": ELSEWHERE}
         try:
-            return await self.tracker.ask(
+            job = self.tracker.submit(
                 "track", data=recording.path, model_json=trial.model_json, bounds=trial.bounds,
                 state=trial.state, missed=trial.missed, earlier=trial.earlier,
                 reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
                 between=await asyncio.to_thread(self._between, trial, recording),
             )  # fmt: skip
+            return await job.result
         except ApiError as error:
             if error.code == "worker-died":
                 self.warm(trial.test.participant)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import cache
 from types import ModuleType
@@ -14,13 +14,13 @@ from fastapi import APIRouter, FastAPI
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp
 
+from stimrig.api.jobs.worker import Worker
 from stimrig.api.settings import Settings
 from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.version import software_version
 from stimrig.api.web import openapi, pages, problems, routes
 from stimrig.api.web.dependencies import build
 from stimrig.api.web.middleware import BodyLimit, Headers, LookAgain, RequestId, StrictBody
-from stimrig.api.workers.pool import WORKER
 
 
 class Service(FastAPI):
@@ -32,7 +32,7 @@ class Service(FastAPI):
 
 
 def create_app(
-    settings: Settings | None = None, *, worker: tuple[str, ...] = WORKER, lock: ServiceLock | None = None
+    settings: Settings | None = None, *, worker: Callable[..., Worker] = Worker, lock: ServiceLock | None = None
 ) -> FastAPI:
     """The application.
 
@@ -40,8 +40,8 @@ def create_app(
     ----------
     settings : Settings, optional
         Default: from the environment.
-    worker : tuple of str
-        How to start a worker process.
+    worker : callable
+        Makes a worker process.
     lock : ServiceLock, optional
         Held already; default: taken now.
 

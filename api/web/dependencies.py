@@ -9,7 +9,6 @@ import logging
 import shutil
 import time
 from collections.abc import Callable, Coroutine
-from pathlib import Path
 from typing import Annotated, Any, Concatenate, ParamSpec, TypeVar
 
 from fastapi import Depends, Request, Security
@@ -18,6 +17,9 @@ from starlette.requests import HTTPConnection
 
 from stimrig.api import owner_only
 from stimrig.api.clock import Clock, set_zone
+from stimrig.api.jobs.pool import Pool
+from stimrig.api.jobs.registry import Jobs
+from stimrig.api.jobs.worker import Worker
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
@@ -34,12 +36,9 @@ from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, uploads
 from stimrig.api.store.service_lock import KEEP_S, ServiceLock
-from stimrig.api.store.tables import Model, Recording
+from stimrig.api.store.tables import Model
 from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, require
 from stimrig.api.web.openapi import problem
-from stimrig.api.workers.jobs import Jobs
-from stimrig.api.workers.pool import WORKER, Adviser, Pool
-from stimrig.api.workers.process import Places
 
 log = logging.getLogger("stimrig.api")
 P = ParamSpec("P")
@@ -53,10 +52,10 @@ FORGIVEN = (SQLAlchemyError, OSError)
 class Context:
     """Everything a route of the service may need.
 
-    `worker`: how to start a worker process. `lock`: held; let go at the end.
+    `worker`: makes a worker process. `lock`: held; let go at the end.
     """
 
-    def __init__(self, settings: Settings, clock: Clock, worker: tuple[str, ...], lock: ServiceLock) -> None:
+    def __init__(self, settings: Settings, clock: Clock, worker: Callable[..., Worker], lock: ServiceLock) -> None:
         make_folders(settings)
         if settings.time_zone:
             set_zone(settings.time_zone)
@@ -72,7 +71,7 @@ class Context:
         self.people = People(store, clock, self.auth, guesses)
         self.versions = Versions(store, clock)
         rig = self.rig = RigClient(settings.rig_socket, clock)
-        pool = self.pool = Pool(settings.workers, worker, places(settings, store))
+        pool = self.pool = Pool(settings.workers, worker, background=True)
         self.analyses = Analyses(store, clock, pool, self.versions, settings)
         self.tracked = TrackedVersions(store, clock, self.versions)
         self.limits_lock = asyncio.Lock()
@@ -80,8 +79,8 @@ class Context:
         nothing begins with the limits of before."""
         self.keys_lock = asyncio.Lock()
         """Trials of controllers' keys are counted and begun one after the other."""
-        # workers of their own: a folder that the pool learns ends no test
-        adviser, tracker = (Adviser(worker, places(settings, store)) for _ in range(2))
+        # processes of their own: they remember a test or a trial, and nothing else keeps them busy
+        adviser, tracker = Pool(1, worker), Pool(1, worker)
         trials = Trials(rig, store, clock, self.tracked, tracker)
         self.runner = Runner(
             store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
@@ -130,7 +129,7 @@ async def _repeat(every_s: float, work: Callable[[], object]) -> None:
             log.exception("regular work failed; it is done again at the next interval")
 
 
-def build(settings: Settings, worker: tuple[str, ...] = WORKER, lock: ServiceLock | None = None) -> Context:
+def build(settings: Settings, worker: Callable[..., Worker] = Worker, lock: ServiceLock | None = None) -> Context:
     """Make the parts; `lock` is held already, or taken now.
 
     Raises ApiError: the database cannot be opened. HeldError: another service holds the data folder or the database.
@@ -150,13 +149,6 @@ def make_folders(settings: Settings) -> None:
     owner_only.close(settings.logs_dir, 0o700)
     shutil.rmtree(settings.exports_dir, ignore_errors=True)
     owner_only.folder(settings.exports_dir)
-
-
-def places(settings: Settings, store: Store) -> Places:
-    """The folders that workers may reach: those of recordings, known ones of a rig that runs by itself included."""
-    reads = {settings.recordings_dir, *(Path(path).parent for path in store.all(Recording.path))}
-    reads |= {settings.effects_dir} if settings.effects_dir else set()
-    return Places(reads, [settings.exports_dir])
 
 
 def under_limits_lock(

@@ -1,4 +1,4 @@
-"""`python -m stimrig.api.web.server`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
+"""`python -m stimrig.api.web`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
 
 Exit 2: a setting does not hold, another service holds the data, the port is taken, or the database does not open.
 """
@@ -22,6 +22,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from stimrig.api import logs
 from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.jobs.worker import limit_environment
 from stimrig.api.models import carried_structure
 from stimrig.api.settings import Settings, loopback
 from stimrig.api.store.service_lock import ServiceLock
@@ -35,6 +36,7 @@ def main() -> int:
     os.umask(os.umask(0o077) | 0o077)  # what the service and its workers write is for their user only
     try:
         settings = Settings()
+        limit_environment()
         refuse_open_door(settings)
         lock = ServiceLock(settings)  # before the port: who runs already says more than a port that is taken
         listener = bind(settings.host, settings.port)
@@ -175,7 +177,3 @@ def raise_file_limit() -> None:
     most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
     if soft < most:
         resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -25,7 +25,7 @@ from stimrig.identify.errors import IdentifyError
 log = logging.getLogger("stimrig.worker")
 PROCESSOR_S = 900.0
 """Of processor time for a call that names no other bound."""
-VERBS = "stimrig.api.workers.verbs"
+VERBS = "stimrig.api.jobs.verbs"
 
 
 def main() -> None:

@@ -31,12 +31,14 @@ from stimrig.api.settings import Settings
 from stimrig.api.store import Store, database
 from stimrig.api.web.app import create_app
 from stimrig.api.web.server import configuration
-from tests.api import thread_process
+from tests.api import thread_worker
 from tests.api.fake_rig import FakeRig, RigThread
 from tests.harness.looks_first import LooksFirst
 
 TOKEN = "administrator-token-of-the-tests"
 HTML = {"Accept": "text/html,application/xhtml+xml"}
+STUB, REAL = thread_worker.STUB, thread_worker.REAL
+"""Workers as threads: one that fits nothing, and one that does what a worker does."""
 PATIENCE_S = 60.0
 """For each answer: a busy machine is slow, and a test says so where an answer has to be quick."""
 QUICK_SPEED = 600.0
@@ -44,8 +46,6 @@ QUICK_SPEED = 600.0
 NO_TLS = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
 """Services of tests speak plain HTTP: without it every client would read the machine's certificates, 20 ms each."""
 DURABLE = database._durable_sqlite
-STUB, REAL = thread_process.STUB, thread_process.REAL
-"""Workers as threads: one that fits nothing, and one that does what a worker does."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -69,14 +69,6 @@ def pytest_runtest_protocol(item: pytest.Item) -> Iterator[None]:
         return (yield)
     finally:
         asyncio._set_running_loop(None)
-
-
-@pytest.fixture(scope="session", autouse=True)
-def stub_in_this_process() -> Iterator[None]:
-    """To start a process takes a processor 0.1 s, and each service has several."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(asyncio, "create_subprocess_exec", thread_process.start)
-        yield
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -381,7 +373,7 @@ def s3() -> Iterator[Any]:
 @pytest.fixture(scope="module")
 def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A table of a made-up muscle's test."""
-    from tests.api.test_worker import made_up_csv
+    from tests.api.test_jobs import made_up_csv
 
     return made_up_csv(tmp_path_factory.mktemp("record") / "record.csv")
 

@@ -6,8 +6,8 @@ import sys
 from functools import partial
 
 from stimrig.api.web import server
-from tests.api.stub_worker import COMMAND
+from tests.api.thread_worker import PROCESS
 
 if __name__ == "__main__":
-    server.create_app = partial(server.create_app, worker=COMMAND)
+    server.create_app = partial(server.create_app, worker=PROCESS)
     sys.exit(server.main())

@@ -1,23 +1,38 @@
-"""A worker that speaks the protocol of `stimrig.api.workers.child` but fits nothing: quick, and slow when asked to be.
+"""Verbs of a worker that fits nothing: quick, and slow when asked to be.
 
-Run as a process by tests of processes; for all others `tests/api/thread_process.py` has it in the test's own process.
+`tests/api/thread_worker.py` does them in a thread, tests of processes in a process.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import sys
+import os
+import tempfile
+import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from stimrig.api.jobs import curves as real_curves
+from stimrig.api.record_files import find_recording, plain_csv
+from stimrig.identify.errors import BadRequest
 from tests.api.made_up_joint import joint
 
-COMMAND = (sys.executable, "-m", "tests.api.stub_worker")
-"""To start it as a process."""
-Pause = Callable[[float], Any]
+Progress = Callable[[float, str], None]
+
+
+class State(threading.local):
+    """What one worker remembers, in a process or in a thread of its own."""
+
+    pause: Callable[[float], Any] = staticmethod(time.sleep)
+    die: Callable[[int], Any] = staticmethod(os._exit)
+    advice, target = 0, 0.0
+    """Answers since the adaptive test began, and its target."""
+
+
+state = State()
 
 
 FIGURES = {
@@ -46,7 +61,7 @@ def model(effects: list[str]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def curves() -> dict[str, Any]:
+def curves(progress: Progress, **_: Any) -> dict[str, Any]:
     time_s = [k / 10 for k in range(200)]
     torque = [k % 50 / 10 for k in range(200)]
     return {
@@ -56,7 +71,7 @@ def curves() -> dict[str, Any]:
     }  # fmt: skip
 
 
-def comparison() -> dict[str, Any]:
+def comparison(progress: Progress, **_: Any) -> dict[str, Any]:
     time_s = [k / 10 for k in range(200)]
     part = {"label": "prbs", "samples": 100, "rms_nm": 0.2, "mean_nm": 0.1, "share_of_excess": 1.0}
     return {
@@ -85,7 +100,7 @@ EXPERIMENT = {
 }  # fmt: skip
 
 
-def diagnosis(model_json: str | None = None) -> dict[str, Any]:
+def found_missing(model_json: str | None) -> dict[str, Any]:
     held = [effect["id"] for effect in json.loads(model_json)["effects"]] if model_json else []
     missing = {
         "effect": "fatigue", "name": "Fatigue", "probability": 0.93, "rms_before_nm": 0.12, "rms_after_nm": 0.041,
@@ -108,7 +123,7 @@ def diagnosis(model_json: str | None = None) -> dict[str, Any]:
     return {**found, "missing": [missing], "candidates": [beside], "experiment": None, "signatures": {}}
 
 
-def improvement(model_json: str | None = None) -> dict[str, Any]:
+def improvement(model_json: str | None) -> dict[str, Any]:
     held = [effect["id"] for effect in json.loads(model_json)["effects"]] if model_json else []
     new = "threshold_drift" if "fatigue" in held else "fatigue"
     steps = [{"added": added, "fit_percent": 97.0, "rms_nm": rms} for added, rms in ((None, 0.12), (new, 0.041))]
@@ -116,13 +131,14 @@ def improvement(model_json: str | None = None) -> dict[str, Any]:
     return {"verdict": "effect_missing", "noise_sd_nm": 0.04, "steps": steps, "models": models, "refused": []}
 
 
-def carried(folder: Path, earlier: dict[str, Any], say: Any, pause: Pause) -> dict[str, Any]:
+def carry(progress: Progress, data: str, model_json: str) -> dict[str, Any]:
     """Threshold drift is never needed again; the other effects always are."""
+    folder, earlier = Path(data).parent, json.loads(model_json)
     if (folder / "does-not-carry").exists():
-        return {"error": {"expected": True, "detail": (folder / "does-not-carry").read_text(), "place": ""}}
-    say(progress=0.3, text="fitting last session's structure")
+        raise BadRequest((folder / "does-not-carry").read_text())
+    progress(0.3, "fitting last session's structure")
     while (folder / "carrying-slowly").exists():
-        pause(0.05)
+        state.pause(0.05)
     held = [effect["id"] for effect in earlier["effects"]]
     needed = [effect for effect in held if effect != "threshold_drift"]
     rows = [
@@ -136,7 +152,7 @@ def carried(folder: Path, earlier: dict[str, Any], say: Any, pause: Pause) -> di
         "still_needed": needed, "no_longer_needed": [effect for effect in held if effect not in needed],
         "undecided": [], "effects": rows, "figures": [],
     }  # fmt: skip
-    return {"result": {"json": json.dumps(model(needed)) if needed else None, "found": found}}
+    return {"json": json.dumps(model(needed)) if needed else None, "found": found}
 
 
 OPENING = [0.0] * 20 + [7.5 * k for k in range(1, 41)] + [0.0] * 20
@@ -154,14 +170,16 @@ def knowledge(percent: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def advised(advice: int, target: float, pause: Pause) -> dict[str, Any]:
+def adaptive_advise(progress: Progress, **_news: Any) -> dict[str, Any]:
     """Each answer halves the bands, from 8 %; the target of 45 % is one at which the worker dies, of 44 % one at which
     it is slow."""
+    state.advice += 1
+    advice, target = state.advice, state.target
     percent = 16.0 * 0.5**advice
     if advice > 2 and target == 45.0:
-        sys.exit(9)
+        state.die(9)
     if advice > 2 and target == 44.0:
-        pause(3)
+        state.pause(3)
     kind = "next" if target >= 44.0 or percent > target else "enough"
     widths = [100.0, 200.0] * 20
     segments = [{"name": f"step {advice}", "sequence": "widths",
@@ -173,21 +191,21 @@ def advised(advice: int, target: float, pause: Pause) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def tracked(arguments: dict[str, Any], pause: Pause) -> dict[str, Any]:
+def track(progress: Progress, **arguments: Any) -> dict[str, Any]:
     """A gain 2 % lower each trial; `track.json` beside the recording says otherwise, once."""
     told = Path(arguments["data"]).parent / "track.json"
     wanted = json.loads(told.read_text()) if told.exists() else {}
     told.unlink(missing_ok=True)
     if wanted.get("die"):
-        sys.exit(9)
-    pause(wanted.get("slow_s", 0.0))
+        state.die(9)
+    state.pause(wanted.get("slow_s", 0.0))
     error = None if arguments["reference_torque_nm"] is None else 7.5
     if "reason" in wanted:
         return {"error_percent": error, "reason": wanted["reason"]}
-    state = arguments["state"] or {"trials": 0, "gain": 1.0}
-    values = {"gain": state["gain"] * 0.98, "threshold_shift_us": 0.5, "time_scale": 1.0} | wanted.get("values", {})
+    before = arguments["state"] or {"trials": 0, "gain": 1.0}
+    values = {"gain": before["gain"] * 0.98, "threshold_shift_us": 0.5, "time_scale": 1.0} | wanted.get("values", {})
     levels = {name: {"value": value, "low": value - 0.01, "high": value + 0.01} for name, value in values.items()}
-    after = {"trials": state["trials"] + 1, "gain": values["gain"], "missed": arguments["missed"]}
+    after = {"trials": before["trials"] + 1, "gain": values["gain"], "missed": arguments["missed"]}
     after["between"] = arguments["between"]
     step = {
         "outcome": wanted.get("outcome", "followed"), "trial": after["trials"], "now": levels, "coming": levels,
@@ -200,139 +218,122 @@ def tracked(arguments: dict[str, Any], pause: Pause) -> dict[str, Any]:
     return {"error_percent": error, "step": step, "model": json.dumps(moved)}
 
 
-class Stub:
-    """What one worker process remembers.
-
-    Parameters
-    ----------
-    pause : callable
-        How to be slow.
-    """
-
-    def __init__(self, pause: Pause = time.sleep) -> None:
-        self.pause = pause
-        self.advice, self.target = 0, 0.0
-        """Answers since the test began, and the target that it told."""
-
-    def line(self, line: str | bytes, write: Callable[[str], Any]) -> None:
-        """Do one call; what it says is written line by line."""
-        request = json.loads(line)
-
-        def say(**fields: Any) -> None:
-            write(json.dumps({"call": request["call"], **fields}) + "\n")
-
-        say(**self.answer(request["verb"], request["arguments"], say))
-
-    def answer(self, verb: str, arguments: dict[str, Any], say: Any) -> dict[str, Any]:
-        if verb == "fit":
-            say(progress=0.5, text="identifying")
-            if "slow" in arguments.get("effects", []):
-                self.pause(60)
-            if "die" in arguments.get("effects", []):
-                sys.exit(9)
-            if "bad" in arguments.get("effects", []):
-                return {
-                    "error": {
-                        "expected": True,
-                        "detail": "no effect bad. Take one of fatigue, tremor.",
-                        "place": "effects",
-                    }
-                }
-            while (Path(arguments["data"]).parent / "fitting-slowly").exists():
-                self.pause(0.05)
-            document = model([effect.partition(":")[0] for effect in arguments.get("effects", [])])
-            return {"result": {"json": json.dumps(document), "model": document, "notes": []}}
-        if verb == "carry":
-            return carried(Path(arguments["data"]).parent, json.loads(arguments["model_json"]), say, self.pause)
-        if verb == "comparison":
-            return {"result": comparison()}
-        if verb == "curves":
-            return {"result": curves()}
-        if verb == "diagnosis":
-            slow = Path(arguments["data"]).parent / "slow"
-            say(progress=float(slow.read_text()) if slow.exists() else 0.5, text="tried fatigue")
-            if slow.exists():
-                self.pause(60)
-            held = arguments.get("model_json")
-            return {"result": {**diagnosis(held), "improvement": improvement(held)}}
-        if verb == "adaptive_outlook":
-            if arguments["target"]["step_percent"] == 49.0:
-                self.pause(2.0)
-            within = arguments["max_torque_time_nm_s"] >= 20.0
-            words = "The target should be reached in about 9 s with 20 N·m·s."
-            if not within:
-                words = (
-                    "The target is probably out of reach: in about 4 s with 9 N·m·s the curve would be known within "
-                )
-                words += "6.0 % and the step response within 3.0 %."
-            reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
-                     "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
-            known = bool(arguments["models"])
-            return {"result": {"opening_us": OPENING, "reach": reach, "known": known}}
-        if verb == "adaptive_begin":
-            self.advice, self.target = 0, arguments["target"]["curve_percent"]
-        if verb == "adaptive_advise":
-            self.advice += 1
-            return {"result": advised(self.advice, self.target, self.pause)}
-        if verb == "track":
-            return {"result": tracked(arguments, self.pause)}
-        if verb == "forecast":
-            rate_hz = arguments["pulse_rate_hz"] or 40.0
-            return {
-                "result": {
-                    "pulse_rate_hz": rate_hz,
-                    "torque_nm": [width / 100 for width in arguments["pulse_width_us"]],
-                }
-            }
-        if verb == "invert":
-            if arguments.get("table") == "":
-                return {
-                    "error": {"expected": True, "detail": "the upload: empty. Give a header.", "place": "the upload"}
-                }
-            wanted = arguments.get("reference_torque_nm") or [0.0, 1.0, 2.0]
-            widths = [min(100.0 * torque, arguments["largest_us"] or 500.0) for torque in wanted]
-            lacks = [{"begin_s": 0.025, "end_s": 0.05, "reason": "above-plateau", "shortfall_nm": 0.5}]
-            return {"result": {"pulse_rate_hz": 40.0, "duration_s": len(wanted) / 40, "reference_torque_nm": wanted,
-                               "pulse_width_us": widths, "predicted_torque_nm": [width / 100 for width in widths],
-                               "unreachable": lacks, "fit_percent": 90.0, "whole_fit_percent": 80.0,
-                               "tolerance_nm": 0.1}}  # fmt: skip
-        if verb == "join":
-            if arguments["needs"] and (Path(arguments["parts"][0]).parent / "no-angle").exists():
-                detail = "recording 2: it has no angle_rad, which an effect of the model needs. Leave it out."
-                return {"error": {"expected": True, "detail": detail, "place": "recording 2"}}
-            Path(arguments["out"]).write_text("\n".join(arguments["parts"]))
-            return {"result": {"file_sha256": "0" * 64}}
-        if verb == "effects":
-            names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad", *JOINT)
-            words = dict.fromkeys(
-                ("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up"
-            )
-            lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
-            flags = {"predictable": True, "free": False}
-            return {"result": {"effects": [{"id": name, **words, **lists, **flags} for name in names]}}
-        if verb == "export_csv":
-            Path(arguments["out"]).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
-            return {"result": {"rows": 1}}
-        if verb == "plain_csv":
-            from stimrig.api.record_files import plain_csv
-            from stimrig.identify.errors import IdentifyError
-
-            try:
-                return {"result": plain_csv(progress=lambda *_: None, **arguments)}
-            except IdentifyError as error:
-                return {"error": {"expected": True, "detail": str(error), "place": error.place}}
-        if verb == "find_recording":
-            from stimrig.api.record_files import find_recording
-
-            return {"result": find_recording(lambda *_: None, **arguments)}
-        if verb == "recorded":
-            from stimrig.api.workers.curves import recorded
-
-            return {"result": recorded(progress=lambda *_: None, **arguments)}
-        return {"result": {}}
+def fit(progress: Progress, data: str, effects: tuple[str, ...] | list[str] = (), **_: Any) -> dict[str, Any]:
+    progress(0.5, "identifying")
+    if "slow" in effects:
+        state.pause(60)
+    if "die" in effects:
+        state.die(9)
+    if "bad" in effects:
+        raise BadRequest("no effect bad", place="effects", fix="Take one of fatigue, tremor.")
+    while (Path(data).parent / "fitting-slowly").exists():
+        state.pause(0.05)
+    document = model([effect.partition(":")[0] for effect in effects])
+    return {"json": json.dumps(document), "model": document, "notes": []}
 
 
-if __name__ == "__main__":
-    stub = Stub()
-    for line in sys.stdin:
-        stub.line(line, lambda said: print(said, end="", flush=True))
+def diagnosis(progress: Progress, data: str, model_json: str | None = None) -> dict[str, Any]:
+    slow = Path(data).parent / "slow"
+    progress(float(slow.read_text()) if slow.exists() else 0.5, "tried fatigue")
+    if slow.exists():
+        state.pause(60)
+    return {**found_missing(model_json), "improvement": improvement(model_json)}
+
+
+def adaptive_outlook(
+    progress: Progress, target: dict[str, float], max_torque_time_nm_s: float, models: list[str], **_: Any
+) -> dict[str, Any]:
+    if target["step_percent"] == 49.0:
+        state.pause(2.0)
+    within = max_torque_time_nm_s >= 20.0
+    words = "The target should be reached in about 9 s with 20 N·m·s."
+    if not within:
+        words = (
+            "The target is probably out of reach: in about 4 s with 9 N·m·s the curve would be known within "
+            "6.0 % and the step response within 3.0 %."
+        )
+    reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
+             "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
+    return {"opening_us": OPENING, "reach": reach, "known": bool(models)}
+
+
+def adaptive_begin(progress: Progress, target: dict[str, float], **_: Any) -> dict[str, Any]:
+    state.advice, state.target = 0, target["curve_percent"]
+    return {}
+
+
+def forecast(
+    progress: Progress, pulse_width_us: list[float], pulse_rate_hz: float | None = None, **_: Any
+) -> dict[str, Any]:
+    return {"pulse_rate_hz": pulse_rate_hz or 40.0, "torque_nm": [width / 100 for width in pulse_width_us]}
+
+
+def invert(progress: Progress, **arguments: Any) -> dict[str, Any]:
+    if arguments.get("table") == "":
+        raise BadRequest("empty", place="the upload", fix="Give a header.")
+    wanted = arguments.get("reference_torque_nm") or [0.0, 1.0, 2.0]
+    widths = [min(100.0 * torque, arguments["largest_us"] or 500.0) for torque in wanted]
+    lacks = [{"begin_s": 0.025, "end_s": 0.05, "reason": "above-plateau", "shortfall_nm": 0.5}]
+    return {
+        "pulse_rate_hz": 40.0, "duration_s": len(wanted) / 40, "reference_torque_nm": wanted,
+        "pulse_width_us": widths, "predicted_torque_nm": [width / 100 for width in widths],
+        "unreachable": lacks, "fit_percent": 90.0, "whole_fit_percent": 80.0, "tolerance_nm": 0.1,
+    }  # fmt: skip
+
+
+def join(progress: Progress, parts: list[str], out: str, needs: list[str], **_: Any) -> dict[str, Any]:
+    if needs and (Path(parts[0]).parent / "no-angle").exists():
+        words = "it has no angle_rad, which an effect of the model needs"
+        raise BadRequest(words, place="recording 2", fix="Leave it out.")
+    Path(out).write_text("\n".join(parts))
+    return {"file_sha256": "0" * 64}
+
+
+def effects(progress: Progress) -> dict[str, Any]:
+    names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad", *JOINT)
+    words = dict.fromkeys(("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up")
+    lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
+    flags = {"predictable": True, "free": False}
+    return {"effects": [{"id": name, **words, **lists, **flags} for name in names]}
+
+
+def export_csv(progress: Progress, out: str, **_: Any) -> dict[str, Any]:
+    Path(out).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
+    return {"rows": 1}
+
+
+def busy(progress: Progress, seconds: float) -> dict[str, Any]:
+    state.pause(seconds)
+    return {}
+
+
+def nothing(progress: Progress, **_: Any) -> dict[str, Any]:
+    return {}
+
+
+def hostile(progress: Progress, data: str) -> dict[str, Any]:
+    """What a hostile file may do to the process that reads it."""
+    if data == "memory":
+        return {"size": len(bytearray(1 << 40))}
+    if data == "loop":
+        while True:
+            pass
+    if data == "output":
+        return {"text": "x" * (1 << 27)}
+    if data == "file":
+        with tempfile.TemporaryFile() as file:
+            os.posix_fallocate(file.fileno(), 0, 1 << 30)
+    if data == "crash":
+        os.kill(os.getpid(), 11)
+    if data == "exit":
+        raise SystemExit(3)
+    return hostile(progress, data)  # recursion without an end
+
+
+VERBS: dict[str, Callable[..., dict[str, Any]]] = {
+    verb.__name__: verb
+    for verb in (
+        fit, carry, comparison, curves, diagnosis, adaptive_outlook, adaptive_begin, adaptive_advise, track, forecast,
+        invert, join, effects, export_csv, busy, plain_csv, find_recording, real_curves.recorded, hostile,
+    )
+} | dict.fromkeys(("warm", "track_warm"), nothing)  # fmt: skip

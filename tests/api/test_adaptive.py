@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncGenerator
-from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
 
+from stimrig.api.jobs.job import Job
 from stimrig.api.sessions import adaptive_follower, kinds, runner
 from stimrig.api.sessions.adaptive import KEPT, AdaptiveTests
 from stimrig.api.sessions.adaptive_follower import Follower
@@ -63,23 +64,19 @@ def test_a_test_stops_itself_once_enough_is_known(client: httpx.Client, service:
     assert "key" not in plan and service.rig.key not in str(plan)
 
 
-def test_only_new_samples_are_sent_and_none_is_lost(
-    client: httpx.Client, service: Service, participant: str, tmp_path: Path
-) -> None:
-    """The adviser is busy at first: a record without its beginning would mislead. And a recording in a folder that the
-    pool learns meanwhile starts the pool's workers anew, not the one that keeps the test."""
+def test_only_new_samples_are_sent_and_none_is_lost(client: httpx.Client, service: Service, participant: str) -> None:
+    """The adviser is busy at first: a record without its beginning would mislead."""
     asked: list[dict[str, Any]] = []
-    context = service.context
-    adviser = context.runner.adaptive.adviser
-    ask = adviser.ask
+    adviser = service.context.runner.adaptive.adviser
+    submit = adviser.submit
 
-    async def listening(verb: str, **arguments: Any) -> dict[str, Any]:
+    def listening(verb: str, **arguments: Any) -> Job:
         asked.append(arguments if verb == "adaptive_advise" else {})
-        context.pool.places.learn({"data": str(tmp_path / verb / "recording.h5")})
-        await asyncio.sleep(1.5 if verb == "adaptive_begin" else 0.0)
-        return await ask(verb, **arguments)
+        if verb == "adaptive_begin":
+            submit("busy", seconds=1.5)
+        return submit(verb, **arguments)
 
-    adviser.ask = listening
+    adviser.submit = listening
     assert played(client)["adaptive"]["ended"] == "known-enough"
     advised = [arguments for arguments in asked if arguments]
     counters = [number for arguments in advised for number in arguments["samples"]["counter"]]
@@ -346,12 +343,16 @@ class World:
     def monotonic_s(self) -> float:
         return self.now_s
 
-    async def ask(self, what: Any, **arguments: Any) -> Any:
-        """A question to the adviser is a text; None of the answers never comes."""
-        if what == "adaptive_begin":
-            return {}
-        if not isinstance(what, str):
-            self.requests.append((self.now_s, what))
+    async def ask(self, request: Any) -> dict[str, Any]:
+        self.requests.append((self.now_s, request))
+        return {}
+
+    def submit(self, kind: str, **arguments: Any) -> Any:
+        """A job of the adviser; None of the answers never comes."""
+        return SimpleNamespace(result=self.answer(kind, arguments))
+
+    async def answer(self, kind: str, arguments: dict[str, Any]) -> dict[str, Any]:
+        if kind == "adaptive_begin":
             return {}
         self.asked.append(arguments)
         if (answer := self.answers.pop(0) if self.answers else None) is None:

@@ -12,8 +12,8 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.errors import ApiError
-from stimrig.api.workers import adaptive_verbs as verbs
-from stimrig.api.workers.pool import Adviser
+from stimrig.api.jobs import adaptive_verbs as verbs
+from stimrig.api.jobs.pool import Pool
 from stimrig.identify.experiments import adaptive
 from stimrig.identify.experiments.adaptive import Decision
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
@@ -201,20 +201,18 @@ def test_a_worker_that_died_or_a_begin_that_failed_leaves_no_test_to_advise() ->
     news = Cell(sigmoid(71), 1).news([0.0] * 80, 2.0)
 
     async def asked() -> None:
-        adviser = Adviser()
+        adviser = Pool(1)
         try:
-            await adviser.ask("adaptive_begin", **HOW)
+            await adviser.submit("adaptive_begin", **HOW).result
             with pytest.raises(ApiError):
-                await adviser.ask("adaptive_begin", **HOW, models=7)
-            with pytest.raises(ApiError, match="between two questions"):
-                await adviser.ask("adaptive_advise", **news)
-            assert await adviser.ask("adaptive_begin", **HOW) == {}
-            assert adviser.worker.process is not None
-            adviser.worker.process.kill()
-            await adviser.worker.process.wait()
-            with pytest.raises(ApiError, match="between two questions"):
-                await adviser.ask("adaptive_advise", **news)
-            assert await adviser.ask("adaptive_begin", **HOW) == {}
+                await adviser.submit("adaptive_begin", **HOW, models=7).result
+            with pytest.raises(ApiError, match="started again during the test"):
+                await adviser.submit("adaptive_advise", **news).result
+            assert await adviser.submit("adaptive_begin", **HOW).result == {}
+            adviser.workers[0].end()
+            with pytest.raises(ApiError, match="started again during the test"):
+                await adviser.submit("adaptive_advise", **news).result
+            assert await adviser.submit("adaptive_begin", **HOW).result == {}
         finally:
             await adviser.close()
 

@@ -117,8 +117,8 @@ def test_plain_model_is_there_and_offered_whatever_becomes_of_the_carried_one(
         assert client.post(f"/v1/tests/{started}/keep-plain").status_code == 200
     if how == "died":
         for worker in service.context.pool.workers:
-            if worker.call is not None and worker.call.verb == "carry":
-                worker.kill()
+            if worker.job is not None and worker.job.kind == "carry":
+                worker.end()
     test = wait_done(client, started)
     (only,) = versions(client, participant, test)
     assert test["state"] == "completed" and test["model_id"] == only["id"] and only["effects"] == []
@@ -259,7 +259,7 @@ def test_structure_that_the_recording_does_not_bear_is_left_out_and_said(site: S
         test = play_test(client, "P1")
         assert test["state"] == "completed"
         assert client.get(f"/v1/models/{test['model_id']}").json()["effects"] == []
-        assert "not with bad: no effect bad" in test["summary"]["warnings"][-1]
+        assert "not with bad: effects: no effect bad" in test["summary"]["warnings"][-1]
         with signed_in(site) as browser:
             assert csrf(browser) and "not with bad" in browser.get(f"/models/{test['model_id']}").text
 

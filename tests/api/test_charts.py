@@ -22,8 +22,8 @@ from stimrig.api.charts import figure as fig
 from stimrig.api.charts.drawing import Figures, decimate, svg
 from stimrig.api.charts.figure import LIGHT, Axis, Band, Curve, Figure, Label
 from stimrig.api.charts.interactive import plotly_figure
+from stimrig.api.jobs.curves import curves
 from stimrig.api.sessions import joint_plan
-from stimrig.api.workers.curves import curves
 from tests.api import made_up_joint
 from tests.api.conftest import REAL, Service, play_test, run_test, serving, shared_service
 from tests.api.fake_rig import default_widths, muscle

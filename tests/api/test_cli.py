@@ -21,7 +21,7 @@ from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.progress_bar import progress_bar
 from stimrig.identify.healing import place_words
 from stimrig.identify.records.join import write_joined
-from tests.api.test_worker import made_up_csv
+from tests.api.test_jobs import made_up_csv
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 

@@ -19,7 +19,7 @@ import pytest
 from stimrig.api.sessions import controllers
 from tests.api.browser import bring_to_rest
 from tests.api.conftest import REAL, Service, run_service, soon
-from tests.api.test_worker import made_up_csv
+from tests.api.test_jobs import made_up_csv
 from tests.harness.c_program import compiled
 
 ROOT = Path(__file__).parents[2]

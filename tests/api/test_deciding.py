@@ -17,11 +17,11 @@ from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.cli.errors import InputError
 from stimrig.api.client.errors import NotFound
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.verbs import experiment
 from stimrig.api.models import explanation
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.web.pages import model_view
 from stimrig.api.web.responses.models import ExperimentOut
-from stimrig.api.workers.verbs import experiment
 from stimrig.identify.records.record import Source
 
 DECIDING: dict[str, Any] = {

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from stimrig.api.charts import model_charts
+from stimrig.api.jobs.curves import recorded
 from stimrig.api.store.tables import Test
 from stimrig.api.web.pages.views import limits_of
-from stimrig.api.workers.curves import recorded
 from stimrig.rig.messages import Bound, Status
 from tests.api.browser import expected, participant, start
 from tests.api.conftest import Service, shared_service, signed_in

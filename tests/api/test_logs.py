@@ -70,9 +70,9 @@ def test_every_line_is_an_object_also_of_what_ends_the_process(module: str, proc
 
 
 def test_a_worker_that_fails_says_so_in_such_a_line() -> None:
-    call = json.dumps({"call": 1, "verb": "no such verb", "arguments": {}})
-    command = [sys.executable, "-m", "stimrig.api.workers.child"]
-    done = subprocess.run(command, input=call + "\n", capture_output=True, text=True)
+    code = "from stimrig.api import logs; from stimrig.api.jobs.child import answer; logs.configure('worker')"
+    code += "; answer('stimrig.api.jobs.verbs', 'no such verb', None, {})"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     [line] = [json.loads(line) for line in done.stderr.splitlines()]
     assert (line["process"], line["level"]) == ("worker", "error") and "KeyError" in line["exception"]
 

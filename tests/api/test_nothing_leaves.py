@@ -13,13 +13,13 @@ import pytest
 import stimrig
 from stimrig import identify
 from stimrig.api.charts.interactive import CHART_CONFIG
+from stimrig.api.jobs.curves import curves, rounded
 from stimrig.api.models.explanation import step_versions
 from stimrig.api.models.story import story
 from stimrig.api.web.pages.report_file import comparison_html, story_html
-from stimrig.api.workers.curves import curves, rounded
 from tests.api.browser import look_closer, open_tab, settled
 from tests.api.conftest import Service, play_test, shared_service
-from tests.api.test_worker import made_up_csv
+from tests.api.test_jobs import made_up_csv
 
 pytestmark = pytest.mark.browser
 LINK = '<a href="https://elsewhere.example/">here</a>'

@@ -6,8 +6,8 @@ import numpy as np
 
 from stimrig import identify
 from stimrig.api.cli.terminal import model_report
+from stimrig.api.jobs.curves import curves
 from stimrig.api.web.pages.report_file import comparison_html
-from stimrig.api.workers.curves import curves
 from stimrig.identify.json_text import json_value
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record, ramp

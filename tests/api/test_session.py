@@ -102,7 +102,7 @@ def test_recording_comes_back_byte_for_byte(client: httpx.Client, service: Servi
 
 def come_to_rest(pool: Any) -> None:
     """Wait until no worker has anything to do."""
-    soon(lambda: not (pool.queue or any(worker.call for worker in pool.workers)), 60)
+    soon(lambda: not (pool.queue or any(worker.job for worker in pool.all_workers)), 60)
 
 
 def test_comparison_and_diagnosis_are_made_once_and_kept(client: httpx.Client, service: Service, participant: str):

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from stimrig import identify
+from stimrig.api.jobs import tracking_verbs
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store.tables import Recording
-from stimrig.api.workers import tracking_verbs
 from stimrig.identify import tracking
 from stimrig.rig import messages as m
 from tests.api.conftest import REAL, Service, run_test, serving, soon, wait_done

@@ -449,10 +449,10 @@ def test_a_model_on_another_recording(client: httpx.Client, pages: httpx.Client,
 
 def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
+    from stimrig.api.jobs import verbs
+    from stimrig.api.jobs.curves import comparison
+    from stimrig.api.jobs.verbs import fit
     from stimrig.api.web.responses.models import ComparisonOut, DiagnosisOut
-    from stimrig.api.workers import verbs
-    from stimrig.api.workers.curves import comparison
-    from stimrig.api.workers.verbs import fit
 
     path = str(tmp_path / "record.csv")
     hidden_records.write_csv(hidden_records.generate("asymmetric_relaxation", "middle", 8, rate_hz=100), path)

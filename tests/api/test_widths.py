@@ -19,7 +19,7 @@ from stimrig.api.cli import main
 from stimrig.rig.messages import Bound
 from tests.api.conftest import HTML, PATIENCE_S, REAL, TOKEN, Service, run_service
 from tests.api.fake_rig import muscle
-from tests.api.test_worker import made_up_csv
+from tests.api.test_jobs import made_up_csv
 
 TIME_S = np.arange(0, 6, 0.01)
 WANTED_NM = 1.5 * np.sin(np.pi * TIME_S / 6) ** 2

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import json
 import os
 import re
@@ -20,7 +19,6 @@ from argon2 import PasswordHasher
 
 from stimrig.api.clock import Clock
 from stimrig.api.people import accounts
-from tests.api import thread_process
 from tests.api.conftest import STUB, TOKEN, Service, let_go, run_service, wait_done
 from tests.api.fake_arm import still
 from tests.frozen.answers import condensed, words_of
@@ -48,7 +46,6 @@ def served(folder: Path) -> Iterator[Service]:
     ahead_s, zone = BEGAN_S - time.time(), os.environ.get("TZ")
     quick = partial(PasswordHasher, time_cost=1, memory_cost=64, parallelism=1)
     with pytest.MonkeyPatch.context() as patch, tempfile.TemporaryDirectory(prefix="stimrig-") as short:
-        patch.setattr(asyncio, "create_subprocess_exec", thread_process.start)
         patch.setattr(accounts, "PasswordHasher", quick)
         patch.setattr(Clock, "unix_s", lambda _clock: time.time() + ahead_s)
         patch.setenv("TZ", "UTC")

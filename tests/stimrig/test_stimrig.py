@@ -17,12 +17,12 @@ import pytest
 
 import stimrig
 from stimrig import Client, errors
+from stimrig.api.jobs import worker
 from stimrig.api.progress_bar import in_notebook
 from stimrig.api.web.responses.models import JobOut
-from stimrig.api.workers import process
 from stimrig.errors import BadRequest
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
-from tests.api.test_worker import made_up_csv
+from tests.api.test_jobs import made_up_csv
 from tests.harness import few_effects
 
 pytestmark = pytest.mark.slow
@@ -214,7 +214,7 @@ def test_an_upload_waits_as_long_as_the_service_works_on_it(client: Client) -> N
     client.http.event_hooks = {"request": [lambda request: waits.append(request.extensions.get("timeout"))]}
     with pytest.raises(errors.Invalid):
         client.upload("P017", b"")
-    assert waits[-1]["read"] >= process.WALL_FACTOR * (process.PROCESSOR_S["fit"] + process.PROCESSOR_S["carry"])
+    assert waits[-1]["read"] >= worker.WALL_FACTOR * (worker.PROCESSOR_S["fit"] + worker.PROCESSOR_S["carry"])
 
 
 def test_what_progress_raises_cancels_the_job(client: Client) -> None:

@@ -14,7 +14,7 @@ import stimrig
 from stimrig.api.cli import main
 from stimrig.errors import BadRequest, InputError
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
-from tests.api.test_worker import made_up_csv
+from tests.api.test_jobs import made_up_csv
 from tests.frozen.rig_records import of_kind
 from tests.harness import few_effects
 from tests.stimrig.verbs_table import COMMAND_ONLY, PAGE, function_of, page, verbs

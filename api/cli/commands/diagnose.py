@@ -52,9 +52,9 @@ def diagnose(
 
 
 def _report(record: Any, found: Any, improved: Any, structure: Sequence[str], name: str) -> str:
+    from stimrig.api.jobs.curves import rounded, segments_of
+    from stimrig.api.jobs.verbs import finding_of
     from stimrig.api.web.pages.report_file import diagnosis_html
-    from stimrig.api.workers.curves import rounded, segments_of
-    from stimrig.api.workers.verbs import finding_of
 
     comparison = rounded(identify.compare(improved.models[0], record).to_dict())
     return diagnosis_html(finding_of(record, found, improved, structure), comparison, segments_of(record), name)

@@ -12,6 +12,7 @@ from fastapi.responses import RedirectResponse, Response
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.charts.drawing import Figures
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import advice, carried_structure, explanation, stored_model
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controllers
@@ -23,7 +24,6 @@ from stimrig.api.web.pages.render import page
 from stimrig.api.web.pages.report_file import missing_parts
 from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import criticism, participants
-from stimrig.api.workers.jobs import FIT_TOGETHER, Job
 
 router = APIRouter(include_in_schema=False)
 TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model",
@@ -224,10 +224,7 @@ async def run_experiment(context: Ctx, who: Tester, row: Version) -> Response:
 
 async def to_job(job: Job) -> Response:
     """To the result where it is there at once, else to the page that waits for it."""
-    try:
-        await asyncio.wait_for(job.done.wait(), 0.3)
-    except TimeoutError:
-        return RedirectResponse(f"/jobs/{job.id}", 303)
+    await asyncio.wait([job.result], timeout=0.3)
     return RedirectResponse(result_page(job) or f"/jobs/{job.id}", 303)
 
 

@@ -25,7 +25,7 @@ def comparison_html(
 ) -> str:
     """Write measurement against model: where it fails, and by how much.
 
-    `document` is a MODEL.json, `curves` as `stimrig.api.workers.curves.curves` gives them, `name` a file's or a test's,
+    `document` is a MODEL.json, `curves` as `stimrig.api.jobs.curves.curves` gives them, `name` a file's or a test's,
     `test` as the service shows it, `comparison` as `identify.compare` gives it, cleaned and thinned.
     """
     judged, held = stored_model.quality(document), explanation.held_free(document)
@@ -57,8 +57,8 @@ def diagnosis_html(
 ) -> str:
     """Write what is missing, as the page shows it.
 
-    `diagnosis` is as `stimrig.api.workers.verbs.diagnosis` gives it, `comparison` of the examined model with the
-    record, thinned, `segments` as `stimrig.api.workers.curves.runs` gives them.
+    `diagnosis` is as `stimrig.api.jobs.verbs.diagnosis` gives it, `comparison` of the examined model with the
+    record, thinned, `segments` as `stimrig.api.jobs.curves.runs` gives them.
     """
     view = explanation.view(diagnosis, comparison)
     return _page(

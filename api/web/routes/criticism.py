@@ -8,12 +8,12 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse
 
+from stimrig.api.jobs.job import Job
 from stimrig.api.sessions.requests import EffectsIn
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.responses.base import describe_answer, published
 from stimrig.api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
-from stimrig.api.workers.jobs import Job
 
 router = APIRouter(prefix="/v1", tags=["criticism"], responses=PROBLEM)
 LATER: dict[int | str, dict[str, Any]] = {202: {"model": JobOut, "description": "begun; see `Location`"}}
@@ -90,7 +90,7 @@ async def cancel(context: Ctx, _who: Tester, job_id: str) -> dict[str, Any]:
     """Cancel it. What is done already stays done."""
     job = context.jobs.get(job_id)
     context.jobs.cancel(job)
-    await asyncio.wait_for(job.done.wait(), 10)
+    await asyncio.wait([job.result], timeout=10)
     return job.document()
 
 
@@ -103,7 +103,7 @@ def begin_diagnosis(context: Context, model: Model, by: str) -> Job:
     """Diagnose while the person looks on."""
 
     async def work(job: Job) -> str:
-        await context.analyses.diagnosis(model, job.take)
+        await context.analyses.diagnosis(model, job.follow)
         return f"/v1/models/{model.id}/diagnosis"
 
     return context.jobs.start("diagnosis", model.id, by, work)
@@ -114,7 +114,7 @@ def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Jo
 
     async def work(job: Job) -> str:
         new = await context.analyses.add_effects(
-            model, body.effects, by, force=body.force, reason=body.reason, on_call=job.take
+            model, body.effects, by, force=body.force, reason=body.reason, on_call=job.follow
         )
         return f"/v1/models/{new.id}"
 
@@ -125,7 +125,7 @@ def begin_improving(context: Context, model: Model, by: str) -> Job:
     """Improve while the person looks on."""
 
     async def work(job: Job) -> str:
-        _, rows = await context.analyses.improve(model, by, job.take)
+        _, rows = await context.analyses.improve(model, by, job.follow)
         return f"/v1/models/{rows[-1].id}"
 
     return context.jobs.start("improve", model.id, by, work)

@@ -10,6 +10,7 @@ from pydantic import AfterValidator, Field, StrictBool, StringConstraints
 
 from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import together
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.kinds import no_sensor
@@ -23,7 +24,6 @@ from stimrig.api.web.responses.models import VersionOut
 from stimrig.api.web.responses.rig import JointOverviewOut
 from stimrig.api.web.routes import participants
 from stimrig.api.web.routes.criticism import LATER, Wait, later
-from stimrig.api.workers.jobs import FIT_TOGETHER, Job
 from stimrig.rig.messages import AngleStatus, Status
 from stimrig.rig.requests import AnglePoseRequest
 
@@ -82,7 +82,7 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
     """Fit them while the person looks on."""
 
     async def work(job: Job) -> str:
-        model = await together.fit(context.analyses, code, body.recordings, body.effects, by, job.take)
+        model = await together.fit(context.analyses, code, body.recordings, body.effects, by, job.follow)
         return f"/v1/models/{model.id}"
 
     return context.jobs.start(FIT_TOGETHER, code, by, work)

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.api.jobs import adaptive_verbs, tracking_verbs
+from stimrig.api.jobs.curves import comparison, page_curves, recorded
 from stimrig.api.record_files import Progress, export_csv, find_recording, joined, plain_csv
 from stimrig.api.structure import held_by
-from stimrig.api.workers import adaptive_verbs, tracking_verbs
-from stimrig.api.workers.curves import comparison, page_curves, recorded
 from stimrig.identify.json_text import json_value
 
 SIGNATURE_POINTS = 900

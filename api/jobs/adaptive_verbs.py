@@ -95,6 +95,8 @@ def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = 
 def advise(progress: Progress, **news: Any) -> dict[str, Any]:
     """What to play after everything that is laid; see `Running.advise`."""
     progress(0.1, "deciding")
+    if not _running:
+        raise RuntimeError("the worker process was started again during the test")
     return json_value(_running[0].advise(**news))
 
 

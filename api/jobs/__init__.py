@@ -1,0 +1,1 @@
+"""Long work in processes of its own: submit a job, follow its progress, cancel it, await its result."""

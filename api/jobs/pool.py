@@ -1,0 +1,127 @@
+"""Worker processes and a queue of jobs: never in the web process, cancellable, kept warm."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable
+from typing import Any
+
+from stimrig.api.jobs.job import Job, cancelled
+from stimrig.api.jobs.tasks import Tasks
+from stimrig.api.jobs.worker import Worker
+from stimrig.api.logs import current_test
+
+log = logging.getLogger("stimrig.jobs")
+BACKGROUND_NICE = 15
+
+
+class Pool:
+    """A few workers and a queue; the fit after a test goes before everything else.
+
+    Parameters
+    ----------
+    workers : int
+        Processes. Of several the first is kept free for urgent jobs. A pool of one keeps what its process remembers.
+    worker : callable
+        Makes a `Worker`; tests put another in its place.
+    background : bool
+        Whether one more process, of low priority, does jobs that nobody waits for. A new test cancels them.
+    """
+
+    def __init__(self, workers: int, worker: Callable[..., Worker] = Worker, *, background: bool = False) -> None:
+        self.workers = [worker() for _ in range(workers)]
+        self.reserved = self.workers[0] if workers > 1 else None
+        self.background = worker(nice=BACKGROUND_NICE) if background else None
+        self.queue: deque[Job] = deque()
+        self.done_count = 0
+        self.failed_count = 0
+        self.busy_s = 0.0
+        self._tasks = Tasks(log)
+
+    @property
+    def all_workers(self) -> list[Worker]:
+        """All of them, with the one for the background."""
+        return [*self.workers, *([self.background] if self.background else [])]
+
+    def submit(
+        self,
+        kind: str,
+        *,
+        urgent: bool = False,
+        background: bool = False,
+        on_progress: Callable[[Job], None] | None = None,
+        **arguments: Any,
+    ) -> Job:
+        """Queue a job of one verb; await its `result`."""
+        job = Job(kind, arguments, urgent, background, on_progress)
+        if urgent:
+            self.queue.appendleft(job)
+        else:
+            self.queue.append(job)
+        self._dispatch()
+        return job
+
+    def warm(self) -> None:
+        """Have every worker load what it needs before it is needed."""
+        for _ in self.workers:
+            self.submit("warm")
+
+    def cancel_background(self) -> int:
+        """Cancel the jobs that nobody waits for, so that a test has the machine to itself; return how many."""
+        jobs = [job for job in self.queue if job.background]
+        jobs += [self.background.job] if self.background and self.background.job else []
+        for job in jobs:
+            self.cancel(job)
+        return len(jobs)
+
+    def cancel(self, job: Job) -> None:
+        """Take a job off the queue, or end the process that does it."""
+        job = job.part or job
+        if job in self.queue:
+            self.queue.remove(job)
+            job.fail(cancelled())
+        for worker in self.all_workers:
+            if worker.job is job:
+                job.state = "cancelled"
+                worker.end()
+
+    def _dispatch(self) -> None:
+        for worker in self.all_workers:
+            job = self._next_for(worker) if worker.job is None else None
+            if job is not None:
+                self.queue.remove(job)
+                worker.job = job
+                job.start()
+                self._tasks.begin(self._work(worker, job))
+
+    def _next_for(self, worker: Worker) -> Job | None:
+        for job in self.queue:
+            fits = job.background == (worker is self.background)
+            if fits and (worker is not self.reserved or job.urgent or job.kind == "warm"):
+                return job
+        return None
+
+    async def _work(self, worker: Worker, job: Job) -> None:
+        current_test.set(job.test_id)  # a task of its own; whoever happened to dispatch it may have had another test
+        try:
+            job.complete(await worker.run(job))
+            self.done_count += 1
+            log.info("%s done in %.1f s", job.kind, job.elapsed_s)
+        except Exception as error:  # whatever it is: who awaits the job must hear of its end
+            job.fail(error)
+            self.failed_count += 1
+            log.warning("%s: %s", job.kind, error)
+        finally:
+            self.busy_s += job.elapsed_s
+            worker.job = None
+            self._dispatch()
+
+    async def close(self) -> None:
+        """End all processes."""
+        self.queue.clear()
+        for worker in self.all_workers:
+            worker.end()
+        await self._tasks.close()
+        await asyncio.gather(*(worker.close() for worker in self.all_workers))
