@@ -33,7 +33,6 @@ class Connection:
     def __init__(self, url: str, token: str = "", timeout_s: float = 60.0) -> None:
         self.url, self._headers = url.rstrip("/"), {"Authorization": f"Bearer {token}"} if token else {}
         self._etags: dict[str, str] = {}
-        self._own: list[str] = []
         try:
             self.http = httpx.Client(base_url=self.url, headers=self._headers, timeout=timeout_s)
         except httpx.InvalidURL as error:
@@ -57,7 +56,7 @@ class Connection:
         """
         headers, document = httpx.Headers(more.pop("headers", None)), _document(method, path, more.get("json"))
         if document and "if-match" not in headers and (etag := self._etag(document, path)):
-            headers.update({"if-match": etag, "trail-own": ", ".join(self._own[-200:])})
+            headers["if-match"] = etag
         answer = self._send(method, path, headers=headers, **more)
         if answer.is_success and (document or path == "/v1/stop"):
             self._take_etag(document, headers.get("if-match"), answer)
@@ -111,20 +110,16 @@ class Connection:
         return ""
 
     def _take_etag(self, document: str, sent: str | None, answer: httpx.Response) -> None:
-        """Take over the version to which a decision has led; what else had the version before it is read anew.
+        """Take over the version to which a decision has led, wherever the one before it was read.
 
-        A participant has one version with its models. Where an answer says no version, everything is read anew.
+        A participant has one version with its models.
         """
-        self._own += [entry for entry in answer.headers.get("trail-entries", "").split(", ") if entry]
         of_rig = document or "/v1/rig"
         if of_rig.startswith("/v1/rig") or of_rig.endswith("/calibration"):  # there is another version now
             self._etags = {place: etag for place, etag in self._etags.items() if not place.startswith(of_rig)}
-        if "etag" not in answer.headers:
-            return
-        home = f"/v1/participants/{answer.json().get('participant')}"
-        led = [place for place in (document, home) if self._etags.get(place) == sent]
-        others = {place: etag for place, etag in self._etags.items() if etag != sent}
-        self._etags = others | dict.fromkeys(led, answer.headers["etag"])
+        elif "etag" in answer.headers and not answer.request.url.path.endswith("/calibration"):
+            new = answer.headers["etag"]
+            self._etags = {place: new if etag == sent else etag for place, etag in self._etags.items()}
 
     def _unreachable(self, error: Exception) -> Unreachable:
         why = str(error) or type(error).__name__

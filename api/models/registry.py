@@ -25,7 +25,8 @@ from stimrig.api.models.places import (
     site_of_recording,
 )
 from stimrig.api.models.tracking import Limits
-from stimrig.api.store import Store, audit, seen
+from stimrig.api.store import Store, audit, locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
 
 log = logging.getLogger("stimrig.models")
@@ -185,8 +186,10 @@ class Versions:
             path.insert(0, rows[str(path[0].parent_id)])
         return path
 
-    def undo(self, model_id: str, by: str, reason: str) -> Model:
+    def undo(self, model_id: str, by: str, reason: str, tags: Tags | None = None) -> tuple[Model, int]:
         """Go back to the version this one was made from: this one is rejected, and where it was in use, that one is.
+
+        Return it, and the participant's new version.
 
         One that is not usable comes into use by nobody's silence: then the controller gets what was approved before.
 
@@ -201,27 +204,34 @@ class Versions:
         words = f"undone: {reason}" if reason else "undone"
         parent = self.get(row.parent_id)
         with self.store.write() as session:
-            seen.check(session, seen.decisions(row.participant))
+            person = self._participant(session, row)
+            locking.check(session, person, tags)
             holding = self.approved(row.participant)
             self._decide(session, row, False, by, words).undone = True
             usable = self.quality(parent)["verdict"] not in POOR
             if holding is not None and holding.model_id == row.id and usable:
                 self._decide(session, parent, True, by, words, holding.tracking)
-        return parent
+        return parent, person.version
 
-    def decide(self, model_id: str, approved: bool, by: str, reason: str, tracking: Limits | None = None) -> Approval:
-        """Approve or reject a version; only a person does this.
+    def decide(
+        self, model_id: str, approved: bool, by: str, reason: str, tracking: Limits | None = None,
+        *, tags: Tags | None = None,
+    ) -> int:  # fmt: skip
+        """Approve or reject a version; only a person does this. Return the participant's new version.
 
         Parameters
         ----------
         tracking : Limits, optional
             How far it may be tracked; None: not at all.
+        tags : tuple of str
+            Versions that it is decided on.
 
         Raises
         ------
         ApiError
             422: it is not usable, and nobody says why the controller may have it all the same. 500: it is damaged.
-            409: another decision came since it was shown, or it was measured at another site than the present one.
+            412: the participant was changed since it was shown. 409: it was measured at another site than the present
+            one.
         """
         row = self.get(model_id)
         if approved:
@@ -230,15 +240,10 @@ class Versions:
                 title = "This model is not usable: say why it is approved all the same"
                 raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
         with self.store.write() as session:
-            if approved or self._brings_back(row):
-                seen.check(session, seen.decisions(row.participant))
-            return self._decide(session, row, approved, by, reason, tracking.model_dump() if tracking else None)
-
-    def _brings_back(self, row: Model) -> bool:
-        """Whether without this version another one is served; else a rejection only takes away."""
-        holding = self.approved(row.participant)
-        served = holding is not None and holding.model_id == row.id
-        return served and bool(self._last_approvals([row.participant], {row.id}))
+            person = self._participant(session, row)
+            locking.check(session, person, tags)
+            self._decide(session, row, approved, by, reason, tracking.model_dump() if tracking else None)
+            return person.version
 
     def _decide(
         self, session: Session, row: Model, approved: bool, by: str, reason: str,
@@ -255,8 +260,14 @@ class Versions:
         shown = {name: value for name, value in row.fit.items() if name != "figures"}
         detail: dict[str, Any] = {"reason": reason, "shown": {**shown, **self.quality(row)}}
         detail |= {"tracking": decision.tracking} if decision.tracking else {}
-        audit.write(session, now, by, "approve" if approved else "reject", row.id, **detail)
+        person, action = self._participant(session, row), "approve" if approved else "reject"
+        locking.write(session, person, now, by, action, row.id, participant=person.code, **detail)
         return decision
+
+    def _participant(self, session: Session, row: Model) -> Participant:
+        person = session.get(Participant, row.participant)
+        assert person is not None
+        return person
 
     def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
         """Where a version's recording was made, and with what current, mA; None: not known."""
@@ -268,9 +279,9 @@ class Versions:
 
     def _site(self, session: Session, row: Model, approved: bool) -> list[Any]:
         """The participant's site; 409 where a model is to be approved that was measured at another one."""
-        participant, recording = session.get(Participant, row.participant), session.get(Recording, row.recording_id)
-        assert participant is not None and recording is not None
-        here = site_of(participant)
+        recording = session.get(Recording, row.recording_id)
+        assert recording is not None
+        here = site_of(self._participant(session, row))
         test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
         there = site_of_recording(recording, test)
         if approved and there not in (None, here):

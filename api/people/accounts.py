@@ -21,8 +21,9 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
 from stimrig.api.people.pace import Guesses, place_of
-from stimrig.api.store import Store, audit, seen
+from stimrig.api.store import Store, locking
 from stimrig.api.store.audit import digest
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Confirmation, KnownPlace, Token, User
 
 CONFIRMED_S = 120.0
@@ -50,9 +51,8 @@ class People:
             token = self.auth.token_of_person(session, name, scopes)
             row = User(name=name, folded_name=folded_name(name), password_hash=hashed, token_hash=token.hash)
             row.created_utc = row.changed_utc = now = self.clock.utc()
+            locking.write(session, row, now, by, "add user", name, scopes=token.scopes)
             session.add(row)
-            session.flush()
-            audit.write(session, now, by, "add user", name, scopes=token.scopes)
         return row
 
     async def sign_in(self, name: str, password: str, address: str) -> str:
@@ -177,21 +177,21 @@ class People:
             session.delete(row)
             return self._holds(row)
 
-    async def change_password(self, name: str, password: str, who: Principal) -> str | None:
+    async def change_password(self, name: str, password: str, who: Principal, tags: Tags | None) -> str | None:
         """A new password. The person's sessions end; the one that made the change goes on under a new cookie, if any.
 
-        Raises ApiError: 404 nobody of that name.
+        Raises ApiError: 404 nobody of that name; 412 the account was changed since it was shown.
         """
-        return await asyncio.to_thread(self._change_password, name, await self.passwords.hash(password), who)
+        return await asyncio.to_thread(self._change_password, name, await self.passwords.hash(password), who, tags)
 
-    def _change_password(self, name: str, hashed: str, who: Principal) -> str | None:
+    def _change_password(self, name: str, hashed: str, who: Principal, tags: Tags | None) -> str | None:
         with self.store.write() as session:
             row = known_user(session, name)
-            seen.check(session, seen.account(row.name))
+            locking.check(session, row, tags)
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             cookie = self.auth.end_sessions(session, row.token_hash, but=who.session_hash)
-            audit.write(session, self.clock.utc(), who.name, "change password", row.name)
+            locking.write(session, row, self.clock.utc(), who.name, "change password", row.name)
         return cookie
 
     def remove(self, name: str, by: str) -> None:
@@ -201,15 +201,15 @@ class People:
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
             self.auth.end_sessions(session, row.token_hash)
             self.auth.revoke_within(session, row.token_hash[:16], by)
+            locking.write(session, row, self.clock.utc(), by, "remove user", row.name)
 
     def documents(self) -> list[dict[str, Any]]:
         """All users, without their hashes."""
         found = []
         for row in self.store.all(User, order=User.name):
             token = self.store.get(Token, row.token_hash)
-            found.append(
-                {"name": row.name, "scopes": token.scopes, "removed": token.revoked, "created_utc": row.created_utc}
-            )
+            told = {"name": row.name, "created_utc": row.created_utc, "version": row.version}
+            found.append({**told, "scopes": token.scopes, "removed": token.revoked})
         return found
 
     def close(self) -> None:

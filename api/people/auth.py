@@ -19,7 +19,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.schemas.shared import Scope
-from stimrig.api.store import Store, audit, seen
+from stimrig.api.store import Store, audit
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import Confirmation, PageSession, Token
 
@@ -81,25 +81,19 @@ class Auth:
         self._remembering = threading.Lock()
         self._threads = ThreadPoolExecutor(8, "who-asks")
 
-    def issue(self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
-              expires_utc: str | None = None, participant: str | None = None,
-              plan: dict[str, Any] | None = None, made_by: str | None = None) -> str:  # fmt: skip
-        """Make a token and return its text, which is shown this once; `participant` and `plan` as in `Principal`.
-
-        With the token of the hash `made_by` it falls.
-        """
+    def issue(
+        self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
+        expires_utc: str | None = None,
+    ) -> str:  # fmt: skip
+        """Make a token and return its text, which is shown this once."""
         text = text or f"stimrig_{secrets.token_urlsafe(32)}"
         now = self.clock.utc()
         with self.store.write() as session:
-            if participant is not None:
-                seen.check(session, seen.participant(participant), seen.decisions(participant))
             row = Token(hash=digest(text), prefix=text[:12] if origin == "issued" else "(set)", name=name)
             row.scopes, row.created_utc, row.origin = [str(scope) for scope in scopes], now, origin
-            row.expires_utc, row.revoked, row.participant, row.plan = expires_utc, False, participant, plan
-            row.made_by = made_by
+            row.expires_utc, row.revoked = expires_utc, False
             session.merge(row)
-            bound = {} if participant is None else {"participant": participant, "plan": plan, "until": expires_utc}
-            audit.write(session, now, by, "issue token", name, scopes=row.scopes, **bound)
+            audit.write(session, now, by, "issue token", name, scopes=row.scopes)
         return text
 
     def revoke(self, token_id: str, by: str) -> bool:

@@ -10,16 +10,16 @@ from typing import Annotated, Any
 from pydantic import Field, FiniteFloat, StringConstraints
 from sqlalchemy import select
 
-from stimrig.api.decisions import MODEL_TAG
-from stimrig.api.errors import ApiError, forbidden
+from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Auth, Principal, Scope, outside
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.trials import SEQUENCE
-from stimrig.api.store import Store, seen
+from stimrig.api.store import Store, locking
 from stimrig.api.store.audit import digest
+from stimrig.api.store.locking import ChangedError, Tags
 from stimrig.api.store.tables import Participant, Test, Token
 
 LONGEST_S = 300.0
@@ -57,23 +57,27 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
     return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
 
 
-async def start(runner: Runner, lock: asyncio.Lock, store: Store, who: Principal, body: TestIn) -> Test:
+async def start(
+    runner: Runner, lock: asyncio.Lock, store: Store, who: Principal, body: TestIn, tags: Tags | None
+) -> Test:
     """Start a test; where a controller's key asks for it, within its plan.
+
+    `tags`: versions of the participant; of a key, those of the model that the trial was planned with.
 
     Raises ApiError: 403 outside the key or its plan, and by how much; 409 no model of its participant is approved; else
     as `Runner.start`.
     """
     if who.participant is None:
-        if len(seen.sent.get()) >= MODEL_TAG:  # it would be played within the participant's limits: those were not seen
-            raise seen.another_document(f"/v1/participants/{body.participant}")
-        return await runner.start(body, who.name, holder=who.token_hash)
-    seen.shown.set(await asyncio.to_thread(store.seen, runner.clock))
+        return await runner.start(body, who.name, holder=who.token_hash, tags=tags)
     async with lock:  # no two trials share the last one that is left
         try:
             _refuse_kind(who, body)
-            body = await _within_plan(runner, store, who, body)
-            return await runner.start(body, who.name, holder=who.token_hash)
-        except seen.ChangedError:
+            participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
+            model = await asyncio.to_thread(_model_sent, runner, body.participant, tags or ())
+            body = await _within_plan(runner, store, who, body, participant)
+            version = (str(participant.version),)  # what the plan and the model were looked at with
+            return await runner.start(body, who.name, holder=who.token_hash, tags=version, model=model)
+        except ChangedError:
             raise trial_overtaken() from None
         except ApiError as error:
             if error.code not in NEUTRAL:
@@ -82,15 +86,13 @@ async def start(runner: Runner, lock: asyncio.Lock, store: Store, who: Principal
             raise ApiError(error.status, error.code, title, NEUTRAL[error.code]) from None
 
 
-async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestIn) -> TestIn:
+async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestIn, participant: Participant) -> TestIn:
     """The test with the plan's limits, where the plan allows it."""
     plan = who.plan or {}
     await asyncio.to_thread(_refuse_other_rate, runner, body)
-    seen.sent.set(await asyncio.to_thread(_model_sent, runner, body.participant))
     begun = (Test.requested_by == who.name, Test.state != "refused")  # what the rig refused was no trial
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
         raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
-    participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
     limits: dict[str, Any] = {}
     for name in ("current_ma", "max_pulse_width_us"):
         asked = body.profile.sent().get(name) if body.profile else None
@@ -124,13 +126,14 @@ def _refuse_kind(who: Principal, body: TestIn) -> None:
         raise beyond(f"A key sends no {wrong[0]}. Leave it out")
 
 
-def _model_sent(runner: Runner, participant: str) -> str:
+def _model_sent(runner: Runner, participant: str, sent: Tags) -> str:
     """The tag, of those that were sent, of the model that is served now: the approved one, or what was tracked from it.
 
-    Raises ApiError: 409 none of them is.
+    Raises ApiError: 412 none of them is; 409 no model is approved.
     """
     served = [runner.versions.served(participant), runner.trials.tracked.served(participant)]
-    sent = seen.sent.get().split(", ")
+    if served[0] is None:
+        raise unapproved(participant)
     for one in served:
         if one is not None and (tag := one.etag.strip('"')) in sent:
             return tag
@@ -158,9 +161,9 @@ def unapproved(participant: str) -> ApiError:
 
 
 def trial_overtaken() -> ApiError:
-    """409: the trial was planned on what is no longer so; a key learns no more of it."""
+    """412: the trial was planned on what is no longer so; a key learns no more of it."""
     detail = "Fetch the model anew, compute the trial with it, and send its ETag as If-Match."
-    return ApiError(409, "changed-meanwhile", "What the trial was planned with was changed", detail)
+    return ApiError(412, "changed-meanwhile", "What the trial was planned with was changed", detail)
 
 
 def beyond(why: str) -> ApiError:
@@ -182,9 +185,10 @@ def refuse_maker_without(maker: Principal) -> None:
 
 
 def make_key(
-    auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str, made_by: str | None = None
-) -> tuple[str, Token]:
-    """A key that ends with its day: its text, shown this once, and its row.
+    auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str, made_by: str | None = None,
+    tags: Tags | None = None,
+) -> tuple[str, Token, int]:  # fmt: skip
+    """Make a key that ends with its day: its text, shown this once, its row, and the participant's new version.
 
     Parameters
     ----------
@@ -198,12 +202,24 @@ def make_key(
         Who makes it.
     made_by : str, optional
         Hash of that one's token: once it is revoked or has expired, the key opens nothing.
+    tags : tuple of str
+        Versions of the participant that it is made on.
     """
-    text = f"stimrig_{secrets.token_urlsafe(32)}"
+    text, now = f"stimrig_{secrets.token_urlsafe(32)}", auth.clock.utc()
     own = f"{name} ({digest(text)[:6]})"
-    until = auth.clock.end_of_day_utc()
-    auth.issue(own, KEY_SCOPES, by, text=text, expires_utc=until, participant=participant, plan=plan, made_by=made_by)
-    return text, auth.store.get(Token, digest(text))
+    with auth.store.write() as session:
+        person = require_found(session.get(Participant, participant), "participant", participant)
+        locking.check(session, person, tags)
+        row = Token(hash=digest(text), prefix=text[:12], name=own, created_utc=now, participant=participant, plan=plan)
+        row.scopes, row.made_by, row.expires_utc = (
+            [str(scope) for scope in KEY_SCOPES],
+            made_by,
+            auth.clock.end_of_day_utc(),
+        )
+        session.add(row)
+        bound = {"participant": participant, "plan": plan, "until": row.expires_utc}
+        locking.write(session, person, now, by, "issue token", own, scopes=row.scopes, **bound)
+    return text, row, person.version
 
 
 def keys_of(auth: Auth, participant: str) -> list[dict[str, Any]]:

@@ -6,14 +6,14 @@ import math
 import secrets
 from typing import get_args
 
-from sqlalchemy import and_, func, select
+from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, NotFoundError, require_found
 from stimrig.api.sessions.requests import NoteIn, NoteKind
-from stimrig.api.store import Store, audit, seen
-from stimrig.api.store.tables import AuditEntry, Note, Participant, Test
+from stimrig.api.store import Store, audit
+from stimrig.api.store.tables import Note, Participant, Test
 
 KINDS: tuple[NoteKind, ...] = get_args(NoteKind)
 MOST = 2000
@@ -94,18 +94,11 @@ class Notes:
             note = session.get(Note, note_id)
             if note is None or note.participant != participant:
                 raise NotFoundError("note", note_id, f"GET /v1/participants/{participant}/notes lists them.")
-            seen.check(session, about(participant, note.id))
             if note.struck_utc is None:
                 now = self.clock.utc()
                 note.struck_utc, note.struck_by = now, by
                 audit.write(session, now, by, "strike note", participant, note=note.id)
         return note
-
-
-def about(participant: str, note_id: str | None = None) -> seen.About:
-    """Entries of the trail about a participant's notes; of one note, that it was struck."""
-    entries = seen.actions_on(participant, *(("note", "strike note") if note_id is None else ("strike note",)))
-    return entries if note_id is None else and_(entries, AuditEntry.detail["note"].as_string() == note_id)
 
 
 def duration_s(test: Test) -> float:

@@ -6,19 +6,23 @@ import asyncio
 import logging
 from contextlib import suppress
 from dataclasses import dataclass, field
+from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.people import accounts
+from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.trials import SEQUENCE
-from stimrig.api.store import Store, seen
-from stimrig.api.store.tables import AuditEntry, Participant, Token
+from stimrig.api.store import Store, locking
+from stimrig.api.store.tables import Participant, Token
 from stimrig.rig.requests import StopRequest, WithdrawRequest
 
 log = logging.getLogger("stimrig.trials")
 ENDING_S = 2.0
 """So long a start waits for a test whose end has been heard."""
+RIGHTS = (*locking.MODELS, "set muscle", "archive")
+"""Changes with which a right ends that a controller plays by."""
 LOOK_AGAIN_S = 0.25
 """Interval at which it is checked whether a test may still be played: a right may end by time."""
 
@@ -40,22 +44,17 @@ class Current:
     """Hashes of the tokens by whose right it is played."""
     until_utc: str | None = None
     """When that right ends by itself: a controller's key with its day, or with its maker's token."""
-    since: seen.Seen | None = None
-    """The trail's place at its intent, or at the last change that was found; None: not written yet."""
+    version: int | None = None
+    """The participant's at its intent, or at the last change that was found; None: not written yet."""
     over: bool = False
-    """That end was told to the rig."""
-    overtaken: list[AuditEntry] = field(default_factory=list)
-    """Changes that have withdrawn it."""
+    """The end of the right was told to the rig."""
+    changes: list[dict[str, Any]] = field(default_factory=list)
+    """Those of the participant that have withdrawn it."""
     looking: asyncio.Lock = field(default_factory=asyncio.Lock)
     missed: int = 0
     """How often in a row the rig, asked for its state, did not name it."""
     let_go: asyncio.Event = field(default_factory=asyncio.Event)
     """The rig is free of it."""
-
-    @property
-    def rests_on(self) -> tuple[seen.About, ...]:
-        """Entries of the audit trail, since its intent, with which it would not have been begun."""
-        return (*rests_of(self.participant, self.kind), seen.revoked(*self.tokens))
 
     @property
     def holder(self) -> dict[str, str]:
@@ -86,13 +85,16 @@ class Playing:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self.current.let_go.wait(), ENDING_S)
 
-    def overtaking(self, current: Current) -> list[AuditEntry]:
-        """What was changed since its intent was written, with which it would not have been begun."""
+    def find_changes(self, current: Current) -> tuple[int | None, list[dict[str, Any]], bool]:
+        """Return the participant's version, its changes since the test's intent, and whether a right has ended."""
+        if current.version is None:
+            return None, [], False
         with self.store.read() as session:
-            if current.since is None and current.started:  # it plays although this service was restarted
-                current.since = seen.newest(session, "", seen.actions_on(current.test_id, "start test"))
-                current.until_utc = self.until_utc(current.tokens)
-            return [] if current.since is None else seen.since(session, current.since, *current.rests_on)
+            lost = any(not may_play(session.get(Token, each)) for each in current.tokens)
+            row = session.get(Participant, current.participant)
+            if row is None or row.version == current.version:
+                return current.version, [], lost
+            return row.version, locking.since(session, current.version, locking.about(row)), lost
 
     async def look_again(self) -> None:
         """Withdraw the test if what it rests on was changed: called before each change is answered.
@@ -104,13 +106,15 @@ class Playing:
         if current is None:
             return
         async with current.looking:
-            over = self.is_over(current) and not current.over  # known here, also where the store cannot be read
-            changed = [] if over else await asyncio.to_thread(self.overtaking, current)
-            if not changed and not over:
+            version, changes, lost = current.version, list[dict[str, Any]](), self.is_over(current)
+            if not lost:  # by time it is known here, also where the store cannot be read
+                version, changes, lost = await asyncio.to_thread(self.find_changes, current)
+            ended = lost and not current.over
+            if version == current.version and not ended:
                 return
-            current.overtaken = changed or current.overtaken
-            begun = over or (current.kind == SEQUENCE and any(entry.action in seen.RIGHTS for entry in changed))
-            what = changed[-1].action if changed else "its right ended"
+            current.changes = changes or current.changes
+            begun = current.kind == SEQUENCE and (ended or any(change["action"] in RIGHTS for change in changes))
+            what = changes[-1]["action"] if changes else "its right ended" if ended else "the participant was changed"
             reason = f"{what}, after this test was asked for"
             try:
                 await self.rig.ask(WithdrawRequest(test_id=current.test_id, reason=reason, begun=begun))
@@ -118,8 +122,7 @@ class Playing:
                 log.error("%s could not be withdrawn: %s", current.test_id, error)
                 await self.stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
             else:
-                current.since = seen.at(changed[-1], "") if changed else current.since
-                current.over |= over
+                current.version, current.over = version, current.over or ended
 
     async def look_again_and_again(self, current: Current) -> None:
         """Check at intervals whether it may still be played: a right ends by time, too, and no request says so."""
@@ -153,10 +156,9 @@ class Playing:
         return [token for token in (holder, row.made_by if row else None) if token]
 
 
-def rests_of(participant: str, kind: str) -> tuple[seen.About, ...]:
-    """What must have been seen of a test: the participant, and of a controller's trial the decisions on models."""
-    models = (seen.decisions(participant),) if kind == SEQUENCE else ()
-    return (seen.participant(participant), *models)
+def may_play(token: Token | None) -> bool:
+    """Return whether who asked, or made the key that asks, still has the right: it may have been taken since."""
+    return token is not None and not token.revoked and bool({Scope.RUN_TEST, Scope.ADMINISTER} & set(token.scopes))
 
 
 def other_than(asker: str, ran_by: str | None) -> str | None:

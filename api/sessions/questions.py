@@ -11,10 +11,10 @@ import secrets
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
 
-from stimrig.api.clock import Clock, local_day
+from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import Principal
-from stimrig.api.store import seen
+from stimrig.api.store import locking
 
 LIFE_S = 300.0
 """How long what was seen may be confirmed."""
@@ -47,7 +47,7 @@ class Question:
     back: str = ""  # where no leads to; the participant where nothing is said
     at_deg: tuple[float, float] | None = None  # the joint must be between these angles when yes is said
     asker: tuple[str, str | None] = ("", None)
-    seen: seen.Seen | None = None
+    tags: locking.Tags | None = None
     asked_s: float = 0.0
     asked_unix_s: float = 0.0
     answer: asyncio.Future[str] | None = None
@@ -62,7 +62,7 @@ class Questions:
 
     def ask(self, question: Question, who: Principal) -> str:
         """Keep it; the address at which it is shown and answered."""
-        question.asker, question.seen = (who.name, who.csrf), seen.looked.get()
+        question.asker, question.tags = (who.name, who.csrf), locking.form_tags.get()
         question.asked_s, question.asked_unix_s = self.clock.monotonic_s(), self.clock.unix_s()
         self._forget(question)
         number = secrets.token_urlsafe(16)
@@ -100,11 +100,7 @@ class Questions:
     async def yes(self, question: Question) -> str:
         """Do it, once; who says yes again comes to what came of it."""
         if question.answer is None:
-            seen.today.set(lambda: local_day(self.clock.utc()))
-            if question.seen is not None:
-                seen.refuse_another_day(question.seen)
-            seen.shown.set(question.seen)
-            seen.sent.set(str(question.seen or ""))
+            locking.form_tags.set(question.tags)
             question.answer = asyncio.ensure_future(question.action())
         return await asyncio.shield(question.answer)
 

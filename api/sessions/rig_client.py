@@ -43,8 +43,8 @@ class RigClient:
     def __init__(self, path: Path | None, clock: Clock) -> None:
         self.path, self.clock = path, clock
         self.patience_s = 5.0
-        self.latches: dict[str, dict[str, Any]] = {}
-        """Why the rig was stopped, by the version that a re-arm names; as entries of the audit trail are told."""
+        self.latches: dict[str, tuple[str, str]] = {}
+        """When and why the rig was stopped, by the id that a re-arm names."""
         self._status: messages.Status | None = None
         self.connected = False
         self.listeners: list[Callable[[AnyEvent], None]] = []
@@ -57,11 +57,6 @@ class RigClient:
         self._task: asyncio.Task[None] | None = None
 
     @property
-    def latch_known(self) -> bool:
-        """Whether the rig names the stop that it stands at; an older program does not."""
-        return self._status is None or bool(self._status.latch)
-
-    @property
     def status(self) -> messages.Status | None:
         """The newest state."""
         return self._status
@@ -72,8 +67,7 @@ class RigClient:
         if status.latch not in self.latches:
             while len(self.latches) >= MOST_LATCHES:
                 self.latches.pop(next(iter(self.latches)))
-            told = {"at_utc": self.clock.utc(), "who": "", "action": "latched", "subject": "rig"}
-            self.latches[status.latch] = {**told, "detail": {"state": status.state, "reason": status.reason}}
+            self.latches[status.latch] = self.clock.utc(), status.reason
 
     def start(self) -> None:
         """Begin to connect, in the background."""

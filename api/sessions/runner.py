@@ -22,18 +22,18 @@ from stimrig.api.logs import current_test
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.adaptive import ADAPTIVE, AdaptiveTests
 from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Lifecycle
 from stimrig.api.sessions.live import Hub
-from stimrig.api.sessions.playing import Current, Playing, other_than, refuse_archived, rests_of, right_ended
+from stimrig.api.sessions.playing import Current, Playing, may_play, other_than, refuse_archived, right_ended
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
 from stimrig.api.sessions.stop_counter import StopCounter
 from stimrig.api.sessions.trials import Trials
-from stimrig.api.store import Store, audit, seen
+from stimrig.api.store import Store, audit, locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import OPEN_STATES, Participant, Test, Token
 from stimrig.rig import messages, requests
 
@@ -87,7 +87,10 @@ class Runner(Playing):
 
     # ---- start and stop -------------------------------------------------------------------------------------
 
-    async def start(self, body: TestIn, by: str, confirmed: dict[str, Any] | None = None, holder: str = "") -> Test:
+    async def start(
+        self, body: TestIn, by: str, confirmed: dict[str, Any] | None = None, holder: str = "",
+        tags: Tags | None = None, model: str = "",
+    ) -> Test:  # fmt: skip
         """Begin a test.
 
         Parameters
@@ -100,15 +103,17 @@ class Runner(Playing):
             The preview that a person has said yes to; None: a program's request, which nobody was shown.
         holder : str
             Hash of the token by whose right it is begun.
+        tags : tuple of str
+            Versions of the participant that it is begun on.
+        model : str
+            Tag of the model that a controller's trial was planned with.
 
         Raises
         ------
         ApiError
-            404 no such participant; 409 another test runs, the holder named; 409 it would not be what was seen, or a
-            stop came since it was asked for; 503 that was too long ago; what the rig refuses.
+            404 no such participant; 412 it was changed; 409 another test runs, the holder named; 409 it would not be
+            what was seen, or a stop came since it was asked for; 503 that was too long ago; what the rig refuses.
         """
-        if seen.shown.get() is None:  # then it rests on what is read from here on
-            seen.shown.set(await asyncio.to_thread(self.store.seen, self.clock))
         tokens = await asyncio.to_thread(self.tokens_of, holder)
         await self.let_end()
         self.refuse_second()
@@ -117,7 +122,13 @@ class Runner(Playing):
         async with self.start_lock:
             self.refuse_second()
             participant = await self._participant(body)
-            return await self._start(body, participant, by, confirmed, tokens)
+            return await self._start(body, participant, by, confirmed, tokens, tags, model)
+
+    def _check(self, code: str, tags: Tags | None) -> None:
+        with self.store.read() as session:
+            row = session.get(Participant, code)
+            assert row is not None
+            locking.check(session, row, tags)
 
     async def _participant(self, body: TestIn) -> Participant:
         participant = await asyncio.to_thread(self.store.get, Participant, body.participant)
@@ -128,10 +139,9 @@ class Runner(Playing):
 
     async def _start(
         self, body: TestIn, participant: Participant, by: str, confirmed: dict[str, Any] | None,
-        tokens: list[str],
+        tokens: list[str], tags: Tags | None, model: str,
     ) -> Test:  # fmt: skip
-        rests_on = rests_of(body.participant, body.kind)
-        await asyncio.to_thread(self.store.refuse_changed, *rests_on)  # then the preview may differ for no other reason
+        await asyncio.to_thread(self._check, body.participant, tags)  # then the preview may differ for no other reason
         planned = await self._planned(body, participant)
         plan = planned.plan
         until_utc = await asyncio.to_thread(self.until_utc, tokens)
@@ -144,7 +154,7 @@ class Runner(Playing):
             preview = await self._previewed(plan)
             if confirmed is not None and not same(confirmed, preview):
                 raise not_what_was_seen()
-            row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant)
+            row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant, tags, model)
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
@@ -163,10 +173,13 @@ class Runner(Playing):
         plan = planned.plan
         try:
             async with self.limits_lock:
-                if changed := current.overtaken or await asyncio.to_thread(self.overtaking, current):
-                    raise seen.overtaken(changed)
-                if self.is_over(current):
+                if current.over or self.is_over(current):
                     raise right_ended()
+                version, changes, lost = await asyncio.to_thread(self.find_changes, current)
+                if lost:
+                    raise right_ended()
+                if current.changes or version != current.version:
+                    raise locking.ChangedError(version or 0, current.changes or changes)
                 self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
                 key = self.kinds[plan.kind].begin(planned)
                 await self.rig.ask(requests.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
@@ -238,8 +251,9 @@ class Runner(Playing):
         return f"T{stamp}-{secrets.token_hex(3)}"
 
     def _write_intent(
-        self, planned: Planned, preview: dict[str, Any], current: Current, body: TestIn, participant: Participant
-    ) -> Test:
+        self, planned: Planned, preview: dict[str, Any], current: Current, body: TestIn, participant: Participant,
+        tags: Tags | None, model: str,
+    ) -> Test:  # fmt: skip
         now, plan, by = self.clock.utc(), planned.plan, current.by
         row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
         kept: dict[str, Any] = {
@@ -253,13 +267,17 @@ class Runner(Playing):
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         dose = {name: preview.get(name) for name in ("duration_s", "charge_uc", "torque_time_nms")}
         with self.store.write() as session:
-            seen.check(session, *rests_of(plan.participant, plan.kind))
-            if any(not _may_play(session.get(Token, each)) for each in current.tokens):
+            person = session.get(Participant, plan.participant)
+            assert person is not None
+            version = locking.check(session, person, tags)
+            if any(not may_play(session.get(Token, each)) for each in current.tokens):
                 raise right_ended()
+            row.plan = {**row.plan, "participant_version": version}
+            told = {"participant": plan.participant, "kind": plan.kind, "shown": dose, "version": version}
+            told |= {"model": model} if model else {}
+            locking.write(session, row, now, by, "start test", plan.test_id, **told)
             session.add(row)
-            said = {"participant": plan.participant, "kind": plan.kind, "shown": dose}
-            audit.write(session, now, by, "start test", plan.test_id, **said)
-            current.since = seen.newest(session, "")
+            current.version = version
         log.info("test requested, kind %s", plan.kind, extra={"test_id": plan.test_id})
         return row
 
@@ -420,6 +438,8 @@ class Runner(Playing):
             ):
                 tokens = row.plan.get("tokens") or []
                 current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
+                current.version = row.plan.get("participant_version")
+                current.until_utc = await asyncio.to_thread(self.until_utc, tokens)
                 self.current = current
                 self.hub.begin(row.id)
                 self._tasks.begin(self.look_again_and_again(current))
@@ -472,11 +492,6 @@ class Runner(Playing):
             await kind.close()
         await asyncio.to_thread(self._notes.shutdown)
         await asyncio.to_thread(self._telling.shutdown)
-
-
-def _may_play(token: Token | None) -> bool:
-    """Whether who asked, or made the key that asks, still has the right: it may have been taken since."""
-    return token is not None and not token.revoked and bool({Scope.RUN_TEST, Scope.ADMINISTER} & set(token.scopes))
 
 
 def _pulses(preview: Mapping[str, Any]) -> int:

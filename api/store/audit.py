@@ -9,7 +9,6 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from stimrig.api.store import seen
 from stimrig.api.store.tables import AuditEntry
 
 
@@ -19,14 +18,9 @@ def entry_hash(entry: dict[str, Any]) -> str:
     return digest(json.dumps(held, sort_keys=True, separators=(",", ":")))
 
 
-def write(session: Session, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> None:
-    """Append an entry in the caller's transaction, so that action and entry stand or fall together.
-
-    What the person had seen is kept with it (`stimrig.api.store.seen`).
-    """
-    if tag := seen.sent.get():
-        detail["seen"] = tag
-    last = seen.last(session)
+def write(session: Session, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> AuditEntry:
+    """Append an entry in the caller's transaction, so that action and entry stand or fall together."""
+    last = newest(session)
     fields = {
         "seq": last.seq + 1 if last else 1,
         "at_utc": at_utc,
@@ -36,15 +30,21 @@ def write(session: Session, at_utc: str, who: str, action: str, subject: str, **
         "detail": detail,
         "previous_hash": last.hash if last else GENESIS,
     }
-    session.add(AuditEntry(**fields, hash=entry_hash(fields)))
+    entry = AuditEntry(**fields, hash=entry_hash(fields))
+    session.add(entry)
     session.flush()
-    if (written := seen.written.get()) is not None:
-        written.append(fields["seq"])
+    return entry
+
+
+def newest(session: Session) -> AuditEntry | None:
+    """Return the trail's last entry."""
+    return session.scalars(select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)).first()
 
 
 ERASED, ERASE = "(erased)", "erase participant"
 """Subject of an entry whose content was taken away, and the action of the entry that vouches for what is left of it."""
-ON_ACCOUNTS = (*seen.ACCOUNTS, "issue token")
+ACCOUNTS = ("add user", "change password", "remove user")
+ON_ACCOUNTS = (*ACCOUNTS, "issue token", "revoke token")
 """Actions whose subject is the name of a user or a key."""
 
 
@@ -54,12 +54,12 @@ def erase(session: Session, names: set[str], at_utc: str, who: str, **detail: An
     Number, time, person, action and hash of an entry stay, so that the trail stays a chain. A participant's code may
     also be a word of the trail or the name of an account: entries of those stay.
     """
-    newest, erased = seen.last(session), []
+    last, erased = newest(session), []
     subjects = names - {"page", "rig"}  # those of the trail's own words that are no participants
     for entry in session.scalars(select(AuditEntry).order_by(AuditEntry.seq)):
         named = entry.subject in subjects and entry.action not in ON_ACCOUNTS
         if entry.action != ERASE and (named or _mentions(entry.detail, names)):
-            entry.subject, entry.detail = ERASED, {"erased": newest.seq + 1 if newest else 1}
+            entry.subject, entry.detail = ERASED, {"erased": last.seq + 1 if last else 1}
             if names & {entry.who, *entry.who.split(" ")}:  # what a test does by itself goes by its id
                 entry.who = ERASED
             erased.append(entry)

@@ -19,11 +19,10 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError, SQLAl
 from sqlalchemy.orm import Session, sessionmaker
 
 from stimrig.api import owner_only
-from stimrig.api.clock import Clock, local_day
+from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.store import audit, migrations
 from stimrig.api.store.migrations import WRITES
-from stimrig.api.store.seen import About, Seen, check, newest
 from stimrig.api.store.tables import Secret
 
 
@@ -79,20 +78,6 @@ class Store:
     def first(self, table: Any, *where: Any, order: Any = None) -> Any:
         """The first of these, or None."""
         return next(iter(self.all(table, *where, order=order, limit=1)), None)
-
-    def seen(self, clock: Clock, *about: About) -> Seen:
-        """The version of what rests on these entries of the audit trail; without `about`, on any."""
-        with self.read() as session:
-            return newest(session, local_day(clock.utc()), *about)
-
-    def etag(self, clock: Clock, document: str, *about: About) -> str:
-        """The same, as HTTP has it for the document at this path."""
-        return self.seen(clock, *about).etag(document)
-
-    def refuse_changed(self, *about: About) -> None:
-        """Refuse to ask a question about what has changed since the page was shown. Raises ChangedError."""
-        with self.read() as session:
-            check(session, *about)
 
     def note(self, clock: Clock, who: str, action: str, subject: str, **detail: Any) -> None:
         """Append an entry to the audit trail in a transaction of its own."""

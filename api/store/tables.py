@@ -1,10 +1,13 @@
-"""The tables. Times are UTC, as ISO 8601 labels; documents are JSON. Lengths are checked where a text comes in."""
+"""The tables. Times are UTC, as ISO 8601 labels; documents are JSON. Lengths are checked where a text comes in.
+
+`version` of a row: `stimrig.api.store.locking`.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
-from sqlalchemy import JSON, Boolean, Float, ForeignKey, Integer, LargeBinary, String, Text
+from sqlalchemy import JSON, BigInteger, Boolean, Float, ForeignKey, Integer, LargeBinary, String, Text
 from sqlalchemy.orm import DeclarativeBase, Mapped, mapped_column
 
 OPEN_STATES = ("requested", "running", "sealing", "identifying")
@@ -30,6 +33,8 @@ class Participant(Table):
     placement: Mapped[str | None] = mapped_column(String, default=None)
     """Where the electrodes are: with side and muscle the site, to which models and keys belong."""
     archived_utc: Mapped[str | None] = mapped_column(String, default=None)
+    version: Mapped[int] = mapped_column(BigInteger, default=0)
+    __mapper_args__ = {"version_id_col": version, "version_id_generator": False}  # noqa: RUF012
 
 
 class Test(Table):
@@ -51,6 +56,8 @@ class Test(Table):
     finished_utc: Mapped[str | None] = mapped_column(String, default=None)
     ran_by: Mapped[str | None] = mapped_column(String, default=None)
     """Who ran it at the rig, if that was somebody else than `requested_by`."""
+    version: Mapped[int] = mapped_column(BigInteger, default=0)
+    __mapper_args__ = {"version_id_col": version, "version_id_generator": False}  # noqa: RUF012
 
 
 class Note(Table):
@@ -210,6 +217,8 @@ class User(Table):
     token_hash: Mapped[str] = mapped_column(ForeignKey("tokens.hash"))
     created_utc: Mapped[str] = mapped_column(String)
     changed_utc: Mapped[str] = mapped_column(String)
+    version: Mapped[int] = mapped_column(BigInteger, default=0)
+    __mapper_args__ = {"version_id_col": version, "version_id_generator": False}  # noqa: RUF012
 
 
 class KnownPlace(Table):

@@ -35,9 +35,10 @@ from stimrig.api.sessions.stops import StopLog, StopRights
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, uploads
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.service_lock import KEEP_S, ServiceLock
 from stimrig.api.store.tables import Model
-from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, require
+from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, if_match, require
 from stimrig.api.web.openapi import problem
 
 log = logging.getLogger("stimrig.api")
@@ -184,6 +185,15 @@ Rearmer = Annotated[Principal, Security(require(Scope.REARM), scopes=[Scope.REAR
 Approver = Annotated[Principal, Security(require(Scope.APPROVE_MODEL), scopes=[Scope.APPROVE_MODEL])]
 ModelReader = Annotated[Principal, Security(require(Scope.READ_MODEL), scopes=[Scope.READ_MODEL])]
 Administrator = Annotated[Principal, Security(require(Scope.ADMINISTER), scopes=[Scope.ADMINISTER])]
+
+ParticipantVersion = Annotated[Tags, if_match("/v1/participants/{code}")]
+CalibrationVersion = Annotated[Tags, if_match("/v1/participants/{code}/calibration")]
+DecisionVersion = Annotated[Tags, if_match("/v1/models/{model_id}")]
+RejectionVersion = Annotated[Tags | None, if_match("/v1/models/{model_id}", needed=False)]
+TestVersion = Annotated[Tags, if_match("/v1/tests/{test_id}")]
+UserVersion = Annotated[Tags, if_match("/v1/users")]
+LatchVersion = Annotated[Tags, if_match("/v1/rig")]
+AngleVersion = Annotated[Tags, if_match("/v1/rig/angle")]
 
 
 async def _version(context: Ctx, model_id: str) -> Model:

@@ -10,12 +10,11 @@ import asyncio
 import hmac
 import re
 from collections.abc import Awaitable, Callable
-from contextlib import suppress
 from dataclasses import dataclass
 from typing import Annotated, Any
 from urllib.parse import urlsplit
 
-from fastapi import Request, Security
+from fastapi import Depends, Header, Request, Security
 from fastapi.responses import Response
 from fastapi.security import APIKeyCookie, APIKeyHeader, HTTPBearer
 from pydantic import ValidationError
@@ -23,19 +22,16 @@ from sqlalchemy.exc import SQLAlchemyError
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, HTTPConnection
 
-from stimrig.api import decisions
-from stimrig.api.clock import local_day
-from stimrig.api.decisions import MODEL_TAG, OF_RIG, Decision
 from stimrig.api.errors import ApiError, forbidden, not_answering
 from stimrig.api.models.places import kept, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.people.auth import Principal, Scope, outside
 from stimrig.api.sessions.controllers import unapproved
-from stimrig.api.sessions.requests import PARTICIPANT_CODE, StopIn
-from stimrig.api.store import seen
-from stimrig.api.store.audit import storable
+from stimrig.api.sessions.requests import StopIn
+from stimrig.api.store import Store, locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model, Participant, Recording, Test
-from stimrig.api.web.middleware import PARSED, SAFE_METHODS, STOP, entity_tags, wants_html
+from stimrig.api.web.middleware import SAFE_METHODS, STOP, entity_tags, wants_html
 
 POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")
 """What pages ask for again and again by themselves."""
@@ -58,7 +54,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
             who = principal.name
             raise forbidden(f"This needs the scope {scope}; {who} holds {', '.join(sorted(principal.scopes))}.")
         await check_csrf(request, principal)
-        await note_version(request)
+        await note_form(request)
         if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
             await request.app.state.context.people.confirmed(request, principal)
         return principal
@@ -78,8 +74,13 @@ async def identified(request: Request) -> Principal:
         auth.idle.acted(principal.page_session.hash)
     if wants_html(request) or not request.url.path.startswith("/v1/"):
         # before anything of the page is read: what it shows is not older
-        seen.looked.set(await asyncio.to_thread(context.store.seen, context.clock))
+        request.state.version = await asyncio.to_thread(_shown, context.store, request)
     return principal
+
+
+def _shown(store: Store, request: Request) -> int:
+    with store.read() as session:
+        return locking.shown(session, request.url.path, request.path_params)
 
 
 def is_action(request: Request) -> bool:
@@ -135,7 +136,7 @@ nothing.
 Of the models it is the approved one, and what was tracked from it under the approval that holds."""
 
 
-def refuse_outside(versions: Versions, who: Principal, method: str, path: str) -> None:
+def refuse_outside(registry: Versions, who: Principal, method: str, path: str) -> None:
     """Let pass who is bound to nobody, and a key on what it opens.
 
     Raises ApiError: 403 the key is of another site; or, the same for what is another participant's, for what is not
@@ -143,15 +144,15 @@ def refuse_outside(versions: Versions, who: Principal, method: str, path: str) -
     """
     if who.participant is None:
         return
-    if not _opens(versions, who.participant, method, path):
+    if not _opens(registry, who.participant, method, path):
         raise outside(who.participant)
-    row: Participant = versions.store.get(Participant, who.participant)
+    row: Participant = registry.store.get(Participant, who.participant)
     if kept((who.plan or {}).get("site")) != site_of(row):
         detail = "The participant is stimulated at another site now. A person makes a key for it."
         raise ApiError(403, "other-site", "This key is of another site", detail)
 
 
-def _opens(versions: Versions, participant: str, method: str, path: str) -> bool:
+def _opens(registry: Versions, participant: str, method: str, path: str) -> bool:
     for own_method, pattern, table in OPEN:
         found = pattern.fullmatch(path)
         if method != own_method or found is None:
@@ -161,16 +162,16 @@ def _opens(versions: Versions, participant: str, method: str, path: str) -> bool
         if table is str:
             return found[1] == participant
         if table is Model:
-            return _approved(versions, participant, found[1])
-        row = versions.store.get(table, found[1])
+            return _approved(registry, participant, found[1])
+        row = registry.store.get(table, found[1])
         of_test = table is not Recording or (row is not None and row.test_id is not None)
         return row is not None and row.participant == participant and of_test
     return False
 
 
-def _approved(versions: Versions, participant: str, model_id: str) -> bool:
+def _approved(registry: Versions, participant: str, model_id: str) -> bool:
     """Whether a person allows this version today: the approved one, or one tracked from it. Raises ApiError (409)."""
-    approval = versions.approved(participant)
+    approval = registry.approved(participant)
     if approval is None:
         raise unapproved(participant)
     own = re.escape(approval.model_id)
@@ -201,86 +202,34 @@ MOST_TAGS = 20
 """Of `If-Match`: the others are not read."""
 
 
-async def note_version(request: Request) -> None:
-    """Note what the request was decided on, for `stimrig.api.store.seen.check`.
+def if_match(document: str, needed: bool = True) -> Any:
+    """Return a dependency: the versions on which a request was decided; 428 where it does not say.
 
-    Raises ApiError: 428 it does not say, or nothing that is a version; 409 that is one of another document or day.
+    `document`: the one whose `ETag` is sent; `needed`: false for a decision that only takes away.
     """
-    found = decisions.find(request.method, request.url.path)
-    if found is None:
+    header = Header(None, description=f"the `ETag` of `GET {document}` on which this is decided")
+
+    async def tags(request: Request, if_match: list[str] | None = header) -> Tags | None:
+        if if_match is None and not needed:
+            return None
+        sent = [tag.strip('"') for field in if_match or () for tag in entity_tags(field)][:MOST_TAGS]
+        readable = tuple(tag for tag in sent if re.fullmatch(r"[\w.-]{1,120}", tag, re.ASCII))
+        if not readable:
+            own = request.state.who.participant  # a controller's key reads no participant
+            of_key = None if own is None else f"/v1/participants/{own}/model"
+            raise locking.missing(of_key or document.format(**{"code": "{code}", **request.path_params}))
+        return readable
+
+    return Depends(tags)
+
+
+async def note_form(request: Request) -> None:
+    """Note the version that a page's form carries."""
+    if request.method in SAFE_METHODS or request.url.path.startswith("/v1/"):
         return
-    decision, names = found
-    document = decision.document.format(**{**await _names(request, decision), **names})
-    if decision.path == "/v1/tests" and (own := request.state.who.participant) is not None:
-        document = f"/v1/participants/{own}/model"  # a controller's key reads no participant
-    text, marks = await _sent(request, decision, seen.mark_of(document))
-    if decision.field == "latch" and not request.app.state.context.rig.latch_known:
-        raise old_rig()
-    if not decision.needed and request.url.path.startswith("/v1/") and "if-match" not in request.headers:
-        return
-    seen.today.set(lambda: local_day(request.app.state.context.clock.utc()))
-    by_tag = decision.path == "/v1/tests" and all(map(_of_model, text.split(", ")))
-    of_rig = decision.field in OF_RIG
-    readable = re.fullmatch(r"[\w.-]{1,120}", text, re.ASCII) if of_rig else seen.written_as_version(text)
-    if not (by_tag or readable):
-        raise version_missing(document)
-    seen.sent.set(text)
-    if by_tag or of_rig:  # the trail has no such place
-        return
-    place = seen.read(text, *marks)
-    if place is None:
-        raise seen.another_document(document)
-    seen.refuse_another_day(place)
-    seen.shown.set(place)
-    numbers = re.findall(r"\d{1,9}", ",".join(request.headers.getlist("trail-own")), re.ASCII)
-    seen.own.set((storable(request.state.who.name), frozenset(map(int, numbers))))
-
-
-async def _names(request: Request, decision: Decision) -> dict[str, str]:
-    """What a request's body names of the document: a test's participant."""
-    code = "{code}"
-    if decision.path == "/v1/tests" and request.url.path == decision.path:
-        await request.body()
-        with suppress(KeyError, TypeError):  # the route says what is wrong with it
-            said = request.scope[PARSED]["participant"]
-            code = said if isinstance(said, str) and re.fullmatch(PARTICIPANT_CODE, said, re.ASCII) else code
-    return {"code": code}
-
-
-async def _sent(request: Request, decision: Decision, mark: str) -> tuple[str, tuple[str, ...]]:
-    """The version, as `If-Match` or the form's field has it, and the marks that it may have: a page's has none.
-
-    Of several the newest of this document. A controller's key is told nothing of which is the newer: its model's, all.
-    """
-    fields = request.headers.getlist("if-match")
-    if fields:
-        tags = [tag.strip('"') for field in fields for tag in entity_tags(field)][:MOST_TAGS]
-        if request.state.who.participant is not None and (models := list(filter(_of_model, tags))):
-            return ", ".join(models), (mark,)
-        places = {place.entry: tag for tag in tags if (place := seen.read(tag, mark))}
-        return places[max(places)] if places else max(tags, key=lambda tag: bool(seen.written_as_version(tag))), (mark,)
-    if "form" not in request.headers.get("content-type", ""):
-        return "", (mark,)
-    return str((await request.form()).get(decision.field) or ""), ("", mark)
-
-
-def _of_model(tag: str) -> re.Match[str] | None:
-    return re.fullmatch(rf"[0-9a-f]{{{MODEL_TAG}}}", tag)
-
-
-def old_rig() -> ApiError:
-    """409: the rig says nothing by which a stop could be named."""
-    detail = "Its program does not say which stop it stands at. Update and restart the rig's program; then re-arm."
-    return ApiError(409, "rig-outdated", "The rig's program is older than this service", detail)
-
-
-def version_missing(document: str) -> ApiError:
-    """428: nobody says what this was decided on (RFC 6585, section 3), or not so that it can be read."""
-    detail = (
-        f"Send the ETag of GET {document} as If-Match, as you last saw it. On a page: load it again and repeat what "
-        "you did. Nothing was done."
-    )
-    return ApiError(428, "seen-missing", "Say what this was decided on", detail)
+    form = await request.form() if "form" in request.headers.get("content-type", "") else {}
+    sent = (form.get(name) for name in ("latch", "calibration", "seen"))
+    locking.form_tags.set(tuple(str(text) for text in sent if text)[:1] or None)
 
 
 FIELD, HEADER = "right", "x-stop-right"

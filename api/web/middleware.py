@@ -19,7 +19,6 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from stimrig.api.clock import asked_s
 from stimrig.api.errors import ApiError
 from stimrig.api.logs import current_request
-from stimrig.api.store import seen
 from stimrig.identify.json_text import BadJson, NotJson, parse
 
 log = logging.getLogger("stimrig.look_again")
@@ -81,14 +80,9 @@ class Headers(HttpMiddleware):
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As the base class."""
 
-        entries: list[int] = []
-        seen.written.set(entries)
-
         async def send_more(message: Message) -> None:
             if message["type"] == "http.response.start":
                 headers = datastructures.MutableHeaders(scope=message)
-                if entries:
-                    headers["Trail-Entries"] = ", ".join(map(str, entries))
                 page = headers.get("content-type", "").startswith("text/html")
                 for name, value in (PAGE if page else DATA).items():
                     headers.setdefault(name, value)
@@ -181,8 +175,6 @@ def crowded() -> JSONResponse:
 
 DEEPEST = 16
 """Brackets within one another: a test's segment's settings take six."""
-PARSED = "stimrig.json"
-"""Where the scope of a request has what was read."""
 SHORT = 16_384
 """Bytes that are read in less than a millisecond or two."""
 _READER = ThreadPoolExecutor(1, "long-bodies")
@@ -226,9 +218,9 @@ class StrictBody(HttpMiddleware):
             body.extend(message.get("body", b""))
             if message["type"] == "http.request" and not message.get("more_body"):
                 if len(body) <= SHORT:
-                    scope[PARSED] = sound(bytes(body))
+                    sound(bytes(body))
                 else:  # one at a time: a stop, which waits for the event loop, comes between
-                    scope[PARSED] = await asyncio.get_running_loop().run_in_executor(_READER, sound, bytes(body))
+                    await asyncio.get_running_loop().run_in_executor(_READER, sound, bytes(body))
             return message
 
         await self.app(scope, checked, send)

@@ -11,7 +11,7 @@ from typing import get_args
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 
-from stimrig.api.store.tables import Model, Participant, Test
+from stimrig.api.store.tables import AuditEntry, Model, Participant, Test
 from stimrig.api.version import software_version
 from stimrig.api.web.dependencies import Context
 from stimrig.rig.messages import RigState
@@ -89,10 +89,11 @@ def _pulses(context: Context) -> Iterator[Metric]:
 
 def _store(context: Context) -> Iterator[Metric]:
     approved = context.versions.all_approved(context.store.all(Participant.code))
+    entries = context.store.first(AuditEntry.seq, order=AuditEntry.seq.desc())
     yield from gauges((
         ("stimrig_models", "Model versions", len(context.store.all(Model.id))),
         ("stimrig_approved_models", "Participants with one approved today", len(approved)),
-        ("stimrig_audit_entries", "Entries of the audit trail", context.store.seen(context.clock).entry),
+        ("stimrig_audit_entries", "Entries of the audit trail", entries or 0),
         ("stimrig_free_disk_bytes", "Free where the data lie", shutil.disk_usage(context.settings.data_dir).free),
     ))  # fmt: skip
 

@@ -7,7 +7,6 @@ from typing import Any
 from fastapi import FastAPI
 
 from stimrig.api import schemas
-from stimrig.api.decisions import DECISIONS
 from stimrig.api.web.middleware import REFUSALS
 from stimrig.api.web.responses.base import Problem
 from stimrig.api.web.responses.models import TrackedOut
@@ -26,7 +25,8 @@ which plays nothing, and into `POST /v1/tests`.
 
 A decision (approve, set limits, start, re-arm, …) says on what it was made: the `ETag` of the document that its
 operation names, as it was last read, in `If-Match`. A controller's key, which reads no participant, names the approved
-model's. Without: 428. Changed since: 409, with what was there, what is there now, who changed it and when.
+model's. Without: 428. Changed since: 412, with who changed what from what, and the `ETag` of now. The answer to a
+decision carries the new `ETag`.
 
 Live signals come over a WebSocket, `/v1/tests/{id}/live`, with the same token: JSON messages with a `type`, which is
 `history` (all curves so far, once), `live` (about 20 a second, see `LiveOut`), `state` (the rig), `link` (is the
@@ -49,6 +49,10 @@ TOO_MANY = problem("too many wrong tries, or too much at once") | {
     "headers": {"Retry-After": {"description": "s to wait", "required": True, "schema": {"type": "integer"}}}
 }
 """Of every operation that asks who comes: a guess is held to a pace, whatever it was to open."""
+
+
+CHANGED = problem("changed since: `changes` says who, when, from what to what") | {"headers": {"ETag": ETAG}}
+NO_VERSION = problem("`If-Match` is missing, or cannot be read")
 
 
 def describe(app: FastAPI) -> None:
@@ -78,7 +82,6 @@ def _complete(document: dict[str, Any]) -> None:
     for name in EMBEDDED:
         components.update(schemas.components(name))
     components["ModelJson"]["properties"]["tracking"] = {"$ref": "#/components/schemas/TrackedOut"}
-    _tell_of_decisions(document)
     for methods in document["paths"].values():
         for operation in methods.values():
             ways = operation.get("security", [])
@@ -89,22 +92,10 @@ def _complete(document: dict[str, Any]) -> None:
                 operation["description"] = f"{operation.get('description', '')}\n\nScope: `{'`, `'.join(needed)}`."
             if "HTTPValidationError" in str(operation["responses"].get("422")):
                 del operation["responses"]["422"]
+            for header in operation.get("parameters", []):
+                if header["name"] == "if-match":
+                    header |= {"required": "decided now" not in operation["description"], "schema": {"type": "string"}}
+                    operation["responses"] |= {"412": CHANGED, "428": NO_VERSION}
             if "requestBody" in operation:
                 for code, words in REFUSALS.items():
                     operation["responses"].setdefault(code, problem(words))
-
-
-def _tell_of_decisions(document: dict[str, Any]) -> None:
-    """`If-Match` with what decides, and the `ETag` of what it is decided on."""
-    for decision in DECISIONS:
-        operation = document["paths"].get(decision.path, {}).get(decision.method.lower())
-        if operation is None:
-            continue
-        of_key = ", or for a controller's key of `GET /v1/participants/{code}/model`"
-        model = of_key if decision.path == "/v1/tests" else ""
-        words = f"the `ETag` of `GET {decision.document}`{model} on which this is decided"
-        given = {"name": "If-Match", "in": "header", "required": decision.needed, "description": words}
-        operation.setdefault("parameters", []).append(given | {"schema": {"type": "string"}})
-        operation["responses"]["428"] = problem("`If-Match` is missing, or cannot be read")
-        shown = document["paths"][decision.document]["get"]["responses"]["200"]
-        shown.setdefault("headers", {})["ETag"] = ETAG

@@ -15,10 +15,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
 from stimrig.api.errors import ApiError, invalid, not_answering
-from stimrig.api.store import seen
-from stimrig.api.store.seen import ChangedError
 from stimrig.api.web.middleware import wants_html
-from stimrig.api.web.pages import changes
 from stimrig.api.web.pages.render import look, problem_page
 
 log = logging.getLogger("stimrig.api")
@@ -59,15 +56,9 @@ def _http_detail(error: HTTPException) -> str:
 
 async def respond(request: Request, problem: ApiError) -> Response:
     """The problem as JSON, or as a page where a browser's form asked."""
-    if isinstance(problem, ChangedError):
-        problem.extra["changes"] = changes.for_reader(problem.extra["changes"], getattr(request.state, "who", None))
     if wants_html(request):
         await look(request)
-        again = None
-        if isinstance(problem, ChangedError):
-            seen.shown.set(None)  # the page tells all that has changed
-            again = await changes.again(request, problem)
-        return problem_page(request, problem, again)
+        return problem_page(request, problem)
     return JSONResponse(
         problem.body(str(request.url.path)),
         status_code=problem.status,

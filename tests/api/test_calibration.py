@@ -59,7 +59,7 @@ def test_words_that_do_not_hold_are_refused_before_the_rig_hears_of_them(
     assert service.rig.calibration is None
     seen = {"If-Match": client.get("/v1/participants/P017").headers["etag"]}
     refused = client.post("/v1/participants/P9/calibration", headers=seen)
-    assert refused.status_code == 409 and "no version of /v1/participants/P9" in refused.json()["detail"]
+    assert refused.status_code == 404
 
 
 def test_no_calibration_during_a_test(client: httpx.Client, service: Service, participant: str) -> None:
@@ -167,7 +167,7 @@ def test_what_changes_no_limit_leaves_the_calibration_open(client: httpx.Client,
     assert up(client).status_code == 202
 
 
-@pytest.mark.parametrize("end", ["", "-999999", "-999999-00000000", "-{}-00000000", "-1x"])
+@pytest.mark.parametrize("end", ["", "-999999", "-{}0", "-1x"])
 def test_one_that_the_service_did_not_begin_is_discarded_alone(
     client: httpx.Client, service: Service, participant: str, end: str
 ) -> None:
@@ -175,8 +175,8 @@ def test_one_that_the_service_did_not_begin_is_discarded_alone(
     client.post(WHERE)
     known = service.rig.calibration
     assert known is not None
-    stamp, drawn, entry, _ = known.calibration_id.split("-")
-    other = f"{stamp}-{drawn}{end.format(entry)}"
+    stamp, drawn, version = known.calibration_id.split("-")
+    other = f"{stamp}-{drawn}{end.format(version)}"
     service.rig.calibration = known.model_copy(update={"calibration_id": other})
     assert problem(up(client), 409) and problem(client.post(f"{WHERE}/finish"), 409)
     assert client.post(f"{WHERE}/discard").status_code == 200
@@ -232,17 +232,6 @@ def test_the_page_says_that_it_goes_no_further(client: httpx.Client, service: Se
             assert browser.post(f"{page}/{what}", data=sight(service, token)).status_code == answer
 
 
-def test_a_question_about_a_calibration_is_bound_to_the_limits_it_showed(
-    client: httpx.Client, service: Service, pages: httpx.Client, participant: str
-) -> None:
-    token = {"csrf": csrf(pages)}
-    asked = pages.post("/participants/P017/calibration", data={**token, "current_ma": "26", "step_us": "10"})
-    assert "/confirm/" in asked.headers["location"]
-    assert client.put(PROFILE, json=LOWER).status_code == 200
-    assert pages.post(asked.headers["location"], data=token).status_code == 409
-    assert service.rig.calibration is None
-
-
 def test_lowered_during_a_test_says_that_it_holds_from_the_next_one(
     client: httpx.Client, service: Service, pages: httpx.Client, participant: str
 ) -> None:
@@ -293,8 +282,8 @@ def at_once(service: Service, press: Any, count: int = 2) -> list[httpx.Response
 def test_two_presses_at_once_send_exactly_one_train(service: Service, tab: Any) -> None:
     browser, fields = tab
     answers = at_once(service, lambda: browser.post(f"{CALIBRATION_PAGE}/step/repeat", data=fields))
-    assert sorted(answer.status_code for answer in answers) == [303, 409] and trains(service) == 2
-    (late,) = [answer.text for answer in answers if answer.status_code == 409]
+    assert sorted(answer.status_code for answer in answers) == [303, 412] and trains(service) == 2
+    (late,) = [answer.text for answer in answers if answer.status_code == 412]
     assert "Another train was sent after this page was shown, or another mark was set. Nothing was done now." in late
 
 
@@ -303,7 +292,7 @@ def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(service: S
     service.rig_thread.become("running")
     for path in ("step/repeat", "mark/sensory", "finish"):
         answer = browser.post(f"{CALIBRATION_PAGE}/{path}", data=fields)
-        assert answer.status_code == 409 and "Another train was sent" in answer.text, path
+        assert answer.status_code == 412 and "Another train was sent" in answer.text, path
     assert trains(service) == 1 and not service.rig.calibration.marks_us  # pyright: ignore[reportOptionalMemberAccess]
 
 
@@ -311,7 +300,7 @@ def test_a_page_that_shows_not_all_marks_finishes_nothing(client: httpx.Client, 
     browser, fields = tab
     for threshold in ("sensory", "motor", "comfort"):
         client.post(f"{WHERE}/mark", json={"threshold": threshold})
-    assert browser.post(f"{CALIBRATION_PAGE}/finish", data=fields).status_code == 409
+    assert browser.post(f"{CALIBRATION_PAGE}/finish", data=fields).status_code == 412
     assert trains(service) == 1
     assert service.rig.calibration is not None
     now = {**fields, "calibration": client.get(WHERE).json()["version"]}

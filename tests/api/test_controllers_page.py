@@ -47,7 +47,7 @@ def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterato
         with service.client(timeout=120) as admin:
             admin.post("/v1/participants", json={"code": "P017"})
             approve(admin, weaker(made_up_csv(folder / "record.csv"), 0.87))
-        text, _ = controllers.make_key(service.context.auth, "page", "P017", PLAN, "test")
+        text, *_ = controllers.make_key(service.context.auth, "page", "P017", PLAN, "test")
         yield service, text
 
 
@@ -143,7 +143,7 @@ def learner(served: tuple[Service, str], program: str) -> tuple[tuple[Service, s
     """A key of its own, and the page's lines for a program."""
     skip_without(program)
     (lines,) = [block for block in blocks("bash") if f"ten_minutes/{program}" in block]
-    text, _ = controllers.make_key(served[0].context.auth, program, "P017", PLAN, "test")
+    text, *_ = controllers.make_key(served[0].context.auth, program, "P017", PLAN, "test")
     return (served[0], text), ["export URL KEY", lines]
 
 

@@ -27,6 +27,9 @@ from stimrig.api.store import Store
 from stimrig.api.store.service_lock import HeldError, ServiceLock
 from tests.api.conftest import STUB, serving, soon, wait_done
 from tests.api.test_idle_lock import test_a_lock_holds_over_a_restart as test_a_lock_holds_over_a_restart
+from tests.api.test_locking import (
+    test_who_decides_again_sends_the_version_of_the_answer as test_who_decides_again_sends_the_version_of_the_answer,
+)
 from tests.api.test_people import clinician as clinician
 from tests.api.test_people import (
     test_changed_password_and_removal_end_sessions as test_changed_password_and_removal_end_sessions,
@@ -36,9 +39,6 @@ from tests.api.test_people import (
 )
 from tests.api.test_session import test_whole_path_to_the_controller as test_whole_path_to_the_controller
 from tests.api.test_tracked import test_a_restart_goes_on_where_it_was as test_a_restart_goes_on_where_it_was
-from tests.api.test_what_was_seen import (
-    test_a_program_is_held_to_what_it_read as test_a_program_is_held_to_what_it_read,
-)
 from tests.harness.processes import below
 
 pytestmark = [pytest.mark.postgresql, pytest.mark.slow]

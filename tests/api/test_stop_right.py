@@ -282,7 +282,7 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         assert program.get("/v1/rig").json()["state"] == "latched" and service.rig.starts == 0
         assert "I have checked" in browser.get("/").text
         csrf = csrf_of(browser)
-        assert browser.post("/rearm", data={"csrf": csrf}).status_code == 303
+        assert browser.post("/v1/rearm", headers={"X-CSRF-Token": csrf}).status_code == 200
         assert program.post("/v1/tests", json=start).status_code == 202
 
 

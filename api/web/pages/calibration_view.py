@@ -16,7 +16,6 @@ from stimrig.api.errors import ApiError
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.questions import Question, Row
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
-from stimrig.api.store import seen
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import typed
@@ -105,10 +104,9 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     body = typed.checked(CalibrationIn, **values, large_steps=True)
 
     async def open_it() -> str:
-        await calibration.begin_calibration(context, who, code, Response(), body)
+        await calibration.begin_calibration(context, who, code, None, Response(), body)  # pyright: ignore[reportArgumentType]
         return address(code)
 
-    await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
     doubts = profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]})
     if not doubts:
         return await attempt(request, context, code, open_it(), address(code))
@@ -150,7 +148,7 @@ async def step(
 ) -> Response:  # fmt: skip
     """Play one train; the trains that the page knew of and the width on the button say whether both still hold."""
     body = typed.checked(StepIn, direction=direction, shown_us=shown_us)
-    done = calibration.play_step(context, who, code, body, Response())
+    done = calibration.play_step(context, who, code, None, body, Response())  # pyright: ignore[reportArgumentType]
     return await attempt(request, context, code, done, address(code))
 
 
@@ -158,21 +156,21 @@ async def step(
 async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str) -> Response:
     """Mark the last train's width."""
     body = typed.checked(MarkIn, threshold=threshold)
-    done = calibration.set_mark(context, who, code, body, Response())
+    done = calibration.set_mark(context, who, code, None, body, Response())  # pyright: ignore[reportArgumentType]
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/finish")
 async def finish(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Take over what was found."""
-    done = calibration.finish_calibration(context, who, code)
+    done = calibration.close(context, code, who.name, None)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 
 @router.post("/discard")
 async def discard(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Leave everything as it was; however many trains were sent."""
-    done = calibration.discard_calibration(context, who, code)
+    done = calibration.close(context, code, who.name, None, discard=True)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 

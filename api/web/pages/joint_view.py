@@ -140,4 +140,4 @@ async def take_pose(request: Request, context: Ctx, who: Tester) -> Response:
         problem.detail = words[:1].upper() + words[1:]
         return await sensor_page(request, context, text, problem=problem, again=first)
 
-    return await done_or_said(joint.pose(context, who, body), said, "/rig/angle")
+    return await done_or_said(joint.take_pose(context, who.name, body), said, "/rig/angle")

@@ -202,7 +202,7 @@ async def improve(context: Ctx, who: Tester, row: Version) -> Response:
 @router.post("/models/{model_id}/undo")
 async def undo(context: Ctx, who: Approver, model_id: str) -> Response:
     """Back to the version before."""
-    parent = await asyncio.to_thread(context.versions.undo, model_id, who.name, "")
+    parent, _version = await asyncio.to_thread(context.versions.undo, model_id, who.name, "")
     return RedirectResponse(f"/models/{parent.id}#versions", 303)
 
 

@@ -20,7 +20,7 @@ from stimrig.api.people.auth import Principal
 from stimrig.api.sessions import controllers, profiles
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
 from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MuscleIn, NoteIn, TargetIn, TestIn
-from stimrig.api.store import seen
+from stimrig.api.store import locking
 from stimrig.api.store.tables import Recording
 from stimrig.api.web.dependencies import Approver, Context, Ctx, Tester
 from stimrig.api.web.guards import local
@@ -114,14 +114,13 @@ async def taken(request: Request, context: Context, who: Principal, code: str, s
 
     if not form.asked:
         return RedirectResponse(await on(), 303)
-    await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
     if not profile:  # nobody has set any yet: they come together
         participants.check_asked(context, profile, form.asked)
     new, voids = profiles.changed(profile, form.asked)
 
     async def save() -> str:
-        _row, place = await participants.change_profile(context, code, form.asked, who.name, bool(voids))
-        seen.looked.set(place)  # what is asked next rests on what was just decided
+        row = await participants.change_profile(context, code, form.asked, who.name, bool(voids))
+        locking.form_tags.set((str(row.version),))  # what is asked next rests on what was just decided
         return await on()
 
     doubts = [*profiles.jumps(profile, new), *_lost(context, voids)]
@@ -218,7 +217,7 @@ async def make_key(
     asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
     numbers = {field: typed.wanted(text, lambda why, field=field: f"{field}: {why}.") for field, text in asked.items()}
     body = typed.checked(controllers.KeyFor, name=name.strip(), trials=typed.whole(trials), **numbers)
-    text, made = await asyncio.to_thread(people.key_of, context, who, code, body)
+    text, made, _version = await asyncio.to_thread(people.key_of, context, who, code, body)
     return await show_page(request, context, who, code, made={"text": text, "name": made.name})
 
 
@@ -293,7 +292,6 @@ async def set_muscle(
         await participants.change_site(context, code, body, who.name, True)
         return f"/participants/{code}"
 
-    await asyncio.to_thread(context.store.refuse_changed, seen.participant(code))
     before, after = site_words(site_of(row)), site_words(participants.site_in(body))
     warnings = []
     if participants.loses_calibration(row, body):
@@ -317,7 +315,6 @@ async def trials(context: Ctx, who: Tester, code: str) -> Response:
 
     def gather() -> str:
         participants.find(context, code)
-        seen.looked.set(context.store.seen(context.clock))
         return trials_of(context, who, code) or ""
 
     return HTMLResponse(await asyncio.to_thread(gather))

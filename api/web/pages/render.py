@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Awaitable, Callable
-from functools import partial
 from typing import Any
 from urllib.parse import quote
 
@@ -20,10 +19,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.local_time import clock
 from stimrig.api.people.auth import LOCKED, Principal, Scope
 from stimrig.api.sessions.joint_plan import PASSIVE
-from stimrig.api.store import seen
 from stimrig.api.web.dependencies import Context
-from stimrig.api.web.pages import changes
-from stimrig.api.web.pages.changes import Again
 from stimrig.api.web.pages.environment import environment
 
 COLOURS = "stimrig_colours"
@@ -38,8 +34,6 @@ async def done_or_said(done: Awaitable[Any], said: Callable[[ApiError], Awaitabl
     """Do it and go on to a page; what the rig or the service refuses is said on the page that `said` makes."""
     try:
         await done
-    except seen.ChangedError:  # it has a page of its own
-        raise
     except ApiError as error:
         return await said(error)
     return RedirectResponse(leads, 303)
@@ -64,8 +58,9 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     context: Context = request.app.state.context
     bar = {**bar_of(context, principal), "right": stop_right(request, looking), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
-    shown["signed"] = signed(principal)
-    shown["version_of"] = partial(version_of, context)
+    version = getattr(request.state, "version", 0)
+    shown["signed"] = signed(principal, version)
+    shown["version_of"] = lambda _document: version
     shown["csrf"] = (looking.csrf if looking else None) or ""
     kept = request.cookies.get(COLOURS, "")
     shown["colours"] = kept if kept in MEDIA else "system"
@@ -73,16 +68,9 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     return HTMLResponse(html, status_code=status)
 
 
-def version_of(context: Context, document: str) -> str:
-    """Version of a document when this request began: what its page shows is not older. For `data-if-match`."""
-    known = seen.looked.get() or context.store.seen(context.clock)
-    return known.etag(document).strip('"')
-
-
-def signed(principal: Principal | None) -> Markup:
-    """What every form carries: that it is of this session, and what the page was shown on."""
-    told = seen.shown.get() or seen.looked.get()  # a form that comes back for want of something is as old as it was
-    fields = {"csrf": (principal.csrf if principal else None) or "", "seen": told or ""}
+def signed(principal: Principal | None, version: int = 0) -> Markup:
+    """What every form carries: that it is of this session, and the version of what the page shows."""
+    fields = {"csrf": (principal.csrf if principal else None) or "", "seen": version or ""}
     field = Markup('<input type="hidden" name="{}" value="{}">')
     return Markup("").join(field.format(name, value) for name, value in fields.items())
 
@@ -150,15 +138,13 @@ def here(request: Request) -> str:
     return back[0] if back else "/"
 
 
-def problem_page(request: Request, problem: ApiError, again: Again | None = None) -> Response:
+def problem_page(request: Request, problem: ApiError) -> Response:
     """A problem as a page that says what to do; the way to the door where nobody is signed in."""
     if problem.code == LOCKED[0]:
         return RedirectResponse(f"/locked?next={quote(here(request), safe='')}", 303)
     if problem.status == 401 and request.method == "GET":
         return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
     values: dict[str, Any] = {"problem": problem, "back": back_from(request.url.path), "again_at": request.url.path}
-    if isinstance(problem, seen.ChangedError):
-        values |= {"rows": changes.rows(problem.extra["changes"]), "again": again}
     response = page(request, "problem.html", problem.status, **values)
     response.headers.update(problem.headers)
     return response

@@ -15,7 +15,7 @@ from stimrig.api.web.guards import local, same_origin
 from stimrig.api.web.pages import render
 from stimrig.api.web.pages.render import COLOURS, MEDIA, fragment, look, page
 from stimrig.api.web.pages.typed import Text
-from stimrig.api.web.routes.rig import rearm as rearm_rig
+from stimrig.api.web.routes.rig import rearm_rig
 
 router = APIRouter(include_in_schema=False)
 
@@ -63,7 +63,7 @@ async def stopped(request: Request, context: Ctx, key: str) -> Response:
 @router.post("/rearm")
 async def rearm(context: Ctx, who: Rearmer, back: Text = "/") -> Response:
     """A person has looked, and lets the rig work again."""
-    await rearm_rig(context, who)
+    await rearm_rig(context, who.name)
     return RedirectResponse(local(back), 303)
 
 

@@ -19,8 +19,7 @@ from stimrig.api.sessions.joint_plan import HELD, PASSIVE
 from stimrig.api.sessions.playing import other_than, refuse_archived
 from stimrig.api.sessions.questions import Question, Row
 from stimrig.api.sessions.requests import TestIn
-from stimrig.api.store import seen
-from stimrig.api.store.tables import Participant
+from stimrig.api.store.tables import AuditEntry, Participant
 from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment, number
 from stimrig.api.web.routes import participants
@@ -44,8 +43,8 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
     if state == "none":
         required = bool(context.rig.status and context.rig.status.require_calibration)
         return Calibrated(state, "not calibrated", not required)
-    with context.store.read() as session:
-        entry = seen.last(session, seen.actions_on(row.code, "finish calibration"))
+    own = AuditEntry.subject == row.code, AuditEntry.action == "finish calibration"
+    entry = context.store.first(AuditEntry, *own, order=AuditEntry.seq.desc())
     said = {"time": when(profile.get("set_at_utc")), "end": until(profile.get("expires_at_utc"))}
     said["name"] = entry.who if entry else "–"
     if state == "expired":

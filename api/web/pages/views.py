@@ -77,7 +77,7 @@ async def enough(context: Ctx, who: Tester, test_id: str) -> Response:
 async def set_ran_by(context: Ctx, who: Tester, test_id: str, ran_by: Text = "") -> Response:
     """Say who ran a test at the rig."""
     body = typed.checked(RanByIn, ran_by=ran_by.strip() or None)
-    await asyncio.to_thread(tests.set_ran_by, context, who, test_id, body)
+    await asyncio.to_thread(tests.change_ran_by, context, test_id, body.ran_by, who.name)
     return RedirectResponse(f"/tests/{test_id}#notes", 303)
 
 

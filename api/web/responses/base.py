@@ -76,10 +76,14 @@ class EntryOut(Document):
 
 
 class ChangeOut(Document):
-    """What was changed since something was seen."""
+    """A change of what was decided on, since the version that was sent."""
 
-    now: EntryOut
-    seen: EntryOut | None = Field(description="what was there when it was seen; null: nothing, or not known")
+    who: str = Field(description="empty: the rig itself")
+    at_utc: str
+    action: str
+    subject: str
+    old: str = Field(description="what it was, in words; empty: nothing")
+    new: str = Field(description="what it is now")
 
 
 class ReachOut(Document):
@@ -92,6 +96,24 @@ class ReachOut(Document):
     torque_time_nm_s: float = Field(description="what it would cost, N·m·s")
     words: str
     known: bool = Field(False, description="whether a model of an earlier session helps")
+
+
+class ConfirmRow(Document):
+    """What changes, from what to what."""
+
+    what: str
+    now: str
+    before: str = Field(description="empty: nothing was there")
+
+
+class ConfirmOut(Document):
+    """A question that is answered by sending the same again with `?confirm=TOKEN`."""
+
+    title: str
+    button: str
+    rows: list[ConfirmRow]
+    warnings: list[str]
+    token: str
 
 
 class Problem(Document):
@@ -107,13 +129,8 @@ class Problem(Document):
     reasons: dict[str, str] = Field({}, description="409 of effects: why each one was not added, by its id")
     place: str | None = Field(None, description="422 of a file, a model or a reference: what of it does not hold")
     fix: str | None = Field(None, description="with `place`: how to mend it")
-    changes: list[ChangeOut] = Field([], description="409 `changed-meanwhile`: each change, the newest last")
-    seen: str | None = Field(
-        None, description="409 `changed-meanwhile`: the version that was sent; null: of another kind"
-    )
-    latch: str = Field(
-        "", description="409 of a re-arm: names the stop of now; send it as `If-Match` once it was looked at"
-    )
+    changes: list[ChangeOut] = Field([], description="412: each change since the version that was sent, newest last")
+    confirm: ConfirmOut | None = Field(None, description="409: what deserves a second look")
     of: str | None = Field(None, description="409 `other-participant`: whose recording it is; send it as `of`")
     reach: ReachOut | None = Field(None, description="422 `out-of-reach`: what the adaptive test will probably reach")
     evidence: StopEvidence | None = Field(None, description="503 `stop-not-confirmed`: what is known of the stop")

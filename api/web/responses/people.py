@@ -23,6 +23,7 @@ class ListedUser(UserOut):
     """A person in the list of all."""
 
     removed: bool = Field(description="signs in no more")
+    version: int = Field(description="of the account: `If-Match` of a new password")
 
 
 class SessionOut(Document):
@@ -101,6 +102,7 @@ class ParticipantOut(Document):
     muscle: str | None = Field(description="the muscle that is stimulated")
     placement: str | None = Field(description="of the electrodes: with side and muscle the site")
     archived_utc: str | None = Field(description="since when it is archived: no test starts, nothing is deleted")
+    version: int = Field(description="of all that is decided about the participant: its `ETag`")
 
 
 class NoteOut(Document):

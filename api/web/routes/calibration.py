@@ -10,14 +10,17 @@ import zlib
 from typing import Any
 
 from fastapi import APIRouter, Response
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
-from stimrig.api.store import audit, seen
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester
+from stimrig.api.store import audit, locking
+from stimrig.api.store.locking import Tags
+from stimrig.api.store.tables import AuditEntry, Participant
+from stimrig.api.web.dependencies import PROBLEM, CalibrationVersion, Context, Ctx, ParticipantVersion, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
 from stimrig.api.web.routes import participants
@@ -26,13 +29,12 @@ from stimrig.rig import messages, requests
 router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibration"], responses=PROBLEM)
 
 
-def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any]) -> str:
+def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any], tags: Tags | None) -> str:
     """The intent; the calibration's id."""
     with context.store.write() as session:
-        seen.check(session, seen.participant(code))
-        begun, now = seen.newest(session, ""), context.clock.utc()
+        version, now = locking.check(session, participants.within(session, code), tags), context.clock.utc()
         stamp = now[:19].replace("-", "").replace(":", "")
-        identity = f"C{stamp}-{secrets.token_hex(3)}-{begun.entry}-{begun.mark}"
+        identity = f"C{stamp}-{secrets.token_hex(3)}-{version}"
         audit.write(session, now, by, "begin calibration", code, calibration=identity, **asked)
     return identity
 
@@ -50,33 +52,32 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
     return asked
 
 
-def check_seen(found: dict[str, Any], any_train: bool = False) -> None:
+def check_train(found: dict[str, Any], tags: Tags | None, any_train: bool = False) -> None:
     """Refuse what was decided on another calibration, or, but with `any_train`, without knowing of the last train.
 
-    Raises ApiError: 409 it is another one, or another train was sent or is on its way.
+    Raises ApiError: 412 it is another one, or another train was sent or is on its way.
     """
-    sent = seen.sent.get()
-    if not sent:
-        return
-    if sent.partition(".")[0] != found["calibration_id"]:
-        raise another_calibration(found["by"])
-    if not any_train and (sent != found["version"] or found["playing"]):
+    check_calibration(found["calibration_id"], found["by"], tags)
+    if not any_train and (found["version"] not in locking.tags_of(tags) or found["playing"]):
         raise another_train()
 
 
-def another_calibration(who: str) -> ApiError:
-    """409: the one that was seen has ended, and somebody has begun another one."""
-    detail = f"{who} has begun another calibration since this page was shown. Nothing was done. Look at that one first."
-    return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
+def check_calibration(calibration_id: str, by: str, tags: Tags | None) -> None:
+    """Raise ApiError (412): the one that was decided on has ended, and somebody has begun another one."""
+    if calibration_id not in {tag.partition(".")[0] for tag in locking.tags_of(tags)}:
+        detail = (
+            f"{by} has begun another calibration since this page was shown. Nothing was done. Look at that one first."
+        )
+        raise ApiError(412, "changed-meanwhile", "This page is out of date", detail)
 
 
 def another_train() -> ApiError:
-    """409: another train was sent, or another width marked."""
+    """412: another train was sent, or another width marked."""
     detail = (
         "Another train was sent after this page was shown, or another mark was set. Nothing was done now. Look at the "
         "last train and the marks first."
     )
-    return ApiError(409, "changed-meanwhile", "This page is out of date", detail)
+    return ApiError(412, "changed-meanwhile", "This page is out of date", detail)
 
 
 async def _waiting(context: Context, code: str) -> messages.Calibrated | None:
@@ -110,24 +111,24 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
 def outdated(context: Context, code: str, found: messages.CalibrationStatus) -> str:
     """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
     with context.store.read() as session:
-        begun = _begun(session, found.calibration_id)
-        if begun is None:
-            return "It began on other data than this service has. It sends no further train. Discard it and begin anew."
-        if not seen.since(session, begun, seen.participant(code)):
-            return ""
-    row = participants.find(context, code)
+        row = participants.within(session, code)
+        return _outdated_words(row) if _changed(session, row, found.calibration_id) else ""
+
+
+def _outdated_words(row: Participant) -> str:
     now = ", ".join(f"{row.profile[name]:g} {limit.unit}" for name, limit in profiles.LIMITS.items())
     return (
-        f"{row.code} now has other limits ({now}) than when this calibration was begun with {found.current_ma:g} mA. "
-        "It sends no further train and gives no profile. Discard it and begin anew."
+        f"{row.code} now has other limits ({now}) than when this calibration was begun. It sends no further train and "
+        "gives no profile. Discard it and begin anew."
     )
 
 
-def _begun(session: Session, calibration_id: str) -> seen.Seen | None:
-    """Where in this trail a calibration began; None: nowhere."""
-    place = re.fullmatch(rf"C\w+-[0-9a-f]{{6}}-{seen.ENTRY}-{seen.MARK}", calibration_id, re.ASCII)
-    begun = seen.Seen(int(place[1]), place[2], "") if place else None
-    return begun if begun is not None and seen.known(session, begun) else None
+def _changed(session: Session, row: Participant, calibration_id: str) -> bool:
+    """Whether limits, site or archive are others than when this calibration was begun."""
+    begun = re.fullmatch(r"C\w+-[0-9a-f]{6}-(\d{1,18})", calibration_id, re.ASCII)
+    if begun is None or not locking.is_known(session, int(begun[1])):
+        return True  # it began on other data than this service has
+    return bool(locking.since(session, int(begun[1]), locking.settings_of(row.code)))
 
 
 async def sound(context: Context, code: str) -> dict[str, Any]:
@@ -138,9 +139,13 @@ async def sound(context: Context, code: str) -> dict[str, Any]:
     """
     found = await standing(context, code)
     if found["outdated"]:
-        title = "This calibration goes no further"
-        raise ApiError(409, "changed-meanwhile", title, found["outdated"])
+        raise outdated_error(found["outdated"])
     return found
+
+
+def outdated_error(detail: str) -> ApiError:
+    """409: the calibration can only be discarded."""
+    return ApiError(409, "changed-meanwhile", "This calibration goes no further", detail)
 
 
 def _store(
@@ -149,37 +154,40 @@ def _store(
     """What was found is the profile, if nothing of that was changed since; what a calibration does not look for (the
     rest between tests) stays. Storing it again changes nothing."""
     found = result.profile.model_dump() if result.profile else None
+    told = {"calibration": identity, "recordings": result.recordings}
     with context.store.write() as session:
-        if found is not None:
-            row = participants.within(session, code)
-            begun = _begun(session, identity) or seen.Seen(0, "", "")
-            changed = seen.since(session, begun, seen.participant(code))
-            if any(entry.detail.get("calibration") == identity for entry in changed):
-                return dict(row.profile)
-            if changed:
-                raise seen.overtaken(changed)
-            found |= {name: value for name, value in row.profile.items() if found.get(name) is None}
-            row.profile = found
-        action, said = "finish calibration" if found else "discard calibration", {"calibration": identity}
-        audit.write(session, context.clock.utc(), by, action, code, profile=found, recordings=result.recordings, **said)
-    return found
+        row, now = participants.within(session, code), context.clock.utc()
+        if found is None:
+            audit.write(session, now, by, "discard calibration", code, **told)
+        elif not _stored(session, code, identity):
+            if _changed(session, row, identity):
+                raise outdated_error(_outdated_words(row))
+            row.profile = found | {name: value for name, value in row.profile.items() if found.get(name) is None}
+            locking.write(session, row, now, by, "finish calibration", code, profile=row.profile, **told)
+        return None if found is None else dict(row.profile)
+
+
+def _stored(session: Session, code: str, identity: str) -> bool:
+    same = AuditEntry.detail["calibration"].as_string() == identity
+    own = select(AuditEntry.seq).where(AuditEntry.subject == code, AuditEntry.action == "finish calibration", same)
+    return session.scalar(own) is not None
 
 
 @router.post("", status_code=201, **describe_answer(CalibrationOut, 201, "open; nothing was sent yet"))
 async def begin_calibration(
-    context: Ctx, who: Tester, code: str, response: Response, body: CalibrationIn | None = None
+    context: Ctx, who: Tester, code: str, tags: ParticipantVersion, response: Response,
+    body: CalibrationIn | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Open a guided calibration: nothing is sent until a step is asked for."""
     # What is not asked for is the participant's own, so never wider. It is bound to the limits that it is begun with:
-    # the place in the audit trail at which it began ends its id, and so is kept by the rig, which may outlive this
-    # service.
+    # the participant's version ends its id, and so is kept by the rig, which may outlive this service.
     body = body or CalibrationIn.model_validate({})
     async with context.limits_lock:
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
         asked = settings(body, row.profile)
-        identity = await asyncio.to_thread(_write_begin, context, who.name, code, asked)
+        identity = await asyncio.to_thread(_write_begin, context, who.name, code, asked, tags)
         last = messages.Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
             requests.CalibrateStartRequest(
@@ -206,23 +214,27 @@ def tagged(response: Response, found: dict[str, Any]) -> dict[str, Any]:
 
 
 @router.post("/step", status_code=202, **describe_answer(CalibrationOut, 202, "the train is on its way"))
-async def play_step(context: Ctx, _who: Tester, code: str, body: StepIn, response: Response) -> dict[str, Any]:
+async def play_step(
+    context: Ctx, _who: Tester, code: str, tags: CalibrationVersion, body: StepIn, response: Response
+) -> dict[str, Any]:
     """Play one train: wider (`up`, or `fine` by a fine step), narrower, or the same again.
 
     It is over when `playing` is false again.
     """
     async with context.limits_lock:  # of two presses on the same sight one plays
-        check_seen(await sound(context, code))
+        check_train(await sound(context, code), tags)
         await context.rig.ask(requests.CalibrateStepRequest(**body.model_dump()))
     return tagged(response, await standing(context, code))
 
 
 @router.post("/mark", **describe_answer(CalibrationOut))
-async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response: Response) -> dict[str, Any]:
+async def set_mark(
+    context: Ctx, who: Tester, code: str, tags: CalibrationVersion, body: MarkIn, response: Response
+) -> dict[str, Any]:
     """Mark the last train's width as a threshold; marking again replaces."""
     async with context.limits_lock:  # no train comes between looking and marking
         found = await sound(context, code)
-        check_seen(found)
+        check_train(found, tags)
         await context.rig.ask(requests.CalibrateMarkRequest(**body.model_dump()))
     action, told = f"mark {body.threshold}", {"pulse_width_us": found["pulse_width_us"]}
     await asyncio.to_thread(context.store.note, context.clock, who.name, action, code, **told)
@@ -230,29 +242,28 @@ async def set_mark(context: Ctx, who: Tester, code: str, body: MarkIn, response:
 
 
 @router.post("/finish", **describe_answer(CalibratedOut))
-async def finish_calibration(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
-    """Close it: the profile holds until the end of the day."""
-    return await close(context, code, who.name)
+async def finish_calibration(context: Ctx, who: Tester, code: str, tags: CalibrationVersion) -> dict[str, Any]:
+    """Close it: the profile holds until the end of the day. The participant has another version then."""
+    return await close(context, code, who.name, tags)
 
 
 @router.post("/discard", **describe_answer(CalibratedOut))
-async def discard_calibration(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
+async def discard_calibration(context: Ctx, who: Tester, code: str, tags: CalibrationVersion) -> dict[str, Any]:
     """Close it and keep the profile of before; however many trains were sent."""
-    return await close(context, code, who.name, discard=True)
+    return await close(context, code, who.name, tags, discard=True)
 
 
-async def close(context: Context, code: str, by: str, discard: bool = False) -> dict[str, Any]:
+async def close(context: Context, code: str, by: str, tags: Tags | None, discard: bool = False) -> dict[str, Any]:
     """Close a calibration. The rig keeps the result until it is stored here: where that fails, finish it again."""
     async with context.limits_lock:
         waits = await _waiting(context, code)
         if waits is None:
             found = await (standing if discard else sound)(context, code)
-            check_seen(found, any_train=discard)
+            check_train(found, tags, any_train=discard)
             identity = str(found["calibration_id"])
         else:
             identity = waits.calibration_id
-            if (sent := seen.sent.get()) and sent.partition(".")[0] != identity:
-                raise another_calibration(waits.by)
+            check_calibration(identity, waits.by, tags)
         request = requests.CalibrateFinishRequest(by=by, discard=discard, calibration_id=identity)
         result = await context.rig.ask_for(messages.CalibrationResult, request)
         profile = await asyncio.to_thread(_store, context, code, result, by, identity)

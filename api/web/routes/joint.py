@@ -8,23 +8,22 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Response
 from pydantic import AfterValidator, Field, StrictBool, StringConstraints
 
-from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import together
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.kinds import no_sensor
 from stimrig.api.sessions.requests import AngleRad, Body
-from stimrig.api.store import audit, seen
-from stimrig.api.store.seen import Seen
+from stimrig.api.store import locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model, Participant
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester
+from stimrig.api.web.dependencies import PROBLEM, AngleVersion, Context, Ctx, LiveReader, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import VersionOut
 from stimrig.api.web.responses.rig import JointOverviewOut
 from stimrig.api.web.routes import participants
 from stimrig.api.web.routes.criticism import LATER, Wait, later
-from stimrig.rig.messages import AngleStatus, Status
+from stimrig.rig.messages import AngleCalibration, AngleStatus, Status
 from stimrig.rig.requests import AnglePoseRequest
 
 router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
@@ -91,40 +90,57 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
 @router.get("/rig/angle", **describe_answer(AngleStatus))
 async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
-    about = seen.poses()
-    response.headers["ETag"] = await asyncio.to_thread(context.store.etag, context.clock, "/v1/rig/angle", about)
+    response.headers["ETag"] = f'"{await asyncio.to_thread(pose_version, context)}"'
     return (await context.rig.fresh_status()).angle.model_dump()
 
 
+def pose_version(context: Context) -> int:
+    """Return the version of the sensor's calibration."""
+    with context.store.read() as session:
+        return locking.pose_version(session)
+
+
 @router.post("/rig/angle/pose", **describe_answer(AngleStatus))
-async def pose(context: Ctx, who: Tester, body: PoseIn) -> dict[str, Any]:
+async def pose(context: Ctx, who: Tester, tags: AngleVersion, body: PoseIn, response: Response) -> dict[str, Any]:
     """Tell the angle that a goniometer shows, at two poses at least 0.5 rad apart; a third one begins anew."""
+    status = await take_pose(context, who.name, body, tags)
+    response.headers["ETag"] = f'"{await asyncio.to_thread(pose_version, context)}"'
+    return status.angle.model_dump()
+
+
+async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags | None = None) -> Status:
+    """Tell the rig a pose of the sensor. The intent is written before: of one whose answer is lost nobody knows whether
+    it was taken.
+
+    Raises ApiError: 409 no sensor, or the rig refuses; 412 another pose was told meanwhile.
+    """
     sensor(context)
+    told = {"angle_rad": round(body.angle_rad, 4)}
 
-    def write(action: str, *about: seen.About, **detail: Any) -> Seen:
+    def write_intent() -> None:
         with context.store.write() as session:
-            if about:
-                seen.check(session, *about)
-            now = context.clock.utc()
-            audit.write(session, now, who.name, action, "rig", **detail)
-            return seen.newest(session, local_day(now))
+            locking.check_poses(session, tags)
+            locking.write_pose(session, context.clock.utc(), by, locking.POSES[0], **told)
 
-    taken = {"angle_rad": round(body.angle_rad, 4)}
+    def write_calibration(done: AngleCalibration) -> None:
+        with context.store.write() as session:
+            locking.write_pose(session, context.clock.utc(), by, locking.POSES[1], **done.model_dump(exclude={"by"}))
+
     async with context.limits_lock:  # no other pose comes between looking and taking it
         before = context.rig.status.angle.calibration if context.rig.status else None
-        # before the rig is told: of one whose answer is lost nobody knows whether it was taken
-        await asyncio.to_thread(write, seen.POSES[0], seen.poses(), **taken)
+        await asyncio.to_thread(write_intent)
         try:
-            pose = AnglePoseRequest(angle_rad=body.angle_rad, by=who.name, first=body.first)
-            status = await context.rig.ask_for(Status, pose)
+            request = AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first)
+            status = await context.rig.ask_for(Status, request)
         except ApiError as error:
-            place = await asyncio.to_thread(write, "pose not taken", **taken, why=error.detail)
-            seen.shown.set(place)  # who is told of the refusal has seen it
+            await asyncio.to_thread(
+                context.store.note, context.clock, by, "pose not taken", "rig", **told, why=error.detail
+            )
             raise
         context.rig.status = status
         if (done := status.angle.calibration) is not None and done != before:
-            await asyncio.to_thread(write, seen.POSES[1], **done.model_dump(exclude={"by"}))
-    return status.angle.model_dump()
+            await asyncio.to_thread(write_calibration, done)
+    return status
 
 
 @router.get("/participants/{code}/joint", **describe_answer(JointOverviewOut))

@@ -14,9 +14,18 @@ from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
 from stimrig.api.models.tracking import Limits
 from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn, tighter
-from stimrig.api.store import seen
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model, Participant
-from stimrig.api.web.dependencies import PROBLEM, Approver, Context, Ctx, ModelReader, Version
+from stimrig.api.web.dependencies import (
+    PROBLEM,
+    Approver,
+    Context,
+    Ctx,
+    DecisionVersion,
+    ModelReader,
+    RejectionVersion,
+    Version,
+)
 from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import InversionOut, PredictionOut, TrackingOut, VersionOut
@@ -99,8 +108,8 @@ def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]
 @router.get("/models/{model_id}", response_model=None, responses={200: WITH_MODEL})
 def one_model(context: Ctx, _who: ModelReader, row: Version, response: Response) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
-    about = seen.decisions(row.participant)
-    response.headers["ETag"] = context.store.etag(context.clock, f"/v1/models/{row.id}", about)
+    participant: Participant = context.store.get(Participant, row.participant)  # read first: it is not newer
+    response.headers["ETag"] = f'"{participant.version}"'  # what is decided on one model is decided on all
     return {**context.versions.document(row), "model": stored_model.read(row)}
 
 
@@ -112,31 +121,47 @@ def model_file(_who: ModelReader, row: Version) -> Response:
 
 
 @router.post("/models/{model_id}/approve", response_model=VersionOut)
-async def approve(context: Ctx, who: Approver, model_id: str, body: ApprovalIn | None = None) -> dict[str, Any]:
+async def approve(
+    context: Ctx, who: Approver, model_id: str, tags: DecisionVersion, response: Response,
+    body: ApprovalIn | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Let the controller have this version, and what is tracked from it within limits, until the day ends."""
     given = body or ApprovalIn()
     row = await asyncio.to_thread(context.versions.get, model_id)
-    await let_have(context, row, who.name, given.reason, given.tracking)
+    version = await let_have(context, row, who.name, given.reason, given.tracking, tags)
+    response.headers["ETag"] = f'"{version}"'
     return await asyncio.to_thread(context.versions.document, row)
 
 
-async def let_have(context: Context, row: Model, by: str, reason: str, tracking: Limits) -> None:
+async def let_have(
+    context: Context, row: Model, by: str, reason: str, tracking: Limits, tags: Tags | None = None
+) -> int:
     """Approve a version; the worker that follows its trials is warm by the first one."""
-    await asyncio.to_thread(context.versions.decide, row.id, True, by, reason, tracking)
+    version = await asyncio.to_thread(context.versions.decide, row.id, True, by, reason, tracking, tags=tags)
     context.runner.trials.warm(row.participant)
+    return version
 
 
 @router.post("/models/{model_id}/reject", response_model=VersionOut)
-def reject(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
-    """Keep this version from the controller."""
-    context.versions.decide(model_id, False, who.name, body.reason if body else "")
+def reject(
+    context: Ctx, who: Approver, model_id: str, tags: RejectionVersion, response: Response,
+    body: DecisionIn | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Keep this version from the controller. Without `If-Match`: on what is decided now, and without an `ETag`."""
+    version = context.versions.decide(model_id, False, who.name, body.reason if body else "", tags=tags)
+    if tags is not None:  # else what others decided would pass for what was read
+        response.headers["ETag"] = f'"{version}"'
     return context.versions.document(context.versions.get(model_id))
 
 
 @router.post("/models/{model_id}/undo", response_model=VersionOut)
-def undo(context: Ctx, who: Approver, model_id: str, body: DecisionIn | None = None) -> dict[str, Any]:
+def undo(
+    context: Ctx, who: Approver, model_id: str, tags: DecisionVersion, response: Response,
+    body: DecisionIn | None = None,
+) -> dict[str, Any]:  # fmt: skip
     """Go back to the version this one was made from; nothing is deleted."""
-    parent = context.versions.undo(model_id, who.name, body.reason if body else "")
+    parent, version = context.versions.undo(model_id, who.name, body.reason if body else "", tags)
+    response.headers["ETag"] = f'"{version}"'
     return context.versions.document(parent)
 
 

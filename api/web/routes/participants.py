@@ -14,16 +14,15 @@ from fastapi import APIRouter, Query, Response
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from stimrig.api.clock import local_day
 from stimrig.api.errors import ApiError, Change, require_confirmation, require_found
 from stimrig.api.models.places import Site, in_words, site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.sessions import notes, profiles
+from stimrig.api.sessions import profiles
 from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
-from stimrig.api.store import Store, audit, seen
-from stimrig.api.store.seen import Seen
+from stimrig.api.store import Store, locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Approval, Model, Participant, Test
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, Tester, under_limits_lock
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ParticipantVersion, Tester, under_limits_lock
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 from stimrig.api.web.responses.rig import TestOut
@@ -48,10 +47,9 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
         row = Participant(code=body.code, created_utc=now, created_by=by)
         row.profile = profile
         row.side, row.muscle, row.placement = body.side, body.muscle, body.placement
+        site = {"side": row.side, "muscle": row.muscle, "placement": row.placement}
+        locking.write(session, row, now, by, "create participant", body.code, profile=row.profile, **site)
         session.add(row)
-        session.flush()
-        said = {"side": row.side, "muscle": row.muscle, "placement": row.placement}
-        audit.write(session, now, by, "create participant", body.code, profile=row.profile, **said)
     return row
 
 
@@ -68,28 +66,25 @@ def within(session: Session, code: str) -> Participant:
 @under_limits_lock
 def change_profile(
     context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False, confirm: str = "",
-    ask: bool = False,
-) -> tuple[Participant, Seen]:  # fmt: skip
-    """New limits for a participant: those that are asked for, the rest stays; and the place in the trail.
+    ask: bool = False, tags: Tags | None = None,
+) -> Participant:  # fmt: skip
+    """Change limits of a participant: those that are asked for; the rest stays.
 
-    Raises ApiError: 404 no such participant; 422 beyond what the rig takes, or the first ones are not whole; 409
-    changed meanwhile, or the calibration would be lost, and that was not allowed.
+    Raises ApiError: 404 no such participant; 412 changed meanwhile; 422 beyond what the rig takes, or the first ones
+    are not whole; 409 the calibration would be lost, and that was not allowed.
     """
     with context.store.write() as session:
         row = within(session, code)
-        poses = [] if asked.get(profiles.RANGE) is None else [seen.poses()]
-        seen.check(session, seen.participant(code), *poses)
+        locking.check(session, row, tags)
         before = row.profile
         check_asked(context, before, asked)
         profile, voids = profiles.changed(before, add_calibration_time(context, asked))
         confirm_profile(context, code, before, profile, "" if may_void else voids, confirm, ask)
         if profile != before:
             row.profile = profile
-            audit.write(session, context.clock.utc(), by, "set profile", code, profile=profile, voids=voids)
-        shown = seen.shown.get()
-        if shown is not None and seen.since(session, shown, seen.decisions(code), seen.poses()):
-            return row, shown  # limits are answered, not what was decided on models, nor where the angle's zero is
-        return row, seen.newest(session, local_day(context.clock.utc()))
+            now = context.clock.utc()
+            locking.write(session, row, now, by, "set profile", code, profile=profile, voids=voids)
+    return row
 
 
 def confirm_profile(
@@ -183,10 +178,13 @@ def list_participants(
 @router.get("/{code}", **describe_answer(ParticipantOut))
 def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
     """One participant with its profile."""
-    about = seen.participant(code), seen.decisions(code), seen.poses()  # all that a decision on it may rest on
-    version = context.store.etag(context.clock, f"/v1/participants/{code}", *about)
-    response.headers["ETag"] = version  # read first: it is not newer than what is told
-    return find(context, code).as_dict()
+    return tagged(response, find(context, code))
+
+
+def tagged(response: Response, row: Participant) -> dict[str, Any]:
+    """Return a participant's document, with its version as `ETag`."""
+    response.headers["ETag"] = f'"{row.version}"'
+    return row.as_dict()
 
 
 @router.put("/{code}/profile", **describe_answer(ChangedOut))
@@ -194,6 +192,7 @@ async def set_profile(
     context: Ctx,
     who: Tester,
     code: str,
+    tags: ParticipantVersion,
     body: ProfileIn,
     response: Response,
     void_calibration: MayVoid = False,
@@ -205,9 +204,8 @@ async def set_profile(
     A limit wider than at the calibration voids it: 409, unless `void_calibration` or `confirm`. `meanwhile` says what
     it means for a test that runs, or a calibration that is open.
     """
-    row, place = await change_profile(context, code, body.sent(), who.name, void_calibration, confirm, ask)
-    response.headers["ETag"] = place.etag(f"/v1/participants/{code}")
-    return {**row.as_dict(), "meanwhile": meanwhile(context, code)}
+    row = await change_profile(context, code, body.sent(), who.name, void_calibration, confirm, ask, tags)
+    return {**tagged(response, row), "meanwhile": meanwhile(context, code)}
 
 
 @router.get("/{code}/tests", **describe_answer(list[TestOut]))
@@ -231,8 +229,9 @@ def site_in(body: MuscleIn) -> Site:
 
 @under_limits_lock
 def change_site(
-    context: Context, code: str, body: MuscleIn, by: str, voids: bool = False, confirm: str = "", ask: bool = False
-) -> Participant:
+    context: Context, code: str, body: MuscleIn, by: str, voids: bool = False, confirm: str = "", ask: bool = False,
+    tags: Tags | None = None,
+) -> Participant:  # fmt: skip
     """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
     Raises ApiError: 404 no such participant; 409 a test or calibration of it is under way, or the calibration would be
@@ -242,7 +241,7 @@ def change_site(
     now, has_model = context.clock.utc(), ask and context.versions.approved(code) is not None
     with context.store.write() as session:
         row = within(session, code)
-        seen.check(session, seen.participant(code))
+        locking.check(session, row, tags)
         lost, here = loses_calibration(row, body), site_of(row)
         before, after = in_words(here), in_words(site_in(body))
         warnings = []
@@ -258,7 +257,7 @@ def change_site(
             if lost:
                 row.profile = {**row.profile, **dict.fromkeys(profiles.FOUND)}
             row.side, row.muscle, row.placement = site_in(body)
-            audit.write(session, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
+            locking.write(session, row, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
     return row
 
 
@@ -267,7 +266,9 @@ async def set_muscle(
     context: Ctx,
     who: Tester,
     code: str,
+    tags: ParticipantVersion,
     body: MuscleIn,
+    response: Response,
     void_calibration: MayVoid = False,
     confirm: Confirm = "",
     ask: Ask = False,
@@ -277,7 +278,8 @@ async def set_muscle(
     A model belongs to the site at which it was measured: at another one there is no approved model, and no key of a
     controller, until it has its own. Tests keep the site that they were begun with.
     """
-    return (await change_site(context, code, body, who.name, void_calibration, confirm, ask)).as_dict()
+    row = await change_site(context, code, body, who.name, void_calibration, confirm, ask, tags)
+    return tagged(response, row)
 
 
 def refuse_busy(context: Context, code: str) -> None:
@@ -293,39 +295,40 @@ def refuse_busy(context: Context, code: str) -> None:
 
 
 @under_limits_lock
-def put_archived(context: Context, code: str, archived: bool, by: str) -> Participant:
+def put_archived(context: Context, code: str, archived: bool, by: str, tags: Tags | None = None) -> Participant:
     """Put a participant into the archive, or take it out; doing it again changes nothing. Raises as `change_site`."""
     if archived:
         refuse_busy(context, code)
     now = context.clock.utc()
     with context.store.write() as session:
         row = within(session, code)
-        seen.check(session, seen.participant(code))
+        locking.check(session, row, tags)
         if archived != (row.archived_utc is not None):
             row.archived_utc = now if archived else None
-            audit.write(session, now, by, "archive" if archived else "unarchive", code)
+            locking.write(session, row, now, by, "archive" if archived else "unarchive", code)
     return row
 
 
 @router.post("/{code}/archive", **describe_answer(ParticipantOut))
-async def archive(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
+async def archive(context: Ctx, who: Tester, code: str, tags: ParticipantVersion, response: Response) -> dict[str, Any]:
     """Put it into the archive: it is listed no more by default, and no test of it starts."""
-    return (await put_archived(context, code, True, who.name)).as_dict()
+    return tagged(response, await put_archived(context, code, True, who.name, tags))
 
 
 @router.post("/{code}/unarchive", **describe_answer(ParticipantOut))
-async def unarchive(context: Ctx, who: Tester, code: str) -> dict[str, Any]:
+async def unarchive(
+    context: Ctx, who: Tester, code: str, tags: ParticipantVersion, response: Response
+) -> dict[str, Any]:
     """Take it out of the archive."""
-    return (await put_archived(context, code, False, who.name)).as_dict()
+    return tagged(response, await put_archived(context, code, False, who.name, tags))
 
 
 notes_router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)
 
 
 @notes_router.get("", **describe_answer(list[NoteOut]))
-def list_notes(context: Ctx, _who: Tester, code: str, response: Response) -> list[dict[str, Any]]:
+def list_notes(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
     """A participant's notes, newest first, the struck ones among them."""
-    response.headers["ETag"] = context.store.etag(context.clock, f"/v1/participants/{code}/notes", notes.about(code))
     find(context, code)
     return [note.as_dict() for note in context.notes.participant_notes(code)]
 

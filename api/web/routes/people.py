@@ -17,9 +17,21 @@ from stimrig.api.sessions import controllers
 from stimrig.api.sessions.controllers import KeyFor
 from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import TokenIn
-from stimrig.api.store import audit, seen
+from stimrig.api.store import audit, locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import AuditEntry, Token
-from stimrig.api.web.dependencies import PROBLEM, Administrator, Anyone, Approver, Context, Ctx, EvenLocked, Tester
+from stimrig.api.web.dependencies import (
+    PROBLEM,
+    Administrator,
+    Anyone,
+    Approver,
+    Context,
+    Ctx,
+    EvenLocked,
+    ParticipantVersion,
+    Tester,
+    UserVersion,
+)
 from stimrig.api.web.guards import local, same_origin, set_cookie
 from stimrig.api.web.openapi import TOO_MANY
 from stimrig.api.web.responses.base import describe_answer
@@ -85,21 +97,22 @@ async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, 
 
 
 @router.get("/users", **describe_answer(list[ListedUser]))
-def list_users(context: Ctx, _who: Administrator, response: Response) -> list[dict[str, Any]]:
-    """All users."""
-    response.headers["ETag"] = context.store.etag(context.clock, "/v1/users", seen.accounts())
+def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
+    """All users; a new password sends the person's `version` as `If-Match`."""
     return context.people.documents()
 
 
 @router.put("/users/{name}/password", status_code=204)
-async def set_password(context: Ctx, who: Administrator, name: str, body: PasswordIn) -> Response:
+async def set_password(context: Ctx, who: Administrator, name: str, tags: UserVersion, body: PasswordIn) -> Response:
     """A new password; the person's sessions end. One that changes its own goes on under the cookie of the answer."""
-    return await renew_password(context, who, name, body.password, Response(status_code=204))
+    return await renew_password(context, who, name, body.password, Response(status_code=204), tags)
 
 
-async def renew_password(context: Context, who: Principal, name: str, password: str, answer: Response) -> Response:
+async def renew_password(
+    context: Context, who: Principal, name: str, password: str, answer: Response, tags: Tags | None = None
+) -> Response:
     """Change it; the answer carries the cookie of the session that made the change, where it is the person's own."""
-    cookie = await context.people.change_password(name, password, who)
+    cookie = await context.people.change_password(name, password, who, tags)
     if cookie is not None:
         set_cookie(context, answer, cookie)
     return answer
@@ -192,13 +205,16 @@ def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, A
 
 
 @router.post("/participants/{code}/keys", status_code=201, **describe_answer(KeyOut, 201, "made"))
-def participant_key(context: Ctx, who: Approver, code: str, body: KeyFor) -> dict[str, Any]:
+def participant_key(
+    context: Ctx, who: Approver, code: str, tags: ParticipantVersion, body: KeyFor, response: Response
+) -> dict[str, Any]:
     """A key with which a controller plays trials of one participant until the end of the day, within a plan.
 
     Who makes it holds `run-test`, `read-live` and `read-model`, too, and answers for what it plays. Its text is shown
     this once. `DELETE /v1/participants/{code}/keys/{id}` revokes it.
     """
-    text, row = key_of(context, who, code, body)
+    text, row, version = key_of(context, who, code, body, tags)
+    response.headers["ETag"] = f'"{version}"'
     told = {name: getattr(row, name) for name in ("name", "prefix", "scopes", "expires_utc", "participant", "plan")}
     return {"key": text, "id": row.hash[:16], **told}
 
@@ -210,17 +226,20 @@ def revoke_participant_key(context: Ctx, who: Tester, code: str, key_id: str) ->
         raise NotFoundError("key", key_id, f"The page of {code} lists its keys.")
 
 
-def key_of(context: Context, who: Principal, code: str, body: KeyFor) -> tuple[str, Token]:
-    """The text and the row of a new key, for REST and page.
+def key_of(
+    context: Context, who: Principal, code: str, body: KeyFor, tags: Tags | None = None
+) -> tuple[str, Token, int]:
+    """Make a key: its text, its row, and the participant's new version.
 
-    Raises ApiError: 403 who makes it lacks a scope; 409 archived, or changed since it was seen; 422 as `plan_within`.
+    Raises ApiError: 403 who makes it lacks a scope; 409 archived; 412 changed since it was seen; 422 as `plan_within`.
     """
     row = participants.find(context, code)
     controllers.refuse_maker_without(who)
     refuse_archived(row)
-    context.store.refuse_changed(seen.participant(code), seen.decisions(code))
+    with context.store.read() as session:  # first: then the plan is wider for no other reason
+        locking.check(session, participants.within(session, code), tags)
     plan = controllers.plan_within(body, row)
-    return controllers.make_key(context.auth, body.name, code, plan, who.name, who.token_hash)
+    return controllers.make_key(context.auth, body.name, code, plan, who.name, who.token_hash, tags)
 
 
 token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)

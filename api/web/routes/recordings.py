@@ -18,9 +18,10 @@ from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import carried_structure
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Principal, Scope
-from stimrig.api.store import audit, seen, uploads
-from stimrig.api.store.tables import Model, Participant, Recording
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester
+from stimrig.api.store import audit, locking, uploads
+from stimrig.api.store.locking import Tags
+from stimrig.api.store.tables import Model, Recording
+from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, ParticipantVersion, Tester
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import UploadOut
@@ -89,6 +90,7 @@ async def upload(
     context: Ctx,
     who: Tester,
     code: str,
+    tags: ParticipantVersion,
     request: Request,
     response: Response,
     columns: Annotated[list[str], Query(alias="map", max_length=MOST_COLUMNS)] = [],  # noqa: B006
@@ -104,15 +106,16 @@ async def upload(
     data = await request.body()  # `stimrig.api.web.middleware` bounds it
     if not data:
         raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
-    row, model, warnings = await take_in(context, code, data, who, columns, of)
+    row, model, warnings = await take_in(context, code, data, who, columns, of, tags)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
     return {"recording_id": row.id, "model": version, "warnings": warnings}
 
 
 async def take_in(
-    context: Context, code: str, data: bytes, who: Principal, columns: Sequence[str] = (), of: str = ""
-) -> tuple[Recording, Model, list[str]]:
+    context: Context, code: str, data: bytes, who: Principal, columns: Sequence[str] = (), of: str = "",
+    tags: Tags | None = None,
+) -> tuple[Recording, Model, list[str]]:  # fmt: skip
     """Keep a recording of another tool and identify a model from it; what was assumed, and left out of its structure.
 
     Where `columns` are mapped, what is kept is the record as a CSV file of ours, with the SHA-256 of what was sent.
@@ -130,7 +133,7 @@ async def take_in(
         part.unlink(missing_ok=True)
         raise
     warnings = [note for note in (*assumed, *found["notes"], warning) if note]
-    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, who.name, warnings, of))
+    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, who.name, warnings, of, tags))
     plain = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, who.name)
     return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), warnings
 
@@ -198,17 +201,16 @@ def _write(context: Context, data: bytes, suffix: str) -> Path:
 
 
 def _store(
-    context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str], of: str
-) -> Recording:  # fmt: skip
+    context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str], of: str, tags: Tags | None
+) -> Recording:
     now = context.clock.utc()
     row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
     row.file_sha256 = hashlib.sha256(data).hexdigest()
     row.warnings = warnings
     said = {"participant": code, "sha256": row.file_sha256, **({"of": of} if of else {})}
     with uploads.taken_in(path), context.store.write() as session:
-        seen.check(session, seen.participant(code))
-        participant = session.get(Participant, code)
-        assert participant is not None
+        participant = participants.within(session, code)
+        locking.check(session, participant, tags)
         row.site = list(site_of(participant))
         session.add(row)
         session.flush()

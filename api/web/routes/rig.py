@@ -12,13 +12,24 @@ from fastapi.responses import JSONResponse, RedirectResponse, Response
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions.requests import StopIn, TestIn
 from stimrig.api.sessions.stops import StopResult
-from stimrig.api.store import seen
-from stimrig.api.web.dependencies import PROBLEM, Anyone, Context, Ctx, LiveReader, MayStop, Rearmer, Tester
+from stimrig.api.store import locking
+from stimrig.api.store.locking import Tags
+from stimrig.api.web.dependencies import (
+    PROBLEM,
+    Anyone,
+    Context,
+    Ctx,
+    LatchVersion,
+    LiveReader,
+    MayStop,
+    Rearmer,
+    Tester,
+)
 from stimrig.api.web.guards import Press
 from stimrig.api.web.middleware import wants_html
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
-from stimrig.rig.messages import StopEvidence
+from stimrig.rig.messages import Status, StopEvidence
 from stimrig.rig.requests import RearmRequest, SequencesRequest
 
 router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
@@ -82,26 +93,33 @@ async def stop_on_page(request: Request, context: Context, press: Press) -> Resp
 
 
 @router.post("/rearm", **describe_answer(RigOut))
-async def rearm(context: Ctx, who: Rearmer) -> dict[str, Any]:
+async def rearm(context: Ctx, who: Rearmer, tags: LatchVersion, response: Response) -> dict[str, Any]:
     """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
 
     A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
     """
-    latch = seen.sent.get()
-    shown, note = context.rig.latches.get(latch), partial(context.store.note, context.clock, who.name)
-    await asyncio.to_thread(note, "re-arm", "rig", reason=shown and shown["detail"]["reason"])
+    status = await rearm_rig(context, who.name, tags)
+    response.headers["ETag"] = f'"{status.latch}"'
+    return rig_state(context)
+
+
+async def rearm_rig(context: Context, by: str, tags: Tags | None = None) -> Status:
+    """Re-arm the rig after the stop that was shown. Raises ApiError: 412 it was stopped again since."""
+    (latch, *_), latches = locking.tags_of(tags), context.rig.latches
+    _, shown = latches.get(latch, ("", ""))
+    note = partial(context.store.note, context.clock, by)
+    await asyncio.to_thread(note, "re-arm", "rig", reason=shown)
     try:
-        await context.rig.ask(RearmRequest(by=who.name, latch=latch))
+        await context.rig.ask(RearmRequest(by=by, latch=latch))
     except ApiError as error:
         await asyncio.to_thread(note, "re-arm refused", "rig", why=error.detail)
         if error.code != "rig-latch-changed":
             raise
         status = await context.rig.fresh_status()
-        told = seen.ChangedError([{"seen": shown, "now": context.rig.latches[status.latch]}], None, error.detail)
-        told.extra["latch"] = status.latch
-        raise told from error
-    await context.rig.fresh_status()
-    return rig_state(context)
+        at_utc, reason = latches[status.latch]
+        change = {"who": "", "at_utc": at_utc, "action": "latched", "subject": "rig", "old": shown, "new": reason}
+        raise locking.ChangedError(status.latch, [change], error.detail) from error
+    return await context.rig.fresh_status()
 
 
 @router.post("/preview", **describe_answer(PreviewOut))

@@ -16,9 +16,19 @@ from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.playing import other_than
 from stimrig.api.sessions.requests import RanByIn, TestIn
-from stimrig.api.store import audit, seen
+from stimrig.api.store import locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Test
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, LiveReader, Tester, context_of
+from stimrig.api.web.dependencies import (
+    PROBLEM,
+    Context,
+    Ctx,
+    LiveReader,
+    ParticipantVersion,
+    Tester,
+    TestVersion,
+    context_of,
+)
 from stimrig.api.web.guards import refuse_outside, same_origin
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import TestOut
@@ -29,7 +39,6 @@ LOOK_S = 1.0
 """How often a live channel looks whether its session or token is still valid."""
 GOODBYE_S = 2.0
 """So long it waits for a client that reads nothing to hear why it is closed."""
-RAN_BY = "set who ran it"
 LISTED = "GET /v1/tests lists them."
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
 
@@ -40,9 +49,14 @@ def find(context: Context, test_id: str) -> Test:
 
 
 @router.post("", status_code=202, **describe_answer(TestOut, 202, "begun; see `Location`"))
-async def start_test(context: Ctx, who: Tester, body: TestIn, response: Response) -> dict[str, Any]:
-    """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder."""
-    row = await controllers.start(context.runner, context.keys_lock, context.store, who, body)
+async def start_test(
+    context: Ctx, who: Tester, tags: ParticipantVersion, body: TestIn, response: Response
+) -> dict[str, Any]:
+    """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder.
+
+    A controller's key, which reads no participant, sends the `ETag` of `GET /v1/participants/{code}/model`.
+    """
+    row = await controllers.start(context.runner, context.keys_lock, context.store, who, body, tags)
     response.headers["Location"] = f"/v1/tests/{row.id}"
     return context.runner.document(row)
 
@@ -57,21 +71,29 @@ def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str
 @router.get("/{test_id}", **describe_answer(TestOut))
 def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
-    response.headers["ETag"] = context.store.etag(
-        context.clock, f"/v1/tests/{test_id}", seen.actions_on(test_id, RAN_BY)
-    )
-    return context.runner.document(find(context, test_id))
+    row = find(context, test_id)
+    response.headers["ETag"] = f'"{row.version}"'
+    return context.runner.document(row)
 
 
 @router.put("/{test_id}/ran-by", **describe_answer(TestOut))
-def set_ran_by(context: Ctx, who: Tester, test_id: str, body: RanByIn) -> dict[str, Any]:
+def set_ran_by(
+    context: Ctx, who: Tester, test_id: str, tags: TestVersion, body: RanByIn, response: Response
+) -> dict[str, Any]:
     """Say who ran a test at the rig, where that was not who asked for it."""
+    row = change_ran_by(context, test_id, body.ran_by, who.name, tags)
+    response.headers["ETag"] = f'"{row.version}"'
+    return context.runner.document(row)
+
+
+def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tags: Tags | None = None) -> Test:
+    """Note who ran a test at the rig. Raises ApiError: 404 no such test; 412 it was said meanwhile."""
     with context.store.write() as session:
         row = require_found(session.get(Test, test_id), "test", test_id, LISTED)
-        seen.check(session, seen.actions_on(test_id, RAN_BY))
-        row.ran_by = other_than(row.requested_by, body.ran_by)
-        audit.write(session, context.clock.utc(), who.name, RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
-    return context.runner.document(row)
+        locking.check(session, row, tags)
+        row.ran_by, now = other_than(row.requested_by, name), context.clock.utc()
+        locking.write(session, row, now, by, locking.RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
+    return row
 
 
 @router.post("/{test_id}/keep-plain", **describe_answer(TestOut))

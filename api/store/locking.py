@@ -1,0 +1,190 @@
+"""Optimistic locking: a decision is refused (412) once what it was made on has another version.
+
+A row's version is the number of the audit entry of the last decision about it: the entry's place in the trail and 24
+bits of its hash. So a database that was restored from a backup takes no version that was shown before it. Clients send
+the version back as `If-Match` (RFC 9110, section 13.1.1). `check` runs in the decision's own transaction.
+"""
+
+from __future__ import annotations
+
+import re
+from contextvars import ContextVar
+from typing import Any
+
+from sqlalchemy import ColumnElement, and_, or_, select, update
+from sqlalchemy.orm import Session
+
+from stimrig.api.errors import ApiError
+from stimrig.api.store import audit
+from stimrig.api.store.tables import AuditEntry, Model, Participant, Test, User
+
+Tags = tuple[str, ...]
+"""Entity tags of a request's `If-Match`, without their quotes."""
+Versioned = Participant | User | Test
+HASH_DIGITS = 6
+LIMITS = ("create participant", "set profile", "finish calibration")
+SITE, ARCHIVE = ("create participant", "set muscle"), ("create participant", "archive", "unarchive")
+SETTINGS = (*LIMITS, "set muscle", "archive", "unarchive")
+MODELS = ("approve", "reject")
+POSES = ("pose of the angle sensor", "calibrate the angle sensor")
+RAN_BY = "set who ran it"
+GROUPS = (LIMITS, SITE, ARCHIVE, MODELS, POSES)
+"""Actions that set the same thing."""
+UNITS = {"_ma": "mA", "_us": "µs", "_nm": "N·m", "_rad": "rad"}
+MOST_CHANGES = 20
+"""Changes that a refusal lists, the newest."""
+form_tags: ContextVar[Tags | None] = ContextVar("form_tags", default=None)
+"""Versions that a page's form has sent."""
+
+
+def number_of(entry: AuditEntry) -> int:
+    """Return the version that an audit entry stands for."""
+    return entry.seq << 4 * HASH_DIGITS | int(entry.hash[:HASH_DIGITS], 16)
+
+
+def write(session: Session, row: Versioned, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> None:
+    """Write a decision's audit entry and make it the version of the row that was decided on."""
+    row.version = number_of(audit.write(session, at_utc, who, action, subject, **detail))
+
+
+def write_pose(session: Session, at_utc: str, who: str, action: str, **detail: Any) -> None:
+    """Write an entry about the angle sensor. Ranges of angles rest on it: all participants get its version."""
+    version = number_of(audit.write(session, at_utc, who, action, "rig", **detail))
+    session.execute(update(Participant).values(version=version))
+
+
+def pose_version(session: Session) -> int:
+    """Return the version of the angle sensor's calibration; 0 where there is none."""
+    entry = session.scalars(select(AuditEntry).where(_poses()).order_by(AuditEntry.seq.desc()).limit(1)).first()
+    return 0 if entry is None else number_of(entry)
+
+
+def check_poses(session: Session, tags: Tags | None) -> None:
+    """The same as `check` for the angle sensor."""
+    check_number(session, pose_version(session), tags, _poses())
+
+
+def check(session: Session, row: Versioned, tags: Tags | None) -> int:
+    """Return the row's version; without tags nothing is checked.
+
+    Raises ChangedError: it is not among the tags; with each change since: who, when, what it was and what it is.
+    """
+    return check_number(session, row.version, tags, about(row))
+
+
+def check_number(session: Session, version: int, tags: Tags | None, entries: ColumnElement[bool]) -> int:
+    """The same for a version that is no row's; `entries`: those of the trail that change it."""
+    tags = form_tags.get() if tags is None else tags
+    if tags is not None and str(version) not in tags:
+        if not tags:
+            raise missing("the document")
+        numbers = [int(tag) for tag in tags if re.fullmatch(r"\d{1,18}", tag, re.ASCII)]
+        raise ChangedError(version, since(session, max(numbers, default=-1), entries))
+    return version
+
+
+def since(session: Session, version: int, entries: ColumnElement[bool]) -> list[dict[str, Any]]:
+    """Return the changes after a version, the newest last; none where this trail does not have it."""
+    if version and not is_known(session, version):
+        return []
+    place = version >> 4 * HASH_DIGITS
+    later = select(AuditEntry).where(AuditEntry.seq > place, entries).order_by(AuditEntry.seq)
+    return [_change(session, place, entry) for entry in session.scalars(later)]
+
+
+def is_known(session: Session, version: int) -> bool:
+    """Return whether this trail has the version; one that was shown by another database is not known."""
+    entry = session.get(AuditEntry, version >> 4 * HASH_DIGITS)
+    return entry is not None and number_of(entry) == version
+
+
+def tags_of(tags: Tags | None) -> Tags:
+    """Return the tags of a request, or of the page's form. Raises ApiError (428) where there is none."""
+    tags = form_tags.get() if tags is None else tags
+    if not tags:
+        raise missing("the document")
+    return tags
+
+
+def settings_of(code: str) -> ColumnElement[bool]:
+    """Return the condition for entries about a participant's limits, site and archive."""
+    return and_(AuditEntry.subject == code, AuditEntry.action.in_(SETTINGS))
+
+
+def about(row: Versioned) -> ColumnElement[bool]:
+    """Return the condition for entries of decisions about a row."""
+    if isinstance(row, User):
+        return and_(AuditEntry.subject == row.name, AuditEntry.action.in_(audit.ACCOUNTS))
+    if isinstance(row, Test):
+        return and_(AuditEntry.subject == row.id, AuditEntry.action == RAN_BY)
+    of_participant = AuditEntry.detail["participant"].as_string() == row.code
+    decided = and_(of_participant, AuditEntry.action.in_((*MODELS, "issue token")))
+    return or_(settings_of(row.code), decided, _poses())
+
+
+def _poses() -> ColumnElement[bool]:
+    return and_(AuditEntry.subject == "rig", AuditEntry.action.in_(POSES))
+
+
+def _change(session: Session, place: int, entry: AuditEntry) -> dict[str, Any]:
+    alike = next((group for group in GROUPS if entry.action in group), (entry.action,))
+    earlier = select(AuditEntry).where(
+        AuditEntry.seq <= place, AuditEntry.subject == entry.subject, AuditEntry.action.in_(alike)
+    )
+    before = session.scalars(earlier.order_by(AuditEntry.seq.desc()).limit(1)).first()
+    old, new = _values(before, alike), _values(entry, alike)
+    changed = [name for name in new | old if new.get(name) != old.get(name)]
+    told = {name: getattr(entry, name) for name in ("who", "at_utc", "action", "subject")}
+    return {**told, "old": _words(old, changed), "new": _words(new, changed)}
+
+
+def _values(entry: AuditEntry | None, alike: tuple[str, ...]) -> dict[str, Any]:
+    if entry is None:
+        return {}
+    if alike is LIMITS:
+        return entry.detail.get("profile") or {}
+    if alike is SITE:
+        return {name: entry.detail.get(name) for name in ("side", "muscle", "placement")}
+    if alike is ARCHIVE:
+        return {"": "in the archive" if entry.action == "archive" else "not in the archive"}
+    return {"": entry.detail.get("ran_by") or entry.action}
+
+
+def _words(values: dict[str, Any], names: list[str]) -> str:
+    """Say values with their units: "current 5 mA, max pulse width 200 µs"."""
+    words = []
+    for name in names:
+        unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
+        label = name.removesuffix(next((ending for ending in UNITS if name.endswith(ending)), "")).replace("_", " ")
+        if (value := values.get(name)) is not None:
+            words.append(f"{label} {value} {unit}".strip())
+    return ", ".join(words)
+
+
+class ChangedError(ApiError):
+    """412: what was decided on has another version now; the answer's `ETag` has it."""
+
+    def __init__(self, version: int | str, changes: list[dict[str, Any]], detail: str = "") -> None:
+        changes = changes[-MOST_CHANGES:]
+        last = changes[-1] if changes else None
+        what = f"{last['who']}: {last['action']} {last['subject']}, {last['at_utc']}. " if last else ""
+        detail = detail or f"{what}Nothing was done. Look at what is there now; what you decide then is a new decision."
+        super().__init__(412, "changed-meanwhile", "This was changed since you saw it", detail, changes=changes)
+        self.headers["ETag"] = f'"{version}"'
+
+
+def missing(document: str) -> ApiError:
+    """428: the request does not say which version it was decided on (RFC 6585, section 3)."""
+    detail = f"Send the ETag of GET {document} as If-Match, as you last saw it. Nothing was done."
+    return ApiError(428, "version-missing", "Say what this was decided on", detail)
+
+
+def shown(session: Session, path: str, names: dict[str, Any]) -> int:
+    """Return the version of what the page at a path shows; 0 where there is none."""
+    if path == "/rig/angle":
+        return pose_version(session)
+    code = names.get("code")
+    if (model_id := names.get("model_id")) is not None:
+        code = session.scalar(select(Model.participant).where(Model.id == model_id))
+    row = session.get(Test, names["test_id"]) if "test_id" in names else session.get(Participant, code or "")
+    return row.version if row else 0
