@@ -1,6 +1,6 @@
 """What a cohort costs: throughput of one worker and of two, memory over the records, cost of a record, and a plan.
 
-    python -m bench.cohort --records 10000 [--pairs 200] [--costs 12] [--renew 500] [--json FILE]
+    python -m bench.cohort --records 10000 [--pairs 200] [--costs 12] [--json FILE]
 
 `--records` short recordings (23 s at 100 samples/s) of simulated muscles are fitted by two workers: the memory of the
 workers and of their computing processes over the records. `--pairs` of them are fitted, as many as the rig seals them
@@ -24,12 +24,12 @@ import psutil
 import pyarrow.parquet as pq
 
 from bench.common import keep, parser, table, written_by
-from stimrig.api.cohort.cluster import Workers, connected
-from stimrig.api.cohort.computing import Bounds
+from stimrig.api.cohort.cluster import connect
 from stimrig.api.cohort.results import Results
-from stimrig.api.cohort.run import Run
-from stimrig.api.cohort.sources import sources_of
-from stimrig.api.cohort.tasks import Task, checked
+from stimrig.api.cohort.run import run_records
+from stimrig.api.cohort.sources import list_records
+from stimrig.api.cohort.task import Task
+from stimrig.api.cohort.worker import RECORDS_PER_PROCESS, Bounds
 from stimrig.api.version import software_version
 from tests.harness.cohort_records import Session, write
 
@@ -81,42 +81,44 @@ def make(folder: Path, count: int, **more: Any) -> Path:
     return folder
 
 
-class Watch:
-    """Memory of the run's processes: workers of Dask and who asked, MB, sampled as rows come."""
+class Watched(Results):
+    """Results that sample the memory of the run's processes, MB, as rows come."""
 
-    def __init__(self, every: int) -> None:
-        self.every, self.samples = max(1, every), []
+    def __init__(self, *arguments: Any, every: int = 0) -> None:
+        super().__init__(*arguments)
+        self.every, self.rows, self.samples = every, 0, list[dict[str, float]]()
 
-    def __call__(self, tally: Any) -> None:
-        """Sample at some of the rows."""
-        if tally.now % self.every == 0:
-            own = psutil.Process()
-            workers = [child for child in own.children() if "spawn_main" in " ".join(child.cmdline())]
+    def add(self, row: dict[str, Any]) -> str:
+        """Add a row, and sample at some of them."""
+        self.rows += 1
+        if self.every and self.rows % self.every == 0:
+            run = psutil.Process()
+            workers = [child for child in run.children() if "spawn_main" in " ".join(child.cmdline())]
             sizes = [child.memory_info().rss / MB for child in workers]
-            self.samples.append({"rows": tally.now, "client_mb": own.memory_info().rss / MB, "worker_mb": max(sizes)})
+            self.samples.append({"client_mb": run.memory_info().rss / MB, "worker_mb": max(sizes)})
+        return super().add(row)
 
 
 def run(
-    folder: Path, output: Path, verb: str, workers: int, renew: int, watch: Any = None, warm: Path | None = None
-) -> tuple[list[dict[str, Any]], float]:
-    """The rows of a run, and its time without starting the workers, s."""
-    bounds = Bounds(600.0, 10**9, renew)
-    with connected(Workers(count=workers)) as client:
+    folder: Path, output: Path, verb: str, workers: int, *, every: int = 0, warm: Path | None = None
+) -> tuple[list[dict[str, Any]], float, list[dict[str, float]]]:
+    """The rows of a run, its time without starting the workers, s, and samples of memory."""
+    with connect(workers=workers) as client:
         if warm is not None:
-            once(client, warm, output.with_name(f"warm-{output.name}"), verb, bounds)
-        took_s = once(client, folder, output, verb, bounds, watch)
-    return pq.read_table(output).to_pylist(), took_s
+            once(client, warm, output.with_name(f"warm-{output.name}"), verb)
+        took_s, samples = once(client, folder, output, verb, every)
+    return pq.read_table(output).to_pylist(), took_s, samples
 
 
-def once(client: Any, folder: Path, output: Path, verb: str, bounds: Bounds, watch: Any = None) -> float:
-    """One run over a folder with workers that are there; its time, s."""
-    task = checked(Task(verb, software=software_version()))
-    with Results(output, task) as results:
+def once(client: Any, folder: Path, output: Path, verb: str, every: int = 0) -> tuple[float, list[dict[str, float]]]:
+    """One run over a folder with workers that are there; its time, s, and samples of memory."""
+    task = Task(verb, software=software_version())
+    with Watched(output, task, every=every) as results:
         began_s = time.perf_counter()
-        Run(client, sources_of([str(folder)]), task, bounds, results, watch or (lambda _tally: None)).go(keep=True)
+        run_records(client, lambda: list_records([str(folder)]), task, Bounds(), results)
         took_s = time.perf_counter() - began_s
         results.join()
-    return took_s
+    return took_s, results.samples
 
 
 def throughput(folder: Path, place: Path, verb: str, count: int, **more: Any) -> dict[str, Any]:
@@ -127,25 +129,25 @@ def throughput(folder: Path, place: Path, verb: str, count: int, **more: Any) ->
     for turn in range(2):
         for workers in (1, 2):
             output = place / f"{here.name}-{workers}-{turn}.parquet"
-            paces[workers].append(count / run(given, output, verb, workers, 10**6, warm=warm)[1])
+            paces[workers].append(count / run(given, output, verb, workers, warm=warm)[1])
     ratio = statistics.median(paces[2]) / statistics.median(paces[1])
     return {"records": count, "one_per_s": paces[1], "two_per_s": paces[2], "ratio": ratio}
 
 
-def memory(folder: Path, place: Path, count: int, renew: int) -> dict[str, Any]:
+def memory(folder: Path, place: Path, count: int) -> dict[str, Any]:
     """Memory over many records with two workers: of the first tenth and of the last."""
-    watch = Watch(count // 100)
-    rows, took_s = run(make(folder / "many", count), place / "many.parquet", "fit", 2, renew, watch)
+    many = make(folder / "many", count)
+    rows, took_s, samples = run(many, place / "many.parquet", "fit", 2, every=max(1, count // 100))
     rows.sort(key=lambda row: row["computed_utc"])
     sizes = [row["worker_memory_mb"] for row in rows]
     tenth = max(1, count // 10)
-    samples = watch.samples[1:]
+    samples = samples[1:]
     return {
         "records": count,
         "ok": sum(row["status"] == "ok" for row in rows),
         "took_s": took_s,
         "records_per_s": count / took_s,
-        "renewed_after": renew,
+        "renewed_after": RECORDS_PER_PROCESS,
         "computing_mb": [statistics.fmean(sizes[:tenth]), statistics.fmean(sizes[-tenth:]), max(sizes)],
         "worker_mb": ends(samples, "worker_mb"),
         "client_mb": ends(samples, "client_mb"),
@@ -164,7 +166,7 @@ def costs(folder: Path, place: Path, count: int) -> dict[str, Any]:
     full = make(folder / "full", count, **SEALED)
     found = {}
     for verb in ("fit", "diagnose"):
-        rows = run(full, place / f"{verb}.parquet", verb, 1, 10**6)[0]
+        rows = run(full, place / f"{verb}.parquet", verb, 1)[0]
         rows = [row for row in rows if row["status"] == "ok"]
         rows.sort(key=lambda row: row["computed_utc"])
         rows = rows[1:]  # the first one loads what was compiled
@@ -234,7 +236,6 @@ def main() -> None:
     made.add_argument("--records", type=int, default=10_000, help="of the run over which memory is looked at")
     made.add_argument("--pairs", type=int, default=200, help="of each run that compares one worker with two")
     made.add_argument("--costs", type=int, default=12, help="recordings as sealed, fitted and diagnosed")
-    made.add_argument("--renew", type=int, default=500, help="records after which a computing process is renewed")
     made.add_argument("--json", type=Path, help="write the figures here, too")
     options = made.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-bench-cohort-") as scratch:
@@ -247,7 +248,7 @@ def main() -> None:
             "fit, short": throughput(folder, place, "fit", options.pairs),
             "diagnose, short": throughput(folder, place, "diagnose", max(4, options.pairs // 10)),
         }
-        found["memory"] = memory(folder, place, options.records, options.renew)
+        found["memory"] = memory(folder, place, options.records)
     found["plan"] = {verb: plan(cost) for verb, cost in found["costs"].items()}
     found["load_after"] = os.getloadavg()
     command = f"python -m bench.cohort --records {options.records} --pairs {options.pairs} --costs {options.costs}"

@@ -15,9 +15,14 @@ __all__ = ["changed", "diagnose", "figures", "fit", "improve"]
 
 
 def _run(verb: str, data: Sequence[str | Path], output: str | Path, options: dict[str, Any]) -> Report:
-    from stimrig.api.cli.commands.cohort import computed
+    from stimrig.api.cli.commands.cohort import require_extra
+    from stimrig.api.cli.terminal import names
 
-    return Report(f"cohort {verb}", computed(verb, [str(place) for place in data], Path(output), **options))
+    require_extra()
+    from stimrig.api.cohort.run import run_cohort
+
+    options["effects"] = names(options.get("effects"))
+    return Report(f"cohort {verb}", run_cohort(verb, [str(place) for place in data], Path(output), **options))
 
 
 def fit(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
@@ -75,12 +80,12 @@ def changed(old: str | Path, new: str | Path) -> Report:
     new : path
         Results of the later one.
     """
-    from stimrig.api.cli.commands.cohort import need_extra
+    from stimrig.api.cli.commands.cohort import require_extra
 
-    need_extra()
-    from stimrig.api.cohort.changed import compared
+    require_extra()
+    from stimrig.api.cohort.changed import compare_runs
 
-    return Report("cohort changed", compared(Path(old), Path(new)).to_dict())
+    return Report("cohort changed", compare_runs(Path(old), Path(new)))
 
 
 def figures(results: str | Path, html: str | Path) -> Report:
@@ -93,6 +98,6 @@ def figures(results: str | Path, html: str | Path) -> Report:
     html : path
         File to write.
     """
-    from stimrig.api.cli.commands.cohort import drawn
+    from stimrig.api.cli.commands.cohort import draw
 
-    return Report("cohort figures", drawn(Path(results), Path(html)))
+    return Report("cohort figures", draw(Path(results), Path(html)))

@@ -1,4 +1,4 @@
-"""The workers: processes of this machine, or those of a scheduler of Dask that stands elsewhere."""
+"""The workers of a run: processes of this machine, or those of a scheduler of Dask that stands elsewhere."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import signal
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from multiprocessing import resource_tracker
 from typing import Any
 
@@ -19,58 +18,48 @@ from distributed import Client, LocalCluster
 from distributed.comm.core import CommClosedError
 from distributed.security import Security
 
-from stimrig.api.cohort.tasks import SCHEDULER_GONE, CohortError, CutOffError
+from stimrig.api.cohort.errors import SCHEDULER_GONE, CohortError, InterruptedRunError
 from stimrig.api.version import software_version
 
 CONNECT_S = 15.0
-LEAST_MEMORY_BYTES = 256 * 2**20
-WORKER_BYTES = 2**30
-"""What a worker's own process may take: it holds one record's bytes and no more."""
-LOST_WORKERS = 2
-"""A record that so many workers are lost with, and one more, is a row that says so."""
+MIN_MEMORY_BYTES = 256 * 2**20
+SETTINGS = {
+    "distributed.scheduler.allowed-failures": 2,  # of workers that are lost with a record
+    "distributed.comm.timeouts.connect": "10s",
+    "distributed.nanny.pre-spawn-environ": {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1},
+}
 
 
-@dataclass(frozen=True)
-class Workers:
-    """Where the records are computed."""
-
-    scheduler: str = ""  # address of a scheduler; empty: this machine
-    count: int = 2  # processes on this machine
-    memory_bytes: int = 2**30  # what a record may take beyond the libraries
-    wait_s: float = 60.0  # how long to wait for the first worker of a scheduler
-
-
-def memory_of(text: str) -> int:
-    """Bytes of a size such as 1GB or 800MiB. Raises CohortError: it is none, or too small for any fit."""
+def parse_memory(text: str) -> int:
+    """Return the bytes of a size such as 1GB or 800MiB. Raises CohortError: it is none, or too small for a fit."""
     try:
-        found = parse_bytes(text)
+        memory_bytes = parse_bytes(text)
     except (ValueError, TypeError):
         raise CohortError(f"--memory {text}: give a size, as 1GB.") from None
-    if not LEAST_MEMORY_BYTES <= found <= 2**40:
-        raise CohortError(f"--memory {text}: give {LEAST_MEMORY_BYTES // 2**20} MiB or more, as 1GB.")
-    return found
+    if not MIN_MEMORY_BYTES <= memory_bytes <= 2**40:
+        raise CohortError(f"--memory {text}: give {MIN_MEMORY_BYTES // 2**20} MiB or more, as 1GB.")
+    return memory_bytes
 
 
 @contextmanager
-def connected(workers: Workers) -> Iterator[Client]:
-    """A client whose workers are there and have this version; all that was started is ended.
+def connect(scheduler: str = "", workers: int = 2, wait_s: float = 60.0) -> Iterator[Client]:
+    """Give a client whose workers are there and have this version; end all that was started.
 
-    Raises CohortError: no scheduler, no worker, or workers of another version. CutOffError: the scheduler went while it
-    was asked for something.
+    `scheduler`: its address; empty: this many `workers` of this machine; `wait_s`: for the first worker of a scheduler.
+
+    Raises CohortError: no scheduler, no worker, or workers of another version. InterruptedRunError: the scheduler went.
     """
-    quiet()
-    with warnings.catch_warnings():
+    _silence_dask()
+    with warnings.catch_warnings(), config.set(SETTINGS):
         warnings.simplefilter("ignore")
         try:
-            with _remote(workers) if workers.scheduler else _local(workers) as client:
-                if workers.scheduler:
-                    check_versions(client)
+            with _connect_to(scheduler, wait_s) if scheduler else _start_workers(workers) as client:
                 yield client
         except CommClosedError:
-            raise CutOffError(SCHEDULER_GONE) from None
+            raise InterruptedRunError(SCHEDULER_GONE) from None
 
 
-def quiet() -> None:
+def _silence_dask() -> None:
     """Keep Dask's log from the terminal: what matters to the person is said in one line."""
     for name in ("distributed", "tornado", *logging.root.manager.loggerDict):
         if name.partition(".")[0] in ("distributed", "tornado"):
@@ -78,75 +67,60 @@ def quiet() -> None:
 
 
 @contextmanager
-def _local(workers: Workers) -> Iterator[Client]:
-    settings = {
-        "distributed.scheduler.allowed-failures": LOST_WORKERS,
-        "distributed.comm.timeouts.connect": "10s",
-        "distributed.nanny.pre-spawn-environ": {"OPENBLAS_NUM_THREADS": 1, "OMP_NUM_THREADS": 1, "MKL_NUM_THREADS": 1},
-    }
-    with config.set(settings), _without_ctrl_c():
+def _start_workers(count: int) -> Iterator[Client]:
+    # A terminal sends Ctrl-C to every process. The workers must not see it: this process ends them in order.
+    resource_tracker.ensure_running()  # it unblocks the signal in the thread that first needs it
+    unblocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
         cluster = LocalCluster(
-            n_workers=workers.count,
+            n_workers=count,
             threads_per_worker=1,
             processes=True,
             host="127.0.0.1",
-            memory_limit=max(WORKER_BYTES, workers.memory_bytes),
+            memory_limit="1GiB",  # of the worker itself, which holds the bytes of one record
             dashboard_address=None,  # pyright: ignore[reportArgumentType]
             silence_logs=logging.CRITICAL,
             security=Security.temporary(),  # whoever reaches an open scheduler's port runs programs as its user
         )
-    with config.set(settings), cluster, Client(cluster) as client:
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, unblocked)
+    with cluster, Client(cluster) as client:
         yield client
 
 
 @contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """Threads and processes that are started within never see Ctrl-C; here it comes when they are there.
-
-    A terminal sends it to every process. This one ends the others in order; each of them would write a traceback.
-    """
-    resource_tracker.ensure_running()  # it lets Ctrl-C through in the thread that first needs it
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
-
-
-@contextmanager
-def _remote(workers: Workers) -> Iterator[Client]:
-    address = workers.scheduler
+def _connect_to(address: str, wait_s: float) -> Iterator[Client]:
     try:
         client = Client(address, timeout=CONNECT_S, name="stimrig-cohort")
     except (OSError, TimeoutError, ValueError, TypeError, ImportError, RuntimeError) as error:
-        words = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
-        fix = "Is `dask scheduler` running there, with the same version of Dask?"
-        raise CohortError(f"--scheduler {address}: no scheduler answers ({words}). {fix}") from None
-    quiet()  # a client makes loggers of its own
+        reason = " ".join(str(error).split())[:160].rstrip(".") or type(error).__name__
+        remedy = "Is `dask scheduler` running there, with the same version of Dask?"
+        raise CohortError(f"--scheduler {address}: no scheduler answers ({reason}). {remedy}") from None
+    _silence_dask()  # a client makes loggers of its own
     with client:
         try:
-            client.wait_for_workers(1, timeout=workers.wait_s)
+            client.wait_for_workers(1, timeout=wait_s)
         except TimeoutError:
-            fix = "Start some with `dask worker`, or give more time with --wait."
-            raise CohortError(f"--scheduler {address}: no worker within {workers.wait_s:g} s. {fix}") from None
+            remedy = "Start some with `dask worker`, or give more time with --wait."
+            raise CohortError(f"--scheduler {address}: no worker within {wait_s:g} s. {remedy}") from None
+        check_versions(client)
         yield client
 
 
 def check_versions(client: Client) -> None:
-    """Refuse workers whose stimrig or Python is another one. Raises CohortError: names the first such worker."""
-    asked = (("stimrig", software_version(), importlib.metadata.version, ("stimrig",)),
-             ("Python", platform.python_version(), platform.python_version, ()))  # fmt: skip
-    for what, mine, ask, arguments in asked:
-        found: Any = client.run(ask, *arguments, on_error="return")
-        for worker, theirs in found.items():
-            if not isinstance(theirs, str):
-                raise CohortError(f"worker {worker}: no {what} there. Install stimrig[cohort] {software_version()}.")
-            same = theirs == mine if what == "stimrig" else theirs.split(".")[:2] == mine.split(".")[:2]
-            if not same:
-                raise CohortError(f"worker {worker}: {what} {theirs}, here {mine}. Install the same version there.")
+    """Raise CohortError if stimrig or Python of a worker is another version."""
+    for package, ask, arguments, here in (
+        ("stimrig", importlib.metadata.version, ("stimrig",), software_version()),
+        ("Python", _python_version, (), _python_version()),
+    ):
+        versions: Any = client.run(ask, *arguments, on_error="return")
+        for worker, version in versions.items():
+            if not isinstance(version, str):
+                raise CohortError(f"worker {worker}: no {package} there. Install stimrig[cohort] {software_version()}.")
+            if version != here:
+                remedy = "Install the same version there."
+                raise CohortError(f"worker {worker}: {package} {version}, here {here}. {remedy}")
 
 
-def lanes(client: Client) -> int:
-    """Records that are computed at the same time, now: workers may come and go."""
-    threads: Any = client.nthreads()
-    return max(1, sum(threads.values()))
+def _python_version() -> str:
+    return ".".join(platform.python_version_tuple()[:2])

@@ -1,270 +1,246 @@
-"""The figures over a cohort, units on every axis, and their page: one HTML file that works anywhere, offline."""
+"""The page of a cohort: effects by prevalence, parameters over sessions, repeatability, errors.
+
+One HTML file that works offline.
+"""
 
 from __future__ import annotations
 
+import base64
+import io
 import math
+from collections import Counter, defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
+from itertools import cycle
+from pathlib import Path
 from typing import Any
 
-from markupsafe import Markup, escape
+import jinja2
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import binomtest
 
-from stimrig.api.charts.figure import LIGHT
-from stimrig.api.charts.model_charts import COLOURS
-from stimrig.api.charts.plot import LocalFigure
-from stimrig.api.cohort.statistics import PROBABLE, Statistics, wilson
+from stimrig.api.charts.drawing import SETTINGS
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.record import MODEL
+from stimrig.api.cohort.table import read_options, read_rows
 
-LEAST_CASES = 5
+PROBABLE = 0.5
+"""An effect that a diagnosis found missing counts from this probability on."""
+FEW_CASES = 5
 """Of fewer an interval says next to nothing; it is drawn, and said so."""
-MOST_LINES = 20
+MAX_LINES = 20
 """Participants whose lines are drawn: those with the most sessions."""
-MOST_PANELS = 12
-DASHES = ("solid", "dash", "dot", "dashdot")
-UNITS = {"us": "µs", "nm": "N·m", "s": "s"}
-ROW_PX = 26
-
-Figure = dict[str, Any]
+MAX_PARAMETERS = 12
+STYLES = ("-", "--", ":", "-.")
+UNITS = ("_us", "_nm", "_s")
+COLUMNS = ("status", "error_kind", "participant", "day", "begun_utc", "verdict", "effects", "parameters")
 
 
-def prevalence(found: Statistics) -> Figure | None:
-    """Effects by how many have them, with 95 % intervals; None where no effect was found."""
-    of_what, total, counts = found.prevalence()
-    counts = counts[::-1]  # plotly draws from below
-    if not counts:
-        return None
-    shares = [100 * count / total for _, count in counts]
-    ends = [[100 * end for end in wilson(count, total)] for _, count in counts]
-    trace = {
-        "type": "scatter",
-        "mode": "markers",
-        "x": shares,
-        "y": [_plain(effect) for effect, _ in counts],
-        "marker": {"color": LIGHT["model"], "size": 9},
-        "error_x": {
-            "type": "data",
-            "symmetric": False,
-            "array": [high - share for share, (_, high) in zip(shares, ends, strict=True)],
-            "arrayminus": [share - low for share, (low, _) in zip(shares, ends, strict=True)],
-            "color": LIGHT["model"],
-        },
-        "text": [f"{count} of {total} {of_what}" for _, count in counts],
-        "hovertemplate": "%{y}: %{x:.1f} %<br>%{text}<extra></extra>",
+@dataclass
+class Parameter:
+    """A parameter's values over all records, by participant: time, value and standard deviation of each session."""
+
+    unit: str
+    sessions: dict[str, list[tuple[datetime, float, float]]] = field(default_factory=lambda: defaultdict(list))
+
+
+@dataclass
+class Cohort:
+    """Counts and parameters of one table of results."""
+
+    options: dict[str, Any]
+    errors: Counter[str] = field(default_factory=Counter)
+    verdicts: Counter[str] = field(default_factory=Counter)
+    effects: Counter[str] = field(default_factory=Counter)  # records with each effect
+    participants: Counter[str] = field(default_factory=Counter)  # records with a result of each participant
+    effects_of: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    """Records with each effect of each participant, by effect."""
+    parameters: dict[tuple[str, str], Parameter] = field(default_factory=dict)
+    """By what they belong to (`model`, or an effect with its form), and name."""
+
+    @property
+    def ok(self) -> int:
+        """Records with a result."""
+        return self.verdicts.total()
+
+    def prevalence(self) -> tuple[str, int, list[tuple[str, int]]]:
+        """Return what is counted, of how many, and each effect's count, the most frequent first.
+
+        Participants where every record names one: records of the same person are no independent cases. A participant
+        counts whose records show the effect more often than not.
+        """
+        if self.participants.total() < self.ok or not self.participants:
+            return "records", self.ok, self.effects.most_common()
+        counts = {
+            effect: sum(2 * count > self.participants[code] for code, count in counts.items())
+            for effect, counts in self.effects_of.items()
+        }
+        return "participants", len(self.participants), Counter(counts).most_common()
+
+    def ranked_parameters(self) -> list[tuple[str, str]]:
+        """List the parameters that most records have, those of the model first."""
+        count = {key: sum(map(len, one.sessions.values())) for key, one in self.parameters.items()}
+        return sorted(count, key=lambda key: (key[0] != MODEL, -count[key], key))[:MAX_PARAMETERS]
+
+    def repeatability(self) -> list[dict[str, Any]]:
+        """Return the rows of the table of repeatability: parameters of which somebody has two sessions."""
+        rows = []
+        for key in self.ranked_parameters():
+            one = self.parameters[key]
+            values = [[value for _, value, _ in sessions] for sessions in one.sessions.values()]
+            if figures := repeatability(values):
+                few = figures["participants"] < FEW_CASES
+                rows.append({"parameter": title_of(key), "unit": one.unit, "few": few, **figures})
+        return rows
+
+
+def read_cohort(file: Path) -> Cohort:
+    """Read a table of results. Raises CohortError: it is none, or empty."""
+    cohort = Cohort(read_options(file))
+    for row in read_rows(file, COLUMNS):
+        if row["status"] == "ok":
+            _add(cohort, row)
+        else:
+            cohort.errors[row["error_kind"] or "unknown"] += 1
+    if not cohort.ok + cohort.errors.total():
+        raise CohortError(f"{file}: no record in it. Nothing was selected.")
+    return cohort
+
+
+def _add(cohort: Cohort, row: Mapping[str, Any]) -> None:
+    participant, day, time_utc = row["participant"], row["day"], row["begun_utc"]
+    cohort.verdicts[row["verdict"] or "none"] += 1
+    # Of a model all effects count. In two forms of an effect the same name is not the same quantity.
+    forms = {
+        entry["effect"]: f"{entry['effect']} ({entry['form']})" if entry["form"] else entry["effect"]
+        for entry in row["effects"] or []
+        if entry["probability"] is None or entry["probability"] >= PROBABLE
     }
-    return _figure(
-        [trace],
-        ROW_PX * len(counts) + 110,
-        xaxis=axis(f"share of {total} {of_what} (%), 95 % interval (Wilson)", range=[0, 100]),
-        yaxis=axis("effect"),
-    )
+    cohort.effects.update(forms.keys())
+    if not participant:
+        return
+    cohort.participants[participant] += 1
+    for effect in forms:
+        cohort.effects_of[effect][participant] += 1
+    if time_utc is None and day is not None:
+        time_utc = datetime.combine(day, datetime.min.time(), UTC)
+    if time_utc is None:
+        return
+    for entry in row["parameters"] or []:
+        of = MODEL if entry["of"] == MODEL else forms.get(entry["of"])
+        if of is not None and entry["value"] is not None:
+            parameter = cohort.parameters.setdefault((of, entry["name"]), Parameter(entry["unit"]))
+            parameter.sessions[participant].append((time_utc, entry["value"], entry["sd"] or 0.0))
 
 
-def errors(found: Statistics) -> Figure | None:
-    """Records without a result, by reason; None where all have one."""
-    counts = found.errors.most_common()[::-1]
-    if not counts:
+def wilson(count: int, of: int) -> tuple[float, float]:
+    """Return the 95 % interval of a share, by Wilson's score."""
+    interval = binomtest(count, of).proportion_ci(method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def repeatability(values: Sequence[Sequence[float]]) -> dict[str, Any] | None:
+    """Return how values repeat within a participant, by one-way analysis of variance; None if nobody has two sessions.
+
+    `values`: by participant. `within_sd` is pooled; `between_sd` is the part that sessions do not explain; `icc` is
+    ICC(1) of Shrout and Fleiss for single sessions of unequal numbers.
+    """
+    groups = [np.asarray(group) for group in values if len(group) > 1]
+    if not groups:
         return None
-    trace = {
-        "type": "bar",
-        "orientation": "h",
-        "x": [count for _, count in counts],
-        "y": [unlinked(kind) for kind, _ in counts],
-        "marker": {"color": LIGHT["worst"]},
-        "hovertemplate": "%{y}: %{x} records<extra></extra>",
+    pooled, sizes = np.concatenate(groups), np.array([group.size for group in groups])
+    mean, count, total = float(pooled.mean()), len(groups), pooled.size
+    within = sum(float(((group - group.mean()) ** 2).sum()) for group in groups) / (total - count)
+    between_sd = icc = None
+    if count > 1:
+        between = float((sizes * np.array([group.mean() - mean for group in groups]) ** 2).sum()) / (count - 1)
+        usual = float(total - (sizes**2).sum() / total) / (count - 1)  # sessions of a participant
+        between_sd = math.sqrt(max(0.0, (between - within) / usual))
+        both = between + (usual - 1) * within
+        icc = (between - within) / both if both > 0 else None
+    one_sign = pooled.min() > 0 or pooled.max() < 0
+    return {
+        "participants": count,
+        "sessions": total,
+        "mean": mean,
+        "within_sd": math.sqrt(within),
+        "between_sd": between_sd,
+        "cv_percent": 100 * math.sqrt(within) / abs(mean) if one_sign else None,
+        "icc": icc,
     }
-    title = f"records without a result (number, of {found.records})"
-    return _figure([trace], ROW_PX * len(counts) + 110, xaxis=axis(title, rangemode="tozero"), yaxis=axis("reason"))
-
-
-def ranked_parameters(found: Statistics) -> list[tuple[str, str]]:
-    """Parameters by how many records have them, those of the model first."""
-    ranked = sorted(found.series, key=lambda key: (key[0] != "model", -len(found.series[key].value), key))
-    return ranked[:MOST_PANELS]
-
-
-def over_sessions(found: Statistics, key: tuple[str, str]) -> Figure | None:
-    """A parameter over time, a line for each participant; None where nobody has two sessions."""
-    series = found.series[key]
-    people = {who: points for who, points in series.by_participant().items() if len(points) > 1}
-    if not people:
-        return None
-    drawn = sorted(people, key=lambda who: (-len(people[who]), who))[:MOST_LINES]
-    traces = []
-    for number, who in enumerate(drawn):
-        points, colour = people[who], LIGHT[COLOURS[number % len(COLOURS)]]
-        sds = [0.0 if math.isnan(sd) else sd for _, _, sd in points]
-        traces.append({
-            "type": "scatter",
-            "mode": "lines+markers",
-            "name": unlinked(found.people[who]),
-            "x": [datetime.fromtimestamp(at_s, UTC).isoformat() for at_s, _, _ in points],
-            "y": [value for _, value, _ in points],
-            "error_y": {"type": "data", "array": sds, "color": colour, "thickness": 1},
-            "line": {"color": colour, "width": 1.4, "dash": DASHES[number // len(COLOURS) % len(DASHES)]},
-            "marker": {"color": colour, "size": 5},
-        })  # fmt: skip
-    title = f"{title_of(key)} ({series.unit})"
-    return _figure(traces, 340, xaxis=axis("day of the session (date, UTC)", type="date"), yaxis=axis(title))
-
-
-def repeats(found: Statistics) -> list[dict[str, Any]]:
-    """Rows of the table of repeatability: one for each parameter that somebody has of two sessions."""
-    rows = []
-    for key in ranked_parameters(found):
-        series = found.series[key]
-        one = series.repeats()
-        if one is not None:
-            few = one.participants < LEAST_CASES
-            rows.append({"parameter": title_of(key), "unit": series.unit, "few": few, **vars(one)})
-    return rows
 
 
 def title_of(key: tuple[str, str]) -> str:
-    """A parameter in words."""
+    """Return a parameter in words."""
     of, name = key
-    for end in UNITS:
-        name = name.removesuffix(f"_{end}")
-    return _plain(name) if of == "model" else f"{_plain(of)}: {_plain(name)}"
+    for unit in UNITS:
+        name = name.removesuffix(unit)
+    return (name if of == MODEL else f"{of}: {name}").replace("_", " ")
 
 
-def _plain(name: str) -> str:
-    return unlinked(name.replace("_", " "))
+def draw_prevalence(cohort: Cohort) -> Figure | None:
+    """Draw effects by how many have them, with 95 % intervals; None if no effect was found."""
+    of_what, total, counts = cohort.prevalence()
+    if not counts:
+        return None
+    figure = Figure((8, 1.2 + 0.3 * len(counts)), layout="constrained")
+    axes = figure.add_subplot()
+    shares = np.array([count / total for _, count in counts])
+    ends = np.array([wilson(count, total) for _, count in counts]).T
+    names = [effect.replace("_", " ") for effect, _ in counts]
+    axes.errorbar(100 * shares, names, xerr=100 * np.abs(ends - shares), fmt="o", capsize=3)
+    axes.set(xlim=(0, 100), xlabel=f"share of {total} {of_what} (%), 95 % interval (Wilson)", ylabel="effect")
+    axes.invert_yaxis()
+    return figure
 
 
-def unlinked(words: str) -> str:
-    """Return words in which plotly sees no link."""
-    return words.replace("<", "‹").replace(">", "›")
+def draw_sessions(cohort: Cohort, key: tuple[str, str]) -> Figure | None:
+    """Draw a parameter over time, a line for each participant; None if nobody has two sessions."""
+    parameter = cohort.parameters[key]
+    several = [code for code, sessions in parameter.sessions.items() if len(sessions) > 1]
+    if not several:
+        return None
+    figure = Figure((8, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    styles = cycle((f"C{number % 10}", STYLES[number // 10]) for number in range(40))
+    drawn = sorted(several, key=lambda code: (-len(parameter.sessions[code]), code))[:MAX_LINES]
+    for code, (colour, style) in zip(drawn, styles, strict=False):
+        times, values, sds = zip(*sorted(parameter.sessions[code]), strict=True)
+        axes.errorbar(times, values, yerr=sds, label=code, color=colour, linestyle=style, marker=".", elinewidth=1)
+    axes.set(xlabel="day of the session (date, UTC)", ylabel=f"{title_of(key)} ({parameter.unit})")
+    figure.autofmt_xdate()
+    figure.legend(loc="outside right upper", fontsize="small")
+    return figure
 
 
-def axis(title: str, **more: Any) -> dict[str, Any]:
-    """Return an axis with its quantity and unit."""
-    return {"title": {"text": title, "standoff": 8}, "automargin": True, **more}
-
-
-def _figure(data: list[dict[str, Any]], height: int, **axes: Any) -> Figure:
-    return {"data": data, "layout": {"height": height, "hovermode": "closest", "showlegend": len(data) > 1, **axes}}
-
-
-STYLE = """
-body { font: 15px/1.5 system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif; color: #1b2733;
-       max-width: 62rem; margin: 2rem auto; padding: 0 1rem; }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem }
-table { border-collapse: collapse } td, th { padding: .2rem .8rem .2rem 0; text-align: left; vertical-align: top }
-th { border-bottom: 1px solid #d9dfe4 } td.number, th.number { text-align: right }
-.few { color: #b3121d }
-"""
-NOTHING = "Too few: a line needs a participant with two sessions whose participant and day are known."
-
-
-def page(found: Statistics, name: str) -> str:
-    """The page. `found`: from the table of results; `name`: the file's, for the title."""
-    pictures = _Pictures()
-    parts = [
-        *_head(found, name),
-        "<h2>Effects by prevalence</h2>",
-        *_prevalence(found, pictures),
-        "<h2>Parameters over sessions</h2>",
-        *_over_sessions(found, pictures),
-        "<h2>Repeatability between sessions</h2>",
-        *_repeats(found),
-        "<h2>Records without a result</h2>",
-        "<p>None.</p>" if (figure := errors(found)) is None else pictures(figure),
+def page(cohort: Cohort, name: str) -> str:
+    """Return the page of a cohort; `name`: of the file of results, for the title."""
+    of_what, total, counts = cohort.prevalence()
+    with mpl.rc_context(SETTINGS):
+        prevalence = _svg(draw_prevalence(cohort))
+        drawn = ((title_of(key), _svg(draw_sessions(cohort, key))) for key in cohort.ranked_parameters())
+        sessions = [(title, svg) for title, svg in drawn if svg]
+    environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    environment.filters["words"] = lambda text: text.replace("_", " ")
+    environment.filters["number"] = lambda value: "–" if value is None or not math.isfinite(value) else f"{value:.3g}"
+    template = environment.from_string(Path(__file__).with_name("figures.html").read_text("utf-8"))
+    shares = [
+        (effect, count, [100 * share for share in (count / total, *wilson(count, total))]) for effect, count in counts
     ]
-    title = escape(f"Cohort: {name}")
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{title}</title>'
-        f"<style>{STYLE}</style></head><body>\n<h1>{title}</h1>\n" + "\n".join(parts) + "\n</body></html>\n"
-    )
+    return template.render(
+        name=name, cohort=cohort, of_what=of_what, total=total, shares=shares, prevalence=prevalence,
+        sessions=sessions, repeatability=cohort.repeatability(), few_cases=FEW_CASES, max_lines=MAX_LINES,
+        probable=PROBABLE,
+    )  # fmt: skip
 
 
-class _Pictures:
-    """Figures as parts of one page; the library is in it once."""
-
-    def __init__(self) -> None:
-        self.loaded = False
-
-    def __call__(self, figure: Figure) -> str:
-        part = LocalFigure(figure).to_html(full_html=False, include_plotlyjs=not self.loaded)
-        self.loaded = True
-        return part
-
-
-def _head(found: Statistics, name: str) -> list[str]:
-    options = found.options
-    effects = ", ".join(options.get("effects") or [])
-    with_effects = f" (effects: {effects})" if effects else ""
-    rows = [
-        ("results", name),
-        ("verb", f"{options.get('verb')}{with_effects}"),
-        ("selected", options.get("select") or "all records"),
-        ("software", f"stimrig {options.get('software')}"),
-        ("records", f"{found.records}, {found.ok} with a result, {found.errors.total()} without"),
-        ("participants", str(len(found.people)) if found.people else "not known"),
-        ("verdicts", ", ".join(f"{word.replace('_', ' ')} {count}" for word, count in found.verdicts.most_common())),
-    ]
-    return [_table((), [(escape(word), escape(str(text))) for word, text in rows])]
-
-
-def _prevalence(found: Statistics, pictures: _Pictures) -> list[str]:
-    of_what, total, counts = found.prevalence()
-    figure = prevalence(found)
+def _svg(figure: Figure | None) -> str:
+    """Return a figure as the address of an image; empty if there is none."""
     if figure is None:
-        return [f"<p>No effect was found in {total} {of_what}.</p>"]
-    how = "participants whose records show it more often than not" if of_what == "participants" else "records"
-    words = [f"<p>Counted are {how}; from a diagnosis, effects with a probability of {PROBABLE:g} or more.</p>"]
-    if total < LEAST_CASES:
-        words.append(f'<p class="few">Only {total} {of_what}: the intervals are as wide as they look.</p>')
-    rows = []
-    for effect, count in counts:
-        low, high = wilson(count, total)
-        share = f"{100 * count / total:.1f} % ({100 * low:.1f} to {100 * high:.1f})"
-        rows.append((escape(effect.replace("_", " ")), str(count), str(total), share))
-    head = ("effect", of_what, "of", "share, 95 % interval")
-    return [*words, pictures(figure), _table(head, rows)]
-
-
-def _over_sessions(found: Statistics, pictures: _Pictures) -> list[str]:
-    figures = [(key, over_sessions(found, key)) for key in ranked_parameters(found)]
-    parts = []
-    for key, figure in figures:
-        if figure is not None:
-            words = f"{title_of(key)}, with its standard deviation"
-            people = len(figure["data"])
-            if people == MOST_LINES:
-                words += f"; the {people} participants with the most sessions"
-            parts += [f"<p>{escape(words)}</p>", pictures(figure)]
-    if not found.series and found.ok and found.options.get("verb") == "diagnose":
-        parts.append("<p>A diagnosis gives parameters of missing effects only; `cohort fit` gives the model's.</p>")
-    return parts or [f'<p class="few">{NOTHING}</p>']
-
-
-def _repeats(found: Statistics) -> list[str]:
-    rows = repeats(found)
-    if not rows:
-        return [f'<p class="few">{NOTHING}</p>']
-    head = ("parameter", "unit", "participants", "sessions", "mean", "SD within a participant", "SD between",
-            "CV within (%)", "ICC(1)", "")  # fmt: skip
-    table = [
-        (
-            escape(row["parameter"]),
-            escape(row["unit"]),
-            str(row["participants"]),
-            str(row["sessions"]),
-            *(_number(row[name]) for name in ("mean", "within_sd", "between_sd", "cv_percent", "icc")),
-            Markup('<span class="few">few participants</span>') if row["few"] else "",
-        )
-        for row in rows
-    ]
-    words = (
-        "<p>Participants with two sessions or more; SD within: between sessions of one participant, pooled. It holds "
-        "what the muscle did as well as the method's error.</p>"
-    )
-    return [words, _table(head, table)]
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None or not math.isfinite(value) else f"{value:.3g}"
-
-
-def _table(head: tuple[str, ...], rows: list[tuple[Any, ...]]) -> str:
-    top = "<tr>" + "".join(f"<th>{escape(word)}</th>" for word in head) + "</tr>" if head else ""
-    body = "".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table>{top}{body}</table>"
+        return ""
+    image = io.BytesIO()
+    figure.savefig(image, format="svg")
+    return f"data:image/svg+xml;base64,{base64.b64encode(image.getvalue()).decode()}"

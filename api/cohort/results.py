@@ -1,8 +1,7 @@
-"""Results on disk: parts beside the output while the run goes on, one file in the end; nothing doubled, nothing lost.
+"""Results on disk: parts beside the output while the run goes on, joined into one file in the end.
 
-`RESULTS.parquet.parts/` holds `run.json` (the options), a lock, and parts, each written whole or not at all. A run that
-is cut off leaves its parts; the next one with the same options reads which records are done and goes on. The end joins
-them, with the rows of an earlier output, into one file that takes the output's place at once.
+`RESULTS.parquet.parts/` holds a lock and parts, each written whole or not at all, with the options of the run. The next
+run with the same options skips the records that have a row, in the output or in a part.
 """
 
 from __future__ import annotations
@@ -10,75 +9,43 @@ from __future__ import annotations
 import fcntl
 import json
 import shutil
+import time
+from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import IO, Any, Self
+from typing import IO, Self
 
+import pyarrow as pa
 import pyarrow.parquet as pq
 
 from stimrig.api.cohort import table
-from stimrig.api.cohort.computing import COPY, LEFT_OUT, digest
+from stimrig.api.cohort.errors import CohortError, InterruptedRunError
+from stimrig.api.cohort.record import LEFT_OUT, Row
 from stimrig.api.cohort.sources import Entry
-from stimrig.api.cohort.tasks import CohortError, CutOffError, Task, differing
+from stimrig.api.cohort.task import Task, describe_differences
+from stimrig.api.cohort.worker import COPY, digest
 from stimrig.api.whole_file import whole_file
 
-ROWS_A_PART = 500
-MOST_ALIKE = 1000
-KNOWN = ("ok", COPY)
-"""Of a content with a result no other is needed. Each file that failed has its own row: somebody looks for it."""
-AGAIN = ("timeout", "killed", "out of memory", "unreadable", "unexpected")
-"""Errors that another try may not meet again (`--again`)."""
-
-
-@dataclass
-class Done:
-    """Which records are done, by content and by where they lie."""
-
-    contents: set[bytes] = field(default_factory=set)
-    places: set[bytes] = field(default_factory=set)
-    earlier: dict[int, list[bytes]] = field(default_factory=dict)
-    """Contents of runs before this one, by their size: a worker need not do again what only lies elsewhere now."""
-
-    def add(self, row: dict[str, Any]) -> None:
-        """Take in a row's keys."""
-        if row.get("sha256") and row["status"] in KNOWN:
-            self.contents.add(digest(row["sha256"]))
-        if row.get("stamp"):
-            self.places.add(digest(row["address"], row["stamp"]))
-
-    def read(self, row: dict[str, Any]) -> None:
-        """Take in the keys of a row of an earlier run."""
-        self.add(row)
-        if row["sha256"] and row["status"] in KNOWN and row["bytes"] is not None:
-            self.earlier.setdefault(row["bytes"], []).append(digest(row["sha256"]))
-
-    def has_place(self, entry: Entry) -> bool:
-        """Whether this file, in the state in which it is listed, is done."""
-        return bool(entry.stamp) and digest(entry.address, entry.stamp) in self.places
-
-    def has_content(self, sha256: str) -> bool:
-        """Whether this content is done, wherever it lay."""
-        return bool(sha256) and digest(sha256) in self.contents
-
-    def alike(self, entry: Entry) -> tuple[bytes, ...]:
-        """Contents of earlier runs with the file's size, for the worker to compare; none where they are too many."""
-        found = self.earlier.get(-1 if entry.bytes is None else entry.bytes, [])
-        return tuple(found) if len(found) <= MOST_ALIKE else ()
+PART_ROWS = 500
+PART_S = 10.0
+"""What a run that is killed loses at most."""
+GROUP_ROWS = 5000
+MAX_CONTENTS = 1000
+TRANSIENT = ("timeout", "killed", "out of memory", "unreadable", "unexpected")
+"""Errors that another try may not meet (`--again`)."""
 
 
 class Results:
-    """The results of one run. Use it in a `with` statement: it holds the lock.
+    """The results of one run; a `with` statement holds their lock.
 
     Parameters
     ----------
     output : Path
-        The Parquet file to be.
+        The Parquet file to write.
     task : Task
         With the options that all rows share.
     again : bool
-        Whether records that failed for a reason that may have passed are to be done again.
+        Compute records with a transient error again.
 
     Raises
     ------
@@ -89,10 +56,12 @@ class Results:
     def __init__(self, output: Path, task: Task, again: bool = False) -> None:
         self.output, self.task, self.again = output, task, again
         self.folder = output.with_name(output.name + ".parts")
-        self.done = Done()
-        self.waiting: list[dict[str, Any]] = []
+        self._places: set[bytes] = set()  # of files in the state in which they were done
+        self._contents: dict[int, list[bytes]] = {}  # with a result, by size
+        self._copied: set[bytes] = set()  # contents that this run found at another address, too
+        self._waiting: list[Row] = []
+        self._written_s = time.monotonic()
         self._lock: IO[bytes] | None = None
-        self._next = 0
 
     def __enter__(self) -> Self:
         if self.output.is_dir():
@@ -102,109 +71,137 @@ class Results:
             self._lock = (self.folder / "lock").open("ab")
             fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            self._let_go()
+            self._unlock()
             raise CohortError(f"{self.output}: another run writes it now. Wait for it, or give another -o.") from None
         except OSError as error:
-            self._let_go()
-            raise CohortError(
-                f"{self.folder}: {error.strerror}. Give a file in a folder that can be written."
-            ) from None
+            self._unlock()
+            remedy = "Give a file in a folder that can be written."
+            raise CohortError(f"{self.folder}: {error.strerror}. {remedy}") from None
         try:
-            self._begin()
+            self._read()
         except BaseException:
-            if not self._parts() and not (self.folder / "run.json").exists():
-                shutil.rmtree(self.folder, ignore_errors=True)
-            self._let_go()
+            self._close()
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
         try:
             self.flush()
-            if self.folder.exists() and not self._parts():  # nothing is done: nothing to go on from
-                shutil.rmtree(self.folder, ignore_errors=True)
         finally:
-            self._let_go()
+            self._close()
 
-    def _let_go(self) -> None:
+    def _close(self) -> None:
+        if not any(self.folder.glob("[0-9]*.parquet")):  # nothing to resume from
+            shutil.rmtree(self.folder, ignore_errors=True)
+        self._unlock()
+
+    def _unlock(self) -> None:
         if self._lock is not None:
             self._lock.close()
             self._lock = None
 
-    def _begin(self) -> None:
-        """Compare the options with those of what is there, and read which records are done."""
-        about = self.folder / "run.json"
-        before = table.options_of(self.output) if self.output.exists() else None
-        for place, options in ((self.output, before), (about, _stored(about))):
-            if options is not None and (differs := differing(options, self.task.document())):
-                raise CohortError(f"{place}: made with other options ({differs}). Give another -o, or remove it.")
-        with whole_file(about) as file:
-            file.write(json.dumps(self.task.document()).encode())
-        for part in self.folder.glob(".*.new"):
-            part.unlink()  # half-written by a run that was cut off
-        parts = self._parts()
-        self._next = 1 + max((int(part.stem) for part in parts), default=-1)
-        for file in (*([self.output] if self.output.exists() else []), *parts):
-            for row in table.rows_of(file, table.KEYS):
-                if not (self.again and row["status"] == "error" and row["error_kind"] in AGAIN):
-                    self.done.read(row)
+    def _files(self) -> list[Path]:
+        """List the files with rows, the oldest first."""
+        return [*([self.output] if self.output.exists() else []), *sorted(self.folder.glob("[0-9]*.parquet"))]
 
-    def _parts(self) -> list[Path]:
-        return sorted(self.folder.glob("[0-9]*.parquet"))
+    def _read(self) -> None:
+        """Compare the options, and read which records are done."""
+        for file in self._files():
+            if differences := describe_differences(table.read_options(file), self.task.options()):
+                raise CohortError(f"{file}: made with other options ({differences}). Give another -o, or remove it.")
+            for row in table.read_rows(file, (*table.KEYS, "status", "error_kind")):
+                if not (self.again and row["error_kind"] in TRANSIENT):
+                    self._remember(row)
 
-    def add(self, row: dict[str, Any]) -> str:
-        """Take in a row; its status: a content that is there already becomes a copy."""
-        if self.done.has_content(row.get("sha256") or "") and row["status"] != LEFT_OUT:
-            row = {key: row.get(key) for key in ("sha256", "address", "name", "stamp", "bytes")} | {"status": COPY}
-        self.done.add(row)
-        self.waiting.append(row)
-        if len(self.waiting) >= ROWS_A_PART:
+    def _remember(self, row: Row) -> None:
+        if row.get("stamp"):
+            self._places.add(digest(row["address"], row["stamp"]))
+        if row["status"] == "ok":
+            self._contents.setdefault(row["bytes"], []).append(digest(row["sha256"]))
+
+    def has(self, entry: Entry) -> bool:
+        """Return whether this file, in its state of now, has a row."""
+        return bool(entry.stamp) and digest(entry.address, entry.stamp) in self._places
+
+    def contents(self, entry: Entry) -> list[bytes]:
+        """Return digests of contents with a result that this file may be a copy of."""
+        return self._contents.get(entry.size or 0, [])[:MAX_CONTENTS]
+
+    def add(self, row: Row) -> str:
+        """Add a record's row; return its status, which is `copy` if its content has a result already."""
+        if row["status"] == LEFT_OUT:
+            return LEFT_OUT
+        content = digest(row.get("sha256") or "")
+        if row["status"] == COPY or content in self._contents.get(row.get("bytes", -1), []):
+            self._copied.add(content)
+            return COPY
+        self._remember(row)
+        self._waiting.append(row)
+        if len(self._waiting) >= PART_ROWS or time.monotonic() - self._written_s > PART_S:
             self.flush()
         return row["status"]
 
     def flush(self) -> None:
-        """Bring what waits to the disk, as a part of its own. Raises CutOffError: the disk does not take it."""
-        if not self.waiting:
-            return
-        with self._kept(self.folder), whole_file(self.folder / f"{self._next:08d}.parquet") as file:
-            pq.write_table(table.table_of(self.waiting), file, compression="zstd")
-        self._next += 1
-        self.waiting = []
+        """Write the rows that wait as a part. Raises InterruptedRunError: the disk refuses."""
+        self._written_s = time.monotonic()
+        if self._waiting:
+            parts = sorted(self.folder.glob("[0-9]*.parquet"))
+            number = 1 + int(parts[-1].stem) if parts else 0
+            self._write(self.folder / f"{number:08d}.parquet", iter([table.rows_to_table(self._waiting)]))
+            self._waiting = []
 
-    def join(self) -> dict[str, int]:
-        """Write the output and take the parts away; rows by status.
+    def join(self) -> Counter[str]:
+        """Write the output, remove the parts, and count the rows by status.
 
-        Raises CutOffError: the disk does not take it; the parts stay.
+        Raises InterruptedRunError: the disk refuses; the parts stay.
         """
         self.flush()
-        files = [*([self.output] if self.output.exists() else []), *self._parts()]
-        kept, counts = table.kept_rows(files)
-        options = json.dumps(self.task.document())
-        about = {"format": table.FORMAT, "format_version": table.FORMAT_VERSION, "options": options}
-        with (
-            self._kept(self.output),
-            whole_file(self.output) as file,
-            pq.ParquetWriter(file, table.SCHEMA.with_metadata(about), compression="zstd") as writer,
-        ):
-            for group in table.groups(files, kept):
-                writer.write_table(group)
+        counts: Counter[str] = Counter()
+        self._write(self.output, self._current(counts))
         shutil.rmtree(self.folder, ignore_errors=True)
         return counts
 
-    @contextmanager
-    def _kept(self, place: Path) -> Iterator[None]:
-        """Around what is written: a disk that does not take it ends the run, and the parts stay. Raises CutOffError."""
+    def _write(self, file: Path, tables: Iterator[pa.Table]) -> None:
+        about = {"format": table.FORMAT, "format_version": table.FORMAT_VERSION}
+        schema = table.SCHEMA.with_metadata(about | {"options": json.dumps(self.task.options())})
         try:
-            yield
+            with whole_file(file) as place, pq.ParquetWriter(place, schema, compression="zstd") as writer:
+                for rows in tables:
+                    writer.write_table(rows)
         except OSError as error:
-            raise CutOffError(f"{place}: {error.strerror}. Make room; the same command goes on.") from None
+            raise InterruptedRunError(f"{file}: {error.strerror}. Make room; the same command goes on.") from None
 
+    def _current(self, counts: Counter[str]) -> Iterator[pa.Table]:
+        """Yield the rows that count, many at a time, and count them."""
+        current = self._current_rows()
+        waiting = [table.SCHEMA.empty_table()]
+        for file in self._files():
+            with pq.ParquetFile(file) as rows:
+                for batch in rows.iter_batches(table.BATCH_ROWS):
+                    counted = pa.array([next(current) for _ in range(len(batch))])
+                    kept = pa.Table.from_batches([batch]).filter(counted).cast(table.SCHEMA)
+                    counts.update(kept["status"].to_pylist())
+                    waiting.append(kept)
+                    if sum(map(len, waiting)) >= GROUP_ROWS:
+                        yield pa.concat_tables(waiting)
+                        waiting = []
+        if waiting:
+            yield pa.concat_tables(waiting)
 
-def _stored(about: Path) -> dict[str, Any] | None:
-    """The options of parts; None where there are none."""
-    try:
-        return dict(json.loads(about.read_bytes()))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError, TypeError):
-        raise CohortError(f"{about}: cannot be read. Remove the folder {about.parent} to begin anew.") from None
+    def _current_rows(self) -> Iterator[bool]:
+        """Yield for each row whether it counts, the oldest first: the newest of its address and of its content.
+
+        A file that was replaced takes its old row with it, unless the old content lies elsewhere, too.
+        """
+        current: list[bool] = []
+        places, contents = set[bytes](), set[bytes]()
+        for file in reversed(self._files()):
+            for row in reversed(list(table.read_rows(file, ("address", "sha256", "status")))):
+                place, content = digest(row["address"]), digest(row["sha256"] or "")
+                replaced = place in places and not (row["status"] == "ok" and content in self._copied)
+                current.append(not replaced and content not in contents)
+                if file != self.output:  # of its rows none replaced another one
+                    places.add(place)
+                if row["status"] == "ok":
+                    contents.add(content)
+        return reversed(current)

@@ -1,40 +1,33 @@
-"""The table of results: one row a record, each column with its unit and what it says (needs pyarrow).
-
-It is read for the options it was made with, its rows, and which rows of many parts count.
-"""
+"""The table of results: one row for each record, each column with its unit and meaning in its field's metadata."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Sequence
-from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from stimrig.api.cohort.computing import COPY, LEFT_OUT, digest
-from stimrig.api.cohort.record import OF_EFFECT, OF_STEP
+from stimrig.api.cohort.errors import CohortError
+from stimrig.api.cohort.record import Row, failed
 from stimrig.api.cohort.select import FIELDS, LABELS
-from stimrig.api.cohort.tasks import CohortError
 
 FORMAT = "stimrig-cohort"
 FORMAT_VERSION = "1"
+ERRORS_NM = ("rms_before_nm", "rms_after_nm", "held_out_rms_before_nm", "held_out_rms_after_nm")
+OF_STEP = ("fit_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm")
 TEXTS = pa.list_(pa.string())
-EFFECT = pa.struct(
-    [
-        ("effect", pa.string()),
-        ("form", pa.string()),
-        *((name, pa.float64()) for name in OF_EFFECT),
-        ("confused_with", TEXTS),
-    ]
-)
-PARAMETER = pa.struct(
-    [("of", pa.string()), ("name", pa.string()), ("value", pa.float64()), ("sd", pa.float64()), ("unit", pa.string())]
-)
-STEP = pa.struct([("added", pa.string()), *((name, pa.float64()) for name in OF_STEP)])
-REFUSED = pa.struct([("effect", pa.string()), ("log_evidence_gain", pa.float64())])
+EFFECT = pa.struct({
+    "effect": pa.string(), "form": pa.string(), "probability": pa.float64(),
+    **dict.fromkeys(ERRORS_NM, pa.float64()), "confused_with": TEXTS,
+})  # fmt: skip
+PARAMETER = pa.struct({
+    "of": pa.string(), "name": pa.string(), "value": pa.float64(), "sd": pa.float64(), "unit": pa.string(),
+})  # fmt: skip
+STEP = pa.struct({"added": pa.string(), **dict.fromkeys(OF_STEP, pa.float64())})
+REFUSED = pa.struct({"effect": pa.string(), "log_evidence_gain": pa.float64()})
 INSTANT = pa.timestamp("us", tz="UTC")
 
 TYPES: dict[str, pa.DataType] = {
@@ -45,7 +38,7 @@ TYPES: dict[str, pa.DataType] = {
 def _fields(*names: str) -> Iterator[tuple[str, pa.DataType, str, str]]:
     """Columns that a selection may name, too."""
     for name, field in ((name, FIELDS[name]) for name in names):
-        yield name, TYPES.get(name, TYPES[field.type]), field.unit, field.says
+        yield name, TYPES.get(name, TYPES[field.type]), field.unit, field.description
 
 
 COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
@@ -64,7 +57,7 @@ COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
     ("computed_utc", INSTANT, "", "when the row came"),
     ("took_s", pa.float64(), "s", "time to read and compute"),
     ("processor_s", pa.float64(), "s", "processor time of it"),
-    ("worker_memory_mb", pa.float64(), "MB", "memory of the process that computed, after this record"),
+    ("worker_memory_mb", pa.float64(), "MB", "largest memory of the process that computed, so far"),
     ("status", pa.string(), "", "ok or error"),
     ("error_kind", pa.string(), "", "why there is no result, as one word or two"),
     ("error", pa.string(), "", "why there is no result, in one line"),
@@ -86,132 +79,41 @@ COLUMNS: tuple[tuple[str, pa.DataType, str, str], ...] = (
     ("steps", pa.list_(STEP), "", "improve: the models, one effect more each"),
     ("refused", pa.list_(REFUSED), "", "improve: effects that were not added"),
 )
-"""Name, type, unit and what it says."""
-
-MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
-
+"""Name, type, unit and meaning."""
 
 SCHEMA = pa.schema([
-    pa.field(name, kind, metadata={"unit": unit, "description": says}) for name, kind, unit, says in COLUMNS
+    pa.field(name, kind, metadata={"unit": unit, "description": description})
+    for name, kind, unit, description in COLUMNS
 ])  # fmt: skip
-"""Unit and meaning of a column stand in its field's metadata."""
-ROWS_A_GROUP = 5000
-ROWS_AT_ONCE = 1000
+KEYS = ("address", "stamp", "sha256", "bytes", "verb", "software", "computed_utc")
+"""Columns of which record a row is, and how it was made; none is the record's own."""
+BATCH_ROWS = 1000
 """Rows held in memory while tables are read."""
-KEYS = ("sha256", "address", "stamp", "bytes", "status", "error_kind")
-"""Columns that tell which record a row is of."""
 
 
-def table_of(rows: Sequence[dict[str, Any]]) -> pa.Table:
-    """Make a table of rows; keys that are no column are dropped."""
-    arrays = [_array([_cell(row.get(field.name), field.type) for row in rows], field.type) for field in SCHEMA]
-    return pa.Table.from_arrays(arrays, schema=SCHEMA)
-
-
-def _array(values: list[Any], kind: pa.DataType) -> pa.Array:
-    """A column; a value that does not fit is null: what a file says must not end a run."""
+def rows_to_table(rows: Sequence[Row]) -> pa.Table:
+    """Make a table of rows; keys that are no column are dropped. A row that cannot be stored becomes an error."""
     try:
-        return pa.array(values, kind)
-    except MISFITS:
-        return pa.concat_arrays([_one(value, kind) for value in values])
+        return pa.Table.from_pylist(list(rows), SCHEMA)
+    except (pa.ArrowException, OverflowError, TypeError, ValueError) as error:
+        if len(rows) > 1:
+            return pa.concat_tables(rows_to_table([row]) for row in rows)
+        keys = {name: rows[0].get(name) for name in KEYS}
+        return pa.Table.from_pylist([keys | failed("unexpected", f"its row cannot be stored ({error})")], SCHEMA)
 
 
-def _one(value: Any, kind: pa.DataType) -> pa.Array:
-    try:
-        return pa.array([value], kind)
-    except MISFITS:
-        return pa.nulls(1, kind)
-
-
-def _cell(value: Any, kind: pa.DataType) -> Any:
-    """A value as the column holds it; None where a file says nonsense, which must not end a run."""
-    if kind == pa.date32() and isinstance(value, str):
-        try:
-            return date.fromisoformat(value)
-        except ValueError:
-            return None
-    if kind == INSTANT and isinstance(value, str):
-        try:
-            found = datetime.fromisoformat(value)
-            return (found if found.tzinfo else found.replace(tzinfo=UTC)).astimezone(UTC)
-        except (ValueError, OverflowError):
-            return None
-    if kind == pa.string() and isinstance(value, str):
-        return value.encode("utf-8", "replace").decode()
-    return value
-
-
-def kept_rows(files: Sequence[Path]) -> tuple[set[int], dict[str, int]]:
-    """Numbers of the rows to hand out: the last one of each content and of each place; and how many are what.
-
-    A file that was replaced by another takes its old row with it, unless the old content lies elsewhere, too.
-    """
-    by_content: dict[bytes, int] = {}
-    by_place: dict[bytes, int] = {}
-    statuses: dict[int, str] = {}
-    replaced: dict[int, str] = {}
-    failed: dict[int, bytes] = {}
-    copies: dict[bytes, bytes] = {}
-    for number, row in enumerate(row for file in files for row in rows_of(file, KEYS)):
-        place = digest(row["address"])
-        if row["status"] == COPY:
-            copies[place] = digest(row["sha256"])
-        elif row["status"] != LEFT_OUT:
-            content = digest(row["sha256"]) if row["status"] == "ok" else place
-            statuses.pop(by_content.get(content, -1), None)
-            if (old := by_place.get(place, -1)) in statuses:
-                replaced[old] = statuses.pop(old)
-            by_content[content] = by_place[place] = number
-            if row["status"] == "error" and row["sha256"]:
-                failed[number] = digest(row["sha256"])
-            statuses[number] = row["status"]
-    lying = {by_content.get(content, -1) for content in copies.values()}
-    statuses |= {number: status for number, status in replaced.items() if number in lying}
-    for number, content in failed.items():
-        if statuses.get(by_content.get(content, -1)) == "ok":  # done elsewhere since
-            statuses.pop(number, None)
-    counts = {word: sum(1 for status in statuses.values() if status == word) for word in ("ok", "error")}
-    return set(statuses), {**counts, "copies": len(copies)}
-
-
-def rows_of(file: Path, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Rows of a table, some at a time. Raises CohortError: it is damaged, or no such table."""
+def read_rows(file: Path, columns: Sequence[str]) -> Iterator[Row]:
+    """Read rows of a table, some at a time. Raises CohortError: it is damaged, or no such table."""
     try:
         with pq.ParquetFile(file) as table:
-            for batch in table.iter_batches(ROWS_AT_ONCE, columns=list(columns)):
+            for batch in table.iter_batches(BATCH_ROWS, columns=list(columns)):
                 yield from batch.to_pylist()
     except (pa.ArrowException, OSError) as error:
         raise CohortError(f"{file}: cannot be read ({' '.join(str(error).split())[:200]}).") from None
 
 
-def rows_in(file: Path) -> int:
-    return pq.read_metadata(file).num_rows
-
-
-def groups(files: Sequence[Path], kept: set[int]) -> Iterator[pa.Table]:
-    """The rows that are kept, so many at a time."""
-    number, waiting = 0, [SCHEMA.empty_table()]
-    for file in files:
-        with pq.ParquetFile(file) as table:
-            for batch in table.iter_batches(ROWS_AT_ONCE):
-                rows = [index for index in range(batch.num_rows) if number + index in kept]
-                whole = pa.concat_tables(
-                    [SCHEMA.empty_table(), pa.Table.from_batches([batch])], promote_options="default"
-                )
-                waiting.append(whole.select(SCHEMA.names).cast(SCHEMA).take(pa.array(rows, pa.int64())))
-                number += batch.num_rows
-                if sum(part.num_rows for part in waiting) >= ROWS_A_GROUP:
-                    yield pa.concat_tables(waiting)
-                    waiting = []
-    if waiting:
-        yield pa.concat_tables(waiting)
-
-
-def options_of(file: Path) -> dict[str, Any]:
-    """The options that a table of results was made with.
-
-    Raises CohortError: it is no table of results, or there is no such file.
-    """
+def read_options(file: Path) -> dict[str, Any]:
+    """Return the options of the run that made a table. Raises CohortError: no such file, or no table of results."""
     if not file.exists():
         raise CohortError(f"{file}: no such file. Give the -o of `stimrig cohort fit`, `diagnose` or `improve`.")
     fix = "Give a file written by `stimrig cohort fit`, `diagnose` or `improve`."

@@ -3,7 +3,7 @@
 ``{"call": 1, "verb": "fit", "arguments": {…}}`` in; ``progress``, then ``result`` or ``error`` out.
 It ends with who started it, also in the middle of a call; a cancelled call's worker is killed. Before the first
 call it shuts itself in (`api.workers.confinement`): what it reads, others may have made. ``--reads`` and ``--writes``
-name the folders that stay open. A cohort's records are computed by the same process, with verbs of its own.
+name the folders that stay open.
 """
 
 from __future__ import annotations

@@ -1,30 +1,25 @@
 """`stimrig cohort`: one verb over many recordings, two runs compared, figures over a cohort.
 
-Dask and pyarrow are an extra (`pip install stimrig[cohort]`): loaded where they are used, so that the verb can say so.
+Its packages are an extra (`pip install stimrig[cohort]`): loaded where they are used, so that the verb can say so.
 """
 
 from __future__ import annotations
 
 import importlib.util
 import inspect
-import sys
-import time
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from stimrig.api.cli.commands.fit import METHOD
 from stimrig.api.cli.errors import INTERRUPTED, CommandError, InputError
 from stimrig.api.cli.terminal import Json, names, say, say_json, table, write
-from stimrig.api.progress_bar import in_notebook, progress_bar
 
-if TYPE_CHECKING:
-    from stimrig.api.cohort.tally import Tally
-
-NEEDED = ("dask", "distributed", "pyarrow", "fsspec")
+NEEDED = ("dask", "distributed", "fsspec", "pyarrow")
+MAX_LISTED = 40
+"""Changed records that are shown; --json gives all."""
 
 Given = Annotated[
     list[str],
@@ -46,40 +41,33 @@ Columns = Annotated[
     typer.Option("--map", help="columns of another tool's files, as in `stimrig fit`", show_default=False),
 ]
 
-
 RUNS = {
-    "fit": ("Fit a model to every selected record; one row each in Parquet.", ()),
-    "diagnose": (
-        "What is missing in the plain structure, for every selected record; one row each in Parquet.",
-        ("method", "effects"),
-    ),
-    "improve": (
-        "Add effects as long as the evidence lasts, for every selected record; one row each in Parquet.",
-        ("method", "effects"),
-    ),
+    "fit": "Fit a model to every selected record; one row each in Parquet.",
+    "diagnose": "What is missing in the plain structure, for every selected record; one row each in Parquet.",
+    "improve": "Add effects as long as the evidence lasts, for every selected record; one row each in Parquet.",
 }
-"""What each verb over records does, and the options of `run` that it lacks."""
 
 
 def register(app: typer.Typer) -> None:
-    """Add the verb and what it can do."""
+    """Add the verb and its verbs."""
     verbs = typer.Typer(no_args_is_help=True, help="Fit or diagnose many recordings, compare two runs, draw a cohort.")
-    for verb, (words, lacks) in RUNS.items():
-        verbs.command(verb, help=words)(run_of(verb, lacks))
+    for verb, help_text in RUNS.items():
+        verbs.command(verb, help=help_text)(_run_of(verb))
     for command in (changed, figures):
         verbs.command(command.__name__)(command)
     app.add_typer(verbs, name="cohort")
 
 
-def run_of(verb: str, lacks: tuple[str, ...]) -> Callable[..., None]:
-    """`run` with one verb, as the command line sees it: with the options that the verb has."""
-    whole = inspect.signature(run, eval_str=True)
-    options = [option for name, option in whole.parameters.items() if name not in ("verb", *lacks)]
+def _run_of(verb: str) -> Callable[..., None]:
+    """Return `run` for one verb, with the options that the verb has."""
+    signature = inspect.signature(run, eval_str=True)
+    without = ("verb",) if verb == "fit" else ("verb", "method", "effects")
+    options = [option for name, option in signature.parameters.items() if name not in without]
 
     def command(**given: Any) -> None:
         run(verb, **given)
 
-    command.__signature__ = whole.replace(parameters=options)  # pyright: ignore[reportFunctionMemberAccess]
+    command.__signature__ = signature.replace(parameters=options)  # pyright: ignore[reportFunctionMemberAccess]
     return command
 
 
@@ -101,9 +89,6 @@ def run(
     limit: Annotated[
         float, typer.Option(min=1.0, max=86400.0, help="what a record may take, s; then it is a row")
     ] = 600.0,
-    renew: Annotated[
-        int, typer.Option(min=1, help="after so many records a worker's computing process is started anew")
-    ] = 500,
     wait: Annotated[
         float, typer.Option(min=0.1, help="with --scheduler: how long to wait for its first worker, s")
     ] = 60.0,
@@ -113,66 +98,26 @@ def run(
     columns: Columns = None,
     as_json: Json = False,
 ) -> None:
-    """One run."""
-    given = {name: value for name, value in locals().items() if name != "as_json"}
-    found = computed(**given)
-    say_json(found) if as_json else say(*run_lines(found))
-    refuse_undone(found["ok"], found["errors"], f"{output} says of each why")
+    """Do one verb with every record."""
+    require_extra()
+    from stimrig.api.cohort.errors import RESUMABLE, InterruptedRunError
+    from stimrig.api.cohort.run import run_cohort
 
-
-def computed(
-    verb: str, data: Sequence[str], output: Path, *, select: str = "", method: str = METHOD, effects: str = "",
-    scheduler: str = "", workers: int = 2, memory: str = "1GB", limit: float = 600.0, renew: int = 500,
-    wait: float = 60.0, again: bool = False, columns: Sequence[str] | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """One run, and the keys of `--json`. Raises InputError, CommandError."""
-    need_extra()
-    from stimrig.api.cohort import cluster
-    from stimrig.api.cohort.computing import Bounds
-    from stimrig.api.cohort.results import Results as Table
-    from stimrig.api.cohort.run import Run
-    from stimrig.api.cohort.select import Selection
-    from stimrig.api.cohort.sources import sources_of
-    from stimrig.api.cohort.tasks import CutOffError, Task, checked
-    from stimrig.api.version import software_version
-
-    given = (verb, Selection(select).text, method, names(effects), tuple(columns or ()), software_version())
-    task = checked(Task(*given))
-    place = cluster.Workers(scheduler, workers, cluster.memory_of(memory), wait)
-    sources = sources_of(data)
-    bounds = Bounds(limit, place.memory_bytes, renew)
-    for source in sources:
-        source.check()
-    began_s = time.monotonic()
     try:
-        with Table(output, task, again) as results, cluster.connected(place) as client:
-            with telling() as tell:
-                tally = Run(client, sources, task, bounds, results, tell).go()
-            counts = results.join()
-    except CutOffError as error:
+        report = run_cohort(
+            verb, data, output, select=select, method=method, effects=names(effects), scheduler=scheduler,
+            workers=workers, memory=memory, limit=limit, wait=wait, again=again, columns=columns,
+        )  # fmt: skip
+    except InterruptedRunError as error:
         raise CommandError(str(error)) from error
     except KeyboardInterrupt:
-        raise CommandError("interrupted. What is done is kept; the same command goes on.", INTERRUPTED) from None
-    if tally.left_open:
-        print(
-            f"stimrig cohort: workers could not be shut in: {tally.left_open}. See `stimrig doctor` there.",
-            file=sys.stderr,
-        )
-    return {
-        "output": str(output),
-        "records": counts["ok"] + counts["error"],
-        "ok": counts["ok"],
-        "errors": counts["error"],
-        "computed": tally.ok + tally.error,
-        "done_before": tally.before,
-        "left_out": tally.left_out,
-        "copies": tally.copies,
-        "took_s": round(time.monotonic() - began_s, 1),
-    }
+        raise CommandError(f"interrupted. {RESUMABLE}", INTERRUPTED) from None
+    say_json(report) if as_json else say(*_run_lines(report))
+    refuse_undone(report["ok"], report["errors"], f"{output} says of each why")
 
 
 def refuse_undone(done: int, failed: int, where: str) -> None:
-    """End with an exit code where not all of what was asked for was done. Raises CommandError, after the report."""
+    """Raise CommandError after the report, where not all of what was asked for was done."""
     nothing = "" if done else "nothing was done: "
     if failed:
         raise CommandError(f"{nothing}{failed} of {done + failed} records gave no result: {where}.")
@@ -186,11 +131,11 @@ def changed(
     as_json: Json = False,
 ) -> None:
     """Whose results differ between two runs, and why: what a new release is judged by before it is used on people."""
-    need_extra()
-    from stimrig.api.cohort.changed import compared
+    require_extra()
+    from stimrig.api.cohort.changed import compare_runs
 
-    found = compared(old, new).to_dict()
-    say_json(found) if as_json else say(*changed_lines(found))
+    report = compare_runs(old, new)
+    say_json(report) if as_json else say(*changed_lines(report))
 
 
 def figures(
@@ -199,124 +144,72 @@ def figures(
     as_json: Json = False,
 ) -> None:
     """Draw a cohort: effects by prevalence, parameters over sessions, repeatability, errors by reason."""
-    found = drawn(results, html)
-    ended = f"{found['records']} records, {found['ok']} with a result, {found['participants']} participants"
-    say_json(found) if as_json else say(ended, f"written to {html}")
+    report = draw(results, html)
+    summary = f"{report['records']} records, {report['ok']} with a result, {report['participants']} participants"
+    say_json(report) if as_json else say(summary, f"written to {html}")
 
 
-def drawn(results: Path, html: Path) -> dict[str, Any]:
-    """Draw a cohort into a file; the keys of `--json`. Raises InputError."""
-    need_extra()
-    from stimrig.api.cohort.figures import page, repeats
-    from stimrig.api.cohort.statistics import read_statistics
+def draw(results: Path, html: Path) -> dict[str, Any]:
+    """Draw a cohort into a file; return the keys of `--json`. Raises InputError."""
+    require_extra()
+    from stimrig.api.cohort.figures import page, read_cohort
 
-    found = read_statistics(results)
-    write(html, page(found, results.name))
-    of_what, total, counts = found.prevalence()
+    cohort = read_cohort(results)
+    write(html, page(cohort, results.name))
+    counted, total, effects = cohort.prevalence()
     return {
-        "output": str(html), "records": found.records, "ok": found.ok, "errors": dict(found.errors),
-        "participants": len(found.people), "verdicts": dict(found.verdicts), "counted": of_what, "of": total,
-        "effects": dict(counts), "repeatability": repeats(found),
+        "output": str(html), "records": cohort.ok + cohort.errors.total(), "ok": cohort.ok,
+        "errors": dict(cohort.errors), "participants": len(cohort.participants), "verdicts": dict(cohort.verdicts),
+        "counted": counted, "of": total, "effects": dict(effects), "repeatability": cohort.repeatability(),
     }  # fmt: skip
 
 
-def need_extra() -> None:
-    """Refuse without the extra. Raises InputError: a package is missing."""
+def require_extra() -> None:
+    """Raise InputError if a package of the extra is missing."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
     if missing:
         raise InputError(f"needs `pip install stimrig[cohort]` ({', '.join(missing)} is missing)")
 
 
-MOST_ROWS = 40
-"""Changed records that are shown; --json gives all."""
-EVERY_S = 60.0
-LEAST_S = 5.0
-"""Before there is no pace to tell a time from."""
-
-
-@contextmanager
-def telling() -> Iterator[Callable[[Tally], None]]:
-    """Give a function that shows a tally on standard error."""
-    watched = sys.stderr.isatty() or in_notebook()
-    began_s = told_s = time.monotonic()
-    with progress_bar() as bar:
-
-        def tell(tally: Tally) -> None:
-            nonlocal told_s
-            now_s = time.monotonic()
-            if watched:
-                bar(share(tally), words(tally, now_s - began_s))
-            elif now_s - told_s >= EVERY_S:
-                told_s = now_s
-                print(words(tally, now_s - began_s), file=sys.stderr, flush=True)
-
-        yield tell
-
-
-def share(tally: Tally) -> float:
-    """The share that is done; 0 while it is not known of how much."""
-    return min(1.0, tally.handled / tally.total) if tally.total else 0.0
-
-
-def words(tally: Tally, elapsed_s: float) -> str:
-    """A tally in one line."""
-    of = "" if tally.total is None else f" of {tally.total}"
-    failed = f", {tally.error} failed" if tally.error else ""
-    if elapsed_s < LEAST_S or not tally.now:
-        return f"{tally.handled}{of}{failed}"
-    pace = tally.now / elapsed_s
-    left_s = None if tally.total is None else max(0.0, (tally.total - tally.handled) / pace)
-    return f"{tally.handled}{of}{failed}, {pace:.3g}/s" + ("" if left_s is None else f", {duration(left_s)} left")
-
-
-def duration(seconds: float) -> str:
-    """A duration in two units at most."""
-    minutes = seconds / 60
-    if minutes < 1:
-        return f"{seconds:.0f} s"
-    return f"{minutes:.0f} min" if minutes < 90 else f"{minutes // 60:.0f} h {minutes % 60:.0f} min"
-
-
-def run_lines(found: dict[str, Any]) -> list[str]:
-    """What a person is told of a run."""
+def _run_lines(report: dict[str, Any]) -> list[str]:
     lines = [
-        f"records        {found['records']}: {found['ok']} with a result, {found['errors']} without "
+        f"records        {report['records']}: {report['ok']} with a result, {report['errors']} without "
         "(column `error` says why)",
-        f"this run       {found['computed']} computed, {found['done_before']} done before, {found['took_s']:g} s",
+        f"this run       {report['computed']} computed, {report['done_before']} done before, {report['took_s']:g} s",
+        *skipped_lines(report, "counted"),
     ]
-    lines += passed_over(found, "counted")
-    if not found["records"] + found["left_out"]:
+    if not report["records"] + report["left_out"]:
         lines.append("Nothing was found. A folder is searched for .h5, .hdf5, .csv, .tsv, .txt and .mat files.")
-    return [*lines, f"written to     {found['output']}"]
+    return [*lines, f"written to     {report['output']}"]
 
 
-def passed_over(found: dict[str, Any], done: str) -> list[str]:
-    """Records that were not meant, and files whose content was there already."""
-    left_out, copies = found["left_out"], found["copies"]
+def skipped_lines(report: dict[str, Any], verb: str) -> list[str]:
+    """Describe records that were not selected, and files whose content was there already."""
+    left_out, copies = report["left_out"], report["copies"]
     lines = [f"left out       {left_out} that --select does not mean"] if left_out else []
-    return lines + ([f"copies         {copies} files with the content of another: {done} once"] if copies else [])
+    return lines + ([f"copies         {copies} files with the content of another: {verb} once"] if copies else [])
 
 
-def changed_lines(found: dict[str, Any]) -> list[str]:
-    """A comparison for people."""
-    old, new, limits = found["old"], found["new"], found["tolerances"]
+def changed_lines(report: dict[str, Any]) -> list[str]:
+    """Describe a comparison of two runs."""
+    old, new, limits = report["old"], report["new"], report["tolerances"]
     lines = [
         f"{old['verb']}: stimrig {old['software']} ({old['file']}) → stimrig {new['software']} ({new['file']})",
-        *([f"made with other options: {found['other_options']}"] if found["other_options"] else []),
-        f"{found['compared']} records in both: {found['unchanged']} unchanged, {found['changed']} changed",
-        *(f"  {count:6d}  {kind}" for kind, count in found["counts"].items()),
+        *([f"made with other options: {report['other_options']}"] if report["other_options"] else []),
+        f"{report['compared']} records in both: {report['unchanged']} unchanged, {report['changed']} changed",
+        *(f"  {count:6d}  {kind}" for kind, count in report["counts"].items()),
         f"unchanged: a probability within {limits['probability']:g}, a parameter within {limits['parameter_sd']:g} sd "
         f"(without one {100 * limits['parameter_without_sd_relative']:g} %), held-out rms within "
         f"{100 * limits['held_out_rms_relative']:g} %",
     ]
-    for words, key in (("old", "only_in_old"), ("new", "only_in_new")):
-        if listed := found[key]:
-            more = f" and {len(listed) - 10} more" if len(listed) > 10 else ""
-            lines.append(f"only in {words}: {len(listed)} ({', '.join(listed[:10])}{more})")
+    for run_name in ("old", "new"):
+        if records := report[f"only_in_{run_name}"]:
+            more = f" and {len(records) - 10} more" if len(records) > 10 else ""
+            lines.append(f"only in {run_name}: {len(records)} ({', '.join(records[:10])}{more})")
     rows = [
         (row["record"], row["participant"] or "–", row["day"] or "–", "; ".join(row["why"]))
-        for row in found["records"][:MOST_ROWS]
+        for row in report["records"][:MAX_LISTED]
     ]
     lines += ["", *table(("record", "participant", "day", "why"), rows)] if rows else []
-    hidden = len(found["records"]) - len(rows)
+    hidden = len(report["records"]) - len(rows)
     return [*lines, *([f"and {hidden} records more (--json gives all)"] if hidden else [])]

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.commands.cohort import Columns, Given, Select, passed_over, refuse_undone, telling
+from stimrig.api.cli.commands.cohort import Columns, Given, Select, refuse_undone, skipped_lines
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.terminal import Json, say, say_json
 from stimrig.api.export.record_file import WRITERS
@@ -40,17 +40,16 @@ def exported(
     if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
         raise InputError("--format parquet: pyarrow is missing. Install it: pip install pyarrow.")
     from stimrig.api.cohort.select import Selection
-    from stimrig.api.cohort.sources import sources_of
-    from stimrig.api.export.folder import ERRORS, Export
+    from stimrig.api.export.folder import ERRORS, export_records
     from stimrig.identify.records.columns import parsed
 
     parsed(columns)  # refused before the folder is made
-    with telling() as tell:
-        tally = Export(sources_of(data), Selection(select), output, format, columns or (), not no_dates, tell).run()
     return {
-        "output": str(output), "format": format, "records": tally.ok, "errors": tally.error,
-        "left_out": tally.left_out, "copies": tally.copies, "errors_file": str(output / ERRORS),
-    }  # fmt: skip
+        "output": str(output),
+        "format": format,
+        **export_records(data, Selection(select), output, format, columns or (), dates=not no_dates),
+        "errors_file": str(output / ERRORS),
+    }
 
 
 def report(found: dict[str, Any]) -> list[str]:
@@ -58,4 +57,4 @@ def report(found: dict[str, Any]) -> list[str]:
     lines = [f"records        {found['records']}, listed in {Path(found['output']) / 'records.csv'}"]
     if found["errors"]:
         lines.append(f"not exported   {found['errors']}; {found['errors_file']} says why")
-    return [*lines, *passed_over(found, "exported"), f"written to     {found['output']}"]
+    return [*lines, *skipped_lines(found, "exported"), f"written to     {found['output']}"]

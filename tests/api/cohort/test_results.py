@@ -1,0 +1,224 @@
+"""Results on disk: whole or not there, resumable, no row twice, none lost."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from datetime import UTC, date, datetime
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from stimrig.api.cohort import results, table
+from stimrig.api.cohort.errors import CohortError, InterruptedRunError
+from stimrig.api.cohort.record import LEFT_OUT
+from stimrig.api.cohort.results import Results
+from stimrig.api.cohort.sources import Entry
+from stimrig.api.cohort.task import Task
+from stimrig.api.cohort.worker import COPY
+
+pytestmark = pytest.mark.slow
+
+TASK = Task("fit", software="1.0")
+
+
+def row(name: str, content: str | None = None, status: str = "ok", **more: Any) -> dict[str, Any]:
+    sha256 = None if content == "" else hashlib.sha256((content or name).encode()).hexdigest()
+    keys = {"address": f"/d/{name}", "name": name, "stamp": f"s-{content or name}", "sha256": sha256, "bytes": 3}
+    return {**keys, "status": status, **more}
+
+
+def failure(name: str, kind: str, content: str | None = None) -> dict[str, Any]:
+    return row(name, content, "error", error_kind=kind)
+
+
+def entry(name: str, content: str | None = None) -> Entry:
+    return Entry(f"/d/{name}", name, stamp=f"s-{content or name}", known={"name": name, "bytes": 3})
+
+
+def written(output: Path) -> list[str]:
+    return sorted(f"{row['name']} {row['status']}" for row in pq.read_table(output).to_pylist())
+
+
+@pytest.fixture
+def output(tmp_path: Path) -> Path:
+    return tmp_path / "results.parquet"
+
+
+def run(output: Path, *rows: dict[str, Any], join: bool = True, **options: Any) -> list[str]:
+    """Add rows in a run; return the status of each."""
+    with Results(output, TASK, **options) as results:
+        statuses = [results.add(one) for one in rows]
+        if join:
+            results.join()
+    return statuses
+
+
+def refuse(output: Path, match: str, task: Task = TASK) -> None:
+    with pytest.raises(CohortError, match=match), Results(output, task):
+        pass
+
+
+def test_interrupted_run_resumes(output: Path) -> None:
+    run(output, row("a"), failure("b", "bad record"), row("c", status=LEFT_OUT), join=False)
+    assert not output.exists()
+    with Results(output, TASK) as results:
+        assert [results.has(entry(name)) for name in "abcd"] == [True, True, False, False]
+        assert not results.has(entry("a", "changed"))
+        assert len(results.contents(entry("z"))) == 1, "a file of the size of `a` may be a copy of it"
+        results.add(row("d"))
+        assert results.join() == {"ok": 2, "error": 1}
+    assert written(output) == ["a ok", "b error", "d ok"]
+    assert not results.folder.exists()
+
+
+def test_finished_results_take_in_what_is_new(output: Path) -> None:
+    run(output, row("a"), row("b"))
+    run(output, row("c"))
+    assert written(output) == ["a ok", "b ok", "c ok"]
+
+
+def test_run_that_did_nothing_leaves_nothing(output: Path) -> None:
+    with Results(output, TASK) as results:
+        assert results.folder.exists()
+    assert list(output.parent.iterdir()) == []
+    with Results(output, Task("diagnose", software="1.0")):
+        pass
+
+
+def test_half_written_part_counts_for_nothing(output: Path) -> None:
+    run(output, row("a"), join=False)
+    Path(f"{output}.parts/.00000001.parquet.new").write_bytes(b"PAR1half")
+    run(output, row("b"))
+    assert written(output) == ["a ok", "b ok"]
+
+
+def test_killed_between_joining_and_removing_the_parts(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", lambda *_, **__: None)
+        run(output, row("a"), failure("b", "timeout"))
+    assert Path(f"{output}.parts").exists()
+    run(output)
+    assert written(output) == ["a ok", "b error"]
+
+
+def test_full_disk_keeps_the_parts(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    run(output, row("a"), join=False)
+    with Results(output, TASK) as results, monkeypatch.context() as patch:
+        patch.setattr(pq.ParquetWriter, "write_table", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+        with pytest.raises(InterruptedRunError, match="No space left"):
+            results.join()
+    assert not output.exists()
+    run(output)
+    assert written(output) == ["a ok"]
+
+
+def test_content_counts_once_wherever_it_lies(output: Path) -> None:
+    assert run(output, row("a", "x"), row("b", "x")) == ["ok", COPY]
+    assert written(output) == ["a ok"]
+
+
+def test_replaced_file_takes_its_old_row_with_it(output: Path) -> None:
+    run(output, row("a", "old"), row("b", "moved"))
+    assert run(output, row("a", "new"), row("b", "other"), row("c", "moved"))[-1] == COPY
+    for _ in range(2):
+        assert {row["stamp"] for row in pq.read_table(output).to_pylist()} == {"s-new", "s-other", "s-moved"}
+        run(output)
+
+
+def test_transient_errors_are_repeated_if_asked(output: Path) -> None:
+    run(output, failure("slow", "timeout"), failure("far", "unreadable", ""), failure("bad", "bad record"))
+    with Results(output, TASK) as results:
+        assert results.has(entry("slow"))
+    with Results(output, TASK, again=True) as results:
+        assert not results.has(entry("slow")) and results.has(entry("bad"))
+        assert [results.add(row(name)) for name in ("slow", "far")] == ["ok", "ok"]
+        results.join()
+    assert written(output) == ["bad error", "far ok", "slow ok"]
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        (Task("diagnose", software="1.0"), "verb fit, now diagnose"),
+        (Task("fit", software="2.0"), "software 1.0, now 2.0"),
+        (Task("fit", effects=("fatigue",), software="1.0"), "effects none, now fatigue"),
+        (Task("fit", 'rig == "R"', software="1.0"), "select none"),
+    ],
+)
+@pytest.mark.parametrize("join", [False, True])
+def test_other_options_are_refused(output: Path, other: Task, named: str, join: bool) -> None:
+    run(output, row("a"), join=join)
+    refuse(output, named, other)
+    with Results(output, TASK) as results:
+        assert results.has(entry("a"))
+
+
+def test_two_runs_never_write_one_output(output: Path) -> None:
+    with Results(output, TASK):
+        refuse(output, "another run")
+    run(output)
+
+
+def test_other_files_are_never_overwritten(output: Path, tmp_path: Path) -> None:
+    output.write_bytes(b"somebody's letter")
+    refuse(output, "no table of results")
+    pq.write_table(pa.table({"a": [1]}), output)
+    refuse(output, "no results of a cohort")
+    assert pq.read_table(output).num_rows == 1
+    refuse(tmp_path, "a folder")
+    assert [path.name for path in tmp_path.iterdir()] == [output.name]
+    (tmp_path / "file").write_bytes(b"")
+    refuse(tmp_path / "file" / "x.parquet", "can be written")
+
+
+def test_many_rows_are_written_in_groups(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(results, "PART_ROWS", 7)
+    monkeypatch.setattr(results, "GROUP_ROWS", 10)
+    monkeypatch.setattr(table, "BATCH_ROWS", 4)
+    run(output, *(row(str(number % 50), status="ok" if number % 3 else LEFT_OUT) for number in range(60)))
+    assert written(output) == sorted({f"{number % 50} ok" for number in range(60) if number % 3})
+    assert pq.read_metadata(output).num_row_groups > 2
+
+
+def test_columns_have_types_and_units(output: Path) -> None:
+    time_utc = datetime(2026, 2, 1, tzinfo=UTC)
+    parameter = {"of": "model", "name": "damping", "value": 1, "sd": None, "unit": "1", "more": "dropped"}
+    run(output, row("a", day=date(2026, 1, 31), computed_utc=time_utc, parameters=[parameter], took_s=0.5, nobody=1))
+    found = pq.read_table(output)
+    assert found.schema.field("rms_nm").metadata[b"unit"] == "N·m".encode()
+    assert all(field.metadata[b"description"] for field in found.schema)
+    assert json.loads(found.schema.metadata[b"options"]) == TASK.options()
+    (stored,) = found.to_pylist()
+    assert (stored["day"], stored["computed_utc"]) == (date(2026, 1, 31), time_utc)
+    assert stored["parameters"][0]["value"] == 1.0
+
+
+@pytest.mark.parametrize("nonsense", [{"kind": "\ud800"}, {"rate_hz": "fast"}, {"rate_hz": 2**2000}, {"begun_utc": {}}])
+def test_row_that_cannot_be_stored_is_an_error(nonsense: dict[str, Any]) -> None:
+    found = table.rows_to_table([row("a"), {**row("b"), **nonsense}]).to_pylist()
+    assert [one["status"] for one in found] == ["ok", "error"]
+    assert found[1]["address"] == "/d/b" and found[1]["error_kind"] == "unexpected" and found[1]["error"]
+
+
+EMPTY = table.SCHEMA.empty_table()
+TABLES = {
+    "other-columns": (pa.table({"a": [1]}), b"{}"),
+    "texts": (pa.table({name: ["x"] for name in table.SCHEMA.names}), b"{}"),
+    "deep": (EMPTY, b"[" * 100_000),
+    "no-object": (EMPTY, b"[1]"),
+}
+
+
+@pytest.mark.parametrize("name", TABLES)
+def test_damaged_results_are_refused_in_one_line(tmp_path: Path, name: str) -> None:
+    content, options = TABLES[name]
+    about = {b"format": table.FORMAT.encode(), b"format_version": table.FORMAT_VERSION.encode(), b"options": options}
+    pq.write_table(content.replace_schema_metadata(about), tmp_path / "r.parquet")
+    with pytest.raises(CohortError, match=r"r\.parquet: ") as caught:
+        table.read_options(tmp_path / "r.parquet")
+    assert "\n" not in str(caught.value)
