@@ -265,20 +265,6 @@ def check_door(settings: Settings) -> Iterator[Finding]:
     yield Finding("address", "ok", says)
 
 
-def check_workers(_settings: Settings) -> Iterator[Finding]:
-    """Can the processes that read other people's files be shut in?"""
-    command = [sys.executable, "-m", "stimrig.api.workers.confinement"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=30)
-    left_open = json.loads(done.stdout)
-    if not left_open:
-        says = "isolated: no network, no files but recordings, limits on memory and time"
-        yield Finding("workers", "ok", says)
-    for what, why in left_open.items():
-        fix = "a kernel from 5.13 on with Landlock" if what == "files" else "Linux on x86_64 or aarch64 with seccomp"
-        says = f"{what}: workers that read uploads cannot be isolated from them here ({why})"
-        yield Finding("workers", "care", says, f"{fix}; until then upload only files from people you trust")
-
-
 MARKS = {"ok": "ok   ", "care": "care ", "fails": "FAILS"}
 
 
