@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 from stimrig.api import local_time
 from stimrig.api.charts.drawing import svg
@@ -90,81 +93,53 @@ def _dates(sessions: Sequence[dict[str, Any]]) -> Axis:
     return Axis("", limits=(-room, days + room), ticks=ticks)
 
 
-def _panel_of(points: list[Point], title: str, unit: str, x: Axis, levels: Sequence[float] = (), breaks: bool = False
-) -> dict[str, Any]:  # fmt: skip
+def _panel_of(
+    points: Sequence[Point], title: str, unit: str, x: Axis, levels: Sequence[float] = (), breaks: bool = False
+) -> dict[str, Any]:
     known = [point for point in points if point.value is not None]
-    figure = history(points, unit, x, levels, breaks)
-    drawn = svg(figure, WIDE_PX, label=f"{title}, {unit}") if known else ""
+    drawn = svg(history(points, unit, x, levels, breaks), WIDE_PX, label=f"{title}, {unit}") if known else ""
     return {"title": title, "unit": unit, "latest": known[-1].text if known else "–", "svg": drawn}
 
 
-def history(points: list[Point], unit: str, x: Axis, levels: Sequence[float] = (), breaks: bool = False) -> Figure:
+def history(points: Sequence[Point], unit: str, x: Axis, levels: Sequence[float] = (), breaks: bool = False) -> Figure:
     """Return values with their bands; dots are hollow where nothing is approved, flags say that something is noted.
 
     A line joins values; with `breaks` only those at the same current.
     """
-    low, high = span(points)
-    runs = _runs(points, breaks)
-    line = [part for run in runs for part in (*((point.x, point.value) for point in run), (run[-1].x, None))]
-    banded = [[point for point in run if point.half is not None] for run in runs]
-    bands = [_band(run) for run in banded if len(run) > 1]
-    bars = [part for run in banded for point in run for part in _bar(point)]
-    known = [point for run in runs for point in run]
-    curves = [
-        Curve([at for at, _ in line], [value for _, value in line], "", "model"),
-        Curve([at for at, _ in bars], [value for _, value in bars], "", "model", 0.7),
-        *(_dots([point for point in known if point.approved is approved], not approved) for approved in (True, False)),
-        Curve([point.x for point in points if point.flagged], [high] * sum(point.flagged for point in points), "",
-              "width", 0, marker="down", size=8),
-    ]  # fmt: skip
-    rules = tuple(Rule(level, colour="width") for level in levels if low <= level <= high)
-    return Figure(x, (Axis(unit, limits=(low, high)),), tuple(curves), tuple(bands), rules=rules, height=TALL_PX)
-
-
-def _runs(points: list[Point], breaks: bool) -> list[list[Point]]:
-    runs: list[list[Point]] = []
-    before: Point | None = None
+    rows: list[tuple[float, float, float]] = []
+    current_ma: float | None = None
     for point in points:
+        if point.value is None or (breaks and point.current_ma != current_ma):
+            rows.append((point.x, math.nan, math.nan))
         if point.value is not None:
-            if before is None or (breaks and before.current_ma != point.current_ma):
-                runs.append([])
-            runs[-1].append(point)
-        before = point if point.value is not None else None
-    return runs
+            rows.append((point.x, point.value, math.nan if point.half is None else point.half))
+        current_ma = point.current_ma
+    at, value, half = np.array(rows).T
+    known = np.nan_to_num(half)
+    limits = span(value - known, value + known, value)
+    bars = np.column_stack([value - half, value + half, np.full(at.size, np.nan)])
+    curves = [Curve(at.tolist(), value.tolist(), "", "model"),
+              Curve(np.repeat(at, 3).tolist(), bars.ravel().tolist(), "", "model", 0.7)]  # fmt: skip
+    for hollow in (False, True):
+        dots = [(point.x, point.value) for point in points if point.approved is not hollow]
+        curves.append(Curve([x for x, _ in dots], [y for _, y in dots], "", "model", 0, marker="circle", size=7,
+                            hollow=hollow))  # fmt: skip
+    flags = [point.x for point in points if point.flagged]
+    curves.append(Curve(flags, [limits[1]] * len(flags), "", "width", 0, marker="down"))
+    band = Band(at.tolist(), (value - half).tolist(), (value + half).tolist())
+    rules = tuple(Rule(level, colour="width") for level in levels if limits[0] <= level <= limits[1])
+    return Figure(x, (Axis(unit, limits=limits),), tuple(curves), (band,), rules=rules, height=TALL_PX)
 
 
-def _edges(point: Point) -> tuple[float, float]:
-    value, half = point.value or 0.0, point.half or 0.0
-    return value - half, value + half
-
-
-def _band(run: list[Point]) -> Band:
-    lower, upper = zip(*map(_edges, run), strict=True)
-    return Band([point.x for point in run], lower, upper, listed=False)
-
-
-def _bar(point: Point) -> list[tuple[float, float | None]]:
-    low, high = _edges(point)
-    return [(point.x, low), (point.x, high), (point.x, None)]
-
-
-def _dots(points: list[Point], hollow: bool) -> Curve:
-    return Curve([point.x for point in points], [point.value for point in points], "", "model", 0, marker="circle",
-                 size=7, hollow=hollow)  # fmt: skip
-
-
-def span(points: Sequence[Point]) -> tuple[float, float]:
+def span(lower: Any, upper: Any, value: Any) -> tuple[float, float]:
     """Return the range that is shown: the values, and their bands as far as they do not dwarf them."""
-    values = [point.value for point in points if point.value is not None]
-    if not values:
+    if np.isnan(value).all():
         return 0.0, 1.0
-    low, high = min(values), max(values)
+    low, high = float(np.nanmin(value)), float(np.nanmax(value))
     room = max(high - low, LEAST_SPAN * max(abs(low), abs(high))) or 1.0
-    edges = [_edges(point) for point in points if point.value is not None]
-    if len(values) == 1:  # no other value that its band could dwarf
-        room = max(room, edges[0][1] - values[0])
-    bottom = max(min(below for below, _ in edges), low - room)
-    top = min(max(above for _, above in edges), high + room)
+    if np.isfinite(value).sum() == 1:  # no other value that its band could dwarf
+        room = max(room, float(np.nanmax(upper)) - high)
+    bottom, top = max(float(np.nanmin(lower)), low - room), min(float(np.nanmax(upper)), high + room)
     short = max(room - (top - bottom), 0.0)
     return bottom - short / 2 - 0.06 * room, top + short / 2 + 0.1 * room
 
@@ -199,12 +174,12 @@ def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[di
 
 
 def _trial_point(trial: Mapping[str, Any], name: str) -> Point:
-    value, half = trial_figure(trial, name)
+    value, half = _trial_value(trial, name)
     approved = trial["outcome"] in ("followed", "little")
     return Point(float(trial["number"]), value, half, approved, bool(trial["ask"]), trial_words(trial, name))
 
 
-def trial_figure(trial: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:
+def _trial_value(trial: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:
     """Return a trial's value in the unit that is shown, and half its band; None where it is not known."""
     if name == "error_percent":
         return trial[name], None
@@ -214,7 +189,7 @@ def trial_figure(trial: Mapping[str, Any], name: str) -> tuple[float | None, flo
 
 def trial_words(trial: Mapping[str, Any], name: str) -> str:
     """Return a trial's value with its band: 92.4 ± 0.8 %."""
-    value, half = trial_figure(trial, name)
+    value, half = _trial_value(trial, name)
     if value is None:
         return "–"
     text = f"{value:.1f}" + ("" if half is None else f" ± {half:.1f}")

@@ -19,7 +19,7 @@ from stimrig.api.sessions import controllers
 from stimrig.api.sessions.requests import EffectsIn, TestIn
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Approver, Context, Ctx, ModelReader, Tester, Version
-from stimrig.api.web.pages import next_view, starting, trend_view, typed
+from stimrig.api.web.pages import next_view, starting, typed
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.pages.report_file import missing_parts
 from stimrig.api.web.pages.typed import Text
@@ -50,7 +50,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
         ),
         fit_words=advice.fit_sentence(document.get("fit") or {}),
         step=await next_step_of(context, row, version, who),
-        changes=await trend_view.changes_of(context, row),
+        changes=await asyncio.to_thread(context.trend.changes_to, row),
         ask_password=not await context.people.is_confirmed(who.session_hash),
         **await facts(context, row, document),
         threshold_us=stored_model.threshold_us(row),
