@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
-from stimrig.api.charts.figure import LIGHT, Axis, Band, Curve, Figure, variable
+from stimrig.api.charts.figure import LIGHT, Band, Curve, Figure, variable
 from stimrig.api.charts.interactive import TOOLBAR_PX
 
 MOST_POINTS, MOST_BAND = 2000, 250
@@ -28,7 +28,7 @@ WIDE = ("comparison", "residual", "falling", "story-torque", "story-place")
 """Charts that a report gives its whole width."""
 NARROW = 560.0
 """A narrower chart has no room for the segments' names."""
-FONT_PX, LETTER_PX, LINE_PX, GAP_PX = 11.5, 6.6, 17.0, 26.0
+FONT_PX, LETTER_PX, LINE_PX, GAP_PX, LEFT_PX = 11.5, 6.6, 17.0, 26.0, 72.0
 SETTINGS = {
     "svg.fonttype": "none", "pdf.fonttype": 42, "font.family": "DejaVu Sans", "font.size": FONT_PX,
     "axes.labelsize": FONT_PX, "xtick.labelsize": FONT_PX, "ytick.labelsize": FONT_PX, "legend.fontsize": FONT_PX,
@@ -179,14 +179,10 @@ def _lay_out(
     columns = max(1, int(width / (LETTER_PX * max((len(entry.label) for entry in entries), default=1) + 40)))
     lines = textwrap.wrap(caption, int(width / LETTER_PX))
     below, height = LINE_PX * len(lines), figure.height + LINE_PX * len(lines)
-    left = max(
-        72.0 if count > 1 else 58.0,
-        30 + LETTER_PX * max((len(words) for panel in figure.panels for _, words in panel.ticks), default=0),
-    )
     top = 8 + LINE_PX * (-(-len(entries) // columns) + any(not label.badge for label in figure.labels))
     bottom = below + (38 if figure.x.label else 22)
     each = (height - top - bottom - GAP_PX * (count - 1)) / count
-    place = {"left": left / width, "right": 1 - (14 + right) / width, "top": 1 - top / height,
+    place = {"left": LEFT_PX / width, "right": 1 - (14 + right) / width, "top": 1 - top / height,
              "bottom": bottom / height, "hspace": GAP_PX / each}  # fmt: skip
     paper = Paper((width / 72, height / 72), dpi=72, facecolor=colours["chart"])
     shares = [panel.share for panel in figure.panels]
@@ -199,30 +195,23 @@ def _lay_out(
         axes.tick_params(labelbottom=last)
         fits = LETTER_PX * len(panel.label) < axes.bbox.height + GAP_PX
         axes.set_ylabel(panel.label if fits else panel.label.replace(" (", "\n("))
-        axes.yaxis.set_label_coords((30 if count > 1 else 16) / width, (axes.bbox.y0 + axes.bbox.y1) / 2 / height,
-                                    paper.transFigure)  # fmt: skip
-        _set_axis(axes.yaxis, axes.set_ylim, panel, wide=True)
+        axes.yaxis.set_label_coords(
+            (20 if fits else 32) / width, (axes.bbox.y0 + axes.bbox.y1) / 2 / height, paper.transFigure
+        )
+        axes.set_ylim(*(panel.limits or (0 if panel.from_zero else None, None)))
     panels[-1].set_xlabel(figure.x.label)
-    fits = LETTER_PX * sum(len(words) + 2 for _, words in figure.x.ticks) < width - left
-    _set_axis(panels[-1].xaxis, panels[-1].set_xlim, figure.x, wide=fits)
+    panels[-1].set_xlim(figure.x.limits)
+    if figure.x.ticks:
+        fits = LETTER_PX * sum(len(words) + 2 for _, words in figure.x.ticks) < width - LEFT_PX
+        names = [words if fits else words.split()[0] for _, words in figure.x.ticks]
+        panels[-1].set_xticks([at for at, _ in figure.x.ticks], names)
     if entries:
-        anchor = (left / width if width >= NARROW else 0.01, 1)
+        anchor = (LEFT_PX / width if width >= NARROW else 0.01, 1)
         handles, words = [_handle(entry, colours) for entry in entries], [entry.label.lstrip("_") for entry in entries]
         paper.legend(handles, words, loc="upper left", bbox_to_anchor=anchor, ncols=columns)
     for number, line in enumerate(lines, start=1):
         paper.text(8 / width, (below - LINE_PX * number + 4) / height, line)
     return paper, panels
-
-
-def _set_axis(axis: Any, set_limits: Any, of: Axis, wide: bool) -> None:
-    if of.ticks:
-        axis.set_ticks(
-            [at for at, _ in of.ticks], labels=[words if wide else words.split()[0] for _, words in of.ticks]
-        )
-    if of.limits:
-        set_limits(*of.limits)
-    elif of.from_zero:
-        set_limits(bottom=0)
 
 
 def _add_parts(figure: Figure, panels: Sequence[Any], colours: Mapping[str, Any], width: float) -> None:
@@ -284,19 +273,26 @@ def _compact(text: str, axes: Any) -> str:
     """
     body = text[text.index("</defs>") + len("</defs>") : text.rindex("</svg>")]
     body = re.sub(r"<!--.*?-->", "", body, flags=re.DOTALL)
-    body = re.sub(r"<[^>]*>", lambda tag: _shorten(tag[0]), body)
+    body = re.sub(r">\s+<", "><", re.sub(r"<[^>]*>", lambda tag: _shorten(tag[0]), body)).strip()
     for name, stand_in in STAND_INS.items():
         body = body.replace(stand_in, variable(name))
+    body = re.sub(r'<g[^>]*>(?:<use [^>]* fill="([^"]*)"/>)+', lambda run: _colour_once(run[0], run[1]), body)
     (low, high), (first_px, last_px) = axes.get_xlim(), axes.bbox.intervalx
     scale = f"{low:.6g} {first_px:.6g} {(last_px - first_px) / (high - low):.6g}"
-    return f' data-x="{scale}">' + re.sub(r">\s+<", "><", body).strip()
+    return f' data-x="{scale}">{body}'
 
 
 def _shorten(tag: str) -> str:
     if tag.startswith("<g id="):
         return "<g/>" if tag.endswith("/>") else "<g>"
     tag = re.sub(r' style="([^"]*)"', lambda style: _attributes(style[1]), tag)
-    return re.sub(r"-?\d+\.\d{2,}", lambda value: f"{float(value[0]):.1f}", " ".join(tag.split()))
+    tag = re.sub(r"-?\d+\.\d{2,}", lambda value: f"{float(value[0]):.1f}", " ".join(tag.split()))
+    return re.sub(r" ([ML]) (?=[-\d])", r"\1", tag)
+
+
+def _colour_once(markers: str, fill: str) -> str:
+    """Give the group of a curve's markers their colour in place of each marker."""
+    return markers.replace(f' fill="{fill}"/>', "/>").replace(">", f' fill="{fill}">', 1)
 
 
 def _attributes(style: str) -> str:

@@ -11,8 +11,8 @@ from typing import Annotated
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from stimrig.api.charts.drawing import Figures
-from stimrig.api.charts.interactive import page_figure
+from stimrig.api.charts.drawing import Figures, svg
+from stimrig.api.charts.interactive import TOOLBAR_PX, page_figure
 from stimrig.api.errors import NotFoundError
 from stimrig.api.web.dependencies import Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
@@ -58,7 +58,9 @@ def answer(request: Request, figures: Figures, name: str, width: int) -> Respons
         file_name = f"{request.path_params.get('model_id', 'compare')}-{stem}"
         body = json.dumps(page_figure(figures[stem], file_name)).encode()
     else:
-        body = figures.still(stem, width).encode() if kind == "html" else figures.file(stem, kind, width)
+        body = (
+            svg(figures[stem], width, right=TOOLBAR_PX).encode() if kind == "html" else figures.file(stem, kind, width)
+        )
     return to_keep(request, body, KINDS[kind])
 
 
