@@ -13,16 +13,14 @@ import httpx
 import pytest
 from pydantic import ValidationError
 
-from stimrig.api.clock import Clock
 from stimrig.api.models import tracking
-from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.models.tracking import NEW_TEST, Limits
-from stimrig.api.store import Store
-from stimrig.api.store.tables import Model, Participant, Recording, Test, Tracked
+from stimrig.api.store.tables import Approval, Model, Test, Tracked
 from stimrig.rig.messages import FinishedEvent
 from tests.api import stub_worker
-from tests.api.conftest import STUB, Service, put_database, run_test, serving, soon, wait_done
+from tests.api.clinic import Clinic
+from tests.api.conftest import STUB, Service, run_test, serving, soon, wait_done
 
 WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 40}}]
 MODEL, TRACKING = "/v1/participants/P017/model", "/v1/participants/P017/tracking"
@@ -35,51 +33,33 @@ def gain(document: dict[str, Any], approved: dict[str, Any]) -> float:
 # ---- what is kept and served, on the database alone -----------------------------------------------------------------
 
 
-class Clinic:
-    """One participant in a database, and trials that are followed as the stub says."""
+class Trials(Clinic):
+    """Trials that are followed as the stub says."""
 
     def __init__(self, folder: Path) -> None:
-        put_database(folder)
-        self.folder, self.store, clock = folder, Store(f"sqlite:///{folder}/stimrig.db"), Clock()
-        self.clock, self.versions = clock, Versions(self.store, clock)
-        self.tracked = TrackedVersions(self.store, clock, self.versions)
-        self.count = 0
-        with self.store.write() as session:
-            session.add(Participant(code="P017", profile={}, created_utc=clock.utc(), created_by="Ada"))
+        super().__init__(folder)
+        self.tracked = TrackedVersions(self.store, self.clock, self.versions)
 
-    def test(self, **plan: Any) -> str:
-        """A test that was played, with its recording."""
-        self.count += 1
-        test_id, now = f"T{self.count}", self.clock.utc()
-        plan = {"profile": {"current_ma": 20.0}, "side": None, "muscle": None, "placement": None, **plan}
-        given = {"plan": plan, "summary": {}, "requested_by": "Ada", "requested_utc": now}
-        with self.store.write() as session:
-            session.add(Test(id=test_id, participant="P017", kind="sequence", state="completed", **given))
-            session.flush()
-            session.add(Recording(id=f"R{test_id}", participant="P017", test_id=test_id, path="", file_sha256="",
-                                  created_utc=now))  # fmt: skip
-            session.get_one(Test, test_id).recording_id = f"R{test_id}"
-        return test_id
+    @property
+    def approval(self) -> Approval:
+        """The newest one."""
+        return self.store.first(Approval, Approval.approved, order=Approval.id.desc())
 
-    def approve(self, model_id: str = "", limits: Limits = Limits(), **plan: Any) -> str:  # noqa: B008
-        """A model that a person approves, of a new test without an id."""
-        if not model_id:
-            text = json.dumps(stub_worker.model([]))
-            model_id = self.versions.add(text, "P017", f"R{self.test(**plan)}", "Ada").id
-        self.approval = self.versions.decide(model_id, True, "Ada", "", limits)
+    def begin(self, limits: Limits | None = None, **plan: Any) -> str:
+        """A model that a person approves, of a new test."""
+        model_id = self.model(**plan).id
+        self.approve(model_id, limits or Limits())
         return model_id
 
     def follow(self, test_id: str = "", **wanted: Any) -> Tracked | None:
         """A trial is played under the approval and followed; `wanted`: what the worker says of it."""
         trial = self.tracked.open_trial(test_id or self.test(approval_id=self.approval.id))
-        if trial is None:
-            return None
+        assert trial is not None
         (self.folder / "track.json").write_text(json.dumps(wanted))
-        given = {name: getattr(trial, name) for name in ("state", "missed", "bounds", "model_json")}
-        data = {"data": str(self.folder / "trial.h5"), "reference_torque_nm": None, "between": []}
-        if not trial.problem:
-            return self.tracked.keep(trial, stub_worker.tracked({**data, **given}, lambda _: None))
-        return self.tracked.keep(trial, {"reason": trial.problem})
+        given: dict[str, Any] = {name: getattr(trial, name) for name in ("state", "missed", "bounds", "model_json")}
+        given |= {"data": str(self.folder / "trial.h5"), "reference_torque_nm": None, "between": []}
+        found = {"reason": trial.problem} if trial.problem else stub_worker.track(lambda *_: None, **given)
+        return self.tracked.keep(trial, found)
 
     def served(self) -> dict[str, Any]:
         """What the controller is served."""
@@ -95,8 +75,8 @@ class Clinic:
 
 
 @pytest.fixture
-def clinic(tmp_path: Path) -> Iterator[Clinic]:
-    made = Clinic(tmp_path)
+def clinic(tmp_path: Path) -> Iterator[Trials]:
+    made = Trials(tmp_path)
     yield made
     made.store.close()
 
@@ -122,10 +102,10 @@ STILL = Limits(gain_percent=0.0)
     ],
 )
 def test_beyond_the_limits_the_last_version_within_stays_and_a_person_is_asked(
-    clinic: Clinic, limits: Limits, trials: list[dict[str, Any]], trial: int, share: float, words: str | None
+    clinic: Trials, limits: Limits, trials: list[dict[str, Any]], trial: int, share: float, words: str | None
 ) -> None:
     """Which words for which limit: below."""
-    clinic.approve(limits=limits)
+    clinic.begin(limits)
     before, rows = clinic.served(), []
     for wanted in trials:
         before = clinic.served()
@@ -142,16 +122,16 @@ def test_beyond_the_limits_the_last_version_within_stays_and_a_person_is_asked(
         assert rows[-1].step["state"]["missed"] == 2, "what is known has become less certain"
 
 
-def test_where_nothing_is_tracked_no_trial_is_followed(clinic: Clinic) -> None:
-    clinic.approve(limits=Limits(gain_percent=0, threshold_percent=0, time_scale_percent=0))
+def test_where_nothing_is_tracked_no_trial_is_followed(clinic: Trials) -> None:
+    clinic.begin(Limits(gain_percent=0, threshold_percent=0, time_scale_percent=0))
     assert clinic.tracked.allowing("P017") is None and clinic.served() == clinic.plain()
 
 
-def test_a_new_approval_starts_anew_and_a_rejected_one_serves_nothing(clinic: Clinic) -> None:
-    model = clinic.approve()
+def test_a_new_approval_starts_anew_and_a_rejected_one_serves_nothing(clinic: Trials) -> None:
+    model = clinic.begin()
     clinic.follow()
     begun = clinic.test(approval_id=clinic.approval.id)
-    clinic.approve(model)
+    clinic.approve(model, Limits())
     assert clinic.served() == clinic.plain()
     row = clinic.follow(begun)
     assert row and row.outcome == "not-followed" and clinic.served() == clinic.plain(), "begun under the older one"
@@ -161,10 +141,9 @@ def test_a_new_approval_starts_anew_and_a_rejected_one_serves_nothing(clinic: Cl
     assert clinic.tracked.served("P017") is None is clinic.tracked.document("P017")
 
 
-def test_undo_ends_what_was_tracked_and_keeps_the_limits(clinic: Clinic) -> None:
-    first = clinic.versions.get(clinic.approve())
-    text = json.dumps(stub_worker.model(["fatigue"]))
-    child = clinic.versions.add(text, "P017", first.recording_id, "Ada", first.id).id
+def test_undo_ends_what_was_tracked_and_keeps_the_limits(clinic: Trials) -> None:
+    first = clinic.versions.get(clinic.begin())
+    child = clinic.model(("fatigue",), first.recording_id[1:], first.id).id
     clinic.approve(child, Limits(gain_percent=15.0))
     clinic.follow()
     assert clinic.served()["tracking"]["approved_model_id"] == child
@@ -174,18 +153,18 @@ def test_undo_ends_what_was_tracked_and_keeps_the_limits(clinic: Clinic) -> None
     assert told and told["limits"]["gain_percent"] == 15.0 and told["trials"] == []
 
 
-def test_rates_are_learnt_from_the_same_place(clinic: Clinic) -> None:
-    model = clinic.approve()
+def test_rates_are_learnt_from_the_same_place(clinic: Trials) -> None:
+    model = clinic.begin()
     clinic.follow()
     assert clinic.tracked.earlier(clinic.approval) == []
-    clinic.approve(model)
+    clinic.approve(model, Limits())
     assert len(clinic.tracked.earlier(clinic.approval)) == 1, "the approval before this one"
-    clinic.approve(profile={"current_ma": 15.0})
+    clinic.begin(profile={"current_ma": 15.0})
     assert clinic.tracked.earlier(clinic.approval) == [], "none at this current"
 
 
-def test_a_damaged_model_is_not_followed(clinic: Clinic) -> None:
-    model = clinic.approve()
+def test_a_damaged_model_is_not_followed(clinic: Trials) -> None:
+    model = clinic.begin()
     with clinic.store.write() as session:
         row = session.get_one(Model, model)
         row.document, row.etag = row.document.replace(b"1", b"2", 1), hashlib.sha256(row.document).hexdigest()
