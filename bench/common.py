@@ -79,7 +79,7 @@ def line(cells: Iterable[object]) -> str:
 @contextmanager
 def services(*emulator: str) -> Iterator[Any]:
     """A service with its emulated rig, and its client."""
-    from stimrig.api.cli.launcher import Services
+    from stimrig.api.cli.supervisor import Services
     from stimrig.api.client.rest import Client
     from stimrig.api.settings import Settings
 

@@ -20,7 +20,7 @@ from stimrig.identify.summary import register_plotter
 if TYPE_CHECKING:
     from stimrig import cohort
     from stimrig.api.charts.plot import plot
-    from stimrig.api.cli.result_files import save
+    from stimrig.api.cli.files import save
     from stimrig.api.client.rest import Client
     from stimrig.api.schemas import load as schema
     from stimrig.identify import Model, Record, compare, next_experiment, predict, read
@@ -40,7 +40,7 @@ _PLACES = {
     "effects": ("stimrig.identify.effects", "library"),
     "schema": ("stimrig.api.schemas", "load"),
     "plot": ("stimrig.api.charts.plot", "plot"),
-    "save": ("stimrig.api.cli.result_files", "save"),
+    "save": ("stimrig.api.cli.files", "save"),
     "Client": ("stimrig.api.client.rest", "Client"),
     **{name: ("stimrig.progress", name) for name in ("carry", "diagnose", "explain", "fit", "improve")},
     **{name: ("stimrig.verbs", name)

@@ -16,7 +16,7 @@ __all__ = ["changed", "diagnose", "figures", "fit", "improve"]
 
 def _run(verb: str, data: Sequence[str | Path], output: str | Path, options: dict[str, Any]) -> Report:
     from stimrig.api.cli.commands.cohort import require_extra
-    from stimrig.api.cli.terminal import names
+    from stimrig.api.cli.options import names
 
     require_extra()
     from stimrig.api.cohort.run import run_cohort

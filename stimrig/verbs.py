@@ -184,7 +184,7 @@ def emulate(options: str = "", data: str | Path | None = None) -> Iterator[Clien
     from stimrig.api.cli.errors import LaunchError
 
     try:
-        from stimrig.api.cli.launcher import Services
+        from stimrig.api.cli.supervisor import Services
         from stimrig.api.settings import Settings
     except ModuleNotFoundError as error:
         raise LaunchError(f"needs more packages: pip install 'stimrig[page]' ({error.name} is missing)") from None

@@ -9,7 +9,7 @@ from typing import Any
 
 from stimrig import identify
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import load_record
+from stimrig.api.cli.files import load_record
 from stimrig.api.client.errors import NotFound
 from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
@@ -18,8 +18,8 @@ from stimrig.identify.records.join import LEAST_SAMPLES, samples_between
 from stimrig.identify.records.record import Source
 
 
-def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
-    """The next experiment of recordings as a test, with the participant whose recordings they are.
+def plan_experiment(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
+    """Plan the next experiment of recordings as a test of the participant whose recordings they are.
 
     Beside it `recorded_ma`, with what current they were made, mA.
 
@@ -32,7 +32,7 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
     owner = _owner(sources, data, participant)
     currents_ma = sorted({source.current_ma for source in sources if source.current_ma is not None})
     if len(currents_ma) > 1:
-        made_with = " and ".join(f"{one:g} mA" for one in currents_ma)
+        made_with = " and ".join(f"{current:g} mA" for current in currents_ma)
         raise InputError(f"these recordings were made with {made_with}. Give those of one current.")
     if samples_between(record.sample_rate_hz, record.pulse_rate_hz) < LEAST_SAMPLES:
         least = f"{LEAST_SAMPLES * record.pulse_rate_hz:g} Hz"
@@ -47,18 +47,16 @@ def asked(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
     experiment = identify.next_experiment(explained.diagnosis) or identify.next_experiment(explained.left)
     if experiment is None:
         raise InputError(f"{data[0]}: no experiment is asked for: nothing is left to decide. Leave out --decide.")
-    segments = [dict(segment) for segment in experiment.segments]
     return {
         "participant": owner,
         "kind": "next-experiment",
-        "segments": segments,
+        "segments": [dict(segment) for segment in experiment.segments],
         "pulse_rate_hz": record.pulse_rate_hz,
         "recorded_ma": currents_ma[0],
     }
 
 
 def _owner(sources: Sequence[Source], data: Sequence[Path], participant: str | None) -> str:
-    """Who is stimulated: whose recordings these are."""
     owners = {source.participant for source in sources} - {""}
     if len(owners) > 1:
         raise InputError(f"these recordings are of several people: {', '.join(sorted(owners))}.")
@@ -74,7 +72,7 @@ def _owner(sources: Sequence[Source], data: Sequence[Path], participant: str | N
 
 
 def check_participant(client: Client, code: str, recorded_ma: float | None) -> None:
-    """See, before anything is played, that the participant is known here and stimulated with the recordings' current.
+    """Check, before anything is played, that the participant is known and has the recordings' current.
 
     Raises InputError: somebody who has recordings would be made anew, with default limits; or the current is another
     one.
@@ -82,19 +80,20 @@ def check_participant(client: Client, code: str, recorded_ma: float | None) -> N
     try:
         now_ma = client.participant(code)["profile"]["current_ma"]
     except NotFound as error:
-        told = "their limits are not known here. Give the --data folder or --url of the recording, or set them first."
-        raise InputError(f"there is no participant {code}: {told}") from error
+        fix = "their limits are not known here. Give the --data folder or --url of the recording, or set them first."
+        raise InputError(f"there is no participant {code}: {fix}") from error
     if recorded_ma not in (None, now_ma):
         now = f"{code} is now stimulated with {now_ma:g} mA"
         raise InputError(f"the recording was made with {recorded_ma:g} mA, {now}: they cannot be joined.")
 
 
-def diagnosed(data: Sequence[Path], recording: bytes) -> dict[str, Any]:
-    """What is missing by the recordings and a new one together; in `left`, once that is added."""
+def diagnose_together(data: Sequence[Path], recording: bytes) -> dict[str, Any]:
+    """Diagnose the recordings and a new one together; `left` is what is missing once that is added."""
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         new = Path(folder) / "recording.h5"
         new.write_bytes(recording)
         record = load_record([*data, new])
         explained = identify.explain(record, progress)
-    held = held_by(explained.improvement.models[-1], record)
-    return {"structure": [], **explained.diagnosis.to_dict(), "left": {"structure": held, **explained.left.to_dict()}}
+    structure = held_by(explained.improvement.models[-1], record)
+    left = {"structure": structure, **explained.left.to_dict()}
+    return {"structure": [], **explained.diagnosis.to_dict(), "left": left}

@@ -94,8 +94,10 @@ class Connection:
             answer = self.http.request(method, path, **more)
         except (httpx.RequestError, httpx.InvalidURL) as error:
             raise self._unreachable(error) from error
-        if method == "GET":  # a calibration that waits to be stored has a version with its 404
-            self._etags[answer.request.url.path] = answer.headers.get("etag", "")
+        if method == "GET":
+            self._etags.pop(answer.request.url.path, None)
+            if "etag" in answer.headers or answer.status_code == httpx.codes.FORBIDDEN:
+                self._etags[answer.request.url.path] = answer.headers.get("etag", "")
         return answer
 
     def _etag(self, document: str, path: str) -> str:
@@ -104,9 +106,10 @@ class Connection:
         A controller's key cannot read the participant of a test: its trials are planned with the model.
         """
         for place in (document, f"{document}/model") if path == "/v1/tests" else (document,):
-            missing = place not in self._etags and self._send("GET", place).status_code == httpx.codes.NOT_FOUND
-            if missing or self._etags[place]:
-                return self._etags[place]
+            if place not in self._etags and self._send("GET", place).status_code == httpx.codes.NOT_FOUND:
+                return self._etags.get(place, "")  # a calibration that waits to be stored has a version with its 404
+            if etag := self._etags.get(place):
+                return etag
         return ""
 
     def _take_etag(self, document: str, sent: str | None, answer: httpx.Response) -> None:

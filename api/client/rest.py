@@ -359,6 +359,7 @@ class Client(Connection):
             raise
         if job.result_url is not None:
             return kind.read(self.get(job.result_url))
-        if job.state == "cancelled" or job.problem is None:
-            raise NotCompleted("", f"the job ended as {job.state}", document=job.to_dict())
-        raise refused(f"GET /v1/jobs/{job.id}", job.problem.status, job.problem.to_dict())
+        ended = job.to_dict()
+        if job.state == "cancelled" or ended["problem"] is None:
+            raise NotCompleted("", f"the job ended as {job.state}", document=ended)
+        raise refused(f"GET /v1/jobs/{job.id}", ended["problem"]["status"], ended["problem"])

@@ -34,7 +34,7 @@ SERVICE_KEY = 0x5354494D52494702
 KEEP_S = 5.0
 """Interval at which the service checks that it still holds its lock files and the advisory lock."""
 INHERITED = "STIMRIG_FOLDER_LOCK"
-"""Environment variable with the descriptor of the folder's lock, which the launcher passes to what it starts."""
+"""Environment variable with the descriptor of the folder's lock, which the supervisor passes to what it starts."""
 OTHER_FOLDER = "stop it, or take another folder: --data, STIMRIG_DATA_DIR"
 OTHER_DATABASE = "stop it, or take another database: STIMRIG_DATABASE_URL"
 
@@ -155,7 +155,7 @@ def reserve(settings: Settings) -> int | None:
 
 
 def _lock_folder(folder: Path) -> int | None:
-    """Lock a folder, or use the lock that the launcher has passed on; its descriptor."""
+    """Lock a folder, or use the lock that the supervisor has passed on; its descriptor."""
     given = os.environ.get(INHERITED, "")
     with contextlib.suppress(OSError):
         if given and os.path.samestat(os.fstat(int(given)), folder.stat()):

@@ -36,9 +36,9 @@ def main() -> int:
     os.umask(os.umask(0o077) | 0o077)  # what the service and its workers write is for their user only
     try:
         settings = Settings()
-        limit_environment()
         refuse_open_door(settings)
         lock = ServiceLock(settings)  # before the port: who runs already says more than a port that is taken
+        limit_environment()
         listener = bind(settings.host, settings.port)
         lock.tell(address_of(listener))
         asyncio.run(carried_structure.refuse_unknown(settings))  # before a first token is drawn: it is told only once

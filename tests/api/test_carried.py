@@ -15,7 +15,7 @@ import httpx
 import pytest
 
 from stimrig.api.cli import main
-from stimrig.api.cli.terminal import carried_lines
+from stimrig.api.cli.reports import carried_lines
 from stimrig.api.models import carried_structure
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Approval, Model

@@ -109,7 +109,9 @@ def test_the_verb_asks_for_it_and_diagnoses_all_together(
     monkeypatch.setattr(verb, "on_own_services", play)
     monkeypatch.setattr(verb, "say_json", told.append)
     output = tmp_path / "second.h5"
-    monkeypatch.setattr(deciding, "diagnosed", lambda *_: pytest.fail("not written") if not output.exists() else FOUND)
+    monkeypatch.setattr(
+        deciding, "diagnose_together", lambda *_: pytest.fail("not written") if not output.exists() else FOUND
+    )
     verb.test(decide=[first], output=output, as_json=True)
     assert output.read_bytes() == b"second", "written before the long work that may fail"
     assert sent == {
@@ -122,7 +124,7 @@ def test_the_verb_asks_for_it_and_diagnoses_all_together(
 def test_both_are_diagnosed_together(recordings: list[list[Path]], tmp_path: Path) -> None:
     first = tmp_path / "first.h5"
     first.touch()
-    found = deciding.diagnosed([first], b"second")
+    found = deciding.diagnose_together([first], b"second")
     assert found["verdict"] == "nothing_missing" and found["left"]["structure"] == []
     assert recordings[0][0] == first and len(recordings[0]) == 2
 
@@ -175,7 +177,7 @@ def test_nobody_is_made_anew_or_stimulated_with_another_current_for_a_recording(
         verb, "run_test", lambda *_, **more: started.append(more) or {"model_id": "", "recording_id": 0}
     )
     with pytest.raises(InputError, match=said) if said else nullcontext():
-        verb.through("url", "token", OWNER, asked={"kind": "next-experiment", "recorded_ma": recorded_ma})
+        verb.through("url", "token", OWNER, request={"kind": "next-experiment", "recorded_ma": recorded_ma})
     assert started == ([] if said else [{"kind": "next-experiment"}])
 
 
@@ -186,7 +188,7 @@ def test_recordings_of_two_currents_are_not_continued(
     record = SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=Source(parts=parts))
     monkeypatch.setattr(deciding, "load_record", lambda _: record)
     with pytest.raises(InputError, match="made with 16 mA and 20 mA"):
-        deciding.asked([tmp_path / "first.h5", tmp_path / "second.h5"], None)
+        deciding.plan_experiment([tmp_path / "first.h5", tmp_path / "second.h5"], None)
 
 
 def test_where_the_recording_cannot_be_written_is_said_before_anything_is_played(

@@ -16,7 +16,7 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api.cli.child import Child
+from stimrig.api.cli.supervisor import Child
 from tests.api.conftest import TOKEN, soon, wait_done
 from tests.harness.looks_first import LooksFirst
 

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from stimrig.api.cli.errors import LaunchError
-from stimrig.api.cli.launcher import Services
+from stimrig.api.cli.supervisor import Services
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
 from tests.api.conftest import TOKEN, soon, wait_done

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from stimrig.api.cli.child import LAST_BYTES, Child
+from stimrig.api.cli.supervisor import LAST_BYTES, Child
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Participant
 

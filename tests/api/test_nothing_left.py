@@ -25,10 +25,10 @@ LIMIT_S = 90.0
 BIRTH = """
 import os, sys, time
 from pathlib import Path
-from stimrig.api.cli import child, launcher
+from stimrig.api.cli import supervisor
 
 folder, when = Path(sys.argv[1]), sys.argv[2]
-born = child.die_with_parent
+born = supervisor.die_with_parent
 
 def held(*given):
     if when == "after":
@@ -40,10 +40,10 @@ def held(*given):
     if when == "before":
         born(*given)
 
-child.die_with_parent = held
-with launcher.Endings():
-    child.Child("child", ["sleep", "3600"], folder / "log").start()
-    time.sleep(3600)
+supervisor.die_with_parent = held
+supervisor.on_endings(supervisor.raise_once)
+supervisor.Child("child", ["sleep", "3600"], folder / "log").start()
+time.sleep(3600)
 """
 """A child that is held between fork and exec, before or after the launcher has readied it."""
 

@@ -18,9 +18,8 @@ import httpx
 import pytest
 
 from stimrig.api.cli import main
-from stimrig.api.cli.child import Child
 from stimrig.api.cli.errors import LaunchError
-from stimrig.api.cli.launcher import Services
+from stimrig.api.cli.supervisor import Child, Services
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.service_lock import INHERITED, HeldError, ServiceLock, reserve

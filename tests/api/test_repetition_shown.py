@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from stimrig import identify
-from stimrig.api.cli.terminal import model_report
+from stimrig.api.cli.reports import model_report
 from stimrig.api.jobs.curves import curves
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.identify.json_text import json_value

@@ -17,7 +17,7 @@ import pytest
 from stimrig import identify
 from stimrig.api.cli import main
 from stimrig.api.cli.commands.diagnose import effect_lines
-from stimrig.api.cli.session_report import report_lines
+from stimrig.api.cli.reports import report_test
 from stimrig.api.models import advice, explanation, registry, stored_model
 from stimrig.api.web.pages import report_view
 from stimrig.api.web.pages.environment import environment
@@ -291,7 +291,7 @@ def test_warnings_are_told_on_every_page_and_in_the_terminal(client: httpx.Clien
                 f"/tests/{done['id']}", f"/models/{done['model_id']}", f"/models/{done['model_id']}/report",
             )
         }  # fmt: skip
-        shown["terminal"] = "\n".join(report_lines(done, model))
+        shown["terminal"] = "\n".join(report_test(done, model))
         shown["file"] = comparison_html(
             model, client.get(f"/v1/models/{done['model_id']}/curves").json(), done["id"], done
         )

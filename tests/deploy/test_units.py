@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from stimrig.api.cli.launcher import SEAL_S
+from stimrig.api.cli.supervisor import SEAL_S
 from stimrig.rig.__main__ import BEAT_PERIOD_S, PROCESS_PRIORITY
 from stimrig.rig.adapters.machine import PRIORITY
 

@@ -10,7 +10,9 @@ from typing import Annotated
 import typer
 
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import Json, given, say, say_json, write
+from stimrig.api.cli.files import write
+from stimrig.api.cli.options import Json, given
+from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.errors import ApiError
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, audit

@@ -17,7 +17,8 @@ from sqlalchemy.engine import make_url
 
 from stimrig.api.cli.commands.audit import DataDir, settings_of
 from stimrig.api.cli.errors import CommandError, InputError
-from stimrig.api.cli.terminal import Json, say, say_json
+from stimrig.api.cli.options import Json
+from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.store.copies import copy_database
 from stimrig.api.store.database import sqlite_file
 from stimrig.api.whole_file import sha256_of, to_disk

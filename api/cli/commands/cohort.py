@@ -15,7 +15,9 @@ import typer
 
 from stimrig.api.cli.commands.fit import METHOD
 from stimrig.api.cli.errors import INTERRUPTED, CommandError, InputError
-from stimrig.api.cli.terminal import Json, names, say, say_json, table, write
+from stimrig.api.cli.files import write
+from stimrig.api.cli.options import Json, names
+from stimrig.api.cli.terminal import say, say_json, table
 
 NEEDED = ("dask", "distributed", "fsspec", "pyarrow")
 MAX_LISTED = 40

@@ -6,38 +6,23 @@ from collections.abc import Sequence
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli.terminal import (
-    ColumnMap,
-    HeldModel,
-    Html,
-    Json,
-    SeveralData,
-    load_held,
-    number,
-    percent,
-    repetition_lines,
-    say,
-    say_json,
-    short,
-    write,
-)
+from stimrig.api.cli.files import load_structure, short, write
+from stimrig.api.cli.options import ColumnMap, HeldModel, Html, Json, SeveralData
+from stimrig.api.cli.reports import repetition_lines
+from stimrig.api.cli.terminal import number, percent, say, say_json
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.structure import in_words, worded
 
 
 def diagnose(
-    data: SeveralData,
-    model_json: HeldModel = None,
-    html: Html = None,
-    columns: ColumnMap = None,
-    as_json: Json = False,
+    data: SeveralData, model_json: HeldModel = None, html: Html = None, columns: ColumnMap = None, as_json: Json = False
 ) -> None:
     """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
 
     Takes 5 to 30 s, longer where structure is left or with several recordings. DATA decides: a model given with --model
     lends its structure, not its numbers.
     """
-    record, model, structure = load_held(model_json, data, columns)
+    record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         if html is None:
             found = identify.diagnose(record, model, progress)
@@ -61,7 +46,7 @@ def _report(record: Any, found: Any, improved: Any, structure: Sequence[str], na
 
 
 def diagnosis_lines(found: dict[str, Any]) -> list[str]:
-    """A diagnosis for people."""
+    """Write a diagnosis for people."""
     from stimrig.identify.conclusion import conclude
     from stimrig.identify.summary import certainty, held_out_label
 
@@ -94,7 +79,7 @@ def diagnosis_lines(found: dict[str, Any]) -> list[str]:
 
 
 def _command(found: dict[str, Any], kind: str) -> str:
-    """The commands that do what is advised."""
+    """Name the commands that do what is advised."""
     if kind == "nothing":
         return "The model is that of `stimrig fit DATA -o MODEL.json`."
     plays = "`stimrig test --decide DATA` plays the next experiment." if found.get("deciding_experiment") else ""
@@ -104,7 +89,7 @@ def _command(found: dict[str, Any], kind: str) -> str:
 
 
 def effect_lines(effect: dict[str, Any]) -> list[str]:
-    """One candidate."""
+    """Write one candidate."""
     from stimrig.identify.summary import probability, sure
 
     p = float(effect.get("probability") or 0.0)

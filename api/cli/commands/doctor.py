@@ -19,7 +19,8 @@ from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from stimrig.api.cli.terminal import Json, given, say, say_json
+from stimrig.api.cli.options import Json, given
+from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.settings import Settings
 
 Verdict = Literal["ok", "care", "fails"]

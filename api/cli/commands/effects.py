@@ -9,7 +9,9 @@ import typer
 
 from stimrig import identify
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import Json, load_model, say, say_json
+from stimrig.api.cli.files import load_model
+from stimrig.api.cli.options import Json
+from stimrig.api.cli.terminal import say, say_json
 
 
 def effects(

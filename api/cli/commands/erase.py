@@ -17,7 +17,8 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.cli.commands.audit import DataDir, open_store, settings_of
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import Json, say, say_json
+from stimrig.api.cli.options import Json
+from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.clock import Clock
 from stimrig.api.store import Store, audit, migrations
 from stimrig.api.store.service_lock import HeldError, ServiceLock

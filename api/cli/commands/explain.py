@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from stimrig import identify
-from stimrig.api.cli.result_files import story_page, told
-from stimrig.api.cli.terminal import (
-    ColumnMap,
-    HeldModel,
-    Json,
-    LastModel,
-    SeveralData,
-    load_held,
-    number,
-    say,
-    say_json,
-    short,
-    write,
-    write_model,
-)
+from stimrig.api.cli.files import load_structure, short, story_of, story_page, write, write_model
+from stimrig.api.cli.options import ColumnMap, HeldModel, Json, LastModel, SeveralData
+from stimrig.api.cli.terminal import labelled, number, say, say_json
 from stimrig.api.progress_bar import progress_bar
 
 
@@ -40,10 +27,10 @@ def explain(
 
     Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o no model is kept.
     """
-    record, model, structure = load_held(model_json, data, columns)
+    record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         explained = identify.explain(record, progress, model)
-    shown = told(record, explained, structure)
+    shown = story_of(record, explained, structure)
     if output is not None:
         write_model(output, explained.improvement.models[-1])
     if html is not None:
@@ -68,7 +55,7 @@ def _write_figures(folder: Path, shown: dict[str, Any]) -> None:
 
 
 def story_lines(shown: dict[str, Any]) -> list[str]:
-    """The story for people at a terminal."""
+    """Write the story for people at a terminal."""
     made, changed = shown["story"], len(shown["story"]["rows"]) > 1
     first, last = made["rows"][0], made["rows"][-1]
     lines = [
@@ -77,30 +64,26 @@ def story_lines(shown: dict[str, Any]) -> list[str]:
         f"1 compare      fit {number(first['fit_percent'])} %, error {number(first['rms_nm'], 4)} N·m; held out fit "
         f"{number(first['held_out_fit_percent'])} %, error {number(first['held_out_rms_nm'], 4)} N·m",
     ]
-    lines += _numbered("2 fails in", [place["text"] for place in made["places"]] or ["no place stands out"])
+    lines += labelled("2 fails in", [place["text"] for place in made["places"]] or ["no place stands out"])
     why = made["why"]
-    lines += _numbered("3 missing", [f"{why['title']}.", *[_named(one) for one in why["missing"]],
+    lines += labelled("3 missing", [f"{why['title']}.", *[_named(one) for one in why["missing"]],
                                      *[f"{one['id']}: {one['words']}" for one in why["free"]]])  # fmt: skip
     if changed:
         error = "held-out error" if made["error"] == "held_out_rms_nm" else "error"
         errors = [(number(one["before_nm"], 4), number(one["after_nm"], 4)) for one in made["steps"]]
         added = zip(made["steps"], errors, strict=True)
-        lines += _numbered("4 added", [f"{one['label']}: {error} {a} -> {b} N·m" for one, (a, b) in added])
+        lines += labelled("4 added", [f"{one['label']}: {error} {a} -> {b} N·m" for one, (a, b) in added])
         healed = [f"{place['text'].partition(':')[0]}: {place['became']}" for place in made["places"]]
-        lines += _numbered("  there", healed)
+        lines += labelled("  there", healed)
         lines.append(f"  now          fit {number(last['fit_percent'])} %, error {number(last['rms_nm'], 4)} N·m")
-    lines += _numbered(f"{4 + changed} ended", [made["ended"]])
+    lines += labelled(f"{4 + changed} ended", [made["ended"]])
     experiment = made["then"]["experiment"]
     if experiment:
-        lines += _numbered("  next", [experiment["text"], "`stimrig test --decide DATA` plays it, judges both."])
+        lines += labelled("  next", [experiment["text"], "`stimrig test --decide DATA` plays it, judges both."])
     return lines
 
 
 def _named(one: dict[str, Any]) -> str:
-    """An effect that is missing, how sure that is, and what it is."""
+    """Write which effect is missing, how sure that is, and what it is."""
     sure = f" ({one['sure_words']})" if one["sure_words"] else ""
     return f"{one['id']}{sure}: {one['plain']}"
-
-
-def _numbered(label: str, texts: Sequence[str]) -> list[str]:
-    return [f"{label if not row else '':15}{text}" for row, text in enumerate(texts)]

@@ -11,7 +11,8 @@ import typer
 
 from stimrig.api.cli.commands.cohort import Columns, Given, Select, refuse_undone, skipped_lines
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import Json, say, say_json
+from stimrig.api.cli.options import Json
+from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.export.record_file import WRITERS
 
 

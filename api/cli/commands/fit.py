@@ -9,19 +9,10 @@ import typer
 
 from stimrig import identify
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import (
-    ColumnMap,
-    Json,
-    SeveralData,
-    carried_lines,
-    load_model,
-    load_record,
-    model_report,
-    names,
-    say,
-    say_json,
-    write_model,
-)
+from stimrig.api.cli.files import load_model, load_record, write_model
+from stimrig.api.cli.options import ColumnMap, Json, SeveralData, names
+from stimrig.api.cli.reports import carried_lines, model_report
+from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.progress_bar import progress_bar
 
 METHOD = "maximum-likelihood"

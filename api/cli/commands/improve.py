@@ -5,24 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli.result_files import story_page, told
-from stimrig.api.cli.terminal import (
-    ColumnMap,
-    HeldModel,
-    Html,
-    Json,
-    LastModel,
-    SeveralData,
-    load_held,
-    number,
-    repetition_lines,
-    say,
-    say_json,
-    short,
-    table,
-    write,
-    write_model,
-)
+from stimrig.api.cli.files import load_structure, short, story_of, story_page, write, write_model
+from stimrig.api.cli.options import ColumnMap, HeldModel, Html, Json, LastModel, SeveralData
+from stimrig.api.cli.reports import repetition_lines
+from stimrig.api.cli.terminal import labelled, number, say, say_json, table
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.structure import in_words
 
@@ -42,27 +28,26 @@ def improve(
 
     Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o nothing is kept.
     """
-    record, model, structure = load_held(model_json, data, columns)
+    record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         if html is None:
             improved = identify.improve(record, progress=progress, model=model)
         else:
             explained = identify.explain(record, progress, model)
             improved = explained.improvement
-            write(html, story_page(told(record, explained, structure), short(data)))
+            write(html, story_page(story_of(record, explained, structure), short(data)))
     found = {"structure": structure, **improved.to_dict()}
     del found["models"]
     if output is not None:
         write_model(output, improved.models[-1])
     if as_json:
         say_json(found)
-        return
-    say(*improvement_lines(found))
-    say(*[f"written to     {path}" for path in (output, html) if path is not None])
+    else:
+        say(*improvement_lines(found), *[f"written to     {path}" for path in (output, html) if path is not None])
 
 
 def improvement_lines(found: dict[str, Any]) -> list[str]:
-    """The steps for people."""
+    """Write the steps for people."""
     from stimrig.identify.effects import any_free
 
     rows = [
@@ -84,4 +69,4 @@ def improvement_lines(found: dict[str, Any]) -> list[str]:
     refused = [f"{row['effect']}: {row['reason']}" for row in found.get("refused") or []]
     if len(refused) > FEW:
         refused[FEW:] = [f"and {len(refused) - FEW} effects more (--json says which)"]
-    return [*lines, *[f"{'not added' if not number else '':15}{text}" for number, text in enumerate(refused)]]
+    return [*lines, *labelled("not added", refused)]

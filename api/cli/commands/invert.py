@@ -8,7 +8,9 @@ from typing import Annotated
 import typer
 
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import Json, ModelFile, load_model, number, percent, say, say_json, table, write
+from stimrig.api.cli.files import load_model, write
+from stimrig.api.cli.options import Json, ModelFile
+from stimrig.api.cli.terminal import number, percent, say, say_json, table
 
 
 def invert(

@@ -8,20 +8,9 @@ from typing import Annotated
 import typer
 
 from stimrig import identify
-from stimrig.api.cli.terminal import (
-    ColumnMap,
-    Data,
-    Json,
-    ModelFile,
-    load_model,
-    load_record,
-    number,
-    percent,
-    say,
-    say_json,
-    write_mat,
-    writing,
-)
+from stimrig.api.cli.files import load_model, load_record, writing
+from stimrig.api.cli.options import ColumnMap, Data, Json, ModelFile
+from stimrig.api.cli.terminal import number, percent, say, say_json
 
 
 def predict(
@@ -34,20 +23,20 @@ def predict(
     """Free-run simulation from the recorded pulse widths: time_s,torque_nm,predicted_torque_nm."""
     import numpy as np
 
+    from stimrig.identify import plain_mat
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
 
     model = load_model(model_json, "predict MODEL.json DATA -o FILE")
     record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))
     found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
-    if output.suffix.lower() == ".mat":
-        write_mat(output, found)
-    else:
-        with writing(output) as place:
+    with writing(output) as place:
+        if output.suffix.lower() == ".mat":
+            plain_mat.write(place, found)
+        else:
             np.savetxt(place, np.column_stack(list(found.values())), "%.9g", ",", header=",".join(found), comments="")
-    residual = record.torque_nm - predicted
     reached = best_fit_percent(record.torque_nm, predicted)
-    rms_nm = float(np.sqrt(np.mean(residual**2)))
+    rms_nm = float(np.sqrt(np.mean((record.torque_nm - predicted) ** 2)))
     if as_json:
         say_json({"output": str(output), "rows": len(predicted), "fit_percent": reached, "rms_nm": rms_nm})
         return

@@ -10,7 +10,7 @@ from typing import Annotated
 import typer
 
 from stimrig.api.cli.errors import InputError, LaunchError
-from stimrig.api.cli.terminal import Json
+from stimrig.api.cli.options import Json
 
 
 def recover(
@@ -23,7 +23,7 @@ def recover(
 
 
 def sealed(journal: Path, folder: Path | None, as_json: bool = True) -> str:
-    """Seal it in a process of its own, and what that says. Raises InputError, LaunchError: it cannot."""
+    """Seal it in a process of its own; return what that says. Raises InputError, LaunchError: it cannot."""
     options = [*(["-o", str(folder)] if folder else []), *(["--json"] if as_json else [])]
     command = [sys.executable, "-m", "stimrig.rig.recover", *options, "--", str(journal)]
     ended = subprocess.run(command, capture_output=True, text=True)

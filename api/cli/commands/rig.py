@@ -13,9 +13,10 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.child import die_with_parent
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import Json, say, say_json
+from stimrig.api.cli.options import Json
+from stimrig.api.cli.supervisor import die_with_parent
+from stimrig.api.cli.terminal import say, say_json
 
 
 def register(app: typer.Typer) -> None:

@@ -11,9 +11,10 @@ from typing import Annotated
 import typer
 
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.launcher import Ended, Services
+from stimrig.api.cli.options import DataDir, Emulate, RigFile, given
 from stimrig.api.cli.stop_key import StopKey, at_rig
-from stimrig.api.cli.terminal import given, say, sign_in_lines
+from stimrig.api.cli.supervisor import Services
+from stimrig.api.cli.terminal import say
 from stimrig.api.settings import Settings
 from stimrig.rig.messages import Status
 
@@ -21,33 +22,33 @@ from stimrig.rig.messages import Status
 def serve(
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="default 8000, or STIMRIG_PORT")] = None,
     host: Annotated[str | None, typer.Option(help="default 127.0.0.1, or STIMRIG_HOST")] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
+    rig: RigFile = None,
     rig_socket: Annotated[
         Path | None, typer.Option(help="use the running rig that listens here; or STIMRIG_RIG_SOCKET")
     ] = None,
-    data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
-    emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",
+    data: DataDir = None,
+    emulate: Emulate = "",
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
-    named = given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data)
-    settings = Settings(**named)
-    found = attachable(settings, emulate) if settings.rig_socket else None
-    with contextlib.suppress(Ended), Services(settings, emulate.split(), attach=settings.rig_socket) as services:
-        say(*welcome(services, settings), *rig_state(services, found))
+    settings = Settings(**given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
+    attached = rig_status(settings, emulate) if settings.rig_socket else None
+    made = Services(settings, emulate.split(), attach=settings.rig_socket)
+    with contextlib.suppress(KeyboardInterrupt), made as services:
+        say(*welcome(services, attached))
         try:
             with StopKey(at_rig(services.socket), say) as key:
                 if key.watched:
-                    say("any key stops a running test; Ctrl-C ends the service" + ("" if found else " and the rig"))
+                    say("any key stops a running test; Ctrl-C ends the service" + ("" if attached else " and the rig"))
                 while True:
                     time.sleep(0.2)
                     for event in services.watch():
                         say(event)
-        except Ended:
-            say("stopping" + ("; the rig goes on by itself" if found else ""))
+        except KeyboardInterrupt:
+            say("stopping" + ("; the rig goes on by itself" if attached else ""))
 
 
-def attachable(settings: Settings, emulate: str) -> Status:
-    """The state of the rig that runs already.
+def rig_status(settings: Settings, emulate: str) -> Status:
+    """Ask the rig that runs already for its state.
 
     Raises InputError: a rig to be started was named, too, or none listens at the socket.
     """
@@ -71,21 +72,22 @@ def attachable(settings: Settings, emulate: str) -> Status:
         ) from error
 
 
-def rig_state(services: Services, found: Status | None = None) -> list[str]:
-    """What keeps the rig from working, if anything does."""
-    if found is not None:
-        return [] if found.state == "ready" else [f"the rig is {found.state}: {found.reason or 'it is busy'}"]
-    state = services.rig.ready.get("state", "ready")
-    return [] if state == "ready" else [f"the rig is {state}: {services.rig.last_words()}"]
-
-
-def welcome(services: Services, settings: Settings) -> list[str]:
-    """Where it is, and how to get in."""
+def welcome(services: Services, attached: Status | None) -> list[str]:
+    """Write where the service is, how to get in, and what keeps the rig from working, if anything does."""
+    settings, url, drawn = services.settings, services.url, services.api.ready["drawn_token"]
     devices = f"rig file {settings.rig_file}" if settings.rig_file else "the emulated rig"
-    if services.attached:
-        devices = f"the rig at {settings.rig_socket}"
-    lines = [f"stimrig serves {services.url}/ with {devices}; data and logs in {settings.data_dir.absolute()}"]
-    lines += sign_in_lines(services.url, services.drawn_token, bool(settings.admin_token), "STIMRIG_ADMIN_TOKEN")
-    if services.control_line:
-        lines.append(f"the emulator's control line: {services.control_line}")
-    return lines
+    if attached:
+        devices, state = f"the rig at {settings.rig_socket}", attached.state
+        why = attached.reason or "it is busy"
+    else:
+        state, why = services.rig.ready.get("state", "ready"), services.rig.last_words()
+    lines = [f"stimrig serves {url}/ with {devices}; data and logs in {settings.data_dir.absolute()}"]
+    if drawn:
+        lines += [f"first administrator's token, shown this once: {drawn}", f"sign in: {url}/sign-in#token={drawn}"]
+    elif settings.admin_token:
+        lines += ["the administrator's token is the one in STIMRIG_ADMIN_TOKEN"]
+    else:
+        lines += ["sign in with a token issued before (set STIMRIG_ADMIN_TOKEN to replace a lost one)"]
+    if services.emulator is not None:
+        lines += [f"the emulator's control line: {services.emulator.ready.get('control')}"]
+    return [*lines, *([] if state == "ready" else [f"the rig is {state}: {why}"])]

@@ -6,7 +6,8 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.terminal import Json, number, say, say_json, table
+from stimrig.api.cli.options import Json
+from stimrig.api.cli.terminal import number, say, say_json, table
 from stimrig.api.progress_bar import progress_bar
 
 

@@ -17,15 +17,18 @@ import typer
 
 from stimrig.api.cli import deciding
 from stimrig.api.cli.commands.diagnose import diagnosis_lines
-from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.launcher import Services
-from stimrig.api.cli.session_report import report_lines, run_test
+from stimrig.api.cli.errors import CommandError, InputError
+from stimrig.api.cli.files import writing
+from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, given
+from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
-from stimrig.api.cli.terminal import Json, given, say, say_json, writing
-from stimrig.api.client.errors import ServiceError
+from stimrig.api.cli.supervisor import Services
+from stimrig.api.cli.terminal import CLEAR_LINE, number, say, say_aside, say_json
+from stimrig.api.client.errors import ServiceError, Unreachable
 from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.settings import Settings
+from stimrig.api.web.responses.rig import TestOut
 from stimrig.rig.messages import LABEL_TITLES, Labels
 
 
@@ -36,14 +39,14 @@ def test(
             help="participant's code; default TEST, or with --decide whose the recording is", show_default=False
         ),
     ] = None,
-    rig: Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")] = None,
+    rig: RigFile = None,
     url: Annotated[str, typer.Option(help="a running service; default: one is started", envvar="STIMRIG_URL")] = "",
-    data: Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")] = None,
+    data: DataDir = None,
     protocol: Annotated[
         str | None, typer.Option(help="which fixed test: paper (default), short", show_default=False)
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the recording (HDF5) here")] = None,
-    emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')] = "",
+    emulate: Emulate = "",
     adaptive: Annotated[bool, typer.Option("--adaptive", help="a test that stops itself once enough is known")] = False,
     target: Annotated[
         str, typer.Option(help="with --adaptive: half-widths of the bands of curve and step response, %", metavar="C,S")
@@ -74,7 +77,8 @@ def test(
 
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
-    asked = how(adaptive, protocol, target, max_time, max_torque_time, anyway) | given(**labels)
+    bounds = given(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time, anyway=anyway or None)
+    request = kind_of_test(adaptive, protocol, target, bounds) | given(**labels)
     if decide and (adaptive or protocol is not None):
         raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
     token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
@@ -82,45 +86,30 @@ def test(
     if url and not token:
         raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
     if decide:
-        asked |= deciding.asked(decide, participant)
-    code = asked.pop("participant", participant or "TEST")
+        request |= deciding.plan_experiment(decide, participant)
+    code = request.pop("participant", participant or "TEST")
     if url and token:
         over = Event()
         with StopKey(at_service(url, token, over.is_set), say_aside) as key:
             announce(key)
-            found = through(url, token, code, over=over.set, asked=asked)
+            found = through(url, token, code, over=over.set, request=request)
     else:
-        found = on_own_services(rig, data, emulate, code, asked)
+        found = on_own_services(rig, data, emulate, code, request)
     recording = found.pop("recording")
     if output is not None:  # first: what was measured is not lost, whatever comes after
         with writing(output) as place:
             place.write_bytes(recording)
     if decide:
-        found["diagnosis"] = deciding.diagnosed(decide, recording)
+        found["diagnosis"] = deciding.diagnose_together(decide, recording)
     if as_json:
         say_json(found)
         return
-    say(*report_lines(found["test"], None if decide else found["model"]))
+    say(*report_test(found["test"], None if decide else found["model"]))
     if decide:
         say("", "both together", "", *diagnosis_lines(found["diagnosis"]), "")
         if found["diagnosis"]["left"]["structure"]:
             say("with what was added", "", *diagnosis_lines(found["diagnosis"]["left"]), "")
     say(f"recording      {output or found['test']['recording_url']}")
-
-
-def check_output(output: Path | None) -> None:
-    """See that the recording can be written: a folder that is not there would be found after the test.
-
-    Raises InputError: it cannot.
-    """
-    if output is None:
-        return
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{output}: {error.strerror}. Give a file in a folder that can be written.") from error
-    if output.is_dir() or not os.access(output if output.exists() else output.parent, os.W_OK):
-        raise InputError(f"{output}: give a file in a folder that can be written.")
 
 
 def take_labels(verb: Any) -> None:
@@ -136,34 +125,40 @@ def take_labels(verb: Any) -> None:
 take_labels(test)
 
 
-def how(
-    adaptive: bool,
-    protocol: str | None,
-    target: str,
-    max_time: float | None,
-    max_torque_time: float | None,
-    anyway: bool,
-) -> dict[str, Any]:
-    """What the service is asked for beside the participant.
+def check_output(output: Path | None) -> None:
+    """Check that the recording can be written: a folder that is not there would be found after the test.
+
+    Raises InputError: it cannot.
+    """
+    if output is None:
+        return
+    try:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{output}: {error.strerror}. Give a file in a folder that can be written.") from error
+    if output.is_dir() or not os.access(output if output.exists() else output.parent, os.W_OK):
+        raise InputError(f"{output}: give a file in a folder that can be written.")
+
+
+def kind_of_test(adaptive: bool, protocol: str | None, target: str, bounds: dict[str, Any]) -> dict[str, Any]:
+    """Return what the service is asked for beside the participant.
 
     Raises InputError: an option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
     """
-    bounds = given(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time)
-    asked = bounds | given(anyway=anyway or None)
     if not adaptive:
-        if asked or target:
+        if bounds or target:
             raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
-        return {} if protocol is None else {"protocol": protocol}
+        return given(protocol=protocol)
     if protocol is not None:
         raise InputError("--protocol is for a fixed test; leave it out, or leave out --adaptive.")
-    for option, value in (("--max-time", max_time), ("--max-torque-time", max_torque_time)):
-        if value is not None and not 0 < value < math.inf:
-            raise InputError(f"{option} {value:g}: give a number above 0.")
-    return {"kind": "adaptive", **asked, **({"target": target_of(target)} if target else {})}
+    for option, name in (("--max-time", "max_duration_s"), ("--max-torque-time", "max_torque_time_nm_s")):
+        if not 0 < bounds.get(name, 1.0) < math.inf:
+            raise InputError(f"{option} {bounds[name]:g}: give a number above 0.")
+    return {"kind": "adaptive", **bounds, **({"target": target_of(target)} if target else {})}
 
 
 def target_of(text: str) -> dict[str, float]:
-    """A target as it is typed: one number for both curves, or two. Raises InputError: it is none."""
+    """Read a target as it is typed: one number for both curves, or two. Raises InputError: it is none."""
     try:
         values = [float(part) for part in text.split(",")]
     except ValueError:
@@ -179,26 +174,18 @@ def announce(key: StopKey) -> None:
         say_aside("any key stops the test")
 
 
-def say_aside(words: str) -> None:
-    """On standard error, on a line of its own: standard output is the result's."""
-    print(f"\r\x1b[K{words}" if sys.stderr.isatty() else words, file=sys.stderr, flush=True)
-
-
 def on_own_services(
-    rig: Path | None, data: Path | None, emulate: str, participant: str, asked: dict[str, Any]
+    rig: Path | None, data: Path | None, emulate: str, participant: str, request: dict[str, Any]
 ) -> dict[str, Any]:
     """Start rig and service for this one test."""
-    settings = Settings(**given(rig_file=rig, data_dir=data))
+    settings, token, over = Settings(**given(rig_file=rig, data_dir=data)), secrets.token_urlsafe(32), Event()
     settings.port = 0
-    token = secrets.token_urlsafe(32)
-
-    over = Event()
     with (
         Services(settings, emulate.split(), token) as services,
         StopKey(at_rig(services.socket, over.is_set), say_aside) as key,
     ):
         announce(key)
-        return through(services.url, token, participant, services.watch, over.set, asked)
+        return through(services.url, token, participant, services.watch, over.set, request)
 
 
 def through(
@@ -207,14 +194,14 @@ def through(
     participant: str,
     events: Callable[[], list[str]] = list,
     over: Callable[[], object] = list,
-    asked: dict[str, Any] | None = None,
+    request: dict[str, Any] | None = None,
 ) -> dict[str, Any]:
-    """The test through a service; `events` and `over` as in `run_test`.
+    """Run the test through a service; `events` and `over` as in `run_test`.
 
-    Raises InputError: as `deciding.check_participant`, where `asked` has `recorded_ma`. ServiceError: the service
+    Raises InputError: as `deciding.check_participant`, where the request has `recorded_ma`. ServiceError: the service
     cannot be reached, or the test did not end in a model.
     """
-    more = dict(asked or {})
+    more = dict(request or {})
     with Client(url, token) as client:
         if "recorded_ma" in more:  # it is no request of the service: nobody is made anew for a recording
             deciding.check_participant(client, participant, more.pop("recorded_ma"))
@@ -226,3 +213,60 @@ def through(
                 best = client.improve(best, progress)["id"]
         model = client.model_file(best)
         return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}
+
+
+def run_test(
+    client: Client,
+    participant: str,
+    events: Callable[[], list[str]] = list,
+    over: Callable[[], object] = list,
+    **more: Any,
+) -> dict[str, Any]:
+    """Run a test, the default pre-session test unless `more` says otherwise, and show its progress.
+
+    The participant is made unless it is there. `events` says which processes of the service have ended; one is enough
+    to give up. `over` is called as soon as nothing of the test is played any more.
+
+    Raises CommandError: a process has ended. Raises ServiceError: the test was refused, or did not complete.
+    """
+    show = Progress()
+
+    def watch(test: TestOut) -> None:
+        for event in events():
+            raise CommandError(event)
+        if test.state not in ("requested", "running"):
+            over()
+        show(test)
+
+    client.ensure_participant(participant)
+    try:
+        return client.run_test(participant, watch, **more).to_dict()
+    except Unreachable as error:
+        for event in events():
+            raise CommandError(event) from error
+        raise
+
+
+class Progress:
+    """A progress line: on a terminal in place, elsewhere a line a segment."""
+
+    def __init__(self) -> None:
+        self.terminal, self.last = sys.stderr.isatty(), ""
+
+    def __call__(self, test: TestOut) -> None:
+        """Show where the test stands."""
+        if test.state == "identifying":
+            segment = (test.identification or {}).get("text") or "identifying"
+            words = f"identification: {segment}"
+        elif test.adaptive and test.state == "running":
+            segment = test.adaptive["problem"] or test.adaptive["words"] or "a first look at the muscle"
+            words = f"{test.elapsed_s:4.1f} s  {number(test.adaptive['torque_time_nm_s'], 1)} N·m·s  {segment}"
+        else:
+            segment = test.segment or test.state
+            words = f"{segment:10} {100 * test.progress:3.0f} %  {test.time_left_s:4.0f} s left"
+        if self.terminal:
+            words, end = (test.state, "\n") if test.done else (words, "")
+            print(f"{CLEAR_LINE}  {words}", end=end, file=sys.stderr, flush=True)
+        elif segment != self.last and not test.done:
+            print(f"  {words}", file=sys.stderr, flush=True)
+        self.last = segment

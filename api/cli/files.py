@@ -1,0 +1,199 @@
+"""Read what verbs are given; write what they make with -o and --html, and programs with `stimrig.save`."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from stimrig import identify
+from stimrig.api.cli.errors import InputError
+from stimrig.api.structure import held_by, in_words
+from stimrig.api.whole_file import whole_path
+
+LARGEST_MODEL_BYTES = 32 * 2**20
+
+
+def load_model(path: Path, usage: str = "") -> Any:
+    """Read a model; `usage`: of a verb that takes it before a recording.
+
+    Raises InputError: the file cannot be read, or holds no model.
+    """
+    if path.suffix.lower() == ".mat":
+        raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
+    try:
+        with path.open("rb") as file:
+            return identify.Model.from_json(file.read(LARGEST_MODEL_BYTES))
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
+    except identify.IdentifyError as error:
+        with contextlib.suppress(identify.IdentifyError):
+            identify.read(path)
+            fix = f"The model comes first: stimrig {usage}." if usage else "Give a file written by `stimrig fit -o`."
+            raise InputError(f"{path}: this is a recording, not a model. {fix}") from error
+        raise InputError(f"{path}: {error}") from error
+
+
+def load_record(data: Sequence[Path], columns: list[str] | None = None, effects: Sequence[str] = ()) -> Any:
+    """Read a record from its file, or from several as one; what was assumed goes to standard error.
+
+    Raises InputError: a file is named twice. IdentifyError: one cannot be read, they do not go together, or one lacks
+    what one of the `effects` needs.
+    """
+    from stimrig.api import record_files
+    from stimrig.identify import effects as library
+
+    twice = [path for number, path in enumerate(data) if path in data[:number]]
+    if twice:
+        raise InputError(f"{twice[0]}: named twice. Name each recording once.")
+    needs: dict[str, None] = {}
+    for effect in effects if len(data) > 1 else ():
+        with contextlib.suppress(identify.IdentifyError):  # of an unknown one the fit says so
+            needs |= dict.fromkeys(library.find_effect(effect.partition(":")[0]).needs)
+    return record_files.read(data, columns, [*needs], note=lambda words: print(words, file=sys.stderr))
+
+
+def load_structure(path: Path | None, data: Sequence[Path], columns: list[str] | None) -> tuple[Any, Any, list[str]]:
+    """Read a record, the model whose structure is meant on it (none: the plain one), and the effects of that.
+
+    Raises InputError: as `load_model`; the model is one of another pulse rate, or one that effects do not stand on.
+    """
+    model = None if path is None else load_model(path)
+    record = load_record(data, columns)
+    try:
+        return record, model, held_by(model, record)
+    except identify.IdentifyError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def short(data: Sequence[Path]) -> str:
+    """Name files at the head of a report."""
+    return ", ".join(path.name for path in data)
+
+
+@contextlib.contextmanager
+def writing(path: Path) -> Iterator[Path]:
+    """Yield a place to write a file at, which is then whole or as it was. Raises InputError: it cannot be written."""
+    try:
+        with whole_path(path) as place:
+            yield place
+    except OSError as error:
+        raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
+
+
+def write(path: Path, content: str | bytes) -> None:
+    """Write a file. Raises InputError: it cannot be written."""
+    with writing(path) as place:
+        place.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def write_model(path: Path, model: Any) -> None:
+    """Write a model: as MODEL.json, or where the name ends in .mat as a MAT file. Raises InputError."""
+    with writing(path) as place:
+        _write_model(place, model)
+
+
+def _write_model(path: Path, model: Any) -> None:
+    from stimrig.identify import plain_mat
+
+    if path.suffix.lower() == ".mat":
+        plain_mat.write(path, model.to_dict())
+    else:
+        path.write_text(model.to_json(), "utf-8", newline="")
+
+
+def save(what: Any, path: str | Path, record: identify.Record | None = None) -> Path:
+    """Write a result to a file; the end of its name says how.
+
+    Parameters
+    ----------
+    what : Model, Record, Inversion or Explanation
+        A model: MODEL.json, `.mat` for other tools, or `.html`, a report beside its record. A record: `.csv` (joined
+        ones, too), `.mat` or `.parquet`, as `read` takes them. An inversion: `.csv`, as `stimrig invert -o`. An
+        explanation: `.html`.
+    path : str or Path
+        The file; one that is there is replaced.
+    record : Record, optional
+        The measurement that a report shows.
+
+    Returns
+    -------
+    Path
+        The file.
+
+    Raises
+    ------
+    BadRequest
+        There is no such file of this result, or a report without its record.
+    OSError
+        It cannot be written.
+    """
+    from stimrig.api.export.record_file import WRITERS, write_record
+    from stimrig.api.models import inverted
+    from stimrig.identify.inversion import Inversion
+
+    path = Path(path)
+    kind = path.suffix.lower()
+    with whole_path(path) as place:
+        if kind == ".html":
+            place.write_text(report(what, record, path.stem), "utf-8", newline="")
+        elif isinstance(what, identify.Model) and kind in (".json", ".mat"):
+            _write_model(place, what)
+        elif isinstance(what, identify.Record) and kind[1:] in WRITERS:
+            write_record(what, place, kind[1:])
+        elif isinstance(what, Inversion) and kind == ".csv":
+            place.write_text(inverted.table(what.to_dict()), "utf-8", newline="")
+        else:
+            fix = "A model is .json, .mat or .html, an explanation .html, a record .csv, .mat or .parquet, an "
+            fix += "inversion .csv."
+            raise identify.BadRequest(f"no {kind or 'such'} file of a {type(what).__name__}", place=str(path), fix=fix)
+    return path
+
+
+def report(what: Any, record: identify.Record | None, name: str, compared: identify.Comparison | None = None) -> str:
+    """Write a model or an explanation beside its record as one HTML file that works offline."""
+    from stimrig.api.jobs.curves import curves, rounded
+    from stimrig.api.web.pages.report_file import comparison_html
+    from stimrig.identify.json_text import json_value
+
+    if record is not None and isinstance(what, identify.Explanation):
+        return story_page(story_of(record, what, held_by(what.improvement.models[0], record)), name)
+    if record is not None and isinstance(what, identify.Model):
+        comparison = rounded((compared or identify.compare(what, record)).to_dict())
+        return comparison_html(what.to_dict(), json_value(curves(what, record)), name, comparison=comparison)
+    fix = "save(model, 'report.html', record); of what `explain` gives, too."
+    raise identify.BadRequest("a report is of a model or an explanation, beside its record", place=name, fix=fix)
+
+
+def story_of(record: Any, explained: Any, structure: Sequence[str]) -> dict[str, Any]:
+    """Return the story of a record, and what its figures are drawn from."""
+    from stimrig.api.jobs.curves import curves, rounded
+    from stimrig.api.jobs.verbs import with_experiment
+    from stimrig.api.models.explanation import step_versions
+    from stimrig.api.models.story import story
+    from stimrig.identify.conclusion import only_open
+
+    models = explained.improvement.models
+    before, after = (
+        {"curves": curves(model, record), "comparison": rounded(compared.to_dict())}
+        for model, compared in ((models[0], explained.before), (models[-1], explained.after))
+    )
+    after = after if len(models) > 1 else before
+    held = held_by(models[-1], record)
+    diagnoses = (with_experiment(record, explained.diagnosis, structure), with_experiment(record, explained.left, held))
+    improvement, left_open = explained.improvement.to_dict(), only_open(vars(explained.left)) or {}
+    # of what is left open the last diagnosis speaks
+    improvement["refused"] = [row for row in improvement["refused"] if row["effect"] != left_open.get("effect")]
+    told = story(step_versions(improvement), before["comparison"], after["comparison"], *diagnoses)
+    words = in_words(structure)
+    return {"story": told, "before": before, "after": after, "improvement": improvement, "structure": words}
+
+
+def story_page(shown: dict[str, Any], name: str) -> str:
+    """Write the story as a file."""
+    from stimrig.api.web.pages.report_file import story_html
+
+    refused = shown["improvement"]["refused"]
+    return story_html(shown["story"], shown["before"], shown["after"], name, refused, shown["structure"])

@@ -1,0 +1,280 @@
+"""Emulator, rig and service as processes that live and die together: `Services` starts, watches and ends them.
+
+The rig is started again when it dies (it comes up uncertain and waits for a person), the service too. None outlives the
+supervisor: SIGTERM and Ctrl-C end them in order, and the kernel ends those that are left when the supervisor is killed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from stimrig.api import owner_only
+from stimrig.api.cli.errors import LaunchError
+from stimrig.api.settings import Settings
+from stimrig.api.store.service_lock import INHERITED, HeldError, reserve
+
+READY_S, END_S = 60.0, 6.0
+SEAL_S = 35.0
+"""The rig may still have a test to seal."""
+RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
+LAST_BYTES = 100_000
+"""So much of a log's end is read for a process's last words."""
+ENDINGS = (signal.SIGTERM, signal.SIGINT)
+LIBC = ctypes.CDLL(None, use_errno=True)
+PR_SET_PDEATHSIG = 1
+
+
+def on_endings(handler: Any) -> dict[signal.Signals, Any]:
+    """Set what SIGTERM and Ctrl-C do; return what they did. Only the main thread may."""
+    main = threading.current_thread() is threading.main_thread()
+    return {number: signal.signal(number, handler) for number in ENDINGS} if main else {}
+
+
+def raise_once(_number: int, _frame: object) -> None:
+    """Interrupt what is going on; further signals do not interrupt the ending."""
+    on_endings(signal.SIG_IGN)
+    raise KeyboardInterrupt
+
+
+def die_with_parent(parent: int, mask: Iterable[int]) -> None:
+    """In the child, before it becomes another program: end when the parent does, and at once if it has ended.
+
+    Until here a signal would have been taken by the parent's handler, of which the other program knows nothing.
+    """
+    for number in ENDINGS:
+        signal.signal(number, signal.SIG_DFL)
+    LIBC.prctl(PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:
+        os._exit(1)
+    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+
+
+@dataclass
+class Child:
+    """One process: its command, its log, and the JSON line that it prints once it is ready."""
+
+    name: str
+    command: list[str]
+    log: Path
+    environment: dict[str, str] = field(default_factory=dict)
+    inherits: tuple[int, ...] = ()
+    """Descriptors that it keeps open."""
+    process: subprocess.Popen[bytes] | None = None
+    ready: dict[str, Any] = field(default_factory=dict)
+    restarts: int = 0
+    started_s: float = 0.0
+    _log_start: int = 0
+
+    def start(self) -> dict[str, Any]:
+        """Start it and return its ready line. Raises LaunchError: there is none; its own last line says why."""
+        self.started_s = time.monotonic()
+        with self.log.open("ab") as log:
+            self._log_start = log.tell()
+            # A signal comes before there is a process, or when it is known: never between.
+            mask = signal.pthread_sigmask(signal.SIG_BLOCK, ENDINGS)
+            try:
+                self.process = subprocess.Popen(
+                    self.command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=log,
+                    env=os.environ | self.environment, pass_fds=self.inherits,
+                    start_new_session=True,  # Ctrl-C reaches the supervisor only, which ends them in order
+                    preexec_fn=partial(die_with_parent, os.getpid(), mask),
+                )  # fmt: skip
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        try:
+            self.ready = json.loads(_first_line(self.process))
+        except ValueError:
+            raise self.failure() from None
+        return self.ready
+
+    def failure(self) -> LaunchError:
+        """End it and return why it is not there, in its own words; 2 is bad input, where they name place and fix."""
+        assert self.process is not None
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self.process.wait(2)
+        code = self.process.poll()
+        self.end()
+        words = self.last_words() or (f"it ended with code {code}" if code is not None else "it did not start in time")
+        words = re.sub(rf"^({self.name}: )?(stimrig( emulate)?: )?", "", words)
+        return LaunchError(words, 2) if code == 2 else LaunchError(f"{self.name}: {words} (log: {self.log})")
+
+    def last_words(self) -> str:
+        """Return the last line of its log that is meant for people; empty where there is none, or no log any more."""
+        try:
+            with self.log.open("rb") as log:
+                log.seek(max(self._log_start, log.seek(0, os.SEEK_END) - LAST_BYTES))
+                lines = [line.strip() for line in log.read().decode(errors="replace").splitlines() if line.strip()]
+            plain = [line for line in lines if not line.startswith("{")]
+            return plain[-1] if plain else str(json.loads(lines[-1])["message"])
+        except (OSError, ValueError, KeyError, IndexError):  # a line is cut off where the disk is full
+            return ""
+
+    def alive(self) -> bool:
+        """Tell whether it runs."""
+        return self.process is not None and self.process.poll() is None
+
+    def end(self, limit_s: float = END_S) -> None:
+        """Send SIGTERM, and SIGKILL if it has not ended by then."""
+        if self.process is None:
+            return
+        self.process.terminate()
+        try:
+            self.process.wait(limit_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+        if self.process.stdout is not None:
+            self.process.stdout.close()
+
+
+def _first_line(process: subprocess.Popen[bytes]) -> str:
+    assert process.stdout is not None
+    end_s, text = time.monotonic() + READY_S, b""
+    while not text.endswith(b"\n") and select.select([process.stdout], [], [], max(0.0, end_s - time.monotonic()))[0]:
+        piece = os.read(process.stdout.fileno(), 65536)
+        if not piece:
+            break
+        text += piece
+    return text.decode(errors="replace").partition("\n")[0]
+
+
+class Services:
+    """The whole rig: with no rig file, the emulator stands in for the hardware.
+
+    `admin_token`: set the administrator's token instead of drawing one. `attach`: socket of a rig that runs already:
+    none is started, and none is ended.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        emulate: Sequence[str] = (),
+        admin_token: str | None = None,
+        attach: Path | None = None,
+    ) -> None:
+        self.settings, self.admin_token, self.attached = settings, admin_token, attach is not None
+        self._folder_lock: int | None = None
+        owner_only.folder(owner_only.folder(settings.data_dir) / settings.logs_dir.name)
+        self.runtime = Path(tempfile.mkdtemp(prefix="stimrig-"))  # a Unix socket's path holds 107 characters only
+        self.socket = attach.absolute() if attach else self.runtime / "rig.sock"
+        self.emulator: Child | None = None
+        if settings.rig_file is None and not self.attached:
+            self.emulator = self._child("emulator", "stimrig.hardware_sim", "--die-with-parent", *emulate)
+        self.rig, self.api = self._child("rig", "stimrig.rig"), self._child("api", "stimrig.api.web")
+
+    def _child(self, name: str, *module: str) -> Child:
+        return Child(name, [sys.executable, "-m", *module], self.settings.logs_dir / f"{name}.log")
+
+    def __enter__(self) -> Services:
+        self._handlers = on_endings(raise_once)
+        try:
+            self.start()
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        on_endings(signal.SIG_IGN)
+        self.stop()
+        for number, handler in self._handlers.items():
+            signal.signal(number, handler)
+
+    @property
+    def emulated(self) -> bool:
+        """Whether no person is connected: the emulator was started here, or runs behind the rig that is attached to."""
+        return self.emulator is not None or (self.attached and self.settings.emulated)
+
+    @property
+    def url(self) -> str:
+        """Where the service answers."""
+        return str(self.api.ready["url"])
+
+    def start(self) -> None:
+        """Start everything, the devices first, once the data folder is locked.
+
+        Raises LaunchError: another service runs on the data, or a process does not come up.
+        """
+        data = str(self.settings.data_dir.absolute())
+        try:
+            self._folder_lock = reserve(self.settings)
+        except HeldError as error:
+            raise LaunchError(str(error), 2) from error
+        if self._folder_lock is not None:  # all that is started holds it, until the last of them has ended
+            for child in filter(None, (self.emulator, self.rig, self.api)):
+                child.inherits = (self._folder_lock,)
+        if self.emulator is not None:
+            self.emulator.start()
+        if not self.attached:
+            devices = ["--config", str(self.settings.rig_file)]
+            if self.emulator is not None:
+                devices = ["--emulator-json", json.dumps(self.emulator.ready)]
+            self.rig.command += [*devices, "--socket", str(self.socket), "--data", data]
+            try:
+                self.rig.start()
+            except LaunchError as error:
+                place = str(self.settings.rig_file)
+                if error.exit_code != 2 or self.settings.rig_file is None or place in str(error):
+                    raise
+                raise LaunchError(f"{place}: {error}", 2) from error
+        self.api.environment = {
+            INHERITED: "" if self._folder_lock is None else str(self._folder_lock),
+            "STIMRIG_DATA_DIR": data,
+            "STIMRIG_RIG_SOCKET": str(self.socket),
+            "STIMRIG_HOST": self.settings.host,
+            "STIMRIG_PORT": str(self.settings.port),
+            "STIMRIG_EMULATED": str(self.emulated).lower(),
+            **({} if self.admin_token is None else {"STIMRIG_ADMIN_TOKEN": self.admin_token}),
+        }
+        self.api.start()
+        self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
+
+    def watch(self) -> list[str]:
+        """Start again what died; return what happened, in words.
+
+        Raises LaunchError: the emulator ended, or a process does not stay up.
+        """
+        if self.emulator is not None and not self.emulator.alive():
+            raise self.emulator.failure()
+        ours = (self.api,) if self.attached else (self.rig, self.api)
+        return [_restart(child) for child in ours if not child.alive()]
+
+    def stop(self) -> None:
+        """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""
+        self.rig.end(SEAL_S)
+        self.api.end()
+        if self.emulator is not None:
+            self.emulator.end()
+        if self._folder_lock is not None:
+            os.close(self._folder_lock)
+        shutil.rmtree(self.runtime, ignore_errors=True)
+
+
+def _restart(child: Child) -> str:
+    if time.monotonic() - child.started_s > 60:
+        child.restarts = 0
+    if child.restarts >= len(RESTART_S):
+        raise child.failure()
+    time.sleep(RESTART_S[child.restarts])
+    child.restarts += 1
+    words = child.last_words()
+    child.end()
+    child.start()
+    return f"{child.name} had ended ({words or 'without a message'}) and was started again"
