@@ -1,7 +1,7 @@
-"""What a model's verdict means for the person who decides: what to do, what was found, what a controller would risk.
+"""Advice to the person who decides on a model: what to do next, which checks failed, what a controller would risk.
 
-`identify` judges (the gates in MODEL.json); here each gate that failed is said in a clinician's words, and identify's
-own sentence stays beside it as the technical term.
+`identify` judges (the gates in MODEL.json). Here each failed gate gets a clinician's words; the sentence of `identify`
+stays beside them as the technical term.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from typing import Any, Literal, NamedTuple
 
 from stimrig.api.models.stored_model import followed
 
-Act = Literal["approve", "look", "add", "improve", "test", "fit", "wait"]
-"""The first button; with "look", "fit" and "wait" there is none. "improve" adds several effects one by one."""
+Act = Literal["approve", "add", "improve", "experiment", "look", "test", "fit", "wait"]
+"""The button of the page. "improve" adds several effects one by one; with "wait" there is none."""
 
 
 class Gate(NamedTuple):
-    """Texts of a check that failed: what was found, what to do with a model that is usable with care and with one that
-    is not usable, and what the controller would do wrong."""
+    """Texts of a failed check: the finding, what to do with a model that is usable with care and with one that is not
+    usable, and what the controller would do wrong."""
 
     found: str
     look: str
@@ -28,7 +28,7 @@ class Gate(NamedTuple):
 
 @dataclass(frozen=True)
 class Finding:
-    """A check that failed, in a clinician's words, and in identify's."""
+    """A failed check in a clinician's words and in those of `identify`."""
 
     gate: str
     words: str
@@ -39,7 +39,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Advice:
-    """The sentence at the top of a model's page, and its first button."""
+    """The sentence at the top of a model's page, and its button."""
 
     act: Act
     words: str
@@ -135,33 +135,51 @@ BESIDE: dict[str, str] = {
     "unexplained": "Usable: approve it. Some error is left that is not explained.",
     "missing": "Usable: approve it. An effect is possibly missing.",
 }
-"""What to do with a usable model whose diagnosis is not that nothing is missing, and names no likely effect."""
+"""Advice on a usable model by the kind of its diagnosis, where that names no likely effect."""
 
 
 def findings(document: dict[str, Any]) -> list[Finding]:
-    """The checks that failed, those that make a model not usable first; empty for models without stored checks."""
+    """List the failed checks, those that make a model not usable first; empty for models without stored checks."""
     gates = (document.get("quality") or {}).get("gates") or {}
     failed = [(name, gate) for name, gate in gates.items() if not gate.get("passed", True)]
     failed.sort(key=lambda pair: (pair[1].get("severity") != "refuse", pair[0] != "evidence"))
     return [
-        Finding(name, str(known.found), str(known.risk), gate.get("says", ""), gate.get("severity") == "refuse")
+        Finding(name, GATES[name].found, GATES[name].risk, gate.get("says", ""), gate.get("severity") == "refuse")
         for name, gate in failed
-        if (known := GATES.get(name)) is not None
+        if name in GATES
     ]
 
 
 def advice(
-    verdict: str, found: Sequence[Finding], missing: Sequence[str], kind: str | None = "nothing", looking: bool = False
+    verdict: str,
+    failed: Sequence[Finding],
+    missing: Sequence[str],
+    kind: str | None = "nothing",
+    *,
+    diagnosing: bool = False,
+    experiment: bool = False,
 ) -> Advice:
-    """What to do with a model: one sentence for its verdict and for what its diagnosis found.
+    """Say what to do with a model, from its verdict and its diagnosis.
 
-    `verdict`: identify's; `found`: the checks that failed, the worst first; `missing`: names of effects that the
-    diagnosis found likely to be missing.
+    Parameters
+    ----------
+    verdict : str
+        The verdict of `identify`.
+    failed : sequence of Finding
+        The failed checks, the worst first.
+    missing : sequence of str
+        Names of the effects that the diagnosis found likely to be missing.
+    kind : str, optional
+        Kind of the diagnosis' conclusion; None without a diagnosis.
+    diagnosing : bool
+        The diagnosis is under way.
+    experiment : bool
+        The diagnosis has planned a further test.
     """
     effects = " and ".join(f"“{name}”" for name in missing)
     add: Act = "add" if len(missing) == 1 else "improve"
-    first = GATES[found[0].gate] if found else None
-    if looking and verdict in ("usable", "usable with care"):
+    worst = GATES[failed[0].gate] if failed else None
+    if diagnosing and verdict in ("usable", "usable with care"):
         return Advice("wait", "Wait: what is missing in the model is still being looked for.")
     if verdict == "usable":
         if missing:
@@ -170,37 +188,40 @@ def advice(
     if verdict == "usable with care":
         if missing:
             return Advice(add, f"Usable with care: add {effects} first.")
-        look = first.look if first else "Usable with care: look at where the error sits first."
-        forced = bool(found) and found[0].gate == "evidence"
-        return Advice("approve" if kind in ("nothing", "unsure") and not forced else "look", look)
+        words = worst.look if worst else "Usable with care: look at where the error sits first."
+        if kind in ("nothing", "unsure") and not (failed and failed[0].gate == "evidence"):
+            return Advice("approve", words)
+        if experiment:
+            return Advice("experiment", "Usable with care: play the next experiment first.")
+        return Advice("look", words)
     if verdict == "not usable":
-        if missing and all(finding.gate in ("gap", "ceiling") for finding in found if finding.severe):
+        if missing and all(finding.gate in ("gap", "ceiling") for finding in failed if finding.severe):
             return Advice(add, f"Not usable as it is: add {effects}, or test again.")
         again = "Not usable: test again with electrodes, fixture and load cell checked."
-        return Advice("test", str(first.test) if first else again)
+        return Advice("test", worst.test if worst else again)
     return Advice("fit", "There is no verdict on this model: test again, or fit the recording again.")
 
 
-def risks(document: dict[str, Any], found: Sequence[Finding]) -> list[str]:
-    """What a controller would risk with a model that is not usable, in sentences."""
-    fit = (document.get("fit") or {}).get("held_out_fit_percent")
-    said = list(dict.fromkeys(finding.risk for finding in found))
-    if fit is not None:
-        error = f"{100.0 - fit:.0f}"
-        said.append(f"On held-out pulses the error is {error} % of the torque.")
-    return said or ["Nobody knows how far the torque will be from what the controller expects."]
+def risks(document: dict[str, Any], failed: Sequence[Finding]) -> list[str]:
+    """List what a controller would risk with a model that is not usable, in sentences."""
+    fit_percent = (document.get("fit") or {}).get("held_out_fit_percent")
+    sentences = list(dict.fromkeys(finding.risk for finding in failed))
+    if fit_percent is not None:
+        sentences.append(f"On held-out pulses the error is {100.0 - fit_percent:.0f} % of the torque.")
+    return sentences or ["Nobody knows how far the torque will be from what the controller expects."]
 
 
 def fit_sentence(fit: dict[str, Any]) -> str:
-    """How much of the torque the model follows, and how much noise lets it: of pulses not used for fitting if any."""
-    found = followed(fit)
-    if found.percent is None:
+    """Say how much of the torque the model follows and how much the noise allows, on held-out pulses if there are any.
+
+    Empty where the fit is not defined.
+    """
+    figure = followed(fit)
+    if figure.percent is None:
         return ""
-    if found.percent <= 0.0:
-        return f"{found.where} the model does not follow the torque at all."
-    reached = f"{found.percent:.1f}"
-    fit_is = f"{found.where} the fit is {reached} %"
-    if found.ceiling_percent is None:
-        return f"{fit_is}."
-    limit = f"the noise allows about {found.ceiling_percent:.1f} %"
-    return f"{fit_is}; {limit}."
+    if figure.percent <= 0.0:
+        return f"{figure.where} the model does not follow the torque at all."
+    reached = f"{figure.where} the fit is {figure.percent:.1f} %"
+    if figure.ceiling_percent is None:
+        return f"{reached}."
+    return f"{reached}; the noise allows about {figure.ceiling_percent:.1f} %."

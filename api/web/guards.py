@@ -33,7 +33,7 @@ from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model, Participant, Recording, Test
 from stimrig.api.web.middleware import SAFE_METHODS, STOP, entity_tags, wants_html
 
-POLLED = ("/rig/", "/jobs/now/", "/v1/jobs/")
+POLLED = ("/rig/", "/v1/jobs/")
 """What pages ask for again and again by themselves."""
 BEARER = HTTPBearer(scheme_name="token", description="a token, or a controller's key", auto_error=False)
 SESSION = APIKeyCookie(

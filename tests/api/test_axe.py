@@ -124,10 +124,9 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: http
     first = play_test(client, "X3")["model_id"]
     added = client.post(f"/v1/models/{first}/effects", json={"effects": ["fatigue"]}).json()["id"]
     tab.goto(f"{service.url}/models/{added}")
-    chart(tab, "falling")
     settled(tab)
     tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
-    for figure in ("comparison", "recruitment", "residual"):
+    for figure in ("comparison", "recruitment", "residual", "falling"):
         chart(tab, figure)
     look_closer(tab, "step")
     examined(tab, "model, all open")

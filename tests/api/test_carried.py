@@ -190,13 +190,13 @@ def test_model_page_says_what_carries_over(
     plain, child = versions(client, participant, test)
     client.get(f"/v1/models/{child['id']}/diagnosis")
     page = pages.get(f"/models/{child['id']}").text
-    section = page[page.index('id="carried"') :].partition("</section>")[0]
+    section = page[page.index('id="carried"') :].partition("</details>")[0]
     assert "has the structure of the last approved model" in section
     assert "<b>Fatigue</b>" in section and ">kept<" in section
     assert "<b>Threshold_drift</b>" in section and "asked for again" in section  # by the stub's diagnosis
     assert f"/models/{plain['id']}" in section
     other = pages.get(f"/models/{plain['id']}").text
-    assert "is better" in other and f"/models/{child['id']}" in other
+    assert "explains this recording better" in other and f"/models/{child['id']}" in other
     assert 'id="carried"' not in pages.get(f"/models/{approved['id']}").text
 
 

@@ -93,13 +93,13 @@ def swipe(page: Any, chart: Any) -> None:
 def test_a_finger_scrolls_the_page_and_zooms_when_asked(browser: Any, service: Service, model: str) -> None:
     for page in open_tab(browser, service, has_touch=True, is_mobile=True):
         page.set_viewport_size(TABLET)
-        drawn(page, service, model, "comparison")
-        chart = page.locator("[data-figure=comparison]")
+        drawn(page, service, model, "residual")
+        chart = page.locator("[data-figure=residual]")
         chart.scroll_into_view_if_needed()
         before = page.evaluate(AT_REST)
         swipe(page, chart)
         assert page.evaluate(AT_REST) > before + 100
-        state = "() => document.querySelector('[data-figure=comparison] .plot').layout.dragmode"
+        state = "() => document.querySelector('[data-figure=residual] .plot').layout.dragmode"
         assert page.evaluate(state) is False
         chart.locator(".modebar-btn[data-val=zoom]").click()
         assert page.evaluate(state) == "zoom"

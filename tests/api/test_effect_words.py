@@ -5,16 +5,12 @@ from __future__ import annotations
 from stimrig.api.effect_words import library, parameter_words
 from stimrig.api.models import explanation, stored_model
 from stimrig.identify import effects
-from tests.api.conftest import Service, play_test, shared_service, signed_in, soon
 
 PLAIN = {
     "sample_rate_hz": 40.0,
     "linear": {"b": [0.0, 0.002], "a": [1.0, -1.93, 0.934], "delay_samples": 0},
     "uncertainty": {"figures": {}},
 }
-
-
-service = shared_service()
 
 
 def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -> None:
@@ -38,17 +34,3 @@ def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
     assert explanation.label(row) == f"+ fatigue, {title}"
     for known in ({}, library):
         assert explanation.card(rival, known, {})["rivals"] == [title]
-
-
-def test_a_page_that_waits_reads_how_far_the_work_is(service: Service) -> None:
-    slow = service.context.settings.recordings_dir / "slow"
-    slow.parent.mkdir(parents=True, exist_ok=True)
-    slow.write_text("0.4")
-    with service.client() as http, signed_in(service) as browser:
-        model = play_test(http, "G1")["model_id"]
-        job = http.get(f"/v1/models/{model}/diagnosis", params={"wait": False}).json()["id"]
-        now = soon(lambda: (told := browser.get(f"/jobs/now/{job}").json())["text"] and told)
-        assert now == {"progress": 0.4, "text": "tried fatigue", "time_left_s": now["time_left_s"], "done": False}
-        assert http.get(f"/v1/jobs/{job}").json()["text"] == "tried fatigue"
-        slow.unlink()
-        assert http.delete(f"/v1/jobs/{job}").is_success  # it would stand still for a minute

@@ -62,7 +62,7 @@ def test_a_model_that_holds_it_shows_it_and_the_diagnosis_does_not_offer_it_agai
     assert card["words"] == "Pulses open a gate." and card["axis"] == SHAPE["effect"]
     assert list(diagnosis_charts.free_effects([card])) == ["free-free_gate"]
     drawn = Figures(diagnosis_charts.free_effects([card]))
-    shown = environment.get_template("why.html").module.free(card, drawn)  # pyright: ignore[reportAttributeAccessIssue]
+    shown = environment.get_template("model_parts.html").module.free(card, drawn)  # pyright: ignore[reportAttributeAccessIssue]
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
     assert explanation.remaining(diagnosis(), ["free_gate"], {})["free"] == []
     assert explanation.held_free({"effects": [{"id": "fatigue"}]}) == []

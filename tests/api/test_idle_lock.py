@@ -86,7 +86,6 @@ def test_it_locks_after_ten_minutes_and_not_before(service: Service, clock: SetC
         ("/rig/now", {}),
         ("/rig/notice", {}),
         ("/v1/jobs/none", {}),
-        ("/jobs/now/none", {}),
         ("/", {**SCRIPT, **HTML}),
         ("/v1/rig", SCRIPT),
     ],

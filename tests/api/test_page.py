@@ -31,7 +31,7 @@ from tests.api.browser import (
     start,
     without_values,
 )
-from tests.api.conftest import HTML, Service, csrf, shared_service, soon, wait_done
+from tests.api.conftest import HTML, Service, shared_service, soon, wait_done
 
 pytestmark = pytest.mark.browser
 
@@ -58,6 +58,7 @@ def test_a_clinicians_whole_way(tab: Any, service: Service, client: httpx.Client
     assert "the fit is 97.9 %" in tab.inner_text("main")
     for words in ("Torque (N·m)", "Residual", "Time (s)"):
         expected(tab.locator("#torque").get_by_text(words).first).to_be_visible()
+    tab.get_by_text("Approve or reject it").click()  # the page's own button adds the effect that is missing
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text("the controller gets this model").wait_for()
@@ -142,7 +143,7 @@ def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> 
     )
     job = {"progress": 0.5, "text": "at work", "time_left_s": 2.0, "done": False}
     answers = iter([500, 503])  # of a service that starts again
-    tab.route("http://wait.test/jobs/now/J", lambda route: route.fulfill(json=job, status=next(answers, 200)))
+    tab.route("http://wait.test/v1/jobs/J", lambda route: route.fulfill(json=job, status=next(answers, 200)))
     tab.route("http://wait.test/", lambda route: route.fulfill(body=body, content_type="text/html"))
     tab.goto("http://wait.test/")
     tab.get_by_text("at work").wait_for()
@@ -163,16 +164,6 @@ def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> 
 def blank(browser: Any, service: Service) -> Iterator[Any]:
     """A tab in which nobody has signed in."""
     yield from open_tab(browser, service, signed_in=False)
-
-
-def test_a_form_without_a_reason_decides_nothing(service: Service, pages: httpx.Client, client: httpx.Client) -> None:
-    model = service.play_test("C2")["model_id"]
-    refused = pages.post(f"/models/{model}/reject", data={"csrf": csrf(pages), "reason": "  "})
-    assert refused.status_code == 422 and "needs a reason" in refused.text
-    assert client.get(f"/v1/models/{model}").json()["decision"] is None
-    given = pages.post(f"/models/{model}/reject", data={"csrf": csrf(pages), "reason": "electrode slipped"})
-    assert given.status_code == 303
-    assert client.get(f"/v1/models/{model}").json()["decision_reason"] == "electrode slipped"
 
 
 def test_every_export_of_a_model_and_a_test_is_there(service: Service, pages: httpx.Client) -> None:
@@ -235,7 +226,9 @@ def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, ser
     blank.get_by_role("cell", name=name, exact=True).first.wait_for()
     blank.get_by_label("Name of the controller").fill("ilc in room 3")
     blank.get_by_role("button", name="Make the key").click()
-    key = blank.locator(".notice .mono").inner_text()
+    blank.get_by_text("shown this once").wait_for()
+    key = blank.locator("#key-made .mono").inner_text()
+    blank.reload()
     with service.client(key) as controller:
         assert controller.get("/v1/participants/none/model").status_code == 404
         assert controller.get("/v1/rig").status_code == 403

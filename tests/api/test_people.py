@@ -88,15 +88,6 @@ def test_approval_needs_the_password_once_more(
     assert again.status_code == 403, "a confirmation is good for one decision"
 
 
-def test_form_approval_carries_the_password(client: httpx.Client, clinician: httpx.Client, participant: str) -> None:
-    model_id = run_test(client, participant)["model_id"]
-    fields = {"csrf": clinician.headers["X-CSRF-Token"], "reason": "good"}
-    assert clinician.post(f"/models/{model_id}/approve", data=fields).status_code == 403
-    assert clinician.post(f"/models/{model_id}/approve", data=fields | {"password": "wrong word"}).status_code == 401
-    assert clinician.post(f"/models/{model_id}/approve", data=fields | {"password": PASSWORD}).status_code == 303
-    assert client.get(f"/v1/participants/{participant}/model").status_code == 200
-
-
 def test_a_form_signs_in_and_leads_on_and_another_site_does_not(service: Service, clinician: httpx.Client) -> None:
     with service.client(token=None, follow_redirects=False) as browser:
         form = {"name": "Ada", "password": PASSWORD, "next": "/participants/P1"}
@@ -151,8 +142,7 @@ def test_changed_password_and_removal_end_sessions(client: httpx.Client, clinici
     assert client.post("/v1/users", json={"name": "Eve", "password": "short"}).status_code == 422
 
 
-@pytest.mark.parametrize("by_form", [False, True])
-def test_who_changes_their_own_password_stays_under_a_new_cookie(service: Service, by_form: bool) -> None:
+def test_who_changes_their_own_password_stays_under_a_new_cookie(service: Service) -> None:
     with service.client() as client:
         client.post("/v1/users", json={"name": "Root", "password": PASSWORD, "scopes": ["administer"]})
     own, other = service.client(token=None), service.client(token=None)
@@ -160,11 +150,8 @@ def test_who_changes_their_own_password_stays_under_a_new_cookie(service: Servic
         signed = browser.post("/v1/sessions", json={"name": "Root", "password": PASSWORD}).json()
         browser.headers["X-CSRF-Token"] = signed["csrf"]
     old = dict(own.cookies)
-    if by_form:
-        answer = own.post("/administration/users/Root/password", data={"password": "another passphrase"})
-    else:
-        answer = own.put("/v1/users/Root/password", json={"password": "another passphrase"})
-    assert answer.status_code in (204, 303) and "HttpOnly" in answer.headers["set-cookie"]
+    answer = own.put("/v1/users/Root/password", json={"password": "another passphrase"})
+    assert answer.status_code == 204 and "HttpOnly" in answer.headers["set-cookie"]
     assert dict(own.cookies) != old and own.get("/v1/users").status_code == 200
     assert own.post("/v1/stop").status_code == 200 and own.post("/v1/rearm").status_code == 200, "its forms stay good"
     assert other.get("/v1/users").status_code == 401, "every other session has ended"

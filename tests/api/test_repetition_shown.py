@@ -24,6 +24,6 @@ def test_a_report_and_the_command_line_have_it():
     model = identify.fit(record)
     document = model.to_dict()
     page = comparison_html(document, json_value(curves(model, record)), "a record")
-    assert "Of variance that repeats" in page
+    assert "What repeats" in page
     assert "Between 2 repeats of the same pulses the torque differs by" in page
     assert any(line.startswith("repetition     Between 2 repeats") for line in model_report(document))

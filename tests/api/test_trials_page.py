@@ -11,7 +11,7 @@ import pytest
 from stimrig.api import local_time
 from stimrig.api.models.tracking import OUTCOMES, sentences
 from stimrig.api.web.responses.models import TrialOut
-from tests.api.conftest import Service, csrf
+from tests.api.conftest import Service
 from tests.api.test_tracked import play, say, tracked
 
 PAGE = "/participants/P017"
@@ -97,20 +97,18 @@ def test_what_is_asked_leads_to_the_shortest_test_in_one_click(
 def test_a_person_sets_the_limits_with_the_approval(pages: httpx.Client, client: httpx.Client, approved: str) -> None:
     client.post(f"/v1/models/{approved}/reject", json={"reason": "once more"})
     page = pages.get(f"/models/{approved}").text
-    assert re.search(r'name="gain_percent"[^>]*value="20"', page)
+    assert re.search(r'name="tracking.gain_percent"[^>]*value="20"', page)
     summary = re.search(r'<details class="more tracking"><summary>(.*?)</summary>', page, re.S)
     assert summary and "gain ±20\u00a0%, threshold ±20\u00a0% (±" in summary[1], "it is read before it is approved"
-    form = {"csrf": csrf(pages), "password": "correct horse battery"}
-    for wrong in ("61", "-1", "", "1e1", "nan"):
-        refused = pages.post(f"/models/{approved}/approve", data={**form, "gain_percent": wrong})
-        assert refused.status_code == 422, wrong
+    approve = f"/v1/models/{approved}/approve"
+    for wrong in (61.0, -1.0, None, "nan"):
+        assert client.post(approve, json={"tracking": {"gain_percent": wrong}}).status_code == 422, wrong
     assert tracked(client).status_code == 404
-    sent = {**form, "gain_percent": "12,5", "threshold_percent": "0", "time_scale_percent": "60"}
-    assert pages.post(f"/models/{approved}/approve", data=sent).status_code == 303
+    limits = {"gain_percent": 12.5, "threshold_percent": 0.0, "time_scale_percent": 60.0}
+    assert client.post(approve, json={"tracking": limits}).status_code == 200
     shown = pages.get(f"/models/{approved}").text
     assert "gain ±12.5\u00a0%, threshold as approved, time scale ±60\u00a0%" in shown
-    limits = client.get("/v1/participants/P017/tracking").json()["limits"]
-    assert limits == {"gain_percent": 12.5, "threshold_percent": 0.0, "time_scale_percent": 60.0}
+    assert client.get("/v1/participants/P017/tracking").json()["limits"] == limits
 
 
 @pytest.mark.browser

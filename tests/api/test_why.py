@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,7 +17,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.web.pages.report_file import missing_parts
 from stimrig.identify.conclusion import conclude, why_ended
-from tests.api.conftest import Service, csrf, run_test, signed_in, soon, wait_done
+from tests.api.conftest import Service, run_test, signed_in, soon, wait_done
 from tests.harness import few_effects
 
 pytestmark = pytest.mark.slow
@@ -422,9 +423,9 @@ def test_only_what_is_likely_missing_is_advised() -> None:
     assert found["likely"] == [] and "possibly missing" in found["title"] and len(found["missing"]) == 1
 
 
-def test_forcing_on_the_page_wants_a_reason_and_refusals_are_pages(pages: httpx.Client, model: str) -> None:
-    led = pages.post(f"/models/{model}/effects", data={"csrf": csrf(pages), "effect": "tremor"})
-    page = soon(lambda: (found := pages.get(led.headers["location"])).status_code != 200 and found)
+def test_a_job_that_fails_has_a_page_that_says_why(client: httpx.Client, pages: httpx.Client, model: str) -> None:
+    job = client.post(f"/v1/models/{model}/effects?wait=false", json={"effects": ["tremor"]}).json()["id"]
+    page = soon(lambda: (found := pages.get(f"/jobs/{job}")).status_code != 200 and found)
     assert page.status_code == 409
     assert "gives no evidence for this effect" in page.text and "Back to the model" in page.text
 
@@ -433,10 +434,10 @@ def test_cancelled_diagnosis_offers_to_begin_anew(client: httpx.Client, service:
     make_slow(service)
     model = run_test(client, participant)["model_id"]
     with signed_in(service) as browser:
-        assert "Cancel" in browser.get(f"/models/{model}").text
-        led = browser.post(f"/models/{model}/diagnosis/cancel", data={"csrf": csrf(browser)})
-        page = soon(lambda: "Diagnose now" in (text := browser.get(led.headers["location"]).text) and text)
-        assert "data-job" not in page
+        job = re.findall(r'data-call="DELETE (/v1/jobs/\w+)"', browser.get(f"/models/{model}").text)[0]
+        assert client.delete(job).json()["state"] == "cancelled"
+        page = browser.get(f"/models/{model}").text
+        assert "Diagnose now" in page and "data-job" not in page
 
 
 def test_a_model_on_another_recording(client: httpx.Client, pages: httpx.Client, model: str, participant: str) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import csv
-import html
 import io
 import json
-import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import httpx
 import numpy as np
@@ -17,7 +16,7 @@ import pytest
 from stimrig import Client
 from stimrig.api.cli import main
 from stimrig.rig.messages import Bound
-from tests.api.conftest import HTML, PATIENCE_S, REAL, TOKEN, Service, run_service
+from tests.api.conftest import PATIENCE_S, REAL, TOKEN, Service, run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_jobs import made_up_csv
 
@@ -42,6 +41,11 @@ def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterato
 
 
 @pytest.fixture
+def service(served: tuple[Service, str]) -> Service:
+    return served[0]
+
+
+@pytest.fixture
 def client(served: tuple[Service, str]) -> Iterator[httpx.Client]:
     with served[0].client(timeout=60) as client:
         yield client
@@ -55,7 +59,7 @@ def table(time_s: np.ndarray = TIME_S, torque_nm: np.ndarray = WANTED_NM) -> byt
 def test_the_muscle_follows_what_was_asked_for(served: tuple[Service, str]) -> None:
     service, model_id = served
     with Client(service.url, TOKEN, PATIENCE_S) as client:
-        found = client.widths(model_id, WANTED_NM.tolist(), TIME_S.tolist())
+        found = client.widths(model_id, WANTED_NM.tolist(), time_s=TIME_S.tolist())
         assert client.predict(model_id, found["pulse_width_us"]) == pytest.approx(
             found["predicted_torque_nm"], abs=1e-5
         )
@@ -129,43 +133,58 @@ def test_a_senseless_reference_is_refused_in_words(client: httpx.Client, served:
         assert answer.status_code in (400, 422), answer.text
 
 
-def test_the_page_shows_reference_prediction_and_what_is_out_of_reach(
-    client: httpx.Client, served: tuple[Service, str]
-) -> None:
-    address = f"/models/{served[1]}/widths"
-    assert f'href="{address}"' in client.get(f"/models/{served[1]}?diagnose=0", headers=HTML).text
-    empty = client.get(address, headers=HTML)
-    assert empty.status_code == 200 and "No reference yet." in empty.text and 'class="still"' not in empty.text
-    sent = client.post(address, files={"file": ("reach.csv", table(torque_nm=20 * WANTED_NM))}, headers=HTML)
-    assert sent.status_code == 200 and 'class="still"' in sent.text and "reach.csv" in sent.text
-    for words in ("Torque above rest (N·m)", "Pulse width (µs)", "Time (s)", "too high for the widest pulse"):
-        assert words in sent.text, words
-    reference = html.unescape(re.search(r'name="reference" value="([^"]*)"', sent.text)[1])  # pyright: ignore
-    got = client.post(address + ".csv", data={"reference": reference})
-    assert got.headers["content-type"].startswith("text/csv") and "widths.csv" in got.headers["content-disposition"]
-    rows = list(csv.DictReader(io.StringIO(got.text)))
-    assert list(rows[0]) == ["time_s", "pulse_width_us", "reference_torque_nm", "predicted_torque_nm"]
-    assert len(rows) == 240 and max(float(row["pulse_width_us"]) for row in rows) == 250.0
-    whole = client.post(address, files={"file": ("r.csv", table())}, headers=HTML)
-    assert "All of it can be reached." in whole.text and "Out of reach" not in whole.text
-
-
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("text", "words"),
     [
-        (b"", "empty"),
-        (b"a,b\n1,2\n", "line 1"),
-        (b"time_s,torque_nm\n0,1\n0.1,x\n", "line 3, column torque_nm"),
-        (b"\x89HDF\r\n\x1a\n\x00\x00", "not text"),
-        (b"time_s,torque_nm\n0,\xb51\n", "line 2"),
+        ("", "empty"),
+        ("a,b\n1,2\n", "line 1"),
+        ("time_s,torque_nm\n0,1\n0.1,x\n", "line 3, column torque_nm"),
+        ("\x89HDF\r\n\x1a\n\x00\x00", "not text"),
+        ("time_s,torque_nm\n0,\ufffd1\n", "line 2"),
     ],
 )
-def test_a_file_that_is_no_reference_is_told_beside_the_form(
-    client: httpx.Client, served: tuple[Service, str], content: bytes, words: str
+def test_a_table_that_is_no_reference_is_refused_with_its_place(
+    client: httpx.Client, served: tuple[Service, str], text: str, words: str
 ) -> None:
-    answer = client.post(f"/models/{served[1]}/widths", files={"file": ("x.csv", content)}, headers=HTML)
-    assert answer.status_code == 422 and words in html.unescape(answer.text), answer.text[-3000:]
-    assert "Find the pulse widths" in answer.text
+    answer = client.post(f"/v1/models/{served[1]}/widths", json={"table": text})
+    assert answer.status_code == 422 and words in answer.json()["detail"]
+
+
+def test_a_table_says_the_same_as_its_numbers(client: httpx.Client, served: tuple[Service, str]) -> None:
+    ask = f"/v1/models/{served[1]}/widths"
+    numbers = {"reference_torque_nm": WANTED_NM.round(5).tolist(), "time_s": TIME_S.round(4).tolist()}
+    first, second = (client.post(ask, json=body).json() for body in (numbers, {"table": table().decode()}))
+    assert first == second
+    assert client.post(ask, json=numbers | {"table": "torque_nm\n1\n"}).status_code == 422, "one of the two"
+
+
+@pytest.mark.browser
+def test_the_page_shows_what_comes_of_a_reference_and_what_is_out_of_reach(
+    tab: Any, service: Service, served: tuple[Service, str], tmp_path: Path
+) -> None:
+    path = f"/models/{served[1]}/widths"
+    tab.goto(f"{service.url}/models/{served[1]}?diagnose=0")
+    assert tab.get_by_role("link", name="Widths for a torque").get_attribute("href") == path
+    tab.goto(service.url + path)
+    for name, torque_nm in (("reach.csv", WANTED_NM), ("beyond.csv", 20 * WANTED_NM)):
+        (tmp_path / name).write_bytes(table(torque_nm=torque_nm))
+        tab.locator("#reference").set_input_files(tmp_path / name)
+        tab.get_by_role("button", name="Find the pulse widths").click()
+        tab.locator("#result-title", has_text=name).wait_for()
+        tab.locator("#widths-plot .scatterlayer").first.wait_for()
+        assert tab.locator("#lacking").is_visible() == (name == "beyond.csv")
+    assert "too high for the widest pulse" in tab.locator("#lacking").inner_text()
+    with tab.expect_download() as saved:
+        tab.get_by_role("button", name="Download the widths").click()
+    rows = list(csv.DictReader(io.StringIO(Path(saved.value.path()).read_text())))
+    assert list(rows[0]) == ["time_s", "pulse_width_us", "reference_torque_nm", "predicted_torque_nm"]
+    assert len(rows) == 240 and max(float(row["pulse_width_us"]) for row in rows) == 250.0
+    (tmp_path / "wrong.csv").write_text("time_s,torque_nm\n0,1\n0.1,x\n")
+    tab.locator("#reference").set_input_files(tmp_path / "wrong.csv")
+    tab.get_by_role("button", name="Find the pulse widths").click()
+    tab.get_by_text("line 3, column torque_nm").wait_for()
+    assert tab.locator("#result").is_hidden()
+    assert [error for error in tab.errors if "422" not in error] == []
 
 
 def test_the_verb_writes_the_same_table(

@@ -18,7 +18,6 @@ from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store.tables import Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import limits_form, starting, typed
-from stimrig.api.web.pages.model_view import to_job
 from stimrig.api.web.pages.render import done_or_said, page
 from stimrig.api.web.routes import joint, participants
 from stimrig.api.web.routes.joint import PoseIn, TogetherIn
@@ -101,7 +100,7 @@ async def fit_together(request: Request, context: Ctx, who: Tester, code: str) -
     if not chosen:
         raise ApiError(422, "invalid-input", "No recording is ticked", "Go back and tick those that belong together.")
     body = typed.checked(TogetherIn, recordings=chosen, effects=list(together.JOINT_EFFECTS))
-    return await to_job(joint.begin_fit(context, code, body, who.name))
+    return RedirectResponse(f"/jobs/{joint.begin_fit(context, code, body, who.name).id}", 303)
 
 
 @router.get("/rig/angle")

@@ -1,4 +1,4 @@
-"""Reports as one HTML file that works anywhere, offline, without a script: its charts are pictures."""
+"""Reports as one HTML file that works offline: `comparison_html`, `diagnosis_html` and `story_html`."""
 
 from __future__ import annotations
 
@@ -14,6 +14,11 @@ from stimrig.api.web.pages.environment import HERE, environment
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
 """Nothing runs in a report, nothing is loaded, nothing leaves."""
+PARTS: dict[str, Any] = {
+    "lead": "", "model": None, "why": None, "story": None, "test": None, "held": [], "plain": [], "places": [],
+    "splits": [], "tests": [], "refused": [],
+}  # fmt: skip
+"""Parts of `report.html` that a report may leave out."""
 
 
 def comparison_html(
@@ -25,16 +30,26 @@ def comparison_html(
 ) -> str:
     """Write measurement against model: where it fails, and by how much.
 
-    `document` is a MODEL.json, `curves` as `stimrig.api.jobs.curves.curves` gives them, `name` a file's or a test's,
-    `test` as the service shows it, `comparison` as `identify.compare` gives it, cleaned and thinned.
+    Parameters
+    ----------
+    document : dict
+        A MODEL.json.
+    curves : dict
+        As `stimrig.api.jobs.curves.curves` gives them.
+    name : str
+        Name of the file or the test.
+    test : dict, optional
+        The test as the service shows it.
+    comparison : dict, optional
+        As `identify.compare` gives it, cleaned and thinned.
     """
-    judged, held = stored_model.quality(document), explanation.held_free(document)
-    return _page(
-        "report.html",
-        held=held,
+    held, effects = explanation.held_free(document), [effect["id"] for effect in document.get("effects") or []]
+    model = {**stored_model.figures(document), **stored_model.quality(document)}
+    return _write(
         title=f"{name}: measurement against model",
-        model={**stored_model.figures(document), **judged, "id": document["model_id"], "method": document["method"]},
-        effects=[effect["id"] for effect in document.get("effects") or []],
+        lead=f"with {', '.join(effects)}" if effects else "",
+        model={**model, "id": document["model_id"], "method": document["method"]},
+        held=held,
         recruitment=stored_model.recruitment(document),
         dynamics=stored_model.dynamics(document),
         repetition=stored_model.repetition(document),
@@ -55,24 +70,26 @@ def comparison_html(
 def diagnosis_html(
     diagnosis: dict[str, Any], comparison: dict[str, Any], segments: list[dict[str, Any]], name: str
 ) -> str:
-    """Write what is missing, as the page shows it.
+    """Write what is missing.
 
-    `diagnosis` is as `stimrig.api.jobs.verbs.diagnosis` gives it, `comparison` of the examined model with the
-    record, thinned, `segments` as `stimrig.api.jobs.curves.runs` gives them.
+    Parameters
+    ----------
+    diagnosis : dict
+        As `stimrig.api.jobs.verbs.diagnosis` gives it.
+    comparison : dict
+        Of the examined model with the record, thinned.
+    segments : list of dict
+        As `stimrig.api.jobs.curves.runs` gives them.
+    name : str
+        Name of the record.
     """
-    view = explanation.view(diagnosis, comparison)
-    return _page(
-        "report_diagnosis.html",
-        title=f"{name}: what is missing",
-        figures=Figures(
-            diagnosis_charts.diagnosis_figures(comparison, segments, view, diagnosis.get("signatures") or {}, [])
-        ),
-        **missing_parts(view, comparison),
-    )
+    view, signatures = explanation.view(diagnosis, comparison), diagnosis.get("signatures") or {}
+    figures = diagnosis_charts.diagnosis_figures(comparison, segments, view, signatures, [])
+    return _write(title=f"{name}: what is missing", figures=Figures(figures), **missing_parts(view, comparison))
 
 
 def missing_parts(view: dict[str, Any] | None, comparison: dict[str, Any] | None) -> dict[str, Any]:
-    """What `missing.html` shows, on the page and in a file."""
+    """Return `why` (the view of a diagnosis, if there is one), and `places`, `splits` and `tests` of the error."""
     if view is not None:
         return {"why": view, **{key: view[key] for key in ("places", "splits", "tests")}}
     alone = comparison or {}
@@ -85,16 +102,27 @@ def story_html(
     told: dict[str, Any], before: dict[str, Any], after: dict[str, Any], name: str,
     refused: Sequence[dict[str, Any]] = (), structure: str = "",
 ) -> str:  # fmt: skip
-    """Write the story, as `stimrig.api.models.story.story` gives it.
+    """Write the story of a model.
 
-    `before` and `after` are curves and comparison of the first model and of the last one, `refused` what was tried and
-    not added, `structure` what it was begun with.
+    Parameters
+    ----------
+    told : dict
+        As `stimrig.api.models.story.story` gives it.
+    before, after : dict
+        Curves and comparison of the first model and of the last one.
+    name : str
+        Name of the record.
+    refused : sequence of dict
+        Effects that were tried and not added.
+    structure : str
+        The structure that the first model had.
     """
     figures = story_charts.story_figures(told, before, after)
-    shown = {"story": told, "figures": figures, "refused": refused, "structure": structure}
-    return _page("report_story.html", title=f"{name}: {told['title']}", name=name, **shown)
+    begun = f" · begun with {structure}" if structure else ""
+    lead = f"{name} · noise {told['noise_sd_nm'] or 0.0:.4f} N·m{begun}"
+    return _write(title=told["title"], lead=lead, story=told, figures=figures, refused=refused)
 
 
-def _page(template: str, **values: Any) -> str:
+def _write(**values: Any) -> str:
     style = Markup("").join(Markup((HERE / "static" / name).read_text("utf-8")) for name in ("page.css", "lead.css"))
-    return environment.get_template(template).render(**values, style=style, policy=POLICY)
+    return environment.get_template("report.html").render(**PARTS | values, style=style, policy=POLICY)

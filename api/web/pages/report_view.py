@@ -1,4 +1,4 @@
-"""A model's report on one sheet: session, verdict, curves, what is missing, who decided, a place to sign. No script."""
+"""A model's report on one sheet, without a script: session, verdict, curves, what is missing, a place to sign."""
 
 from __future__ import annotations
 
@@ -14,42 +14,41 @@ from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.places import site_of, site_of_recording
 from stimrig.api.store.tables import Note, Participant, Recording, Test
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
-from stimrig.api.web.pages.model_view import draw_own, facts, measurement, versions_of
+from stimrig.api.web.pages.model_view import draw_model, facts, measurement, versions_of
 from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
-SIZES = {
-    "comparison": (760.0, 312.0), "recruitment": (375.0, 215.0), "step": (375.0, 215.0), "joint_g": (760.0, 215.0),
-    "joint_h": (760.0, 215.0),
-}  # fmt: skip
+CHARTS = {
+    "comparison": (760.0, 312.0, "Torque measured and predicted, what is left, and the pulse width, over time"),
+    "recruitment": (375.0, 215.0, "Steady torque over pulse width"),
+    "step": (375.0, 215.0, "Step response over time"),
+    "joint_g": (760.0, 215.0, "Share of the muscle's torque over the angle of the joint"),
+    "joint_h": (760.0, 215.0, "Passive torque over the angle of the joint"),
+}
+"""Width and height (px) of each chart, and what it shows."""
 MOST_NOTES = 12
 """Notes on one report; the participant's page has all of them."""
 
 
 @router.get("/models/{model_id}/report")
 async def report(request: Request, context: Ctx, _who: ModelReader, row: Version) -> Response:
-    """One sheet on a model."""
-    document = stored_model.read(row)
-    measured = await measurement(context, row)
-    found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    """Show one sheet on a model."""
+    document, measured = stored_model.read(row), await measurement(context, row)
+    charts = draw_model(document, measured)
+    diagnosis = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
-    figures = draw_own(document, measured)
-    words = {
-        "comparison": "Torque measured and predicted, what is left, and the pulse width, over time",
-        "recruitment": "Steady torque over pulse width",
-        "step": "Step response over time",
-        "joint_g": "Share of the muscle's torque over the angle of the joint",
-        "joint_h": "Passive torque over the angle of the joint",
-    }
-    drawn = {name: svg(figures[name], *SIZES[name], words[name], light=True) for name in words if name in figures}
     return page(
         request,
         "report_sheet.html",
         model=await asyncio.to_thread(context.versions.document, row),
         **await facts(context, row, document),
-        drawn=drawn,
+        drawn={
+            name: svg(charts[name], width, height, words, light=True)
+            for name, (width, height, words) in CHARTS.items()
+            if name in charts
+        },
         problem=measured["problem"],
-        why=explanation.view(found, measured["comparison"]) if found else None,
+        why=explanation.view(diagnosis, measured["comparison"]) if diagnosis else None,
         versions=await asyncio.to_thread(versions_of, context, row),
         recording=recording,
         session=await asyncio.to_thread(session_of, context, recording),
@@ -57,7 +56,7 @@ async def report(request: Request, context: Ctx, _who: ModelReader, row: Version
 
 
 def session_of(context: Context, recording: Recording) -> dict[str, Any]:
-    """The session that a recording belongs to, as it was when its test was begun; `test` None: it was uploaded.
+    """Return the session of a recording, as it was when its test was begun; `test` None: it was uploaded.
 
     The site of a record whose site was not kept is that of now.
     """
@@ -76,9 +75,9 @@ def session_of(context: Context, recording: Recording) -> dict[str, Any]:
 
 
 def _notes(context: Context, recording: Recording, test: Test | None) -> list[Note]:
-    """The test's by their time in it, then those on the day as a whole."""
-    standing = [note for note in context.notes.participant_notes(recording.participant) if note.struck_utc is None]
-    own = [note for note in standing if test is not None and note.test_id == test.id]
+    """List the test's notes by their time in it, then those on the day as a whole."""
+    valid = [note for note in context.notes.participant_notes(recording.participant) if note.struck_utc is None]
+    of_test = [note for note in valid if test is not None and note.test_id == test.id]
     today = local_day(test.requested_utc if test else recording.created_utc)
-    general = [note for note in standing if note.test_id is None and local_day(note.at_utc) == today]
-    return [*sorted(own, key=lambda note: -1.0 if note.at_s is None else note.at_s), *reversed(general)]
+    general = [note for note in valid if note.test_id is None and local_day(note.at_utc) == today]
+    return [*sorted(of_test, key=lambda note: -1.0 if note.at_s is None else note.at_s), *reversed(general)]

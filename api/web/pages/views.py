@@ -18,7 +18,7 @@ from stimrig.api.sessions.requests import RanByIn
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import Context, Ctx, LiveReader, Tester
 from stimrig.api.web.pages import typed
-from stimrig.api.web.pages.model_view import draw_own, measurement
+from stimrig.api.web.pages.model_view import draw_model, measurement
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.pages.typed import Text
 from stimrig.api.web.routes import tests
@@ -112,7 +112,7 @@ async def measured(context: Context, model_id: str) -> Markup | None:
     found = await measurement(context, row)
     if found["curves"] is None:
         return None
-    figure = draw_own(stored_model.read(row), found)["comparison"]
+    figure = draw_model(stored_model.read(row), found)["comparison"]
     return svg(figure, 1160.0, 520.0, "Torque measured and predicted, what is left, and the pulse width, over time")
 
 

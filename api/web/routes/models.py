@@ -214,15 +214,26 @@ async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: Width
 
 
 class ReferenceIn(Body):
-    """A torque to follow."""
+    """A torque to follow, as numbers or as the text of a table."""
 
-    reference_torque_nm: Annotated[Column, Field(description="above rest, N·m; one for each pulse, without `time_s`")]
+    reference_torque_nm: (
+        Annotated[Column, Field(description="above rest, N·m; one for each pulse, without `time_s`")] | None
+    ) = None
+    table: Annotated[str, Field(description="instead: a CSV file with `time_s,torque_nm`, or `torque_nm`")] | None = (
+        None
+    )
     time_s: Annotated[Column, Field(description="times of the torques, s, rising by at most 1 s")] | None = None
     angle_rad: Angles | None = None
     pulse_rate_hz: ModelsRateHz = None
     max_pulse_width_us: FiniteFloat | None = Field(None, gt=0, le=500, description="never above the participant's, µs")
     max_rise_us: FiniteFloat | None = Field(None, gt=0, le=500, description="from pulse to pulse, µs; None: the rig's")
     whole_us: StrictBool = Field(True, description="whole µs")
+
+    @model_validator(mode="after")
+    def _one_reference(self) -> ReferenceIn:
+        if (self.reference_torque_nm is None) == (self.table is None):
+            raise ValueError("give reference_torque_nm, or the text of a table")
+        return self
 
 
 @router.post("/models/{model_id}/widths", **describe_answer(InversionOut))
@@ -231,7 +242,7 @@ async def widths(context: Ctx, _who: ModelReader, model_id: str, body: Reference
 
     Of a version, or of one that was tracked from it (its `model_id`).
     """
-    given = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz"})
+    given = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz", "table"})
     return await invert(context, model_id, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
 
 

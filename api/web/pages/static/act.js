@@ -89,7 +89,7 @@ const act = (() => {
     try {
       const answer = await fetch(at, { method, headers, cache: "no-store", signal: ending.signal, body: method === "DELETE" ? undefined : file || JSON.stringify(body) });
       const json = /json/.test(answer.headers.get("content-type") || "");
-      return { ok: answer.ok, status: answer.status, etag: (answer.headers.get("etag") || "").replace(/^W\/|"/g, ""), location: answer.headers.get("location"), body: json ? await answer.json() : null };
+      return { ok: answer.ok, status: answer.status, etag: (answer.headers.get("etag") || "").replace(/^W\/|"/g, ""), location: answer.headers.get("location"), body: json && answer.status !== 204 ? await answer.json() : null };
     } finally { clearTimeout(timer); }
   }
 

@@ -31,7 +31,7 @@ async function follow(box) {
     await new Promise((resolve) => setTimeout(resolve, 400));
     let job;
     try {
-      const answer = await fetch("/jobs/now/" + box.dataset.job, { headers: { Accept: "application/json" } });
+      const answer = await fetch("/v1/jobs/" + box.dataset.job, { headers: { Accept: "application/json" } });
       if (answer.status >= 500) continue;
       if (!answer.ok && answering()) continue;
       if (!answer.ok) { arrive(words, left); return; }
