@@ -30,12 +30,8 @@ from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
 
 log = logging.getLogger("stimrig.models")
-COLUMNS = (
-    "id", "participant", "recording_id", "parent_id", "added_effect", "carried_from_id", "carried", "method", "effects",
-    "created_utc", "created_by",
-)  # fmt: skip
-"""What clients see of a version's row as it is."""
-
+COLUMNS = tuple(column.name for column in Model.__table__.columns if column.name not in ("document", "etag", "fit"))
+"""Columns of a version that clients see as they are."""
 POOR = ("not usable", "unknown")
 """The verdicts with which an approval needs a reason."""
 AT_ONCE = 16
@@ -64,7 +60,6 @@ def is_reason(text: str) -> bool:
 class Served:
     """What the controller fetches: the bytes and their tag."""
 
-    model_id: str
     body: bytes
     etag: str
     approval_id: int
@@ -73,15 +68,10 @@ class Served:
 
 
 class Versions:
-    """The models of all participants.
-
-    Which approval holds is read from the database each time. The bytes that it stands for never change, and are kept in
-    memory.
-    """
+    """The models of all participants."""
 
     def __init__(self, store: Store, clock: Clock) -> None:
         self.store, self.clock = store, clock
-        self._served: dict[str, Served] = {}
         self._damaged: set[str] = set()
 
     def add(
@@ -165,10 +155,8 @@ class Versions:
         One that holds any of `with_evidence` without evidence is passed over: it was made before anybody had looked.
         """
         rows = self.store.all(Model, Model.parent_id == parent.id, Model.recording_id == parent.recording_id)
-        return next((
-            row for row in rows if sorted(row.effects) == sorted(effects)
-            and set(with_evidence).isdisjoint(row.fit.get("without_evidence") or ())
-        ), None)  # fmt: skip
+        alike = [row for row in rows if sorted(row.effects) == sorted(effects)]
+        return next((row for row in alike if set(with_evidence).isdisjoint(row.fit["without_evidence"])), None)
 
     def lineage(self, model: Model) -> list[Model]:
         """The versions from the first one of the recording to this one, then its newest descendants."""
@@ -195,16 +183,16 @@ class Versions:
 
         Raises ApiError: 409 there is nothing before it.
         """
-        row = self.get(model_id)
+        row, newest = self.get(model_id), self.decision(model_id)
         if row.parent_id is None:
             detail = f"{model_id} is the first version. Reject it instead."
-            if (decision := self.decision(model_id)) is not None and not decision.approved:
+            if newest is not None and not newest.approved:
                 detail = f"{model_id} is the first version, and it is rejected. Approve it anew to use it all the same."
             raise ApiError(409, "nothing-to-undo", "There is no version before this one", detail)
         words = f"undone: {reason}" if reason else "undone"
         parent = self.get(row.parent_id)
         with self.store.write() as session:
-            person = self._participant(session, row)
+            person = session.get_one(Participant, row.participant)
             locking.check(session, person, tags)
             holding = self.approved(row.participant)
             self._decide(session, row, False, by, words).undone = True
@@ -240,7 +228,7 @@ class Versions:
                 title = "This model is not usable: say why it is approved all the same"
                 raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
         with self.store.write() as session:
-            person = self._participant(session, row)
+            person = session.get_one(Participant, row.participant)
             locking.check(session, person, tags)
             self._decide(session, row, approved, by, reason, tracking.model_dump() if tracking else None)
             return person.version
@@ -250,40 +238,38 @@ class Versions:
         tracking: dict[str, float] | None = None,
     ) -> Approval:  # fmt: skip
         """Write a decision and its entry, with what the person was shown of the model."""
-        now = self.clock.utc()
-        decision = Approval(model_id=row.id, participant=row.participant, approved=approved, reason=reason)
-        decision.by, decision.at_utc = by, now
-        decision.site = self._site(session, row, approved)
-        decision.expires_utc = self.clock.end_of_day_utc() if approved else None
-        decision.tracking = tracking if approved else None
+        now, person = self.clock.utc(), session.get_one(Participant, row.participant)
+        decision = Approval(
+            model_id=row.id,
+            participant=row.participant,
+            approved=approved,
+            reason=reason,
+            by=by,
+            at_utc=now,
+            site=self._site(session, row, person, approved),
+            expires_utc=self.clock.end_of_day_utc() if approved else None,
+            tracking=tracking if approved else None,
+        )
         session.add(decision)
-        shown = {name: value for name, value in row.fit.items() if name != "figures"}
-        detail: dict[str, Any] = {"reason": reason, "shown": {**shown, **self.quality(row)}}
+        detail: dict[str, Any] = {"shown": {name: value for name, value in row.fit.items() if name != "figures"}}
         detail |= {"tracking": decision.tracking} if decision.tracking else {}
-        person, action = self._participant(session, row), "approve" if approved else "reject"
-        locking.write(session, person, now, by, action, row.id, participant=person.code, **detail)
+        action, told = "approve" if approved else "reject", {"participant": person.code, "reason": reason}
+        locking.write(session, person, now, by, action, row.id, **told, **detail)
         return decision
-
-    def _participant(self, session: Session, row: Model) -> Participant:
-        person = session.get(Participant, row.participant)
-        assert person is not None
-        return person
 
     def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
         """Where a version's recording was made, and with what current, mA; None: not known."""
         with self.store.read() as session:
-            recording = session.get(Recording, row.recording_id)
-            assert recording is not None
-            test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
-            return site_of_recording(recording, test), None if test is None else place_of(test)[3]
+            return self._measured_at(session, row)
 
-    def _site(self, session: Session, row: Model, approved: bool) -> list[Any]:
-        """The participant's site; 409 where a model is to be approved that was measured at another one."""
-        recording = session.get(Recording, row.recording_id)
-        assert recording is not None
-        here = site_of(self._participant(session, row))
+    def _measured_at(self, session: Session, row: Model) -> tuple[Site | None, float | None]:
+        recording = session.get_one(Recording, row.recording_id)
         test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
-        there = site_of_recording(recording, test)
+        return site_of_recording(recording, test), None if test is None else place_of(test)[3]
+
+    def _site(self, session: Session, row: Model, person: Participant, approved: bool) -> list[Any]:
+        """The participant's site; 409 where a model is to be approved that was measured at another one."""
+        here, (there, _current) = site_of(person), self._measured_at(session, row)
         if approved and there not in (None, here):
             detail = (
                 f"{row.id} was measured at {in_words(there)}. {row.participant} is now stimulated at {in_words(here)}. "
@@ -311,9 +297,9 @@ class Versions:
         last = self._last_approvals([participant]).get(participant)
         return None if last is None else self.get(last.model_id)
 
-    def _last_approvals(self, participants: Collection[str], without: Collection[str] = ()) -> dict[str, Approval]:
+    def _last_approvals(self, participants: Collection[str]) -> dict[str, Approval]:
         query = select(Approval).where(Approval.participant.in_(participants)).order_by(Approval.id.desc())
-        rejected = set(without)
+        rejected: set[str] = set()
         newest: dict[str, Approval] = {}
         with self.store.read() as session:
             of = session.scalars(select(Participant).where(Participant.code.in_(participants)))
@@ -331,25 +317,17 @@ class Versions:
         """The versions that were approved and not rejected since, oldest first, the last one of each recording."""
         decided = self.store.all(Approval, Approval.participant == participant, order=Approval.id)
         newest = {decision.model_id: decision for decision in decided}
-        rows = [
-            self.get(decision.model_id)
-            for decision in decided
-            if decision is newest[decision.model_id] and decision.approved
-        ]
-        return list({row.recording_id: row for row in reversed(rows)}.values())[::-1]
+        in_order = sorted(newest.values(), key=lambda decision: decision.id, reverse=True)
+        rows = [self.get(decision.model_id) for decision in in_order if decision.approved]
+        return list({row.recording_id: row for row in rows[::-1]}.values())
 
     def served(self, participant: str) -> Served | None:
         """What the controller gets, or None where nothing is approved. Raises ApiError (500) where that is damaged."""
         approval = self.approved(participant)
         if approval is None:
             return None
-        found = self._served.get(participant)
-        if found is None or found.approval_id != approval.id:
-            row = self.get(approval.model_id)
-            found = self._served[participant] = Served(
-                row.id, stored_model.whole(row), f'"{row.etag}"', approval.id, approval.at_utc
-            )
-        return found
+        row = self.get(approval.model_id)
+        return Served(stored_model.whole(row), f'"{row.etag}"', approval.id, approval.at_utc)
 
     def recruitment(self, participant: str) -> dict[str, list[float]] | None:
         """Recruitment curve of the approved model; None where nothing is approved, or where that cannot be read."""

@@ -209,10 +209,8 @@ class TrackedVersions:
         row = self.newest(approved.approval_id)
         if row is None or row.document is None:
             return approved
-        document = json.loads(row.document)
-        return Served(
-            document["model_id"], row.document, f'"{row.etag}"', row.approval_id, document["tracking"]["at_utc"]
-        )
+        at_utc = json.loads(row.document)["tracking"]["at_utc"]
+        return Served(row.document, f'"{row.etag}"', row.approval_id, at_utc)
 
     def text_of(self, model_id: str) -> str:
         """MODEL.json of a version, or of one that was tracked from it. Raises ApiError (404, 500)."""
