@@ -1,9 +1,8 @@
-"""`python -m stimrig.rig.builder previews` (or `live`): what the rig has built by a process of its own.
+"""`python -m stimrig.rig.builder`: builds previews in a process of its own, as `rig.adapters.builders` asks.
 
-Previews: the first line on standard input holds the rig's limits; each further line is the request for one preview, and
-gets one line as its reply. Live: each pickled `Taken` gets two lines. An empty line says that it takes them. Both are
-asked by `rig.adapters.builders`. The process ends when its standard input ends, or with the rig. It has a lower
-priority at the processor than the rig, for previews the lowest, and a limit on its memory.
+The first line on standard input holds the rig's limits; each further pair of lines is the request for one preview, and
+gets one line as its reply. An empty line says that it takes them. The process ends when its standard input ends, or
+with the rig. It has the lowest priority at the processor, and a limit on its memory.
 """
 
 from __future__ import annotations
@@ -20,14 +19,14 @@ MAX_MEMORY_BYTES = 1 << 30
 PR_SET_PDEATHSIG = 1
 
 
-def main(builds: str) -> int:
-    _modest(5 if builds == "previews" else 0)
+def main() -> int:
+    _modest(5)
     from stimrig.rig import logs
-    from stimrig.rig.control import live, replies  # after the limits are set: importing numpy takes time
+    from stimrig.rig.control import replies  # after the limits are set: importing numpy takes time
 
-    logs.configure(f"builder-{builds}")
+    logs.configure("builder-previews")
     print(flush=True)
-    {"previews": replies.serve, "live": live.serve}[builds](sys.stdin.buffer, sys.stdout.buffer)
+    replies.serve(sys.stdin.buffer, sys.stdout.buffer)
     return 0
 
 
@@ -44,4 +43,4 @@ def _modest(nice: int) -> None:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main())

@@ -5,6 +5,9 @@ These two are the only modules of `rig` that `api` imports, beside its stop key.
 
 from __future__ import annotations
 
+import struct
+from base64 import b64decode
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -386,15 +389,6 @@ class Extended(Message):
     torque_time_left_nms: float = Field(description="of what was measured until now")
 
 
-class TorqueSamples(Message):
-    """Every torque sample since the last live event, as it arrived: not aligned, zero offset not removed."""
-
-    host_time_s: list[float] = Field(description="when the host received it, test's clock")
-    counter: list[int] = Field(description="the cell's counter, unwrapped; -1: it has none. A gap: samples were lost")
-    torque_nm: list[float | None] = Field(description="None: no number came")
-    sync: list[int] = Field(description="stimulator's sync line; 255: there is none")
-
-
 class StateEvent(Message):
     event: Literal["state"] = "state"
     status: Status
@@ -422,19 +416,14 @@ class Pause(Message):
     cause: str = Field("", description="as far as the system knows it")
 
 
-class LiveEvent(Message):
-    """Data for a page's chart, about 20 times per second while torque arrives."""
+class LiveState(Message):
+    """Where a test is, and its dose so far."""
 
     event: Literal["live"] = "live"
     test_id: str | None
     segment: str | None
     elapsed_s: float
     duration_s: float = Field(description="of an adaptive test: the longest that it may take")
-    time_s: list[float] = Field(description="start of each bin on the test's clock, s")
-    torque_min_nm: list[float]
-    torque_max_nm: list[float]
-    pulse_time_s: list[float]
-    pulse_width_us: list[float]
     torque_age_s: float
     lost_samples: int
     dropped_pulses: int
@@ -449,15 +438,36 @@ class LiveEvent(Message):
     ended_by: str = Field("", description="why nothing will be laid any more; empty: more may be (see `Extended`)")
     laid_segments: list[LaidSegment] = Field(default_factory=list, description="all that are laid; adaptive tests only")
     pauses: list[Pause] = Field(default_factory=list, description="all of the test so far")
-    outcomes: PulseOutcomes | None = Field(None, description="for who subscribed with `samples`")
     angle_rad: float | None = Field(None, description="the newest; None without a sensor, or where it gives nothing")
     velocity_rad_s: float | None = Field(None, description="of the last 50 ms, so 25 ms late")
-    samples: TorqueSamples | None = Field(None, description="for who subscribed with `samples`")
-    angle: list[list[float | None]] | None = Field(
-        None,
-        description="for who subscribed with `samples`: time on the test's clock (s, when the host received it), angle "
-        "(rad) and velocity (rad/s, of the 50 ms before) of every sample since the last live event; None: no sensor",
+
+
+TORQUE_ROW = struct.Struct("<dddqB")
+"""A torque sample as it arrived: host's receive time (rig's clock, s), the transport's own time, torque (N·m, zero
+offset not removed; NaN: no number came), the cell's counter (unwrapped; -1: it has none; a gap: samples were lost), the
+stimulator's sync line (255: there is none). `stimrig.rig.signals.SAMPLE` is the same."""
+ANGLE_ROW = struct.Struct("<ddd")
+"""A sample of the angle: host's receive time, angle (rad), velocity (rad/s, of the 50 ms before)."""
+
+
+class LiveEvent(LiveState):
+    """All that is new, about 20 times per second while torque arrives. Samples are rows of numbers, base64."""
+
+    zero_s: float = Field(description="zero of the test's clock on the rig's clock, s; when idle the rig's start")
+    pulse_rate_hz: float = 1.0
+    torque: str = Field(description="every torque sample, `TORQUE_ROW`")
+    angle: str | None = Field(None, description="every sample of the angle, `ANGLE_ROW`; None: no sensor")
+    outcomes: PulseOutcomes = PulseOutcomes(
+        index=[], pulse_width_us=[], written_time_s=[], acknowledged_time_s=[], status=[]
     )
+
+    def torque_rows(self) -> Iterator[tuple[Any, ...]]:
+        """Unpack the torque samples."""
+        return TORQUE_ROW.iter_unpack(b64decode(self.torque))
+
+    def angle_rows(self) -> Iterator[tuple[float, float, float]]:
+        """Unpack the samples of the angle."""
+        return ANGLE_ROW.iter_unpack(b64decode(self.angle or ""))
 
 
 class FinishedEvent(Message):

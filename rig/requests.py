@@ -34,7 +34,6 @@ class StatusRequest(Message):
 class SubscribeRequest(Message):
     kind: Literal["subscribe"] = "subscribe"
     id: int = 0
-    samples: bool = Field(default=False, description="live events also carry every torque sample")
 
 
 class PreviewRequest(Message):

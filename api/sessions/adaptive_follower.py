@@ -21,6 +21,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.pool import Pool
 from stimrig.api.sessions.kinds import SERVICE, Watcher
+from stimrig.api.sessions.live import samples_of
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.rig.messages import AHEAD, SAFE_END_S, LiveEvent, SegmentPlan, TestPlan
 from stimrig.rig.requests import EnoughRequest, ExtendRequest
@@ -57,8 +58,8 @@ class News:
 
     def take(self, event: LiveEvent) -> None:
         """Take one event's."""
-        for held, new in ((self.samples, event.samples), (self.outcomes, event.outcomes)):
-            for name, values in {} if new is None else new:
+        for held, new in ((self.samples, samples_of(event)), (self.outcomes, event.outcomes.model_dump())):
+            for name, values in new.items():
                 held.setdefault(name, []).extend(values)
 
 

@@ -8,6 +8,7 @@ import math
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
+from math import isfinite
 from typing import Any, ClassVar
 
 from stimrig.api.errors import ApiError
@@ -222,13 +223,15 @@ class JointWatcher(Watcher):
         """As `Watcher`; where the samples are enough, have the rig end the test well."""
         told = self.told
         told.torque_time_nm_s = event.torque_time_nms
-        for at_s, width_us in zip(event.pulse_time_s, event.pulse_width_us, strict=True):
+        for index, width_us in zip(event.outcomes.index, event.outcomes.pulse_width_us, strict=True):
+            at_s = index / event.pulse_rate_hz
             if not (width_us > 0.0):
                 self._since_s = None
             else:
                 self._since_s, self._last_s = at_s if self._since_s is None else self._since_s, at_s
-        for row in event.angle or []:
-            self._take(row)
+        for host_s, angle_rad, velocity_rad_s in event.angle_rows():
+            if isfinite(angle_rad) and isfinite(velocity_rad_s):
+                self._take(host_s - event.zero_s, angle_rad, velocity_rad_s)
         if told.state == "watching" and told.coverage.enough and not event.ended_by:
             told.state, told.ended = "ending", "covered"
             self.begin(self._say_enough())
@@ -237,10 +240,7 @@ class JointWatcher(Watcher):
             self._told_s = now_s
             self.tell()
 
-    def _take(self, row: list[float | None]) -> None:
-        time_s, angle_rad, velocity_rad_s = row
-        if time_s is None or angle_rad is None or velocity_rad_s is None:
-            return
+    def _take(self, time_s: float, angle_rad: float, velocity_rad_s: float) -> None:
         self.told.angle_rad, self.told.velocity_rad_s = angle_rad, velocity_rad_s
         self.told.coverage.add(time_s, angle_rad, velocity_rad_s, self._counts(time_s))
 

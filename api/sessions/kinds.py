@@ -15,7 +15,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.requests import TestIn
-from stimrig.api.sessions.rig_client import RigClient, samples_of
+from stimrig.api.sessions.rig_client import RigClient, events_of
 from stimrig.api.store.tables import Test
 from stimrig.rig.messages import AnglePlan, FinishedEvent, LiveEvent, TestPlan
 
@@ -140,7 +140,7 @@ class Watcher:
             await self._tasks.close()
 
     async def _listen(self, path: Path | None) -> None:
-        async with contextlib.aclosing(samples_of(path, self.plan.test_id)) as events:
+        async with contextlib.aclosing(events_of(path, self.plan.test_id)) as events:
             async for event in events:
                 self.hear(event)
 

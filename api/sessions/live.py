@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import asyncio
+from math import floor, isfinite
 from typing import Any
 
+from pydantic import Field
+
 from stimrig.api.clock import Clock
-from stimrig.rig.messages import LiveEvent
+from stimrig.rig.messages import LiveEvent, LiveState
 
 QUEUE_LENGTH = 200
 SERIES = ("time_s", "torque_min_nm", "torque_max_nm", "pulse_time_s", "pulse_width_us")
@@ -17,13 +20,51 @@ ANGLE_OLD_S = 0.5
 """An older angle is not shown as that of now."""
 
 
-def within_test(event: LiveEvent) -> LiveEvent:
-    """A frame without bins from before the test's own clock had begun: they would be drawn across the chart."""
-    kept = [index for index, time_s in enumerate(event.time_s) if -1.0 <= time_s <= event.elapsed_s + 1.0]
-    if len(kept) == len(event.time_s):
-        return event
-    series = {name: [getattr(event, name)[index] for index in kept] for name in SERIES[:3]}
-    return event.model_copy(update=series)
+BIN_S = 0.01
+
+
+class LiveOut(LiveState):
+    """A message of the live channel of the type `live`; `type` stands in the place of `event`. Times from the begin of
+    the test, s: negative ones, at most 1 s, are before it."""
+
+    time_s: list[float] = Field(description="start of each bin on the test's clock, s")
+    torque_min_nm: list[float]
+    torque_max_nm: list[float]
+    pulse_time_s: list[float]
+    pulse_width_us: list[float]
+
+
+def frame_of(event: LiveEvent) -> LiveOut:
+    """Return what pages draw of an event: the torque as minimum and maximum of bins of 10 ms, and the pulses.
+
+    Bins from before the test's own clock had begun are left out: they would be drawn across the chart.
+    """
+    bins: dict[int, tuple[float, float]] = {}
+    for host_s, _, torque_nm, _, _ in event.torque_rows():
+        number, value = floor((host_s - event.zero_s) / BIN_S), torque_nm if isfinite(torque_nm) else 0.0
+        low, high = bins.get(number, (value, value))
+        bins[number] = min(low, value), max(high, value)
+    if event.test_id is not None:
+        bins = {number: both for number, both in bins.items() if -1.0 <= number * BIN_S <= event.elapsed_s + 1.0}
+    return LiveOut(
+        **{name: getattr(event, name) for name in LiveState.model_fields},
+        time_s=[round(number * BIN_S, 4) for number in bins],
+        torque_min_nm=[round(low, 5) for low, _ in bins.values()],
+        torque_max_nm=[round(high, 5) for _, high in bins.values()],
+        pulse_time_s=[index / event.pulse_rate_hz for index in event.outcomes.index],
+        pulse_width_us=event.outcomes.pulse_width_us,
+    )
+
+
+def samples_of(event: LiveEvent) -> dict[str, list[Any]]:
+    """Return an event's torque samples as columns, on the test's clock; None for a torque that is no number."""
+    rows = list(event.torque_rows())
+    return {
+        "host_time_s": [round(row[0] - event.zero_s, 6) for row in rows],
+        "counter": [row[3] for row in rows],
+        "torque_nm": [round(row[2], 6) if isfinite(row[2]) else None for row in rows],
+        "sync": [row[4] for row in rows],
+    }
 
 
 class Hub:
@@ -35,7 +76,7 @@ class Hub:
         self._angle: tuple[float, float] | None = None
         self.test_id: str | None = None
         self.history: dict[str, list[float]] = {name: [] for name in (*SERIES, *ANGLES)}
-        self.newest: LiveEvent | None = None
+        self.newest: LiveOut | None = None
         self._queues: set[asyncio.Queue[dict[str, Any]]] = set()
 
     def begin(self, test_id: str) -> None:
@@ -44,21 +85,21 @@ class Hub:
         self.history = {name: [] for name in (*SERIES, *ANGLES)}
 
     def live(self, event: LiveEvent) -> None:
-        """Take a frame, keep it, pass it on."""
-        if event.torque_max_nm:
-            middle_nm = (event.torque_min_nm[-1] + event.torque_max_nm[-1]) / 2
+        """Take what is new, keep it, pass it on."""
+        frame = frame_of(event)
+        if frame.torque_max_nm:
+            middle_nm = (frame.torque_min_nm[-1] + frame.torque_max_nm[-1]) / 2
             self._torque = middle_nm, self.clock.monotonic_s() - event.torque_age_s
         if event.angle_rad is not None:
             self._angle = event.angle_rad, self.clock.monotonic_s()
         if event.test_id == self.test_id and event.test_id is not None:
-            event = within_test(event)
-            self.newest = event
+            self.newest = frame
             for name in SERIES:
-                self.history[name].extend(getattr(event, name))
-            self._keep_angle(event)
-        self.send({"type": "live", **event.model_dump(exclude={"event"})})
+                self.history[name].extend(getattr(frame, name))
+            self._keep_angle(frame)
+        self.send({"type": "live", **frame.model_dump(exclude={"event"})})
 
-    def _keep_angle(self, event: LiveEvent) -> None:
+    def _keep_angle(self, event: LiveOut) -> None:
         if event.angle_rad is not None and event.velocity_rad_s is not None:
             values = event.elapsed_s, event.angle_rad, event.velocity_rad_s
             for name, value in zip(ANGLES, values, strict=True):

@@ -260,10 +260,10 @@ def no_rig(detail: str) -> ApiError:
     return ApiError(503, "rig-unreachable", "The rig cannot be reached", f"{words}. Is its process running?")
 
 
-async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[messages.LiveEvent, None]:
-    """The live events of a test with all samples, until it has ended.
+async def events_of(path: Path | None, test_id: str) -> AsyncGenerator[messages.LiveEvent, None]:
+    """Yield the live events of a test until it has ended.
 
-    On a connection of its own: the lasting one carries what pages draw.
+    On a connection of its own, which nothing else delays: of a reader that is slow the rig leaves out events.
 
     Raises ApiError: 503 the rig cannot be reached, or the connection broke before the end.
     """
@@ -272,7 +272,7 @@ async def samples_of(path: Path | None, test_id: str) -> AsyncGenerator[messages
     except OSError as error:
         raise no_rig(str(error)) from error
     try:
-        writer.write(requests.SubscribeRequest(samples=True).model_dump_json().encode() + b"\n")
+        writer.write(requests.SubscribeRequest().model_dump_json().encode() + b"\n")
         async for event in _live_events(reader):
             if event.get("test_id") == test_id:
                 if event["event"] == "finished":

@@ -7,10 +7,10 @@ from typing import Any
 from fastapi import FastAPI
 
 from stimrig.api import schemas
+from stimrig.api.sessions.live import LiveOut
 from stimrig.api.web.middleware import REFUSALS
 from stimrig.api.web.responses.base import Problem
 from stimrig.api.web.responses.models import TrackedOut
-from stimrig.api.web.responses.rig import LiveOut
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
 EMBEDDED = ("model", "effects")

@@ -1,7 +1,7 @@
-"""What the rig has built by processes beside it, `stimrig.rig.builder`: previews, and the JSON of live events.
+"""Previews, which the rig has built by a process beside it, `stimrig.rig.builder`.
 
-So neither a plan nor what pages are told takes memory or processor time from the rig's sender. Previews are built one
-at a time, with limits on memory and time; requests that would have to wait too long are refused at once.
+So a plan takes no memory or processor time from the rig's sender. Previews are built one at a time, with limits on
+memory and time; requests that would have to wait too long are refused at once.
 """
 
 from __future__ import annotations
@@ -11,11 +11,9 @@ import contextlib
 import json
 import logging
 import os
-import pickle
 import sys
 from dataclasses import asdict
 
-from stimrig.rig.control.live import Taken
 from stimrig.rig.errors import BusyError, PlanError
 from stimrig.rig.limits import Limit
 
@@ -26,17 +24,20 @@ MAX_START_S = 20.0
 """Real seconds after which a builder that has not begun is given up. An idle computer needs half a second."""
 MAX_BUILD_S = 30.0
 """Real seconds allowed for one preview. The longest test needs 0.1 s of processor time, at the lowest priority."""
-MAX_LIVE_S = 5.0
-"""Real seconds allowed for one live event."""
 MAX_REPLY_BYTES = 8_000_000
 
 
-class Builder:
-    """One such process, started when first needed, and again if it has died or taken too long."""
+class Previews:
+    """Sends requests for previews to a process, started when first needed, and again if it has died or taken too long.
 
-    def __init__(self, builds: str, first: bytes = b"") -> None:
-        self._builds, self._first = builds, first
+    `table`, `speed`: of the rig.
+    """
+
+    def __init__(self, table: dict[str, Limit], speed: float) -> None:
+        rows = {name: asdict(row) for name, row in table.items()}
+        self._first = json.dumps({"table": rows, "speed": speed}).encode() + b"\n"
         self._one = asyncio.Lock()
+        self._waiting = 0
         self._process: asyncio.subprocess.Process | None = None
 
     async def warm(self) -> None:
@@ -45,7 +46,7 @@ class Builder:
             try:
                 await self._begin()
             except OSError as error:  # it is started again when it is needed
-                log.warning("the builder of %s did not start: %r", self._builds, error)
+                log.warning("the builder of previews did not start: %r", error)
 
     async def close(self) -> None:
         process, self._process = self._process, None
@@ -58,7 +59,7 @@ class Builder:
         """The process, once it has said that it takes requests."""
         if self._process is None or self._process.returncode is not None:
             process = await asyncio.create_subprocess_exec(
-                sys.executable, "-m", "stimrig.rig.builder", self._builds,
+                sys.executable, "-m", "stimrig.rig.builder",
                 stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE, limit=MAX_REPLY_BYTES,
                 env={**os.environ, "OPENBLAS_NUM_THREADS": "1"},
             )  # fmt: skip
@@ -75,28 +76,15 @@ class Builder:
             self._process = process
         return self._process
 
-    async def _ask(self, request: bytes, within_s: float, lines: int = 1) -> list[bytes]:
-        process = await self._begin()  # its start is not part of the time
-        return await asyncio.wait_for(self._exchange(process, request, lines), within_s)
-
-    async def _exchange(self, process: asyncio.subprocess.Process, request: bytes, lines: int) -> list[bytes]:
+    async def _exchange(self, process: asyncio.subprocess.Process, request: bytes) -> bytes:
         assert process.stdin is not None
         assert process.stdout is not None
         process.stdin.write(request)
         await process.stdin.drain()
-        replies = [await process.stdout.readline() for _ in range(lines)]
-        if not replies[-1].endswith(b"\n"):
+        reply = await process.stdout.readline()
+        if not reply.endswith(b"\n"):
             raise ConnectionError("the builder has died")
-        return replies
-
-
-class Previews(Builder):
-    """Sends requests for previews to their builder."""
-
-    def __init__(self, table: dict[str, Limit], speed: float) -> None:
-        rows = {name: asdict(row) for name, row in table.items()}
-        super().__init__("previews", json.dumps({"table": rows, "speed": speed}).encode() + b"\n")
-        self._waiting = 0
+        return reply
 
     async def reply(self, line: bytes, angle_set_at_utc: str | None = None) -> bytes:
         """Reply to a preview request; both are one line of JSON. `angle_set_at_utc`: see `check_range`.
@@ -109,7 +97,8 @@ class Previews(Builder):
         request = json.dumps(angle_set_at_utc).encode() + b"\n" + line.rstrip(b"\n") + b"\n"
         try:
             async with self._one:
-                return (await self._ask(request, MAX_BUILD_S))[0]
+                process = await self._begin()  # its start is not part of the time
+                return await asyncio.wait_for(self._exchange(process, request), MAX_BUILD_S)
         except TimeoutError:
             await self.close()
             raise BusyError(f"preview: not built within {MAX_BUILD_S:g} s, the computer is busy; try again") from None
@@ -118,22 +107,3 @@ class Previews(Builder):
             raise PlanError("preview: it could not be built; make the plan shorter") from None
         finally:
             self._waiting -= 1
-
-
-class LiveLines(Builder):
-    """Has live events made."""
-
-    def __init__(self) -> None:
-        super().__init__("live")
-
-    async def make(self, taken: Taken) -> list[bytes]:
-        """The event with every sample, and without; nothing where it could not be made: no test waits for a page."""
-        async with self._one:
-            for _ in range(2):  # what became of a pulse is told once: it is worth a new process
-                try:
-                    found = await self._ask(pickle.dumps(taken), MAX_LIVE_S, 2)
-                    return found if found[0].strip() else []
-                except (OSError, ValueError) as error:  # a timeout is one, too
-                    log.warning("a live event could not be made: %r", error)
-                    await self.close()
-        return []

@@ -1,6 +1,6 @@
 """The Unix socket: requests in, replies and events out, one JSON object per line. Also starts the stop socket.
 
-Requests are tasks of the rig, in its own thread; previews and live events are built in other processes. The numbers of
+Requests are tasks of the rig, in its own thread; previews are built in another process. The numbers of
 connections, of waiting requests and of bytes in a request are limited; requests above a limit are refused at once.
 """
 
@@ -16,7 +16,7 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stimrig.rig.adapters.builders import LiveLines, Previews
+from stimrig.rig.adapters.builders import Previews
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connections, StopServer
 from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
@@ -46,19 +46,17 @@ class Server:
         self.rig: Rig
         self._ask: Ask
         self._loop: asyncio.AbstractEventLoop | None = None
-        self._subscribers: dict[asyncio.StreamWriter, bool] = {}
-        """Who gets events, and whether with every torque sample."""
+        self._subscribers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
         self._connections = Connections(MAX_SILENT, MAX_ACTIVE)
         self._server: asyncio.Server | None = None
         self._stop_server: StopServer | None = None
         self._previews: Previews | None = None
-        self._live_lines = LiveLines()
 
     def publish(self, event: Event) -> None:
         """Send an event to all subscribers; may be called from any thread."""
         if self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(lambda: self._send_all(line := to_line(event), line))
+            self._loop.call_soon_threadsafe(lambda: self._send_all(to_line(event)))
 
     async def start(self, rig: Rig, ask: Ask, path: Path) -> None:
         """Listen on `path` and on the stop socket; only this user and group may connect.
@@ -82,8 +80,7 @@ class Server:
                 f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
             ) from None
         self._keep(self._loop.create_task(self._live()))
-        # whoever is told that the rig is ready sees its first test from the beginning
-        await asyncio.gather(self._previews.warm(), self._live_lines.warm())
+        await self._previews.warm()
 
     async def close(self) -> None:
         if self._server is not None:
@@ -93,9 +90,8 @@ class Server:
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for builder in (self._previews, self._live_lines):
-            if builder is not None:
-                await builder.close()
+        if self._previews is not None:
+            await self._previews.close()
 
     def _keep(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
@@ -104,21 +100,24 @@ class Server:
     async def _live(self) -> None:
         while True:
             await asyncio.sleep(LIVE_PERIOD_S)
-            taken = self.rig.take_live(samples=any(self._subscribers.values()))
-            if taken is not None and self._subscribers and (lines := await self._live_lines.make(taken)):
-                self._send_all(*lines, live=True)
+            try:
+                event = self.rig.take_live()
+                if event is not None and self._subscribers:
+                    self._send_all(to_line(event), live=True)
+            except Exception:  # this one is lost, the next may do
+                log.exception("a live event could not be made")
 
-    def _send_all(self, full: bytes, plain: bytes, live: bool = False) -> None:
-        for writer, samples in tuple(self._subscribers.items()):
+    def _send_all(self, line: bytes, live: bool = False) -> None:
+        for writer in tuple(self._subscribers):
             if writer.transport.is_closing():  # it left while its subscription was still being answered
-                self._subscribers.pop(writer, None)
+                self._subscribers.discard(writer)
                 continue
             waiting = writer.transport.get_write_buffer_size()
             if waiting > DEAD_BYTES:
-                self._subscribers.pop(writer, None)
+                self._subscribers.discard(writer)
                 writer.transport.abort()
             elif waiting < SLOW_BYTES or not live:
-                writer.write(full if samples else plain)
+                writer.write(line)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         pending: set[asyncio.Task[None]] = set()
@@ -137,7 +136,7 @@ class Server:
         except ConnectionError as error:
             log.warning("client disconnected: %s", error)
         finally:
-            self._subscribers.pop(writer, None)
+            self._subscribers.discard(writer)
             self._connections.leave(writer.transport)
             await asyncio.gather(*pending, return_exceptions=True)
             writer.close()
@@ -188,7 +187,7 @@ class Server:
         reply = await asyncio.wrap_future(self._ask(lambda: obey(rig, request)))
         _write(writer, to_line(reply))
         if request.kind == "subscribe" and reply.ok:
-            self._subscribers[writer] = request.samples
+            self._subscribers.add(writer)
             _write(writer, to_line(StateEvent(status=await asyncio.wrap_future(self._ask(self._status)))))
 
     async def _status(self) -> Status:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from base64 import b64encode
 from collections.abc import Callable
 from typing import Any
 
 from stimrig.rig import messages as m
 
 RATE_HZ = 200.0
+ZERO_S = 1000.0
+"""When a test begins, on the rig's clock."""
 Way = Callable[[float], tuple[float, float]]
 """From the time (s) to the angle (rad) and its velocity (rad/s)."""
 
@@ -63,7 +66,8 @@ class FakeArm:
         if self.way is None:
             return {}
         times = [k / RATE_HZ for k in range(round(start * RATE_HZ), round(end * RATE_HZ))]
-        return {**self.now(end), "angle": [[time_s, *self.way(time_s)] for time_s in times]}
+        rows = [m.ANGLE_ROW.pack(ZERO_S + time_s, *self.way(time_s)) for time_s in times]
+        return {**self.now(end), "angle": b64encode(b"".join(rows)).decode()}
 
     def refuses(self, plan: m.TestPlan, time_s: float) -> str:
         """Why a start is refused; empty: it is not."""

@@ -16,6 +16,8 @@ import sys
 import threading
 import time
 import traceback
+from base64 import b64encode
+from math import nan
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +27,7 @@ from pydantic import TypeAdapter
 
 from stimrig.rig import messages as m
 from stimrig.rig import requests as rig_requests
-from tests.api.fake_arm import FakeArm
+from tests.api.fake_arm import ZERO_S, FakeArm
 from tests.api.fake_score import PULSE_RATE_HZ, FakeScore
 from tests.harness.muscle import Patient
 
@@ -116,7 +118,7 @@ class FakeRig:
             "charge_per_phase_uc": m.Bound(lo=0, hi=20, unit="µC", owner="rig file"),
         }
         self._stop = asyncio.Event()
-        self._writers: dict[asyncio.StreamWriter, bool] = {}
+        self._writers: set[asyncio.StreamWriter] = set()
         """Who subscribed, and whether with samples."""
         self.key = ""
         self.arm = FakeArm()
@@ -155,8 +157,8 @@ class FakeRig:
             await asyncio.sleep(FRAME_S)
             if self.cell_speaks and not self.mute and self.state != "running":
                 self._send(m.LiveEvent(
-                    test_id=None, segment=None, elapsed_s=0.0, duration_s=0.0, time_s=[0.0], torque_min_nm=[0.42],
-                    torque_max_nm=[0.44], pulse_time_s=[], pulse_width_us=[], torque_age_s=self.torque_age_s,
+                    test_id=None, segment=None, elapsed_s=0.0, duration_s=0.0, zero_s=0.0,
+                    torque=packed([(0.0, 0.42, 0), (0.001, 0.44, 1)]), torque_age_s=self.torque_age_s,
                     lost_samples=0, dropped_pulses=0, **self.arm.now(time.monotonic()),
                 ))  # fmt: skip
 
@@ -186,7 +188,7 @@ class FakeRig:
                     continue
                 reply = await self._answer(request, writer)
                 writer.write(reply.model_dump_json().encode() + b"\n")
-        self._writers.pop(writer, None)
+        self._writers.discard(writer)
         writer.close()
 
     async def _answer(self, request: Any, writer: asyncio.StreamWriter) -> m.Reply:
@@ -202,7 +204,7 @@ class FakeRig:
         return self.status()
 
     async def _on_subscribe(self, request: Any, writer: asyncio.StreamWriter) -> Any:
-        self._writers[writer] = request.samples
+        self._writers.add(writer)
 
     def _widths(self, plan: m.TestPlan) -> tuple[list[float], list[dict[str, Any]]]:
         for segment in plan.segments or []:
@@ -373,13 +375,10 @@ class FakeRig:
         self.become("ready")
 
     def _send(self, event: Any) -> None:
-        full = event.model_dump_json().encode() + b"\n"
-        plain = full
-        if getattr(event, "samples", None) is not None:
-            plain = event.model_copy(update={"samples": None}).model_dump_json().encode() + b"\n"
-        for writer, samples in list(self._writers.items()):
+        line = event.model_dump_json().encode() + b"\n"
+        for writer in list(self._writers):
             with contextlib.suppress(ConnectionError, RuntimeError):
-                writer.write(full if samples else plain)
+                writer.write(line)
 
     async def _run(self, plan: m.TestPlan) -> None:
         try:
@@ -415,29 +414,23 @@ class FakeRig:
         self.elapsed_s = end
         widths, segments = score.widths, score.segments
         self.segment = next((s["name"] for s in segments if s["start_s"] <= end < s["end_s"]), None)
-        bins = [start + (end - start) * k / 4 for k in range(5)]
-        pieces = [torque[round(a * self.rate_hz) : round(b * self.rate_hz)] or [0.0] for a, b in zip(bins, bins[1:])]  # noqa: B905, RUF007
         first, last = round(start * PULSE_RATE_HZ), round(end * PULSE_RATE_HZ)
         self._send(
             m.LiveEvent(
-                test_id=plan.test_id, segment=self.segment, elapsed_s=end, duration_s=self.duration_s, time_s=bins[:-1],
-                torque_min_nm=[min(p) for p in pieces], torque_max_nm=[max(p) for p in pieces],
-                pulse_time_s=[k / PULSE_RATE_HZ for k in range(first, last)], pulse_width_us=widths[first:last],
+                test_id=plan.test_id, segment=self.segment, elapsed_s=end, duration_s=self.duration_s, zero_s=ZERO_S,
+                torque=self._samples(torque, start, end), pulse_rate_hz=PULSE_RATE_HZ,
                 torque_age_s=0.004, lost_samples=0, dropped_pulses=0,
                 sent_pulses=sum(1 for width in widths[:last] if width),
                 charge_uc=sum(widths[:last]) * plan.profile.current_ma / 1000, **score.live(),
                 torque_time_nms=sum(map(abs, torque[: round(end * self.rate_hz)])) / self.rate_hz,
-                samples=self._samples(torque, start, end), outcomes=_outcomes(widths[:last], first),
+                outcomes=_outcomes(widths[:last], first),
                 pauses=self.pauses, **self.arm.live(start, end),
             )
         )  # fmt: skip
 
-    def _samples(self, torque: list[float], start: float, end: float) -> m.TorqueSamples:
-        counter = list(range(round(start * self.rate_hz), round(end * self.rate_hz)))
-        return m.TorqueSamples(
-            host_time_s=[k / self.rate_hz + 0.0005 * (k % 3) for k in counter], counter=counter,
-            torque_nm=[torque[k] for k in counter], sync=[255] * len(counter),
-        )  # fmt: skip
+    def _samples(self, torque: list[float], start: float, end: float) -> str:
+        counter = range(round(start * self.rate_hz), round(end * self.rate_hz))
+        return packed([(ZERO_S + k / self.rate_hz + 0.0005 * (k % 3), torque[k], k) for k in counter])
 
     def _finish(self, event: m.FinishedEvent) -> None:
         self.finished = event
@@ -471,13 +464,18 @@ class FakeRig:
         )  # fmt: skip
 
 
+def packed(rows: list[tuple[float, float, int]]) -> str:
+    """Host time, torque and counter of samples as a live event carries them."""
+    return b64encode(b"".join(m.TORQUE_ROW.pack(s, nan, nm, k, 255) for s, nm, k in rows)).decode()
+
+
 def _outcomes(widths: list[float], first: int) -> m.PulseOutcomes:
-    """Each pulse since the first was sent and acknowledged in time."""
-    index = [k for k in range(first, len(widths)) if widths[k]]
-    due = [k / PULSE_RATE_HZ for k in index]
+    """Each pulse since the first was sent and acknowledged in time, or is a rest."""
+    index, sent = range(first, len(widths)), widths[first:]
+    due = [k / PULSE_RATE_HZ if width else None for k, width in zip(index, sent, strict=True)]
     return m.PulseOutcomes(
-        index=index, pulse_width_us=[widths[k] for k in index], written_time_s=due,
-        acknowledged_time_s=[s + 0.001 for s in due], status=[0] * len(index),
+        index=list(index), pulse_width_us=sent, written_time_s=due,
+        acknowledged_time_s=[s and s + 0.001 for s in due], status=[0 if width else 1 for width in sent],
     )  # fmt: skip
 
 

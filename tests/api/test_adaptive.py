@@ -365,10 +365,8 @@ class World:
         while self.now_s < FIRST_S:
             self.now_s += 0.02
             yield LiveEvent(
-                test_id=test_id, segment="opening", elapsed_s=self.now_s, duration_s=45.0, time_s=[],
-                torque_min_nm=[], torque_max_nm=[], pulse_time_s=[], pulse_width_us=[], torque_age_s=0.0,
-                lost_samples=0, dropped_pulses=0, sent_pulses=0, charge_uc=0.0, torque_time_nms=0.0, ended_by="",
-                samples=None, laid=30, boundary_s=FIRST_S,
+                test_id=test_id, segment="opening", elapsed_s=self.now_s, duration_s=45.0, zero_s=0.0, torque="",
+                torque_age_s=0.0, lost_samples=0, dropped_pulses=0, laid=30, boundary_s=FIRST_S,
                 outcomes=PulseOutcomes(
                     index=[4], pulse_width_us=[0.0], written_time_s=[None], acknowledged_time_s=[None], status=[2]
                 ),
@@ -379,7 +377,7 @@ class World:
 
 
 def followed(world: World, rate_hz: float, monkeypatch: pytest.MonkeyPatch) -> Follower:
-    monkeypatch.setattr(kinds, "samples_of", world.events)
+    monkeypatch.setattr(kinds, "events_of", world.events)
     opening = SegmentPlan(name="opening", sequence="widths", settings={"pulse_width_us": [0.0] * round(3 * rate_hz)})
     plan = TestPlan(
         test_id="T1", participant="P017",

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from stimrig.rig.messages import LiveEvent
+from stimrig.api.sessions.live import LiveOut
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "lsl_bridge.py"
 NOW_S = 1000.0
@@ -35,7 +35,7 @@ def load() -> ModuleType:
 
 def live(elapsed_s: float, segment: str, time_s: list[float], pulses: list[tuple[float, float]]) -> dict[str, Any]:
     """A message as the service sends it (`stimrig.api.sessions.live.Hub.live`)."""
-    event = LiveEvent(
+    event = LiveOut(
         test_id="T1", segment=segment, elapsed_s=elapsed_s, duration_s=9, time_s=time_s,
         torque_min_nm=[-1.0] * len(time_s), torque_max_nm=[1.0] * len(time_s),
         pulse_time_s=[at_s for at_s, _ in pulses], pulse_width_us=[width_us for _, width_us in pulses],

@@ -12,7 +12,6 @@ import pytest
 
 from stimrig.rig import config
 from stimrig.rig.control import pair
-from stimrig.rig.control.live import live_event
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Disk
@@ -227,10 +226,9 @@ class LiveRig:
         self.until(lambda: self.states[-1] in states)
         return self.rig.status().reason
 
-    def event(self, samples: bool = False) -> LiveEvent | None:
-        """The live event of what is new, made here and not in a process beside."""
-        taken = self.rig.take_live(samples)
-        return None if taken is None else live_event(taken)
+    def event(self) -> LiveEvent | None:
+        """The live event of what is new."""
+        return self.rig.take_live()
 
     def wait_pulses(self, n: int) -> None:
         wanted = len(self.stimulator.sent) + n

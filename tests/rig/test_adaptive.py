@@ -476,21 +476,17 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: C
     live.wait("running")
     live.wait_pulses(5)
     assert ask_more(live, 44).laid == 68
-    event = live.event(samples=True)
-    assert event is not None and event.samples is not None and event.pulse_time_s
+    event = live.event()
+    assert event is not None
     assert (event.laid, event.boundary_s, event.duration_s) == (68, 1.7, 60.0)
     assert [(s.name, s.by) for s in event.laid_segments] == [("rest", "plan"), *[("added", "extension")] * 2]
-    assert len(event.samples.torque_nm) == len(event.samples.counter) == len(event.samples.host_time_s) > 0
-    assert np.all(np.diff(event.samples.counter) == 1)
+    rows = np.array(list(event.torque_rows()))
+    assert np.all(np.diff(rows[:, 3]) == 1) and np.all(np.isfinite(rows[:, [0, 2]]))
     told = event.outcomes
-    assert told is not None and told.index == list(range(len(told.index))) and len(told.index) > 20
-    assert (told.pulse_width_us, told.status) == (event.pulse_width_us, [1] * 20 + [0] * (len(told.index) - 20))
+    assert told.index == list(range(len(told.index))) and len(told.index) > 20
+    assert told.status == [1] * 20 + [0] * (len(told.index) - 20)
     assert all(a < b for a, b in zip(told.written_time_s, told.acknowledged_time_s, strict=True) if a and b)
     assert LiveEvent.model_validate(json.loads(event.model_dump_json())) == event, "read as it was sent"
-    live.machine.wait(0.1)
-    plain = live.event()
-    assert plain is not None
-    assert (plain.outcomes, plain.samples) == (None, None), "only who chooses pieces needs them"
     assert live.rig.status().duration_s == 60.0
     ending = live.ask(live.rig.player.enough(EnoughRequest(test_id="one", by="nurse")))
     assert (ending.ended_by, ending.boundary_s) == ("enough", pytest.approx(2.0, abs=0.7))
@@ -572,13 +568,13 @@ def test_until_a_tests_clock_runs_nothing_is_told_of_it(make: Callable[..., Live
     told = []
     while not told or told[-1].test_id is None:
         live.machine.wait(0.002)
-        told += [event for event in [live.event(samples=True)] if event is not None]
+        told += [event for event in [live.event()] if event is not None]
         assert live.clock.now_s() < 1e5
     assert {event.test_id for event in told[:-1]} <= {None}
-    assert all(event.outcomes is None or event.outcomes.index == [] for event in told[:-1])
+    assert all(event.outcomes.index == [] for event in told[:-1])
     live.wait_pulses(20)
     live.machine.wait(0.3)
-    rest = live.event(samples=True)
-    outcomes = [event.outcomes for event in (told[-1], rest) if event is not None and event.outcomes is not None]
+    rest = live.event()
+    outcomes = [event.outcomes for event in (told[-1], rest) if event is not None]
     index = [number for one in outcomes for number in one.index]
     assert index == list(range(len(index))) and len(index) >= 20, "each of its own pulses, once"

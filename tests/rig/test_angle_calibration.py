@@ -256,9 +256,9 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Angled, tmp_path: 
     finished = live.finished
     assert finished.outcome == "completed", finished
     assert finished.summary["angle"]["range_rad"] == pytest.approx([math.radians(60)] * 2, abs=0.02)
-    event = live.event(samples=True)
-    assert event is not None and event.angle and event.angle_rad == pytest.approx(math.radians(60), abs=0.02)
-    assert all(len(row) == 3 for row in event.angle)
+    event = live.event()
+    assert event is not None and event.angle_rad == pytest.approx(math.radians(60), abs=0.02)
+    assert [row[1] for row in event.angle_rows()][-1] == event.angle_rad
     live.sensor.gone = True
     live.machine.wait(0.1)
     assert live.rig.status().angle.problem != ""

@@ -25,7 +25,7 @@ from stimrig.rig import archive
 from stimrig.rig.acquire.run import CLIMB
 from stimrig.rig.config import EMULATOR_WATCH
 from stimrig.rig.control.sealing import MAY_BE_FELT
-from stimrig.rig.messages import stop_socket
+from stimrig.rig.messages import LiveEvent, stop_socket
 from stimrig.rig.signals import PulseStatus
 from tests.harness.processes import Bench, RigClient, alive, below, default_plan, kill_hard, short_plan
 
@@ -290,20 +290,20 @@ def test_what_is_shown_and_sealed_is_what_was_felt(shared: tuple[Bench, RigClien
     live = client.events.get(timeout=5)
     assert live["event"] == "live"
     assert live["test_id"] is None
-    assert len(live["time_s"]) == len(live["torque_min_nm"]) == len(live["torque_max_nm"]) > 0
+    assert len(list(LiveEvent.model_validate(live).torque_rows())) > 0
     assert client.start(short_plan("whole"))["ok"]
     events, end = [], time.monotonic() + 90
     while not events or events[-1]["event"] != "finished":
         events.append(client.events.get(timeout=end - time.monotonic()))
     states = [e["status"]["state"] for e in events if e["event"] == "state"]
     assert states[:4] == ["arming", "running", "sealing", "ready"]
-    running = [e for e in events if e["event"] == "live" and e["test_id"] == "whole" and e["elapsed_s"] > 0]
-    widths = [w for e in running for w in e["pulse_width_us"]]
+    told = [LiveEvent.model_validate(e) for e in events if e["event"] == "live" and e["test_id"] == "whole"]
+    running = [e for e in told if e.elapsed_s > 0]
+    widths = [w for e in running for w in e.outcomes.pulse_width_us]
     assert len(widths) > 100
     assert max(widths) == 300.0
-    assert {"rest", "prbs", "ramp"} <= {e["segment"] for e in running}
-    assert all(lo <= hi for e in running for lo, hi in zip(e["torque_min_nm"], e["torque_max_nm"], strict=True))
-    assert max(hi for e in running for hi in e["torque_max_nm"]) > 1.0
+    assert {"rest", "prbs", "ramp"} <= {e.segment for e in running}
+    assert max(torque_nm for e in running for _, _, torque_nm, _, _ in e.torque_rows()) > 1.0
     check_recording(events[-1], bench.felt()[before:])
 
 
@@ -444,7 +444,7 @@ def test_a_builder_that_died_is_begun_anew(shared: tuple[Bench, RigClient]):
     assert built["ok"], built
     assert built["body"]["duration_s"] == pytest.approx(38.7)
     children = below(bench.rig.popen.pid)
-    (builder,) = (pid for pid in children if b"previews" in Path(f"/proc/{pid}/cmdline").read_bytes())
+    (builder,) = (pid for pid in children if b"stimrig.rig.builder" in Path(f"/proc/{pid}/cmdline").read_bytes())
     assert os.sched_getscheduler(builder) == os.SCHED_OTHER
     os.kill(builder, signal.SIGKILL)
     wait_until(lambda: not alive(builder))

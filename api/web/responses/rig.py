@@ -13,7 +13,6 @@ from stimrig.rig.messages import (
     Bound,
     CalibrationStatus,
     Labels,
-    LiveEvent,
     ProtocolInfo,
     RigState,
     SequenceInfo,
@@ -258,11 +257,6 @@ class DosesOut(Document):
     held: float = Field(description="of all held tests")
     moving: float
     total: float = Field(description="of the three guided tests together; never above `paper`")
-
-
-class LiveOut(LiveEvent):
-    """A message of the live channel of the type `live`; `type` stands in the place of `event`. Times from the begin of
-    the test, s: negative ones, at most 1 s, are before it."""
 
 
 class JointOut(Document):
