@@ -219,7 +219,7 @@ def draw_sessions(cohort: Cohort, key: tuple[str, str]) -> Figure | None:
 def page(cohort: Cohort, name: str) -> str:
     """Return the page of a cohort; `name`: of the file of results, for the title."""
     of_what, total, counts = cohort.prevalence()
-    with mpl.rc_context(SETTINGS):
+    with mpl.rc_context(SETTINGS):  # pyright: ignore[reportArgumentType]
         prevalence = _svg(draw_prevalence(cohort))
         drawn = ((title_of(key), _svg(draw_sessions(cohort, key))) for key in cohort.ranked_parameters())
         sessions = [(title, svg) for title, svg in drawn if svg]

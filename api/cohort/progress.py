@@ -22,7 +22,7 @@ def progress_of(entries: Callable[[], Iterator[Entry]]) -> Iterator[Any]:
     watched = sys.stderr.isatty() or in_notebook()
     delay_s, interval_s = (1.0, 0.1) if watched else (LOG_S, LOG_S)
     ended = threading.Event()
-    with tqdm(unit=" records", leave=False, delay=delay_s, mininterval=interval_s) as bar:
+    with tqdm(unit=" records", leave=not watched, delay=delay_s, mininterval=interval_s) as bar:
 
         def count() -> None:
             total = 0

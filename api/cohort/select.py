@@ -118,7 +118,7 @@ def _condition(node: ast.expr) -> Condition:
             if value is None and not isinstance(op, ast.Eq | ast.NotEq):
                 raise _refusal(right, "None has no order; compare with == or !=")
             return _of_field(name, lambda given: compare(given, value))
-    raise _refusal(node, "give comparisons of a field with a text or number, joined by and, or, not and brackets")
+    raise _refusal(node, "only comparisons of a field, on their left, and, or, not and brackets can be used")
 
 
 def _joined(conditions: list[Condition], decisive: bool) -> Condition:

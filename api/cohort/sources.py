@@ -101,19 +101,26 @@ def _is_record(name: str, exported: bool) -> bool:
 def _list_folder(place: Path) -> Iterator[Entry]:
     if place.is_file():
         yield _file_entry(place, place)
-        return
-    if not place.is_dir():
+    elif place.is_dir():
+        yield from _list_within(place, place)
+    else:
         raise CohortError(f"{place}: no such file or folder. Give a path, s3://… or https://…")
-    denied: list[OSError] = []
-    for folder, folders, names in os.walk(place, onerror=denied.append):
-        folders[:] = [name for name in folders if not name.startswith(".")]
-        exported = set(EXPORT_TABLES) <= set(names)
-        for path in (Path(folder, name) for name in names if _is_record(name, exported)):
-            if path.is_file():  # a link counts, a pipe does not
-                yield _file_entry(path, place)
-    for error in denied:  # reading it gives the reason, as its row
-        path = str(Path(error.filename).absolute())
-        yield _entry(path, path, str(place))
+
+
+def _list_within(folder: Path, origin: Path) -> Iterator[Entry]:
+    try:
+        items = sorted(os.scandir(folder), key=lambda item: item.name)
+    except OSError:  # reading it as a record gives the reason, as its row
+        path = str(folder.absolute())
+        yield _entry(path, path, str(origin))
+        return
+    exported = set(EXPORT_TABLES) <= {item.name for item in items}
+    for item in items:
+        if item.is_dir(follow_symlinks=False):
+            if not item.name.startswith("."):
+                yield from _list_within(Path(item), origin)
+        elif _is_record(item.name, exported) and item.is_file():  # a link counts, a pipe does not
+            yield _file_entry(Path(item), origin)
 
 
 def _file_entry(path: Path, origin: Path) -> Entry:

@@ -1,4 +1,4 @@
-"""`stimrig cohort` as it is typed: one line for wrong input; killed, interrupted, its workers killed, and whole."""
+"""`stimrig cohort` as it is typed: one line for wrong input, the reports, and a scheduler that stands elsewhere."""
 
 from __future__ import annotations
 
@@ -7,22 +7,23 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import pyarrow.parquet as pq
 import pytest
+from distributed import LocalCluster
 
 from stimrig.api.cli import main
 from stimrig.api.cohort import cluster
 from tests.api.test_schemas import unmet
-from tests.harness.cohort_records import cohort
+from tests.harness.cohort_records import Session, cohort, write
 
 pytestmark = pytest.mark.slow
 
 PATIENCE_S = 240.0
-SESSIONS = 30
 COMMAND = """
 import time
 from stimrig.api.cohort import results
@@ -35,21 +36,32 @@ main()
 """Every row to the disk at once, and not too fast: the test sees how far it is, and is in time to disturb."""
 
 
-def refused(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 2) -> str:
-    capsys.readouterr()
-    assert main.run(["cohort", *arguments]) == code
-    out, err = capsys.readouterr()
-    assert out == "" and err.count("\n") == 1 and err.startswith("stimrig cohort: "), err
-    return err
+@pytest.fixture
+def refusal(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> Callable[..., str]:
+    """Run the verb with wrong input; return its one line."""
+
+    def run(*words: str) -> str:
+        assert main.run(["cohort", *words]) == 2
+        out, err = capsys.readouterr()
+        assert out == "" and err.count("\n") == 1 and err.startswith("stimrig cohort: "), err
+        assert list(tmp_path.iterdir()) == []
+        return err
+
+    return run
+
+
+@pytest.fixture
+def fit(tmp_path: Path) -> tuple[str, ...]:
+    return "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet")
 
 
 def test_without_the_extra_it_says_what_to_install(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    refusal: Callable[..., str], fit: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    known = importlib.util.find_spec
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "dask" else known(name, *more))
-    for words in (["fit", str(tmp_path), "-o", "x.parquet"], ["changed", "a", "b"], ["figures", "a", "-o", "b"]):
-        assert "pip install stimrig[cohort]" in refused(capsys, *words)
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *more: None if name == "dask" else find(name, *more))
+    for words in (fit, ("changed", "a", "b"), ("figures", "a", "-o", "b")):
+        assert "pip install stimrig[cohort]" in refusal(*words)
 
 
 def test_the_verb_loads_without_the_extra() -> None:
@@ -73,119 +85,92 @@ def test_the_verb_loads_without_the_extra() -> None:
         (["--map", "torque_nm"], "torque_nm"),
         (["--limit", "0"], "--limit"),
         (["--workers", "0"], "--workers"),
+        (["/nowhere"], "/nowhere: no such file"),
     ],
 )
-def test_wrong_options_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path, options: list[str], named: str):
-    assert named in refused(capsys, "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet"), *options)
-    assert list(tmp_path.iterdir()) == []
+def test_wrong_options_are_one_line(
+    refusal: Callable[..., str], fit: tuple[str, ...], options: list[str], named: str
+) -> None:
+    assert named in refusal(*fit, *options)
 
 
-def test_missing_data_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    missing = str(tmp_path / "nowhere")
-    assert missing in refused(capsys, "fit", missing, "-o", str(tmp_path / "r.parquet"))
-    assert "no such file" in refused(capsys, "changed", missing, missing)
-    assert "no such file" in refused(capsys, "figures", missing, "-o", str(tmp_path / "f.html"))
+def test_missing_results_are_one_line(refusal: Callable[..., str]) -> None:
+    for words in (("changed", "/nowhere", "/nowhere"), ("figures", "/nowhere", "-o", "f.html")):
+        assert "/nowhere: no such file" in refusal(*words)
 
 
-def test_scheduler_that_is_not_there_is_one_line(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_scheduler_that_is_not_there_or_has_no_workers(
+    refusal: Callable[..., str], fit: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cluster, "CONNECT_S", 1.0)
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport"):
-        words = refused(capsys, "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet"), "--scheduler", address)
+        words = refusal(*fit, "--scheduler", address)
         assert address in words and "no scheduler answers" in words
-
-
-def test_scheduler_without_workers_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    from distributed import LocalCluster
-
-    with LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=None) as empty:
-        words = refused(
-            capsys, "fit", str(tmp_path), "-o", str(tmp_path / "r.parquet"), "--scheduler", empty.scheduler_address,
-            "--wait", "0.5",
-        )  # fmt: skip
+    empty: Any = LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=":0")
+    with empty:
+        words = refusal(*fit, "--scheduler", empty.scheduler_address, "--wait", "0.5")
     assert "no worker within 0.5 s" in words
 
 
-# ---- the real thing: processes that are interrupted and killed
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    place = tmp_path_factory.mktemp("sessions")
-    cohort(place, SESSIONS)
-    (place / "broken.h5").write_bytes(b"no recording")
-    return place
-
-
-def until(reached: Callable[[], Any], what: str, run: subprocess.Popen[str] | None = None) -> None:
-    ends_s = time.monotonic() + PATIENCE_S
-    while not reached():
-        assert run is None or run.poll() is None, f"ended before {what}: {run.communicate()}"
-        assert time.monotonic() < ends_s, what
-        time.sleep(0.01)
-
-
-def rows_in(parts: Path) -> int:
-    """Rows that are on the disk."""
-    return sum(pq.read_metadata(part).num_rows for part in parts.glob("[0-9]*.parquet"))
-
-
-def test_reports(capsys: pytest.CaptureFixture[str], folder: Path, tmp_path: Path) -> None:
-    output = tmp_path / "r.parquet"
-    one = str(next((folder / "P001").iterdir()))
-    assert main.run(["cohort", "fit", one, "-o", str(output), "--workers", "1"]) == 0
+def test_reports(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    output, html = str(tmp_path / "r.parquet"), tmp_path / "f.html"
+    write(tmp_path / "a.h5", Session())
+    assert main.run(["cohort", "fit", str(tmp_path / "a.h5"), "-o", output, "--workers", "1"]) == 0
     out = capsys.readouterr().out
-    assert "1 with a result" in out and str(output) in out
-    assert main.run(["cohort", "changed", str(output), str(output), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert unmet("cohort", report) == [] and report["unchanged"] == 1
-    assert main.run(["cohort", "changed", str(output), str(output)]) == 0
+    assert "1 with a result" in out and output in out
+    assert main.run(["cohort", "changed", output, output]) == 0
     assert "1 records in both: 1 unchanged" in capsys.readouterr().out
-    assert main.run(["cohort", "figures", str(output), "--html", str(tmp_path / "f.html"), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert unmet("cohort", report) == [] and report["records"] == 1
-    assert "Repeatability" in (tmp_path / "f.html").read_text()
-
-
-@pytest.fixture
-def scheduler(tmp_path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """A scheduler of Dask as a process of its own, with two workers; its address."""
-    file = tmp_path / "scheduler.json"
-    here = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
-    main_one = subprocess.Popen([*here, *options], **quiet)
-    workers = []
-    try:
-        until(file.exists, "a scheduler")
-        until(lambda: file.read_text().rstrip().endswith("}"), "its whole file")
-        address = json.loads(file.read_text())["address"]
-        command = [sys.executable, "-m", "distributed.cli.dask_worker", address, "--nthreads", "1", "--no-nanny"]
-        workers = [subprocess.Popen([*command, "--no-dashboard"], **quiet) for _ in range(2)]
-        yield address, main_one
-    finally:
-        for process in (*workers, main_one):
-            process.kill()
-            process.wait()
+    for words, key, value in (
+        (["fit", str(tmp_path / "a.h5"), "-o", output, "--workers", "1"], "done_before", 1),
+        (["changed", output, output], "unchanged", 1),
+        (["figures", output, "-o", str(html)], "records", 1),
+    ):
+        assert main.run(["cohort", *words, "--json"]) == 0
+        report = json.loads(capsys.readouterr().out)
+        assert unmet("cohort", report) == [] and report[key] == value
+    assert "Repeatability" in html.read_text()
 
 
 @pytest.mark.campaign
-def test_another_scheduler_computes_and_when_it_goes_what_is_done_is_kept(
-    folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
-) -> None:
-    address, process = scheduler
-    output = tmp_path / "r.parquet"
+def test_scheduler_elsewhere_computes_and_when_it_goes_what_is_done_is_kept(tmp_path: Path) -> None:
+    def until(reached: Callable[[], Any], what: str) -> None:
+        ends_s = time.monotonic() + PATIENCE_S
+        while not reached():
+            assert time.monotonic() < ends_s, what
+            time.sleep(0.01)
 
-    def begun() -> subprocess.Popen[str]:
-        words = ["cohort", "fit", str(folder), "-o", str(output), "--scheduler", address, "--wait", "200"]
-        command = [sys.executable, "-c", COMMAND, *words]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    def start(*words: str, **options: Any) -> subprocess.Popen[str]:
+        process = subprocess.Popen([sys.executable, *words], text=True, **options)
+        stack.callback(lambda: (process.kill(), process.wait()))
+        return process
 
-    run = begun()
-    until(lambda: rows_in(tmp_path / "r.parquet.parts") >= 3, "three rows", run)
-    process.kill()
-    _, err = run.communicate(timeout=PATIENCE_S)
-    said = err.splitlines()
-    assert run.returncode == 1 and len(said) == 1 and "the scheduler is gone" in said[0], err
-    assert rows_in(tmp_path / "r.parquet.parts") >= 3
+    def rows() -> int:
+        return sum(pq.read_metadata(part).num_rows for part in Path(f"{output}.parts").glob("[0-9]*.parquet"))
+
+    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    cohort(tmp_path / "sessions", 30)
+    file, output = tmp_path / "scheduler.json", tmp_path / "r.parquet"
+    with ExitStack() as stack:
+        options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
+        scheduler = start("-m", "distributed.cli.dask_scheduler", *options, **quiet)
+        until(lambda: file.exists() and file.read_text().rstrip().endswith("}"), "a scheduler")
+        address = json.loads(file.read_text())["address"]
+        for nanny in ("--nanny", "--no-nanny"):
+            start("-m", "distributed.cli.dask_worker", address, "--nthreads", "1", nanny, "--no-dashboard", **quiet)
+        words = (
+            "cohort",
+            "fit",
+            str(tmp_path / "sessions"),
+            "-o",
+            str(output),
+            "--scheduler",
+            address,
+            "--wait",
+            "200",
+        )
+        run = start("-c", COMMAND, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+        until(lambda: rows() >= 3 or run.poll() is not None, "three rows")
+        scheduler.kill()
+        _, err = run.communicate(timeout=PATIENCE_S)
+    assert run.returncode == 1 and err.count("\n") == 1 and "the scheduler is gone" in err, err
+    assert rows() >= 3

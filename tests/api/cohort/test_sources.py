@@ -94,9 +94,9 @@ def test_folder_without_permission_is_one_entry(tmp_path: Path, monkeypatch: pyt
     (tmp_path / "shut").mkdir()
     scan = os.scandir
 
-    def scandir(path: str) -> Any:  # the tests may run as root, whom no permission stops
+    def scandir(path: Any) -> Any:  # the tests may run as root, whom no permission stops
         if str(path).endswith("shut"):
-            raise PermissionError(13, "Permission denied", str(path))
+            raise PermissionError(13, "Permission denied")
         return scan(path)
 
     monkeypatch.setattr(os, "scandir", scandir)
