@@ -47,10 +47,11 @@ def write(session: Session, row: Versioned, at_utc: str, who: str, action: str, 
     row.version = number_of(audit.write(session, at_utc, who, action, subject, **detail))
 
 
-def write_pose(session: Session, at_utc: str, who: str, action: str, **detail: Any) -> None:
-    """Write an entry about the angle sensor. Ranges of angles rest on it: all participants get its version."""
+def write_pose(session: Session, at_utc: str, who: str, action: str, **detail: Any) -> int:
+    """Write an entry about the angle sensor: its version. Ranges of angles rest on it: all participants get it, too."""
     version = number_of(audit.write(session, at_utc, who, action, "rig", **detail))
     session.execute(update(Participant).values(version=version))
+    return version
 
 
 def pose_version(session: Session) -> int:

@@ -15,11 +15,11 @@ from starlette.routing import BaseRoute
 from starlette.types import ASGIApp
 
 from stimrig.api.jobs.worker import Worker
+from stimrig.api.services.context import build
 from stimrig.api.settings import Settings
 from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.version import software_version
 from stimrig.api.web import openapi, pages, problems, routes
-from stimrig.api.web.dependencies import build
 from stimrig.api.web.middleware import BodyLimit, Headers, LookAgain, RequestId, StrictBody
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from stimrig.api.models.together import JOINT_EFFECTS
+from stimrig.api.services.joint import EffectId
 from stimrig.api.sessions import joint_plan
 from stimrig.api.sessions.joint_plan import (
     ENOUGH,
@@ -24,7 +25,6 @@ from stimrig.api.sessions.joint_plan import (
     widths_of,
 )
 from stimrig.api.sessions.joint_plan import coverage_grid as grid
-from stimrig.api.web.routes.joint import EffectId
 from stimrig.identify.effects import find_effect
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.rig.limits import HARD_LIMITS, for_profile

@@ -183,7 +183,7 @@ def test_each_process_of_serve_is_started_under_the_lock_and_the_service_takes_i
 
 def test_a_service_that_does_not_come_up_lets_go(tmp_path: Path) -> None:
     from stimrig.api.errors import ApiError
-    from stimrig.api.web.dependencies import build
+    from stimrig.api.services.context import build
 
     (tmp_path / "stimrig.db").write_bytes(b"not a database at all" * 100)
     with pytest.raises(ApiError, match=r"cannot be opened.*restore the database from a backup"):

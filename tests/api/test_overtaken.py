@@ -13,8 +13,8 @@ import httpx
 import pytest
 from sqlalchemy.exc import OperationalError
 
+from stimrig.api.services import calibrations
 from stimrig.api.sessions import playing, runner
-from stimrig.api.web.routes import calibration
 from tests.api.conftest import Service, run_test, soon
 from tests.api.test_profiles import mark_all
 
@@ -282,11 +282,11 @@ def test_a_calibration_that_could_not_be_stored_is_stored_by_finishing_again(
     at = f"/v1/participants/{participant}/calibration"
     client.post(at, json={})
     mark_all(client)
-    store = calibration._store
-    monkeypatch.setattr(calibration, "_store", Mock(side_effect=OperationalError("is locked", None, Exception())))
+    store = calibrations._store
+    monkeypatch.setattr(calibrations, "_store", Mock(side_effect=OperationalError("is locked", None, Exception())))
     version = client.get(at).headers["etag"]
     assert client.post(f"{at}/finish", headers={"If-Match": version}).status_code == 503
-    monkeypatch.setattr(calibration, "_store", store)
+    monkeypatch.setattr(calibrations, "_store", store)
     page = client.get(f"/participants/{participant}/calibration", headers={"Accept": "text/html"}).text
     assert "waits to be stored" in page
     done = client.post(f"{at}/finish", headers={"If-Match": version})

@@ -241,7 +241,7 @@ def test_database_holds_no_token(service: Service) -> None:
 
 
 def test_first_start_draws_a_token_once(tmp_path) -> None:
-    from stimrig.api.web.dependencies import build
+    from stimrig.api.services.context import build
 
     settings = Settings(data_dir=tmp_path)
     first = build(settings)
@@ -254,7 +254,7 @@ def test_first_start_draws_a_token_once(tmp_path) -> None:
 
 def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
     from stimrig.api.errors import ApiError
-    from stimrig.api.web.dependencies import build
+    from stimrig.api.services.context import build
 
     build(Settings(data_dir=tmp_path, admin_token="first-one")).lock.release()  # pyright: ignore[reportArgumentType]
     later = build(Settings(data_dir=tmp_path, admin_token="second-one"))  # pyright: ignore[reportArgumentType]

@@ -86,7 +86,7 @@ def test_a_row_that_is_not_written_leaves_no_file(tmp_path: Path, short_dir: Pat
     for service in run_service(tmp_path, short_dir, STUB):
         with service.client() as client:
             client.post("/v1/participants", json={"code": "P017"})
-            monkeypatch.setattr("stimrig.api.web.routes.recordings.audit.write", Mock(side_effect=OSError("disk full")))
+            monkeypatch.setattr("stimrig.api.services.recordings.audit.write", Mock(side_effect=OSError("disk full")))
             assert client.post("/v1/participants/P017/recordings", content=b"a,b\n").status_code == 500
             monkeypatch.undo()
         assert not list((tmp_path / "recordings").rglob("upload-*"))

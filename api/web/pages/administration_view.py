@@ -11,12 +11,12 @@ from fastapi.responses import PlainTextResponse, Response
 
 from stimrig.api import local_time
 from stimrig.api.people.auth import ROLES
+from stimrig.api.services import keys
 from stimrig.api.store import audit
 from stimrig.api.store.tables import AuditEntry
 from stimrig.api.web.dependencies import Administrator, Ctx
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.render import page
-from stimrig.api.web.routes import people
 
 router = APIRouter(include_in_schema=False, prefix="/administration")
 NEWEST = 60
@@ -30,14 +30,14 @@ MAY: dict[str, str] = {
 
 
 @router.get("")
-async def show(request: Request, context: Ctx, who: Administrator) -> Response:
+async def show(request: Request, context: Ctx, _who: Administrator) -> Response:
     """Show people, tokens and the newest entries of the audit trail."""
 
     def gather() -> dict[str, Any]:
         entries = context.store.all(AuditEntry, order=AuditEntry.seq)
         return {
             "users": [{**user, "role": role_of(user["scopes"])} for user in context.people.documents()],
-            "tokens": [token for token in people.list_tokens(context, who) if token["origin"] == "issued"],
+            "tokens": [token for token in keys.all_tokens(context) if token["origin"] == "issued"],
             "entries": entries[: -NEWEST - 1 : -1],
             "count": len(entries),
             "first_broken": audit.first_broken(entries),

@@ -13,6 +13,7 @@ from fastapi import APIRouter, Form, Request
 from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
+from stimrig.api.services import calibrations, participants
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.questions import Question, Row
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
@@ -20,7 +21,6 @@ from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.render import done_or_said, page
-from stimrig.api.web.routes import calibration, participants
 from stimrig.rig.messages import Status
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}/calibration")
@@ -48,7 +48,7 @@ async def show_page(
     """The page, with the form as it was sent where something was wrong with it, and what just went wrong."""
     row = await asyncio.to_thread(participants.find, context, code)
     try:
-        found: dict[str, Any] | None = await calibration.standing(context, code)
+        found: dict[str, Any] | None = await calibrations.standing(context, code)
     except ApiError as error:
         if error.status != 404:
             raise
@@ -104,7 +104,7 @@ async def begin(request: Request, context: Ctx, who: Tester, code: str) -> Respo
     body = typed.checked(CalibrationIn, **values, large_steps=True)
 
     async def open_it() -> str:
-        await calibration.begin_calibration(context, who, code, None, Response(), body)  # pyright: ignore[reportArgumentType]
+        await calibrations.begin(context, code, body, who.name)
         return address(code)
 
     doubts = profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]})
@@ -143,12 +143,12 @@ def read(
 
 @router.post("/step/{direction}")
 async def step(
-    request: Request, context: Ctx, who: Tester, code: str, direction: str,
+    request: Request, context: Ctx, _who: Tester, code: str, direction: str,
     shown_us: Annotated[float | None, Form()] = None,
 ) -> Response:  # fmt: skip
     """Play one train; the trains that the page knew of and the width on the button say whether both still hold."""
     body = typed.checked(StepIn, direction=direction, shown_us=shown_us)
-    done = calibration.play_step(context, who, code, None, body, Response())  # pyright: ignore[reportArgumentType]
+    done = calibrations.step(context, code, body)
     return await attempt(request, context, code, done, address(code))
 
 
@@ -156,21 +156,21 @@ async def step(
 async def mark(request: Request, context: Ctx, who: Tester, code: str, threshold: str) -> Response:
     """Mark the last train's width."""
     body = typed.checked(MarkIn, threshold=threshold)
-    done = calibration.set_mark(context, who, code, None, body, Response())  # pyright: ignore[reportArgumentType]
+    done = calibrations.mark(context, code, body, who.name)
     return await attempt(request, context, code, done, address(code))
 
 
 @router.post("/finish")
 async def finish(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Take over what was found."""
-    done = calibration.close(context, code, who.name, None)
+    done = calibrations.close(context, code, who.name, None)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 
 @router.post("/discard")
 async def discard(request: Request, context: Ctx, who: Tester, code: str) -> Response:
     """Leave everything as it was; however many trains were sent."""
-    done = calibration.close(context, code, who.name, None, discard=True)
+    done = calibrations.close(context, code, who.name, None, discard=True)
     return await attempt(request, context, code, done, f"/participants/{code}")
 
 

@@ -11,13 +11,13 @@ from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import LOCKED, Principal, Scope
+from stimrig.api.services import participants
 from stimrig.api.sessions.requests import ParticipantIn
 from stimrig.api.web.dependencies import Anyone, Context, Ctx, EvenLocked, Tester
 from stimrig.api.web.guards import identified, local, same_origin, set_cookie
 from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.render import look, page, problem_page
 from stimrig.api.web.pages.typed import Text
-from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
 SHOWN = 50

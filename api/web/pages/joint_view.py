@@ -10,6 +10,8 @@ from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
 from stimrig.api.models import together
+from stimrig.api.services import joint, participants
+from stimrig.api.services.joint import PoseIn, TogetherIn
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.joint import target_of
 from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE
@@ -19,8 +21,6 @@ from stimrig.api.store.tables import Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import limits_form, starting, typed
 from stimrig.api.web.pages.render import done_or_said, page
-from stimrig.api.web.routes import joint, participants
-from stimrig.api.web.routes.joint import PoseIn, TogetherIn
 
 router = APIRouter(include_in_schema=False)
 OF_PERSON = "/participants/{code}/joint"

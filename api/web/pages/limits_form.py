@@ -12,9 +12,9 @@ from typing import Any
 
 from starlette.datastructures import FormData
 
+from stimrig.api.services.participants import calibrated_utc
 from stimrig.api.sessions import profiles
 from stimrig.api.web.pages import typed
-from stimrig.api.web.routes.participants import calibrated_utc
 from stimrig.rig.messages import Bound, Status
 
 LONGEST_SHOWN = 60

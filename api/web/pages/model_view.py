@@ -16,6 +16,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import advice, carried_structure, explanation, stored_model
 from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.services import jobs, participants
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store.tables import Model
@@ -23,7 +24,6 @@ from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Tester, Vers
 from stimrig.api.web.pages import next_view, starting
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.pages.report_file import missing_parts
-from stimrig.api.web.routes import criticism, participants
 
 router = APIRouter(include_in_schema=False)
 OVERVIEW_PX, CURVE_PX = 320.0, 190.0
@@ -112,10 +112,10 @@ async def diagnosis_of(
     known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     if known is not None:
         return known, None
-    jobs = [job for job in context.jobs.all.values() if (job.kind, job.subject) == ("diagnosis", row.id)]
-    newest = jobs[-1] if jobs else None
+    begun = [job for job in context.jobs.all.values() if (job.kind, job.subject) == ("diagnosis", row.id)]
+    newest = begun[-1] if begun else None
     if diagnose == 1 or (newest is None and diagnose != 0):
-        newest = criticism.begin_diagnosis(context, row, by)
+        newest = jobs.begin_diagnosis(context, row, by)
         await asyncio.sleep(0.05)
     if newest is not None and newest.state == "completed":  # it ended between the two looks
         known = await asyncio.to_thread(context.analyses.known_diagnosis, row)

@@ -12,13 +12,13 @@ from sqlalchemy import or_
 
 from stimrig.api import local_time
 from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.services import participants
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.joint_plan import KINDS
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store.tables import OPEN_STATES, Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
 from stimrig.api.web.pages import render, starting
-from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
 Kind = Literal[

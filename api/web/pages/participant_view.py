@@ -17,6 +17,7 @@ from stimrig.api.local_time import clock
 from stimrig.api.models.places import site_of
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
 from stimrig.api.people.auth import Principal
+from stimrig.api.services import keys, notes, participants, recordings
 from stimrig.api.sessions import controllers, profiles
 from stimrig.api.sessions.questions import LIFE_S, Question, Row, gone
 from stimrig.api.sessions.requests import LEAST_PERCENT, MOST_PERCENT, MuscleIn, NoteIn, TargetIn, TestIn
@@ -30,7 +31,6 @@ from stimrig.api.web.pages.limits_form import LimitsForm
 from stimrig.api.web.pages.render import page, signed
 from stimrig.api.web.pages.starting import site_words
 from stimrig.api.web.pages.typed import Text
-from stimrig.api.web.routes import participants, people, recordings
 from stimrig.rig.messages import LABEL_TITLES
 
 router = APIRouter(include_in_schema=False, prefix="/participants/{code}")
@@ -217,7 +217,7 @@ async def make_key(
     asked = {"current_ma": current_ma, "max_pulse_width_us": max_pulse_width_us, "max_duration_s": max_duration_s}
     numbers = {field: typed.wanted(text, lambda why, field=field: f"{field}: {why}.") for field, text in asked.items()}
     body = typed.checked(controllers.KeyFor, name=name.strip(), trials=typed.whole(trials), **numbers)
-    text, made, _version = await asyncio.to_thread(people.key_of, context, who, code, body)
+    text, made, _version = await asyncio.to_thread(keys.make, context, who, code, body)
     return await show_page(request, context, who, code, made={"text": text, "name": made.name})
 
 
@@ -254,7 +254,7 @@ async def write_note(
         except ValueError as error:
             raise ApiError(422, "invalid-input", "This time cannot be used", str(error)) from None
     fields = {"kind": kind, "text": text, "test_id": test_id or None, "at_s": at_s, "now": bool(now and test_id)}
-    await participants.write_note(context, who, code, typed.checked(NoteIn, **fields))
+    await notes.add(context, code, typed.checked(NoteIn, **fields), who.name)
     return RedirectResponse(local(back or f"/participants/{code}") + "#notes", 303)
 
 

@@ -10,12 +10,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import LOCKED
+from stimrig.api.services.rig import rearm as rearm_rig
 from stimrig.api.web.dependencies import Anyone, Ctx, Rearmer
 from stimrig.api.web.guards import local, same_origin
 from stimrig.api.web.pages import render
 from stimrig.api.web.pages.render import COLOURS, MEDIA, fragment, look, page
 from stimrig.api.web.pages.typed import Text
-from stimrig.api.web.routes.rig import rearm_rig
 
 router = APIRouter(include_in_schema=False)
 

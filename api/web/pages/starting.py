@@ -14,6 +14,7 @@ from stimrig.api.local_time import until, when
 from stimrig.api.models.changes import dose_words
 from stimrig.api.models.places import Site, site_of
 from stimrig.api.people.auth import Principal
+from stimrig.api.services import participants
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.joint_plan import HELD, PASSIVE
 from stimrig.api.sessions.playing import other_than, refuse_archived
@@ -22,7 +23,6 @@ from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store.tables import AuditEntry, Participant
 from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment, number
-from stimrig.api.web.routes import participants
 
 NOBODY = "today nobody has tested which pulse widths are felt, move the limb and are comfortable"
 

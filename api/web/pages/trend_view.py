@@ -17,10 +17,10 @@ from stimrig.api.charts.model_charts import MOST
 from stimrig.api.errors import ApiError
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.trend import Session, newest_changes
+from stimrig.api.services import participants
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader
 from stimrig.api.web.pages.render import page, rows_shown
-from stimrig.api.web.routes import participants
 
 router = APIRouter(include_in_schema=False)
 COLUMNS = (

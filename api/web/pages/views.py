@@ -14,6 +14,7 @@ from stimrig.api.charts.drawing import svg
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
+from stimrig.api.services import tests
 from stimrig.api.sessions.requests import RanByIn
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import Context, Ctx, LiveReader, Tester
@@ -21,7 +22,6 @@ from stimrig.api.web.pages import typed
 from stimrig.api.web.pages.model_view import draw_model, measurement
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.pages.typed import Text
-from stimrig.api.web.routes import tests
 from stimrig.rig.messages import Status
 
 router = APIRouter(include_in_schema=False)

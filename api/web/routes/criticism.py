@@ -9,9 +9,9 @@ from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse
 
 from stimrig.api.jobs.job import Job
+from stimrig.api.services import jobs
 from stimrig.api.sessions.requests import EffectsIn
-from stimrig.api.store.tables import Model
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, Tester, Version
+from stimrig.api.web.dependencies import PROBLEM, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.responses.base import describe_answer, published
 from stimrig.api.web.responses.models import ComparisonOut, CurvesOut, DiagnosisOut, ImprovementOut, JobOut, VersionOut
 
@@ -42,7 +42,7 @@ async def diagnosis(context: Ctx, who: ModelReader, row: Version, wait: Wait = T
     """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""
     if wait or await asyncio.to_thread(context.analyses.known_diagnosis, row) is not None:
         return await context.analyses.diagnosis(row)
-    return later(begin_diagnosis(context, row, who.name))
+    return later(jobs.begin_diagnosis(context, row, who.name))
 
 
 @router.post("/models/{model_id}/effects", status_code=201, response_model=VersionOut, responses=LATER)
@@ -56,7 +56,7 @@ async def add_effects(
     """
     row = await asyncio.to_thread(context.versions.get, model_id)
     if not wait:
-        return later(begin_adding(context, row, body, who.name))
+        return later(jobs.begin_adding(context, row, body, who.name))
     new = await context.analyses.add_effects(row, body.effects, who.name, force=body.force, reason=body.reason)
     response.headers["Location"] = f"/v1/models/{new.id}"
     return await asyncio.to_thread(context.versions.document, new)
@@ -66,7 +66,7 @@ async def add_effects(
 async def improve(context: Ctx, who: Tester, row: Version, response: Response, wait: Wait = True) -> Any:
     """Add effects one by one while the evidence lasts; each step is a version."""
     if not wait:
-        return later(begin_improving(context, row, who.name))
+        return later(jobs.begin_improving(context, row, who.name))
     found, rows = await context.analyses.improve(row, who.name)
     response.headers["Location"] = f"/v1/models/{rows[-1].id}"
     versions = await asyncio.to_thread(lambda: [context.versions.document(new) for new in rows])
@@ -97,35 +97,3 @@ async def cancel(context: Ctx, _who: Tester, job_id: str) -> dict[str, Any]:
 def later(job: Job) -> Response:
     """202, with the job's address."""
     return JSONResponse(job.document(), status_code=202, headers={"Location": f"/v1/jobs/{job.id}"})
-
-
-def begin_diagnosis(context: Context, model: Model, by: str) -> Job:
-    """Diagnose while the person looks on."""
-
-    async def work(job: Job) -> str:
-        await context.analyses.diagnosis(model, job.follow)
-        return f"/v1/models/{model.id}/diagnosis"
-
-    return context.jobs.start("diagnosis", model.id, by, work)
-
-
-def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Job:
-    """Add effects while the person looks on."""
-
-    async def work(job: Job) -> str:
-        new = await context.analyses.add_effects(
-            model, body.effects, by, force=body.force, reason=body.reason, on_call=job.follow
-        )
-        return f"/v1/models/{new.id}"
-
-    return context.jobs.start("add-effects", model.id, by, work)
-
-
-def begin_improving(context: Context, model: Model, by: str) -> Job:
-    """Improve while the person looks on."""
-
-    async def work(job: Job) -> str:
-        _, rows = await context.analyses.improve(model, by, job.follow)
-        return f"/v1/models/{rows[-1].id}"
-
-    return context.jobs.start("improve", model.id, by, work)

@@ -10,16 +10,14 @@ from fastapi import APIRouter, Header, Query, Response
 from pydantic import Field, FiniteFloat, StrictBool, model_validator
 
 from stimrig.api.clock import unix_of
-from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
-from stimrig.api.models.tracking import Limits
-from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn, tighter
-from stimrig.api.store.locking import Tags
-from stimrig.api.store.tables import Model, Participant
+from stimrig.api.services import models as services
+from stimrig.api.services import participants
+from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn
+from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import (
     PROBLEM,
     Approver,
-    Context,
     Ctx,
     DecisionVersion,
     ModelReader,
@@ -29,7 +27,6 @@ from stimrig.api.web.dependencies import (
 from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import InversionOut, PredictionOut, TrackingOut, VersionOut
-from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["models"], responses=PROBLEM)
 TAG = {"description": "send it as `If-None-Match`", "schema": {"type": "string"}}
@@ -64,22 +61,13 @@ async def approved_model(
     served = await asyncio.to_thread(context.tracked.served if tracked else context.versions.served, code)
     if served is None:
         await asyncio.to_thread(participants.find, context, code)
-        raise none_approved(code)
+        raise services.none_approved(code)
     headers = {"ETag": served.etag, "Cache-Control": "private, no-cache"}
     if tracked:
         headers["Last-Modified"] = formatdate(unix_of(served.at_utc), usegmt=True)
     if if_none_match and matches(if_none_match, served.etag):
         return Response(status_code=304, headers=headers)
     return Response(served.body, media_type="application/json", headers=headers)
-
-
-def none_approved(code: str) -> ApiError:
-    """404, with what to do."""
-    detail = (
-        f"Participant {code!r} has no model approved today; an approval ends with its day. "
-        "POST /v1/models/{id}/approve approves one."
-    )
-    return ApiError(404, "no-approved-model", "No approved model", detail)
 
 
 def matches(if_none_match: str, etag: str) -> bool:
@@ -94,7 +82,7 @@ def tracking(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
     found = context.tracked.document(code)
     if found is None:
         participants.find(context, code)
-        raise none_approved(code)
+        raise services.none_approved(code)
     return found
 
 
@@ -128,18 +116,9 @@ async def approve(
     """Let the controller have this version, and what is tracked from it within limits, until the day ends."""
     given = body or ApprovalIn()
     row = await asyncio.to_thread(context.versions.get, model_id)
-    version = await let_have(context, row, who.name, given.reason, given.tracking, tags)
+    version = await services.approve(context, row, who.name, given.reason, given.tracking, tags)
     response.headers["ETag"] = f'"{version}"'
     return await asyncio.to_thread(context.versions.document, row)
-
-
-async def let_have(
-    context: Context, row: Model, by: str, reason: str, tracking: Limits, tags: Tags | None = None
-) -> int:
-    """Approve a version; the worker that follows its trials is warm by the first one."""
-    version = await asyncio.to_thread(context.versions.decide, row.id, True, by, reason, tracking, tags=tags)
-    context.runner.trials.warm(row.participant)
-    return version
 
 
 @router.post("/models/{model_id}/reject", response_model=VersionOut)
@@ -167,9 +146,6 @@ def undo(
 
 # ---- a trial foretold: what widths would give, and which widths give a torque that is wanted -------------------------
 
-REST_S = 1.0
-"""Before and after a trial: its torque is measured against the rest before it."""
-RISE = "width_rise_us"
 Column = Annotated[list[FiniteFloat], Field(min_length=1, max_length=60_000)]
 WidthUs = Annotated[FiniteFloat, Field(ge=0, le=500)]
 ModelsRateHz = Annotated[
@@ -243,34 +219,4 @@ async def widths(context: Ctx, _who: ModelReader, model_id: str, body: Reference
     Of a version, or of one that was tracked from it (its `model_id`).
     """
     given = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz", "table"})
-    return await invert(context, model_id, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
-
-
-async def invert(
-    context: Context, model_id: str, given: dict[str, Any], width_us: float | None = None, rise_us: float | None = None,
-    whole: bool = True,
-) -> dict[str, Any]:  # fmt: skip
-    """What a worker makes of a reference, within the limits of participant and rig.
-
-    `given`: the reference, as the verb `invert` takes it; `width_us`, `rise_us`: further limits.
-    """
-    text = await asyncio.to_thread(context.tracked.text_of, model_id)
-    version = await asyncio.to_thread(context.tracked.version_of, model_id)
-    participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
-    largest_us = tighter(width_us, participant.profile.get("max_pulse_width_us"))
-    rig = context.rig.status
-    bound, shortest_us = (rig.limits.get(RISE), rig.stimulator.get("shortest_us")) if rig else (None, None)
-    rise_us = tighter(rise_us, bound and bound.hi)
-    call = context.pool.submit(
-        "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=whole,
-        shortest_us=shortest_us or 0.0, **given,
-    )  # fmt: skip
-    found = await call.result
-    limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us, "shortest_pulse_us": shortest_us}
-    return {"model_id": model_id, **found, **limits, "segments": segments(found["pulse_width_us"])}
-
-
-def segments(pulse_width_us: list[float]) -> list[dict[str, Any]]:
-    """A trial of these widths between two rests, for `POST /v1/tests`."""
-    rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": REST_S}}
-    return [rest, {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": pulse_width_us}}, rest]
+    return await services.invert(context, model_id, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)

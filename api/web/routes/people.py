@@ -9,17 +9,15 @@ from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
-from stimrig.api.clock import utc_label
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.people import accounts
 from stimrig.api.people.auth import ROLES, Principal, Scope, unauthorized
-from stimrig.api.sessions import controllers
+from stimrig.api.services import keys
 from stimrig.api.sessions.controllers import KeyFor
-from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import TokenIn
-from stimrig.api.store import audit, locking
+from stimrig.api.store import audit
 from stimrig.api.store.locking import Tags
-from stimrig.api.store.tables import AuditEntry, Token
+from stimrig.api.store.tables import AuditEntry
 from stimrig.api.web.dependencies import (
     PROBLEM,
     Administrator,
@@ -36,7 +34,6 @@ from stimrig.api.web.guards import local, same_origin, set_cookie
 from stimrig.api.web.openapi import TOO_MANY
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import AuditOut, KeyOut, ListedToken, ListedUser, SessionOut, TokenOut, UserOut
-from stimrig.api.web.routes import participants
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
 
@@ -199,9 +196,7 @@ def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, A
 
     One that plays trials: `POST /v1/participants/{code}/keys`.
     """
-    expires_utc = utc_label(context.clock.unix_s() + 86400.0 * body.days)
-    text = context.auth.issue(body.name, [Scope.READ_MODEL], who.name, expires_utc=expires_utc)
-    return {"key": text, "prefix": text[:12], "scopes": [Scope.READ_MODEL], "expires_utc": expires_utc}
+    return keys.make_reader(context, body.name, body.days, who.name)
 
 
 @router.post("/participants/{code}/keys", status_code=201, **describe_answer(KeyOut, 201, "made"))
@@ -213,7 +208,7 @@ def participant_key(
     Who makes it holds `run-test`, `read-live` and `read-model`, too, and answers for what it plays. Its text is shown
     this once. `DELETE /v1/participants/{code}/keys/{id}` revokes it.
     """
-    text, row, version = key_of(context, who, code, body, tags)
+    text, row, version = keys.make(context, who, code, body, tags)
     response.headers["ETag"] = f'"{version}"'
     told = {name: getattr(row, name) for name in ("name", "prefix", "scopes", "expires_utc", "participant", "plan")}
     return {"key": text, "id": row.hash[:16], **told}
@@ -222,24 +217,7 @@ def participant_key(
 @router.delete("/participants/{code}/keys/{key_id}", status_code=204)
 def revoke_participant_key(context: Ctx, who: Tester, code: str, key_id: str) -> None:
     """Revoke a key of a participant; its trial ends at once."""
-    if not controllers.revoke_key(context.auth, code, key_id, who.name):
-        raise NotFoundError("key", key_id, f"The page of {code} lists its keys.")
-
-
-def key_of(
-    context: Context, who: Principal, code: str, body: KeyFor, tags: Tags | None = None
-) -> tuple[str, Token, int]:
-    """Make a key: its text, its row, and the participant's new version.
-
-    Raises ApiError: 403 who makes it lacks a scope; 409 archived; 412 changed since it was seen; 422 as `plan_within`.
-    """
-    row = participants.find(context, code)
-    controllers.refuse_maker_without(who)
-    refuse_archived(row)
-    with context.store.read() as session:  # first: then the plan is wider for no other reason
-        locking.check(session, participants.within(session, code), tags)
-    plan = controllers.plan_within(body, row)
-    return controllers.make_key(context.auth, body.name, code, plan, who.name, who.token_hash, tags)
+    keys.revoke(context, code, key_id, who.name)
 
 
 token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)
@@ -248,24 +226,14 @@ token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLE
 @token_router.post("/tokens", status_code=201, **describe_answer(TokenOut, 201, "issued"))
 def issue_token(context: Ctx, who: Administrator, body: TokenIn) -> dict[str, Any]:
     """Issue a token; its text is shown this once."""
-    known = {scope.value for scope in Scope}
-    wrong = [scope for scope in body.scopes if scope not in known]
-    if wrong:
-        detail = f"Unknown: {', '.join(wrong)}. There are: {', '.join(sorted(known))}."
-        raise ApiError(422, "invalid-input", "No such scope", detail)
-    scopes = [Scope(scope) for scope in body.scopes]
-    text = context.auth.issue(body.name, scopes, who.name, expires_utc=body.expires_utc)
+    text = context.auth.issue(body.name, keys.scopes_of(body.scopes), who.name, expires_utc=body.expires_utc)
     return {"token": text, "name": body.name, "scopes": body.scopes, "expires_utc": body.expires_utc}
 
 
 @token_router.get("/tokens", **describe_answer(list[ListedToken]))
 def list_tokens(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
     """All tokens, by their prefix; never their text."""
-    rows = context.store.all(Token, order=Token.created_utc)
-    return [
-        {key: value for key, value in row.as_dict().items() if key not in ("hash", "made_by")} | {"id": row.hash[:16]}
-        for row in rows
-    ]
+    return keys.all_tokens(context)
 
 
 @token_router.delete("/tokens/{token_id}", status_code=204)

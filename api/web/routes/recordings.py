@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
-import hashlib
 import secrets
-from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
-from stimrig.api.errors import ApiError, require_found
-from stimrig.api.models import carried_structure
-from stimrig.api.models.places import site_of
-from stimrig.api.people.auth import Principal, Scope
-from stimrig.api.store import audit, locking, uploads
-from stimrig.api.store.locking import Tags
-from stimrig.api.store.tables import Model, Recording
-from stimrig.api.web.dependencies import PROBLEM, Context, Ctx, ModelReader, ParticipantVersion, Tester
+from stimrig.api.errors import ApiError
+from stimrig.api.services import participants, recordings
+from stimrig.api.web.dependencies import PROBLEM, Ctx, ModelReader, ParticipantVersion, Tester
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import UploadOut
-from stimrig.api.web.routes import participants
-from stimrig.identify.records import HDF5_MAGIC, PARQUET_MAGIC
 
 router = APIRouter(prefix="/v1", tags=["recordings"], responses=PROBLEM)
 
@@ -49,7 +38,7 @@ MOST_COLUMNS = 8
 @router.get("/recordings/{recording_id}", response_class=FileResponse, responses={200: RAW, 410: GONE})
 def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
     """The raw recording."""
-    row, path = held(context, recording_id)
+    row, path = recordings.held(context, recording_id)
     kind = KINDS.get(path.suffix, "application/x-hdf5")
     return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
 
@@ -57,7 +46,7 @@ def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileRespons
 @router.get("/recordings/{recording_id}/csv", response_class=FileResponse, responses={200: CSV, 410: GONE})
 async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
     """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
-    _row, source = await asyncio.to_thread(held, context, recording_id)
+    _row, source = await asyncio.to_thread(recordings.held, context, recording_id)
     name = f"{recording_id}.csv"
     out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
     gone = BackgroundTask(out.unlink, missing_ok=True)
@@ -67,17 +56,6 @@ async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> F
         out.unlink(missing_ok=True)
         raise
     return FileResponse(out, media_type="text/csv", filename=name, background=gone)
-
-
-def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
-    """A recording and its file. Raises ApiError: 404 no such recording; 410 its file is gone."""
-    row = context.store.get(Recording, recording_id)
-    require_found(row, "recording", recording_id, "A test's document names its recording.")
-    path = Path(row.path)
-    if not path.is_file():
-        detail = f"The file of recording {recording_id!r} is not in its place ({path.name}). Restore it from a backup."
-        raise ApiError(410, "recording-gone", "The recording's file is missing", detail)
-    return row, path
 
 
 @router.post(
@@ -106,113 +84,7 @@ async def upload(
     data = await request.body()  # `stimrig.api.web.middleware` bounds it
     if not data:
         raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
-    row, model, warnings = await take_in(context, code, data, who, columns, of, tags)
+    row, model, warnings = await recordings.take_in(context, code, data, who, columns, of, tags)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
     return {"recording_id": row.id, "model": version, "warnings": warnings}
-
-
-async def take_in(
-    context: Context, code: str, data: bytes, who: Principal, columns: Sequence[str] = (), of: str = "",
-    tags: Tags | None = None,
-) -> tuple[Recording, Model, list[str]]:  # fmt: skip
-    """Keep a recording of another tool and identify a model from it; what was assumed, and left out of its structure.
-
-    Where `columns` are mapped, what is kept is the record as a CSV file of ours, with the SHA-256 of what was sent.
-
-    Raises ApiError: 422 it cannot be read or fitted; 409 it is another participant's than `of` says. Nothing is kept of
-    it.
-    """
-    whole = await asyncio.to_thread(_write, context, data, ".csv" if columns else _suffix(data))
-    part = uploads.part_of(whole)
-    try:
-        assumed, data = await _rename_columns(context, part, columns, data)
-        found, warning = await _identified(context, code, part)
-        of = await asyncio.to_thread(_whose, context, code, who, found.get("of") or "", data, of)
-    except BaseException:  # refused, or nobody waits for it any more
-        part.unlink(missing_ok=True)
-        raise
-    warnings = [note for note in (*assumed, *found["notes"], warning) if note]
-    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, who.name, warnings, of, tags))
-    plain = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, who.name)
-    return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), warnings
-
-
-def _whose(context: Context, code: str, who: Principal, says: str, data: bytes, of: str) -> str:
-    """The other participant whose recording a person has decided to take in; empty: it is nobody else's.
-
-    Refuses what the file, or this database, says is another participant's, where nobody has decided that.
-    """
-    same = Recording.file_sha256 == hashlib.sha256(data).hexdigest()
-    own = says or next(iter(context.store.all(Recording.participant, same, order=Recording.created_utc)), code)
-    if own == code or (own == of and who.may(Scope.APPROVE_MODEL)):
-        return "" if own == code else own
-    detail = (
-        f"The file says that it is a recording of {own}, not of {code}. Nothing of it was kept. Who may approve models "
-        f"can take it for {code} all the same: send it again with of={own}."
-    )
-    raise ApiError(409, "other-participant", "This is another participant's recording", detail, of=own)
-
-
-async def _rename_columns(context: Context, path: Path, columns: Sequence[str], data: bytes) -> tuple[list[str], bytes]:
-    """What was assumed, and the bytes that are kept: the upload's own, or the table of ours that was made of it."""
-    if not columns:
-        return [], data
-    out = path.with_suffix(uploads.PLAIN)
-    try:
-        with _about_the_upload(path):
-            found = await context.pool.submit("plain_csv", data=str(path), out=str(out), columns=list(columns)).result
-        await asyncio.to_thread(out.replace, path)
-    finally:
-        out.unlink(missing_ok=True)
-    return found["notes"], await asyncio.to_thread(path.read_bytes)
-
-
-async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
-    """The model of an upload, and what was left out of its structure."""
-    with _about_the_upload(path):
-        return await carried_structure.fit(context.analyses, code, str(path))
-
-
-@contextlib.contextmanager
-def _about_the_upload(path: Path) -> Iterator[None]:
-    """Every reason why there is no model is about the upload, and tells nothing of this machine."""
-    try:
-        yield
-    except ApiError as error:
-        if error.code == "worker-died":
-            detail = f"{error.detail.partition('. ')[0]}. Is the file damaged? Nothing of it was kept."
-            raise ApiError(422, "data", "The upload cannot be read", detail) from error
-        error.detail = error.detail.replace(str(path), "the upload").replace(path.name, "the upload")
-        if "place" in error.extra:
-            error.extra["place"] = error.extra["place"].replace(str(path), "the upload")
-        raise
-
-
-def _suffix(data: bytes) -> str:
-    kinds = {HDF5_MAGIC: ".h5", b"MATLAB ": ".mat", PARQUET_MAGIC: ".parquet"}
-    return next((suffix for magic, suffix in kinds.items() if data.startswith(magic)), ".csv")
-
-
-def _write(context: Context, data: bytes, suffix: str) -> Path:
-    path = context.settings.recordings_dir / f"{uploads.PREFIX}{secrets.token_hex(8)}{suffix}"
-    uploads.part_of(path).write_bytes(data)
-    return path
-
-
-def _store(
-    context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str], of: str, tags: Tags | None
-) -> Recording:
-    now = context.clock.utc()
-    row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
-    row.file_sha256 = hashlib.sha256(data).hexdigest()
-    row.warnings = warnings
-    said = {"participant": code, "sha256": row.file_sha256, **({"of": of} if of else {})}
-    with uploads.taken_in(path), context.store.write() as session:
-        participant = participants.within(session, code)
-        locking.check(session, participant, tags)
-        row.site = list(site_of(participant))
-        session.add(row)
-        session.flush()
-        audit.write(session, now, by, "upload recording", row.id, **said)
-    return row

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import asyncio
-from functools import partial
 from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 
 from stimrig.api.errors import ApiError
+from stimrig.api.services import rig as services
 from stimrig.api.sessions.requests import StopIn, TestIn
 from stimrig.api.sessions.stops import StopResult
-from stimrig.api.store import locking
-from stimrig.api.store.locking import Tags
 from stimrig.api.web.dependencies import (
     PROBLEM,
     Anyone,
@@ -29,35 +26,19 @@ from stimrig.api.web.guards import Press
 from stimrig.api.web.middleware import wants_html
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
-from stimrig.rig.messages import Status, StopEvidence
-from stimrig.rig.requests import RearmRequest, SequencesRequest
+from stimrig.rig.messages import StopEvidence
+from stimrig.rig.requests import SequencesRequest
 
 router = APIRouter(prefix="/v1", tags=["rig"], responses=PROBLEM)
 FORM = {"schema": StopIn.model_json_schema()}
 STOP = {"requestBody": {"content": {"application/json": FORM, "application/x-www-form-urlencoded": FORM}}}
 
 
-def rig_state(context: Context) -> dict[str, Any]:
-    """What is known of the rig, and how old it is."""
-    status = context.rig.status
-    current = context.runner.current
-    return {
-        "connected": context.rig.connected,
-        "age_s": context.rig.age_s,
-        **(
-            status.model_dump(exclude={"finished"})
-            if status
-            else {"state": "disconnected", "reason": "the rig has not spoken yet"}
-        ),
-        "holder": current.holder if current else None,
-    }
-
-
 @router.get("/rig", **describe_answer(RigOut))
 def rig(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
     """State, devices, newest torque and its age. `ETag` names the last stop: a re-arm says which one it answers."""
     response.headers["ETag"] = f'"{context.rig.status.latch if context.rig.status else ""}"'
-    return rig_state(context)
+    return services.rig_state(context)
 
 
 @router.get("/sequences", **describe_answer(SequencesOut))
@@ -75,7 +56,7 @@ async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
     if wants_html(request):
         return await stop_on_page(request, context, press)
     evidence = await context.runner.stop(press.reason, press.by)
-    rig = {} if press.by_key else {"rig": rig_state(context)}
+    rig = {} if press.by_key else {"rig": services.rig_state(context)}
     return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), **rig})
 
 
@@ -98,28 +79,9 @@ async def rearm(context: Ctx, who: Rearmer, tags: LatchVersion, response: Respon
 
     A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
     """
-    status = await rearm_rig(context, who.name, tags)
+    status = await services.rearm(context, who.name, tags)
     response.headers["ETag"] = f'"{status.latch}"'
-    return rig_state(context)
-
-
-async def rearm_rig(context: Context, by: str, tags: Tags | None = None) -> Status:
-    """Re-arm the rig after the stop that was shown. Raises ApiError: 412 it was stopped again since."""
-    (latch, *_), latches = locking.tags_of(tags), context.rig.latches
-    _, shown = latches.get(latch, ("", ""))
-    note = partial(context.store.note, context.clock, by)
-    await asyncio.to_thread(note, "re-arm", "rig", reason=shown)
-    try:
-        await context.rig.ask(RearmRequest(by=by, latch=latch))
-    except ApiError as error:
-        await asyncio.to_thread(note, "re-arm refused", "rig", why=error.detail)
-        if error.code != "rig-latch-changed":
-            raise
-        status = await context.rig.fresh_status()
-        at_utc, reason = latches[status.latch]
-        change = {"who": "", "at_utc": at_utc, "action": "latched", "subject": "rig", "old": shown, "new": reason}
-        raise locking.ChangedError(status.latch, [change], error.detail) from error
-    return await context.rig.fresh_status()
+    return services.rig_state(context)
 
 
 @router.post("/preview", **describe_answer(PreviewOut))

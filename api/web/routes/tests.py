@@ -11,13 +11,11 @@ from fastapi import APIRouter, Response, WebSocket, WebSocketDisconnect
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.clinical_words import missing_words
-from stimrig.api.errors import ApiError, forbidden, require_found
+from stimrig.api.errors import ApiError, forbidden
 from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.services import tests
 from stimrig.api.sessions import controllers
-from stimrig.api.sessions.playing import other_than
 from stimrig.api.sessions.requests import RanByIn, TestIn
-from stimrig.api.store import locking
-from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import (
     PROBLEM,
@@ -39,13 +37,7 @@ LOOK_S = 1.0
 """How often a live channel looks whether its session or token is still valid."""
 GOODBYE_S = 2.0
 """So long it waits for a client that reads nothing to hear why it is closed."""
-LISTED = "GET /v1/tests lists them."
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
-
-
-def find(context: Context, test_id: str) -> Test:
-    """A test by its id; 404 where there is none."""
-    return require_found(context.store.get(Test, test_id), "test", test_id, LISTED)
 
 
 @router.post("", status_code=202, **describe_answer(TestOut, 202, "begun; see `Location`"))
@@ -71,7 +63,7 @@ def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str
 @router.get("/{test_id}", **describe_answer(TestOut))
 def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
-    row = find(context, test_id)
+    row = tests.find(context, test_id)
     response.headers["ETag"] = f'"{row.version}"'
     return context.runner.document(row)
 
@@ -81,25 +73,15 @@ def set_ran_by(
     context: Ctx, who: Tester, test_id: str, tags: TestVersion, body: RanByIn, response: Response
 ) -> dict[str, Any]:
     """Say who ran a test at the rig, where that was not who asked for it."""
-    row = change_ran_by(context, test_id, body.ran_by, who.name, tags)
+    row = tests.change_ran_by(context, test_id, body.ran_by, who.name, tags)
     response.headers["ETag"] = f'"{row.version}"'
     return context.runner.document(row)
-
-
-def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tags: Tags | None = None) -> Test:
-    """Note who ran a test at the rig. Raises ApiError: 404 no such test; 412 it was said meanwhile."""
-    with context.store.write() as session:
-        row = require_found(session.get(Test, test_id), "test", test_id, LISTED)
-        locking.check(session, row, tags)
-        row.ran_by, now = other_than(row.requested_by, name), context.clock.utc()
-        locking.write(session, row, now, by, locking.RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
-    return row
 
 
 @router.post("/{test_id}/keep-plain", **describe_answer(TestOut))
 async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]:
     """End the fit of the last approved model's structure after a test: the plain model is offered."""
-    row = await asyncio.to_thread(find, context, test_id)
+    row = await asyncio.to_thread(tests.find, context, test_id)
     if not context.runner.lifecycle.keep_plain(test_id):
         detail = f"{test_id} is {row.state}. This can be ended only while the last session's structure is fitted."
         raise ApiError(409, "nothing-carried", "No structure is being carried over", detail)
@@ -109,7 +91,7 @@ async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]
 @router.post("/{test_id}/enough", **describe_answer(Extended))
 async def enough(context: Ctx, who: Tester, test_id: str) -> dict[str, Any]:
     """End a running adaptive, passive or moving test well, at the next pulse: what was measured is used."""
-    row = await asyncio.to_thread(find, context, test_id)
+    row = await asyncio.to_thread(tests.find, context, test_id)
     return (await context.runner.enough(row, who.name)).model_dump()
 
 
@@ -124,7 +106,7 @@ async def live(socket: WebSocket, test_id: str) -> None:
     await socket.accept()
     try:
         who = await asyncio.to_thread(_admit, socket, context)
-        row = await asyncio.to_thread(find, context, test_id)
+        row = await asyncio.to_thread(tests.find, context, test_id)
         await _watched(socket, context, row, by_key=who.participant is not None)
     except ApiError as error:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
@@ -176,7 +158,7 @@ async def _pump(
     history = queue.get_nowait()
     if history["test_id"] == row.id:
         await socket.send_json(history)
-    document = await asyncio.to_thread(lambda: context.runner.document(find(context, row.id)))
+    document = await asyncio.to_thread(lambda: context.runner.document(tests.find(context, row.id)))
     await socket.send_json(_test_message(document))
     while not document["done"]:
         message = await _next(queue) or {"type": "idle", "rig_connected": context.rig.connected}

@@ -8,10 +8,10 @@ from fastapi import APIRouter
 from fastapi.responses import Response
 
 from stimrig.api.models.trend import newest_changes
+from stimrig.api.services import participants
 from stimrig.api.web.dependencies import PROBLEM, Ctx, ModelReader
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import TrendOut
-from stimrig.api.web.routes import participants
 from stimrig.identify.records.cells import lines
 
 router = APIRouter(prefix="/v1/participants/{code}", tags=["trend"], responses=PROBLEM)

@@ -1,0 +1,226 @@
+"""The guided calibration: one short train for each step a person asks for; its result is the participant's profile."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import re
+import secrets
+import zlib
+from typing import Any
+
+from sqlalchemy import select
+from sqlalchemy.orm import Session
+
+from stimrig.api.errors import ApiError
+from stimrig.api.services import participants
+from stimrig.api.services.context import Context
+from stimrig.api.sessions import profiles
+from stimrig.api.sessions.playing import refuse_archived
+from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
+from stimrig.api.store import audit, locking
+from stimrig.api.store.locking import Tags
+from stimrig.api.store.tables import AuditEntry, Participant
+from stimrig.rig import messages, requests
+
+
+def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any], tags: Tags | None) -> str:
+    """The intent; the calibration's id."""
+    with context.store.write() as session:
+        version, now = locking.check(session, participants.within(session, code), tags), context.clock.utc()
+        stamp = now[:19].replace("-", "").replace(":", "")
+        identity = f"C{stamp}-{secrets.token_hex(3)}-{version}"
+        audit.write(session, now, by, "begin calibration", code, calibration=identity, **asked)
+    return identity
+
+
+def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
+    """How the calibration goes: what was asked for, and the participant's own current and torque where it was not.
+
+    Raises ApiError: 422 neither the request nor the participant says one of them.
+    """
+    asked = body.model_dump()
+    for name in ("current_ma", "max_torque_nm"):
+        asked[name] = profile.get(name) if asked[name] is None else asked[name]
+        if asked[name] is None:
+            raise ApiError(422, "no-limits", "The participant has no limits", f"Send {name}; {name} is not known yet.")
+    return asked
+
+
+async def begin(context: Context, code: str, body: CalibrationIn, by: str, tags: Tags | None = None) -> dict[str, Any]:
+    """Open a calibration: where it stands.
+
+    What is not asked for is the participant's own, so never wider. It is bound to the limits that it is begun with: the
+    participant's version ends its id, and so is kept by the rig, which may outlive this service.
+    """
+    async with context.limits_lock:
+        row = await asyncio.to_thread(participants.find, context, code)
+        refuse_archived(row)
+        context.runner.refuse_second()
+        asked = settings(body, row.profile)
+        identity = await asyncio.to_thread(_write_begin, context, by, code, asked, tags)
+        last = messages.Profile.model_validate(row.profile) if body.large_steps else None
+        await context.rig.ask(
+            requests.CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **asked)
+        )
+        return await standing(context, code)
+
+
+async def step(context: Context, code: str, body: StepIn, tags: Tags | None = None) -> dict[str, Any]:
+    """Play one train: where the calibration stands."""
+    async with context.limits_lock:  # of two presses on the same sight one plays
+        check_train(await sound(context, code), tags)
+        await context.rig.ask(requests.CalibrateStepRequest(**body.model_dump()))
+    return await standing(context, code)
+
+
+async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags | None = None) -> dict[str, Any]:
+    """Mark the last train's width as a threshold: where the calibration stands."""
+    async with context.limits_lock:  # no train comes between looking and marking
+        found = await sound(context, code)
+        check_train(found, tags)
+        await context.rig.ask(requests.CalibrateMarkRequest(**body.model_dump()))
+    width = {"pulse_width_us": found["pulse_width_us"]}
+    await asyncio.to_thread(context.store.note, context.clock, by, f"mark {body.threshold}", code, **width)
+    return await standing(context, code)
+
+
+def check_train(found: dict[str, Any], tags: Tags | None, any_train: bool = False) -> None:
+    """Refuse what was decided on another calibration, or, but with `any_train`, without knowing of the last train.
+
+    Raises ApiError: 412 it is another one, or another train was sent or is on its way.
+    """
+    check_calibration(found["calibration_id"], found["by"], tags)
+    if not any_train and (found["version"] not in locking.tags_of(tags) or found["playing"]):
+        raise another_train()
+
+
+def check_calibration(calibration_id: str, by: str, tags: Tags | None) -> None:
+    """Raise ApiError (412): the one that was decided on has ended, and somebody has begun another one."""
+    if calibration_id not in {tag.partition(".")[0] for tag in locking.tags_of(tags)}:
+        detail = (
+            f"{by} has begun another calibration since this page was shown. Nothing was done. Look at that one first."
+        )
+        raise ApiError(412, "changed-meanwhile", "This page is out of date", detail)
+
+
+def another_train() -> ApiError:
+    """412: another train was sent, or another width marked."""
+    detail = (
+        "Another train was sent after this page was shown, or another mark was set. Nothing was done now. Look at the "
+        "last train and the marks first."
+    )
+    return ApiError(412, "changed-meanwhile", "This page is out of date", detail)
+
+
+async def _waiting(context: Context, code: str) -> messages.Calibrated | None:
+    """A calibration of this participant that is closed, and was not stored."""
+    status = await context.rig.fresh_status()
+    waits = status.calibrated
+    return waits if waits is not None and waits.participant == code and status.calibration is None else None
+
+
+async def standing(context: Context, code: str) -> dict[str, Any]:
+    """Where the participant's calibration stands. Raises ApiError: 404 none is open for this participant."""
+    status: messages.Status = await context.rig.fresh_status()
+    found = status.calibration
+    if found is None or found.participant != code:
+        ended = f" The rig is {status.state}: {status.reason}." if status.state == "latched" else ""
+        detail = f"No calibration of {code} is open.{ended} POST /v1/participants/{code}/calibration begins one."
+        error = ApiError(404, "no-calibration", "No calibration is open", detail)
+        if (waits := status.calibrated) is not None and waits.participant == code:
+            error.detail = "It was finished, and waits to be stored. Finish it again, or discard it, with this ETag."
+            error.headers["ETag"] = f'"{waits.calibration_id}.0"'
+        raise error
+    return {
+        **found.model_dump(),
+        "rig_state": status.state,
+        "playing": status.state != "calibrating",
+        "outdated": await asyncio.to_thread(outdated, context, code, found),
+        "version": f"{found.calibration_id}.{len(found.trains)}.{zlib.crc32(repr(found.marks_us).encode()):08x}",
+    }
+
+
+def outdated(context: Context, code: str, found: messages.CalibrationStatus) -> str:
+    """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
+    with context.store.read() as session:
+        row = participants.within(session, code)
+        return _outdated_words(row) if _changed(session, row, found.calibration_id) else ""
+
+
+def _outdated_words(row: Participant) -> str:
+    now = ", ".join(f"{row.profile[name]:g} {limit.unit}" for name, limit in profiles.LIMITS.items())
+    return (
+        f"{row.code} now has other limits ({now}) than when this calibration was begun. It sends no further train and "
+        "gives no profile. Discard it and begin anew."
+    )
+
+
+def _changed(session: Session, row: Participant, calibration_id: str) -> bool:
+    """Whether limits, site or archive are others than when this calibration was begun."""
+    begun = re.fullmatch(r"C\w+-[0-9a-f]{6}-(\d{1,18})", calibration_id, re.ASCII)
+    if begun is None or not locking.is_known(session, int(begun[1])):
+        return True  # it began on other data than this service has
+    return bool(locking.since(session, int(begun[1]), locking.settings_of(row.code)))
+
+
+async def sound(context: Context, code: str) -> dict[str, Any]:
+    """Where the calibration stands, as long as it may go on.
+
+    Raises ApiError: 404 none is open for this participant; 409 the participant's limits were changed since it was
+    begun.
+    """
+    found = await standing(context, code)
+    if found["outdated"]:
+        raise outdated_error(found["outdated"])
+    return found
+
+
+def outdated_error(detail: str) -> ApiError:
+    """409: the calibration can only be discarded."""
+    return ApiError(409, "changed-meanwhile", "This calibration goes no further", detail)
+
+
+def _store(
+    context: Context, code: str, result: messages.CalibrationResult, by: str, identity: str
+) -> dict[str, Any] | None:  # fmt: skip
+    """What was found is the profile, if nothing of that was changed since; what a calibration does not look for (the
+    rest between tests) stays. Storing it again changes nothing."""
+    found = result.profile.model_dump() if result.profile else None
+    told = {"calibration": identity, "recordings": result.recordings}
+    with context.store.write() as session:
+        row, now = participants.within(session, code), context.clock.utc()
+        if found is None:
+            audit.write(session, now, by, "discard calibration", code, **told)
+        elif not _stored(session, code, identity):
+            if _changed(session, row, identity):
+                raise outdated_error(_outdated_words(row))
+            row.profile = found | {name: value for name, value in row.profile.items() if found.get(name) is None}
+            locking.write(session, row, now, by, "finish calibration", code, profile=row.profile, **told)
+        return None if found is None else dict(row.profile)
+
+
+def _stored(session: Session, code: str, identity: str) -> bool:
+    same = AuditEntry.detail["calibration"].as_string() == identity
+    own = select(AuditEntry.seq).where(AuditEntry.subject == code, AuditEntry.action == "finish calibration", same)
+    return session.scalar(own) is not None
+
+
+async def close(context: Context, code: str, by: str, tags: Tags | None, discard: bool = False) -> dict[str, Any]:
+    """Close a calibration. The rig keeps the result until it is stored here: where that fails, finish it again."""
+    async with context.limits_lock:
+        waits = await _waiting(context, code)
+        if waits is None:
+            found = await (standing if discard else sound)(context, code)
+            check_train(found, tags, any_train=discard)
+            identity = str(found["calibration_id"])
+        else:
+            identity = waits.calibration_id
+            check_calibration(identity, waits.by, tags)
+        request = requests.CalibrateFinishRequest(by=by, discard=discard, calibration_id=identity)
+        result = await context.rig.ask_for(messages.CalibrationResult, request)
+        profile = await asyncio.to_thread(_store, context, code, result, by, identity)
+        with contextlib.suppress(ApiError):  # it is stored, whatever the rig says now
+            await context.rig.ask(requests.CalibrateStoredRequest(calibration_id=identity))
+            await context.rig.fresh_status()
+    return {"profile": profile, "recordings": result.recordings}

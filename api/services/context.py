@@ -1,0 +1,159 @@
+"""The parts of the service, made once; services and routes get them as one context."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import logging
+import shutil
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+from sqlalchemy.exc import SQLAlchemyError
+
+from stimrig.api import owner_only
+from stimrig.api.clock import Clock, set_zone
+from stimrig.api.jobs.pool import Pool
+from stimrig.api.jobs.registry import Jobs
+from stimrig.api.jobs.worker import Worker
+from stimrig.api.models.analyses import Analyses
+from stimrig.api.models.registry import Versions
+from stimrig.api.models.tracked import TrackedVersions
+from stimrig.api.models.trend import Trend
+from stimrig.api.people.accounts import People
+from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock
+from stimrig.api.people.pace import Guesses
+from stimrig.api.sessions.notes import Notes
+from stimrig.api.sessions.questions import Questions
+from stimrig.api.sessions.rig_client import RigClient
+from stimrig.api.sessions.runner import Runner
+from stimrig.api.sessions.stops import StopLog, StopRights
+from stimrig.api.sessions.trials import Trials
+from stimrig.api.settings import Settings
+from stimrig.api.store import Store, uploads
+from stimrig.api.store.service_lock import KEEP_S, ServiceLock
+
+log = logging.getLogger("stimrig.api")
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+FORGIVEN = (SQLAlchemyError, OSError)
+"""Errors of regular work that are logged; the work is done again at the next interval."""
+
+
+class Context:
+    """Everything a route of the service may need.
+
+    `worker`: makes a worker process. `lock`: held; let go at the end.
+    """
+
+    def __init__(self, settings: Settings, clock: Clock, worker: Callable[..., Worker], lock: ServiceLock) -> None:
+        make_folders(settings)
+        if settings.time_zone:
+            set_zone(settings.time_zone)
+        store = Store(settings.database)
+        self.clock, self.store, self.started_s = clock, store, time.monotonic()
+        self.settings, self.lock = settings, lock
+        guesses = self.guesses = Guesses(clock)
+        idle = IdleLock(store, clock, settings.idle_lock_min)
+        self.auth = Auth(store, clock, guesses, idle, settings.session_hours)
+        self.drawn_token = self.auth.first_administrator(
+            settings.admin_token.get_secret_value() if settings.admin_token else None
+        )
+        self.people = People(store, clock, self.auth, guesses)
+        self.versions = Versions(store, clock)
+        rig = self.rig = RigClient(settings.rig_socket, clock)
+        pool = self.pool = Pool(settings.workers, worker, background=True)
+        self.analyses = Analyses(store, clock, pool, self.versions, settings)
+        self.tracked = TrackedVersions(store, clock, self.versions)
+        self.limits_lock = asyncio.Lock()
+        """Held by a change of limits, and by a calibration or test while it is sent by them: once a change is answered,
+        nothing begins with the limits of before."""
+        self.keys_lock = asyncio.Lock()
+        """Trials of controllers' keys are counted and begun one after the other."""
+        # processes of their own: they remember a test or a trial, and nothing else keeps them busy
+        adviser, tracker = Pool(1, worker), Pool(1, worker)
+        trials = Trials(rig, store, clock, self.tracked, tracker)
+        self.runner = Runner(
+            store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
+            self.limits_lock,
+        )  # fmt: skip
+        self.trend, self.jobs = Trend(store), Jobs(pool)
+        self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
+        stop_key = store.secret("stop-right")
+        self.stop_rights = StopRights(stop_key, clock)
+        self._tasks: list[asyncio.Task[None]] = []
+
+    async def open(self) -> None:
+        """Connect, warm the workers, take up what a restart left open; begin the regular work."""
+        await asyncio.to_thread(uploads.settle, self.settings.recordings_dir, self.store)
+        self.rig.start()
+        self.pool.warm()
+        for _ in range(20):  # a rig that is there answers within milliseconds
+            if self.rig.connected or self.rig.path is None:
+                break
+            await asyncio.sleep(0.05)
+        await self.runner.resume()
+        regular = ((FLUSH_S, self.auth.idle.flush), (KEEP_S, self.lock.keep))
+        self._tasks = [asyncio.create_task(_repeat(every_s, work)) for every_s, work in regular]
+
+    async def close(self) -> None:
+        """Let everything go."""
+        for part in (self.runner, self.jobs, self.pool, self.rig):
+            await part.close()
+        for task in self._tasks:
+            task.cancel()
+        with contextlib.suppress(SQLAlchemyError):
+            await asyncio.to_thread(self.auth.idle.flush)
+        self.people.close()
+        self.auth.close()
+        self.store.close()
+        self.lock.release()
+
+
+async def _repeat(every_s: float, work: Callable[[], object]) -> None:
+    """Do the work in a thread, at this interval, until it is cancelled."""
+    while True:
+        await asyncio.sleep(every_s)
+        try:
+            await asyncio.to_thread(work)
+        except FORGIVEN:
+            log.exception("regular work failed; it is done again at the next interval")
+
+
+def build(settings: Settings, worker: Callable[..., Worker] = Worker, lock: ServiceLock | None = None) -> Context:
+    """Make the parts; `lock` is held already, or taken now.
+
+    Raises ApiError: the database cannot be opened. HeldError: another service holds the data folder or the database.
+    """
+    lock = lock or ServiceLock(settings)
+    try:
+        return Context(settings, Clock(), worker, lock)
+    except BaseException:
+        lock.release()
+        raise
+
+
+def make_folders(settings: Settings) -> None:
+    """Folders for their owner only; the rig may share that of recordings with a group."""
+    owner_only.close(owner_only.folder(settings.recordings_dir), 0o770)
+    owner_only.close(owner_only.folder(settings.recordings_dir / uploads.PARTS), 0o700)
+    owner_only.close(settings.logs_dir, 0o700)
+    shutil.rmtree(settings.exports_dir, ignore_errors=True)
+    owner_only.folder(settings.exports_dir)
+
+
+def under_limits_lock(
+    change: Callable[Concatenate[Context, P], T],
+) -> Callable[Concatenate[Context, P], Coroutine[Any, Any, T]]:
+    """Do a change in a thread, under the lock of the limits."""
+
+    @functools.wraps(change)
+    async def changed(context: Context, /, *given: P.args, **more: P.kwargs) -> T:
+        async with context.limits_lock:
+            return await asyncio.to_thread(change, context, *given, **more)
+
+    return changed

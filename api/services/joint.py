@@ -1,0 +1,125 @@
+"""A joint that moves: the angle sensor and its calibration, and what is open of the guided tests."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, Field, StrictBool, StringConstraints
+
+from stimrig.api.errors import ApiError
+from stimrig.api.jobs.job import FIT_TOGETHER, Job
+from stimrig.api.models import together
+from stimrig.api.services.context import Context
+from stimrig.api.sessions import profiles
+from stimrig.api.sessions.kinds import no_sensor
+from stimrig.api.sessions.requests import AngleRad, Body
+from stimrig.api.store import locking
+from stimrig.api.store.locking import Tags
+from stimrig.api.store.tables import Participant
+from stimrig.rig.messages import AngleCalibration, AngleStatus, Status
+from stimrig.rig.requests import AnglePoseRequest
+
+NOTHING_OPEN: dict[str, Any] = {
+    "targets": [], "next_rad": None, "tests": {"passive": None, "moving": None}, "doses": None, "known": False,
+    "share_of_paper": None,
+}  # fmt: skip
+
+
+class PoseIn(Body):
+    """What a goniometer shows while the joint is held still."""
+
+    angle_rad: AngleRad = Field(description="elbow: 0 is straight, flexion is positive, rad")
+    first: StrictBool = Field(False, description="begin anew with this one: a first pose that waits is forgotten")
+
+
+def sensor(context: Context) -> AngleStatus:
+    """The rig's angle sensor; 409 where it has none."""
+    status = context.rig.status
+    if status is None or not status.angle.present:
+        raise no_sensor()
+    return status.angle
+
+
+async def overview_of(context: Context, row: Participant) -> dict[str, Any]:
+    """What is open of today's guided tests, and the sensor; nothing of tests where there is no sensor or no range."""
+    status = context.rig.status
+    told = (status.angle if status is not None else AngleStatus()).model_dump()
+    if not told["present"] or profiles.range_of(row.profile) is None:
+        return {"sensor": told, "range_rad": row.profile.get(profiles.RANGE), **NOTHING_OPEN}
+    return {"sensor": told, **await context.runner.joint_overview(row)}
+
+
+def pose_version(context: Context) -> int:
+    """Return the version of the sensor's calibration."""
+    with context.store.read() as session:
+        return locking.pose_version(session)
+
+
+async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags | None = None) -> tuple[Status, int]:
+    """Tell the rig a pose of the sensor: the rig's state, and the version that the sensor's calibration has now.
+
+    The intent is written before: of one whose answer is lost nobody knows whether it was taken.
+
+    Raises ApiError: 409 no sensor, or the rig refuses; 412 another pose was told meanwhile.
+    """
+    sensor(context)
+    pose = {"angle_rad": round(body.angle_rad, 4)}
+
+    def write_intent() -> int:
+        with context.store.write() as session:
+            locking.check_poses(session, tags)
+            return locking.write_pose(session, context.clock.utc(), by, locking.POSES[0], **pose)
+
+    def write_calibration(done: AngleCalibration) -> int:
+        with context.store.write() as session:
+            return locking.write_pose(
+                session, context.clock.utc(), by, locking.POSES[1], **done.model_dump(exclude={"by"})
+            )
+
+    async with context.limits_lock:  # no other pose comes between looking and taking it
+        before = context.rig.status.angle.calibration if context.rig.status else None
+        version = await asyncio.to_thread(write_intent)
+        try:
+            request = AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first)
+            status = await context.rig.ask_for(Status, request)
+        except ApiError as error:
+            await asyncio.to_thread(
+                context.store.note, context.clock, by, "pose not taken", "rig", **pose, why=error.detail
+            )
+            raise
+        context.rig.status = status
+        if (done := status.angle.calibration) is not None and done != before:
+            version = await asyncio.to_thread(write_calibration, done)
+    return status, version
+
+
+def _once(recordings: list[str]) -> list[str]:
+    if len(set(recordings)) != len(recordings):
+        raise ValueError("a recording is named twice")
+    return recordings
+
+
+RecordingId = Annotated[str, StringConstraints(min_length=1, max_length=80)]
+
+
+EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}(:[a-z0-9_|]{1,100})?$")]
+
+
+class TogetherIn(Body):
+    """Recordings of one participant that are to be fitted as one."""
+
+    recordings: Annotated[list[RecordingId], Field(min_length=1, max_length=together.MOST), AfterValidator(_once)]
+    effects: Annotated[list[EffectId], Field(max_length=20)] = Field(
+        default=list(together.JOINT_EFFECTS), description="of the model; needs the joint's angle in each recording"
+    )
+
+
+def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
+    """Fit them while the person looks on."""
+
+    async def work(job: Job) -> str:
+        model = await together.fit(context.analyses, code, body.recordings, body.effects, by, job.follow)
+        return f"/v1/models/{model.id}"
+
+    return context.jobs.start(FIT_TOGETHER, code, by, work)

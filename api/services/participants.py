@@ -1,0 +1,279 @@
+"""Participants: codes and a profile of limits, no names; their site and the archive; the list of all.
+
+Models, approvals and keys belong to one site. In the archive participants who do not come any more are out of the way,
+and nothing of theirs is deleted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from sqlalchemy import func, select
+from sqlalchemy.orm import Session
+
+from stimrig.api.errors import ApiError, Change, require_confirmation, require_found
+from stimrig.api.models.places import Site, in_words, site_of
+from stimrig.api.models.registry import Versions
+from stimrig.api.services.context import Context, under_limits_lock
+from stimrig.api.sessions import profiles
+from stimrig.api.sessions.requests import MuscleIn, ParticipantIn
+from stimrig.api.store import Store, locking
+from stimrig.api.store.locking import Tags
+from stimrig.api.store.tables import Approval, Model, Participant, Test
+from stimrig.rig.messages import Status
+
+
+def create(context: Context, body: ParticipantIn, by: str) -> Participant:
+    """A new participant; 409 where the code is taken, 422 where this rig would refuse its limits."""
+    now = context.clock.utc()
+    profile = body.profile.model_dump(exclude_none=True)
+    if "profile" in body.model_fields_set:
+        check_asked(context, profile, profile)
+        profile = add_calibration_time(context, profile)
+    with context.store.write() as session:
+        if session.get(Participant, body.code) is not None:
+            raise ApiError(409, "exists", "The code is taken", f"Participant {body.code!r} exists. Take another code.")
+        row = Participant(code=body.code, created_utc=now, created_by=by)
+        row.profile = profile
+        row.side, row.muscle, row.placement = body.side, body.muscle, body.placement
+        site = {"side": row.side, "muscle": row.muscle, "placement": row.placement}
+        locking.write(session, row, now, by, "create participant", body.code, profile=row.profile, **site)
+        session.add(row)
+    return row
+
+
+def find(context: Context, code: str) -> Participant:
+    """A participant by its code; 404 where there is none."""
+    return require_found(context.store.get(Participant, code), "participant", code, "POST /v1/participants makes one.")
+
+
+def within(session: Session, code: str) -> Participant:
+    """The same in a transaction that changes it."""
+    return require_found(session.get(Participant, code), "participant", code)
+
+
+@under_limits_lock
+def change_profile(
+    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False, confirm: str = "",
+    ask: bool = False, tags: Tags | None = None,
+) -> Participant:  # fmt: skip
+    """Change limits of a participant: those that are asked for; the rest stays.
+
+    Raises ApiError: 404 no such participant; 412 changed meanwhile; 422 beyond what the rig takes, or the first ones
+    are not whole; 409 the calibration would be lost, and that was not allowed.
+    """
+    with context.store.write() as session:
+        row = within(session, code)
+        locking.check(session, row, tags)
+        before = row.profile
+        check_asked(context, before, asked)
+        profile, voids = profiles.changed(before, add_calibration_time(context, asked))
+        confirm_profile(context, code, before, profile, "" if may_void else voids, confirm, ask)
+        if profile != before:
+            row.profile = profile
+            now = context.clock.utc()
+            locking.write(session, row, now, by, "set profile", code, profile=profile, voids=voids)
+    return row
+
+
+def confirm_profile(
+    context: Context, code: str, before: dict[str, Any], profile: dict[str, Any], voids: str, confirm: str, ask: bool
+) -> None:
+    """Ask before limits that void the calibration; a person, with `ask`, also before a jump."""
+    warnings = profiles.jumps(before, profile) if ask else []
+    if voids:
+        required = context.rig.status is None or context.rig.status.require_calibration is not False
+        then = " Until the participant is calibrated anew, no test starts." if required else ""
+        warnings = [*warnings, f"The calibration is lost with it: {voids}.{then}"]
+    if not warnings:
+        return
+    changes = [
+        Change(
+            limit.words.capitalize(),
+            f"{profile[name]:g} {limit.unit}",
+            f"{before.get(name, profile[name]):g} {limit.unit}",
+        )
+        for name, limit in profiles.LIMITS.items()
+    ]
+    button = f"Yes, set {', '.join(change.now for change in changes)}"
+    if (range_rad := profiles.range_of(profile)) is not None:
+        was_rad = profiles.range_of(before)
+        was = profiles.range_words(was_rad) if was_rad else ""
+        changes.append(Change("Joint angles", profiles.range_words(range_rad), was))
+    refusal = "voids-calibration" if voids else "confirm"
+    require_confirmation(confirm, f"Set these limits for {code}?", button, changes, warnings, refusal)
+
+
+def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]) -> None:
+    """Refuse first limits that are not whole, and what this rig would refuse."""
+    if lacking := [name for name in profiles.LIMITS if {**profile, **asked}.get(name) is None]:
+        raise ApiError(422, "invalid-input", "Some limits are missing", f"Send {', '.join(lacking)}, too.")
+    status = context.rig.status
+    found = profiles.outside(asked, profile, status.limits if status else {})
+    if found := found | profiles.range_outside(asked, status.angle.range_rad if status else None):
+        errors = [{"field": name, "detail": words} for name, words in found.items()]
+        detail = "; ".join(f"{name}: {words}" for name, words in found.items()) + ". Nothing was changed."
+        raise ApiError(422, "invalid-input", "These limits cannot be used", detail, errors=errors)
+
+
+def add_calibration_time(context: Context, asked: dict[str, Any]) -> dict[str, Any]:
+    """What is asked for; a range of joint angles holds as long as the angle sensor's calibration of now."""
+    if asked.get(profiles.RANGE) is None:
+        return asked
+    return {**asked, profiles.SET_AT: calibrated_utc(context.rig.status)}
+
+
+def calibrated_utc(status: Status | None) -> str | None:
+    """When the rig's angle sensor was calibrated; None: by nobody."""
+    calibration = status.angle.calibration if status else None
+    return calibration.set_at_utc if calibration else None
+
+
+def meanwhile(context: Context, code: str) -> str:
+    """What a change of this participant's limits means for what goes on; empty where nothing does."""
+    current, status = context.runner.current, context.rig.status
+    if current is not None and current.participant == code:
+        return (
+            "The test that runs keeps the limits that it was begun with; changed ones hold from the next test on. "
+            "Less current now: press stop."
+        )
+    if status is not None and status.calibration is not None and status.calibration.participant == code:
+        return (
+            "A calibration is open. Once limits are changed it sends no further train and gives no profile: discard it "
+            "and begin anew."
+        )
+    return ""
+
+
+def loses_calibration(row: Participant, body: MuscleIn) -> bool:
+    """Whether a calibration is lost: it was found at another site than the new one."""
+    found = any(row.profile.get(name) is not None for name in profiles.FOUND)
+    pairs = zip(site_of(row), site_in(body), strict=True)
+    return found and any(before is not None and before != after for before, after in pairs)
+
+
+def site_in(body: MuscleIn) -> Site:
+    """The site that is asked for."""
+    return body.side, body.muscle, body.placement
+
+
+@under_limits_lock
+def change_site(
+    context: Context, code: str, body: MuscleIn, by: str, voids: bool = False, confirm: str = "", ask: bool = False,
+    tags: Tags | None = None,
+) -> Participant:  # fmt: skip
+    """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
+
+    Raises ApiError: 404 no such participant; 409 a test or calibration of it is under way, or the calibration would be
+    lost and that was not allowed.
+    """
+    refuse_busy(context, code)
+    now, has_model = context.clock.utc(), ask and context.versions.approved(code) is not None
+    with context.store.write() as session:
+        row = within(session, code)
+        locking.check(session, row, tags)
+        lost, here = loses_calibration(row, body), site_of(row)
+        before, after = in_words(here), in_words(site_in(body))
+        warnings = []
+        if lost and not voids:
+            warnings.append(f"The calibration is lost with it: its thresholds were found at {before}.")
+        if ask and here != site_in(body) and has_model:
+            warnings.append(f"The approved model and its keys are of {before}. Here there is none.")
+        if warnings:
+            title, refusal = f"Change side and muscle of {code}?", "voids-calibration" if lost else "confirm"
+            changes = [Change("Side and muscle", after, before)]
+            require_confirmation(confirm, title, f"Yes, it is {after}", changes, warnings, refusal)
+        if here != site_in(body):
+            if lost:
+                row.profile = {**row.profile, **dict.fromkeys(profiles.FOUND)}
+            row.side, row.muscle, row.placement = site_in(body)
+            locking.write(session, row, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
+    return row
+
+
+def refuse_busy(context: Context, code: str) -> None:
+    """409 while the rig works with this participant."""
+    current, status = context.runner.current, context.rig.status
+    calibration = status.calibration if status else None
+    if current is not None and current.participant == code:
+        detail = f"{current.test_id} of {code} runs. Wait for its end, or stop it; then do it again."
+        raise ApiError(409, "participant-busy", "A test of this participant runs", detail)
+    if calibration is not None and calibration.participant == code:
+        detail = f"A calibration of {code} is open. Finish or discard it; then do it again."
+        raise ApiError(409, "participant-busy", "A calibration of this participant is open", detail)
+
+
+@under_limits_lock
+def put_archived(context: Context, code: str, archived: bool, by: str, tags: Tags | None = None) -> Participant:
+    """Put a participant into the archive, or take it out; doing it again changes nothing. Raises as `change_site`."""
+    if archived:
+        refuse_busy(context, code)
+    now = context.clock.utc()
+    with context.store.write() as session:
+        row = within(session, code)
+        locking.check(session, row, tags)
+        if archived != (row.archived_utc is not None):
+            row.archived_utc = now if archived else None
+            locking.write(session, row, now, by, "archive" if archived else "unarchive", code)
+    return row
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A participant in the list: its last test, its newest model, and what the controller gets."""
+
+    participant: Participant
+    last: Any
+    newest: dict[str, Any] | None
+    approved: Approval | None
+
+
+def matching(store: Store, q: str = "", archived: bool | None = None) -> list[tuple[Participant, str]]:
+    """Participants whose code holds `q`, each with the time at which it was last tested, or made.
+
+    `store`: holds them. `q`: a part of the code, in any case; empty: all. `archived`: only those that are archived, or
+    that are not.
+    """
+    last = select(Test.participant, func.max(Test.requested_utc).label("utc")).group_by(Test.participant).subquery()
+    newest = func.coalesce(last.c.utc, Participant.created_utc)
+    query = select(Participant, newest).outerjoin(last, last.c.participant == Participant.code)
+    if q.strip():
+        query = query.where(Participant.code.icontains(q.strip(), autoescape=True))
+    if archived is not None:
+        query = query.where(Participant.archived_utc.is_not(None) if archived else Participant.archived_utc.is_(None))
+    with store.read() as session:
+        rows = session.execute(query.order_by(newest.desc(), Participant.code)).all()
+    return [(row[0], row[1]) for row in rows]
+
+
+def participant_counts(store: Store) -> dict[str, int]:
+    """How many participants there are, and how many of them are archived."""
+    query = select(func.count(), func.count(Participant.archived_utc)).select_from(Participant)
+    with store.read() as session:
+        total, archived = session.execute(query).one()
+    return {"all": total, "archived": archived}
+
+
+def list_rows(store: Store, versions: Versions, participants: list[Participant]) -> list[Listed]:
+    """What the list says of each; no plans of tests and no models are read for it."""
+    codes = [row.code for row in participants]
+    tests = _newest_rows(store, Test, Test.requested_utc, codes, Test.state, Test.requested_utc)
+    models = _newest_rows(store, Model, Model.created_utc, codes, Model.fit)
+    approved = versions.all_approved(codes)
+    rows = []
+    for row in participants:
+        model = models.get(row.code)
+        newest = {"id": model.id, **model.fit} if model else None
+        rows.append(Listed(row, tests.get(row.code), newest, approved.get(row.code)))
+    return rows
+
+
+def _newest_rows(store: Store, table: Any, at_utc: Any, codes: list[str], *columns: Any) -> dict[str, Any]:
+    """The newest row of each participant in a table, by its time: these columns of it."""
+    newest = select(table.participant, func.max(at_utc).label("utc")).where(table.participant.in_(codes))
+    last = newest.group_by(table.participant).subquery()
+    query = select(table.id, table.participant, *columns)
+    query = query.join(last, (table.participant == last.c.participant) & (at_utc == last.c.utc))
+    with store.read() as session:
+        return {row.participant: row for row in session.execute(query)}

@@ -1,0 +1,28 @@
+"""Tests: finding one, and who ran it."""
+
+from __future__ import annotations
+
+from stimrig.api.errors import require_found
+from stimrig.api.services.context import Context
+from stimrig.api.sessions.playing import other_than
+from stimrig.api.store import locking
+from stimrig.api.store.locking import Tags
+from stimrig.api.store.tables import Test
+
+
+def find(context: Context, test_id: str) -> Test:
+    """A test by its id; 404 where there is none."""
+    return require_found(context.store.get(Test, test_id), "test", test_id, LISTED)
+
+
+def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tags: Tags | None = None) -> Test:
+    """Note who ran a test at the rig. Raises ApiError: 404 no such test; 412 it was said meanwhile."""
+    with context.store.write() as session:
+        row = require_found(session.get(Test, test_id), "test", test_id, LISTED)
+        locking.check(session, row, tags)
+        row.ran_by, now = other_than(row.requested_by, name), context.clock.utc()
+        locking.write(session, row, now, by, locking.RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
+    return row
+
+
+LISTED = "GET /v1/tests lists them."
