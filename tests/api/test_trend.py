@@ -5,15 +5,18 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import re
 from dataclasses import replace
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.api.charts.trend_charts import WIDE_PX
+from stimrig.api.charts.figure import Axis
+from stimrig.api.charts.trend_charts import WIDE_PX, Point, history
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
 from tests.api.conftest import Service, shared_service
@@ -57,17 +60,6 @@ def test_figures_carry_deviations_that_agree_with_what_pages_show() -> None:
         assert 0 < figure["sd"] < 0.1 * max(abs(figure["value"]), 0.05), name
 
 
-def test_deviations_are_those_of_repeated_records() -> None:
-    """Of twelve records of one muscle the figures scatter as the models say, within what twelve can tell."""
-    found = [identify.fit(sessions.record(Planned(Patient(), 0.0), seed)).figures() for seed in range(12)]
-    for name in ("plateau_nm", "time_constant_s", "damping", "threshold_us"):
-        values = [figures[name]["value"] for figures in found]
-        middle = sum(values) / len(values)
-        scatter = (sum((value - middle) ** 2 for value in values) / (len(values) - 1)) ** 0.5
-        said = sum(figures[name]["sd"] for figures in found) / len(found)
-        assert 0.4 < scatter / said < 2.2, (name, scatter, said)
-
-
 def test_one_point_a_session_approved_first_and_the_newest_version_else(service: Service, client: httpx.Client) -> None:
     ids = made(service, "ONE", three())
     context = service.context
@@ -85,26 +77,25 @@ def test_one_point_a_session_approved_first_and_the_newest_version_else(service:
     assert trend(client, "ONE")["sessions"][2]["model_id"] == "a-second-version"
 
 
-def test_what_changed_is_told_against_the_last_approved_session(service: Service, client: httpx.Client) -> None:
-    made(service, "SAME", three())
-    same = trend(client, "SAME")["changes"]
-    assert same["differences"] == [] and same["doubts"] == []
-    assert same["sentences"] == ["Nothing changed beyond its uncertainty since 03 Aug 2026."]
-    made(service, "CHANGED", three(patient=WEAKER))
-    found = trend(client, "CHANGED")["changes"]
-    assert [one["figure"] for one in found["differences"]] == ["plateau_nm"]
-    assert found["sentences"] == ["Plateau 18\u00a0% lower than on 03 Aug 2026, more than twice its uncertainty."]
-
-
-def test_a_plateau_at_another_current_is_no_comparison(service: Service, client: httpx.Client) -> None:
-    stronger = replace(Patient(), gain=1.4 * Patient().gain, time_constant_s=0.7)
-    made(service, "CURRENT", three(patient=stronger, current_ma=25.0, notes={"electrodes": "moved"}))
-    found = trend(client, "CURRENT")["changes"]
-    assert [one["figure"] for one in found["differences"]] == ["time_constant_s"]
-    assert found["doubts"] == [
-        "The current was 20.0\u00a0mA, now it is 25.0\u00a0mA: threshold and plateau are not compared.",
-        "The notes on electrodes differ: “–”, then “moved”.",
-    ]
+@pytest.mark.parametrize(
+    ("code", "last", "changed", "sentences", "doubts"),
+    [
+        ("SAME", {}, [], ["Nothing changed beyond its uncertainty since 03 Aug 2026."], []),
+        ("CHANGED", {"patient": WEAKER}, ["plateau_nm"],
+         ["Plateau 18\u00a0% lower than on 03 Aug 2026, more than twice its uncertainty."], []),
+        ("CURRENT", {"patient": replace(Patient(), gain=1.4 * Patient().gain, time_constant_s=0.7),
+                     "current_ma": 25.0, "notes": {"electrodes": "moved"}}, ["time_constant_s"], None,
+         ["The current was 20.0\u00a0mA, now it is 25.0\u00a0mA: threshold and plateau are not compared.",
+          "The notes on electrodes differ: “–”, then “moved”."]),
+    ],
+)  # fmt: skip
+def test_what_changed_is_said_against_the_last_approved_session(
+    service: Service, client: httpx.Client, code: str, last: Any, changed: list, sentences: list | None, doubts: list
+) -> None:
+    made(service, code, three(**last))
+    found = trend(client, code)["changes"]
+    assert [change["figure"] for change in found["differences"]] == changed and found["doubts"] == doubts
+    assert sentences is None or found["sentences"] == sentences
 
 
 def test_other_effects_are_said_and_only_large_differences_told() -> None:
@@ -118,13 +109,6 @@ def test_other_effects_are_said_and_only_large_differences_told() -> None:
     assert doubt.startswith("The models' effects differ (none, then fatigue):")
     again = replace(other, structure=("fatigue:two_pools",))
     assert changes.doubt_sentences(other, again)[0].startswith("The models describe fatigue in different ways:")
-
-
-def test_a_dose_is_told_in_one_unit_and_says_what_it_counts(client: httpx.Client, days: list[str]) -> None:
-    assert changes.dose_words(12_345.6) == "12.35\u00a0mC" and changes.dose_words(None) == "–"
-    page = compared(client, days[:2])
-    assert "Dose of the day" in page and "behind a difference that of both values together" in page
-    assert "over all pulses of that day&#39;s tests (1), stopped ones, too" in page
 
 
 def test_the_table_has_units_times_and_no_formulas(service: Service, client: httpx.Client) -> None:
@@ -164,6 +148,22 @@ def test_nobody_and_no_session(service: Service, client: httpx.Client) -> None:
 def test_a_figure_shows_no_digits_that_nobody_knows(value: float, uncertainty: float | None, words: str) -> None:
     name = changes.name_of("fatigue.depth")
     assert changes.uncertain_words(value, uncertainty, name) == words
+    assert changes.dose_words(12_345.6) == "12.35\u00a0mC" and changes.dose_words(None) == "–"
+
+
+def test_a_panel_breaks_its_line_at_another_current_and_marks_what_is_noted() -> None:
+    points = [Point(float(k), value, half, k != 1, k == 2, "", current_ma)
+              for k, (value, half, current_ma) in enumerate(
+                  [(1.0, 0.1, 20.0), (1.1, 0.1, 20.0), (None, None, 20.0), (1.2, 0.1, 20.0), (2.0, 9.0, 25.0)])
+              ]  # fmt: skip
+    figure = history(points, "N·m", Axis("", limits=(0.0, 4.0)), levels=[1.5, 99.0], breaks=True)
+    line, _bars, approved, hollow, flags = figure.curves
+    joined = [None if math.isnan(value) else value for value in line.y if value is not None]
+    assert joined == [None, 1.0, 1.1, None, 1.2, None, 2.0] and hollow.hollow and hollow.x == [1.0]
+    assert flags.x == [2.0] and len(approved.x) == 4 and [rule.at for rule in figure.rules] == [1.5]
+    low, high = figure.panels[0].limits or (0.0, 0.0)
+    assert low > -1.0 and high < 4.0, "one wide band does not dwarf the values"
+    assert np.isnan(figure.bands[0].lower).sum() == 3
 
 
 # ---- side by side, and what a model page says of the last approved session -------------------------------------------
@@ -201,21 +201,16 @@ def test_six_models_with_their_differences_to_the_oldest(client: httpx.Client, d
     assert found[2][1].startswith("▼ −1.2") and " ± 0.2" in found[2][1]
     assert found[3][1] == "" and "threshold and plateau are not compared" in page  # at another current
     assert cells(page, "Time constant")[3][1] != ""
+    assert "Dose of the day" in page and "over all pulses of that day&#39;s tests (1), stopped ones, too" in page
+    other = cells(compared(client, [days[0], days[2]], reference=days[2]), "Plateau")
+    assert other[1][1] == "" and other[0][1].startswith("▲ +1.2"), "another one is the reference"
     assert page.count('class="sample"') == 6 and len(set(re.findall(r'stroke="(#\w+|var[^"]+)"', page))) >= 6
 
 
-def test_another_one_is_the_reference(client: httpx.Client, days: list[str]) -> None:
-    page = compared(client, [days[0], days[2]], reference=days[2])
-    found = cells(page, "Plateau")
-    assert found[1][1] == "" and found[0][1].startswith("▲ +1.2")
-
-
-@pytest.mark.parametrize("count", [1, 7])
-def test_too_few_and_too_many(client: httpx.Client, days: list[str], count: int) -> None:
-    answer = client.get("/compare", params={"model": days[:count]}, headers={"Accept": "text/html"})
-    assert answer.status_code == 422 and "choose 2 to 6 models" in answer.text
-    same = client.get("/compare", params={"model": [days[0], days[0]]})
-    assert same.status_code == 422
+def test_too_few_and_too_many(client: httpx.Client, days: list[str]) -> None:
+    for chosen in (days[:1], days[:7], [days[0], days[0]]):
+        answer = client.get("/compare", params={"model": chosen}, headers={"Accept": "text/html"})
+        assert answer.status_code == 422 and "choose 2 to 6 models" in answer.text
 
 
 def test_the_models_page_says_what_changed(client: httpx.Client, days: list[str]) -> None:
