@@ -135,7 +135,12 @@ def _draw(kind: str, figure: Figure, width: float, right: float, caption: str, s
     import matplotlib as mpl
 
     colours = STAND_INS if kind == "page" else {name: _colour(value) for name, value in LIGHT.items()}
-    settings: Any = {**SETTINGS, **{name: colours[role] for name, role in COLOURED.items()}, "svg.hashsalt": salt}
+    settings: Any = {
+        **SETTINGS,
+        **{name: colours[role] for name, role in COLOURED.items()},
+        "svg.hashsalt": salt,
+        "path.simplify": all(curve.cap == "butt" for curve in figure.curves),
+    }
     with mpl.rc_context(settings):
         paper, panels = _lay_out(figure, width, right, caption, colours)
         out = io.BytesIO()
@@ -252,7 +257,7 @@ def _look(curve: Curve, colours: Mapping[str, Any]) -> dict[str, Any]:
         "color": colour, "linewidth": curve.width, "linestyle": DASHES[curve.dash] if curve.width else "none",
         "drawstyle": "steps-post" if curve.step else "default", "marker": MARKERS.get(curve.marker, ""),
         "markersize": curve.size, "markerfacecolor": colours["chart"] if curve.hollow else colour,
-        "markeredgewidth": 1.8 if curve.hollow else 0, "solid_capstyle": "butt",
+        "markeredgewidth": 1.8 if curve.hollow else 0, "solid_capstyle": curve.cap,
     }  # fmt: skip
 
 
@@ -277,6 +282,7 @@ def _compact(text: str, axes: Any) -> str:
     for name, stand_in in STAND_INS.items():
         body = body.replace(stand_in, variable(name))
     body = re.sub(r'<g[^>]*>(?:<use [^>]* fill="([^"]*)"/>)+', lambda run: _colour_once(run[0], run[1]), body)
+    body = re.sub(r"M ?([-\d.]+ [-\d.]+)L\1(?![\d.])", r"M\1h0", body)
     (low, high), (first_px, last_px) = axes.get_xlim(), axes.bbox.intervalx
     scale = f"{low:.6g} {first_px:.6g} {(last_px - first_px) / (high - low):.6g}"
     return f' data-x="{scale}">{body}'

@@ -61,7 +61,8 @@ class Axis:
 class Curve:
     """Points joined by a line; None breaks it. Without `width` only markers are drawn.
 
-    `notes` stand behind the values under the pointer, one for each point.
+    A `cap` that is not `butt` makes dots of lines without length. `notes` stand behind the values under the pointer,
+    one for each point.
     """
 
     x: Sequence[float]
@@ -76,6 +77,7 @@ class Curve:
     size: float = 8
     every: int = 1
     hollow: bool = False
+    cap: str = "butt"
     value: Value | None = None
     notes: Sequence[str] = ()
     listed: bool = True

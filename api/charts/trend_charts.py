@@ -57,7 +57,7 @@ def _panel(figure: str, sessions: Sequence[dict[str, Any]]) -> dict[str, Any]:
         value, uncertainty = entry["value"], entry["uncertainty"]
         text = changes.uncertain_words(value, uncertainty, name)
         text += UNBROKEN + name.unit if value is not None and name.unit != "1" else ""
-        values.append("\n".join(filter(None, (f"{name.words} {text}", entry.get("where")))))
+        values.append("\n".join(filter(None, (text, entry.get("where")))))
         points.append(Point(
             x, None if value is None else value * name.factor,
             None if uncertainty is None else BEYOND * uncertainty * name.factor,
@@ -117,18 +117,27 @@ def history(points: Sequence[Point], unit: str, x: Axis, levels: Sequence[float]
     at, value, half = np.array(rows).T
     known = np.nan_to_num(half)
     limits = span(value - known, value + known, value)
-    bars = np.column_stack([value - half, value + half, np.full(at.size, np.nan)])
-    curves = [Curve(at.tolist(), value.tolist(), "", "model"),
-              Curve(np.repeat(at, 3).tolist(), bars.ravel().tolist(), "", "model", 0.7)]  # fmt: skip
-    for hollow in (False, True):
-        dots = [(point.x, point.value) for point in points if point.approved is not hollow]
-        curves.append(Curve([x for x, _ in dots], [y for _, y in dots], "", "model", 0, marker="circle", size=7,
-                            hollow=hollow))  # fmt: skip
-    flags = [point.x for point in points if point.flagged]
-    curves.append(Curve(flags, [limits[1]] * len(flags), "", "width", 0, marker="down"))
+    gap = np.isnan(np.pad(value, 1, constant_values=np.nan))
+    alone = np.where(gap[:-2] & gap[2:], half, np.nan)  # a band needs two points
+    flags = np.array([point.x for point in points if point.flagged])
+    high = np.full(flags.size, limits[1] - 0.04 * (limits[1] - limits[0]))
+    open_rows = np.isin(at, [point.x for point in points if not point.approved])
+    curves = (
+        Curve(at.tolist(), value.tolist(), "", "model"),
+        _strokes(at, value - alone, value + alone, "model", 0.9),
+        _strokes(at, value, value, "model", 7, "round"),
+        _strokes(at[open_rows], value[open_rows], value[open_rows], "chart", 3.6, "round"),
+        _strokes(flags, high, high, "width", 7, "projecting"),
+    )
     band = Band(at.tolist(), (value - half).tolist(), (value + half).tolist())
     rules = tuple(Rule(level, colour="width") for level in levels if limits[0] <= level <= limits[1])
-    return Figure(x, (Axis(unit, limits=limits),), tuple(curves), (band,), rules=rules, height=TALL_PX)
+    return Figure(x, (Axis(unit, limits=limits),), curves, (band,), rules=rules, height=TALL_PX)
+
+
+def _strokes(x: Any, low: Any, high: Any, colour: str, width: float, cap: str = "butt") -> Curve:
+    """Return an upright line at each x; one of no length with a cap is a dot, and weighs less than a marker."""
+    y = np.column_stack([low, high, np.full(len(x), np.nan)]).ravel()
+    return Curve(np.repeat(x, 3).tolist(), y.tolist(), "", colour, width, cap=cap)
 
 
 def span(lower: Any, upper: Any, value: Any) -> tuple[float, float]:

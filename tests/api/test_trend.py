@@ -157,10 +157,12 @@ def test_a_panel_breaks_its_line_at_another_current_and_marks_what_is_noted() ->
                   [(1.0, 0.1, 20.0), (1.1, 0.1, 20.0), (None, None, 20.0), (1.2, 0.1, 20.0), (2.0, 9.0, 25.0)])
               ]  # fmt: skip
     figure = history(points, "N·m", Axis("", limits=(0.0, 4.0)), levels=[1.5, 99.0], breaks=True)
-    line, _bars, approved, hollow, flags = figure.curves
+    line, bars, dots, hollow, flags = figure.curves
     joined = [None if math.isnan(value) else value for value in line.y if value is not None]
-    assert joined == [None, 1.0, 1.1, None, 1.2, None, 2.0] and hollow.hollow and hollow.x == [1.0]
-    assert flags.x == [2.0] and len(approved.x) == 4 and [rule.at for rule in figure.rules] == [1.5]
+    assert joined == [None, 1.0, 1.1, None, 1.2, None, 2.0] and hollow.x == [1.0] * 3
+    assert flags.x == [2.0] * 3 and np.isfinite(dots.y).sum() == 2 * 4
+    assert np.isfinite(bars.y).sum() == 2 * 2, "a value by itself has a bar"
+    assert [rule.at for rule in figure.rules] == [1.5]
     low, high = figure.panels[0].limits or (0.0, 0.0)
     assert low > -1.0 and high < 4.0, "one wide band does not dwarf the values"
     assert np.isnan(figure.bands[0].lower).sum() == 3
