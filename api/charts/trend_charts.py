@@ -45,48 +45,55 @@ def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     names = dict.fromkeys(name for session in sessions for name in session["figures"])
     first = [name for name in changes.NAMES if name not in changes.LAST]
     effects = [name for name in names if "." in name]
-    return [_panel(name, sessions) for name in (*first, *effects, *changes.LAST) if name in names]
+    days, x = _days(sessions), _dates(sessions)
+    return [_panel(name, sessions, days, x) for name in (*first, *effects, *changes.LAST) if name in names]
 
 
-def _panel(figure: str, sessions: Sequence[dict[str, Any]]) -> dict[str, Any]:
+def _panel(figure: str, sessions: Sequence[dict[str, Any]], days: Sequence[float], x: Axis) -> dict[str, Any]:
     unit = next(session["figures"][figure]["unit"] for session in sessions if figure in session["figures"])
     name = changes.name_of(figure, unit)
     points, values = [], []
-    for session, (x, *_rest) in zip(sessions, session_rows(sessions), strict=True):
+    for session, day in zip(sessions, days, strict=True):
         entry = session["figures"].get(figure) or {"value": None, "uncertainty": None}
         value, uncertainty = entry["value"], entry["uncertainty"]
         text = changes.uncertain_words(value, uncertainty, name)
         text += UNBROKEN + name.unit if value is not None and name.unit != "1" else ""
         values.append("\n".join(filter(None, (text, entry.get("where")))))
         points.append(Point(
-            x, None if value is None else value * name.factor,
+            day, None if value is None else value * name.factor,
             None if uncertainty is None else BEYOND * uncertainty * name.factor,
             session["approved"], bool(session["notes"]), text, session["figures"]["current_ma"]["value"],
         ))  # fmt: skip
-    panel = _panel_of(points, name.words, name.unit, _dates(sessions), breaks=figure in OF_THE_CURVE)
-    return {**panel, "unit": "" if name.unit == "1" else name.unit, "values": values}
+    panel = _panel_of(points, name.words, name.unit, x, breaks=figure in OF_THE_CURVE)
+    return {**panel, "unit": "" if name.unit == "1" else name.unit, "values": "\t".join(values)}
+
+
+def _days(sessions: Sequence[dict[str, Any]]) -> list[float]:
+    """Return the days of each session since the first one."""
+    times_s = [unix_of(session["at_utc"]) for session in sessions]
+    return [(time_s - times_s[0]) / DAY_S for time_s in times_s]
 
 
 def session_rows(sessions: Sequence[dict[str, Any]]) -> list[tuple[float, str, str, str]]:
     """Return of each session its days since the first one, when it was, what is said of it, and its page."""
-    start_s = unix_of(sessions[0]["at_utc"]) if sessions else 0.0
     rows = []
-    for session in sessions:
+    for session, day in zip(sessions, _days(sessions), strict=True):
         lines = [f"approved by {session['approved_by']}" if session["approved"] else "not approved"]
         lines += [f"{note['by']}: {note['text'][:120]}" for note in session["notes"][:4]]
-        days = (unix_of(session["at_utc"]) - start_s) / DAY_S
-        rows.append((days, local_time.when(session["at_utc"]), "\n".join(lines), f"/models/{session['model_id']}"))
+        rows.append(
+            (round(day, 3), local_time.when(session["at_utc"]), "\n".join(lines), f"/models/{session['model_id']}")
+        )
     return rows
 
 
 def _dates(sessions: Sequence[dict[str, Any]]) -> Axis:
     """Return the time axis with a few days, or times of day where all was on one."""
-    start_s, end_s = (unix_of(sessions[end]["at_utc"]) for end in (0, -1))
-    days, count = (end_s - start_s) / DAY_S, MOST_DATES if end_s > start_s else 1
+    start_s, days = (unix_of(sessions[0]["at_utc"]), _days(sessions)[-1]) if sessions else (0.0, 0.0)
+    count = MOST_DATES if days else 1
     ticks = []
     for number in range(count):
         share = number / max(count - 1, 1)
-        label = utc_label(start_s + share * (end_s - start_s))
+        label = utc_label(start_s + share * days * DAY_S)
         short = count > 1 and days < 2
         ticks.append((share * days, local_time.clock(label)[:5] if short else local_time.day(label, year=False)))
     room = 0.06 * days or 0.5

@@ -22,7 +22,7 @@
     if (number < 0) return;
     for (const still of stills) still.insertAdjacentHTML("beforeend", `<rect class="column" x="${left(still, sessions[number][0]) - 4}" width="8" height="100%"/>`);
     const panel = event.target.closest(".panel");
-    const value = panel.querySelector("b").textContent + " " + JSON.parse(panel.dataset.values)[number];
+    const value = panel.querySelector("b").textContent + " " + panel.dataset.values.split("\t")[number];
     tip.textContent = [sessions[number][1], value, sessions[number][2]].join("\n");
     const frame = box.getBoundingClientRect();
     tip.style.left = `${Math.max(8, Math.min(event.clientX - frame.left + 14, frame.width - tip.offsetWidth - 8))}px`;
