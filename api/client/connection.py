@@ -20,14 +20,7 @@ class Connection:
     A decision is sent with the `ETag` that was last read of what it is made on, as `If-Match`; it is refused if anybody
     else has changed that since. A program that has not read it decides on what is there now.
 
-    Parameters
-    ----------
-    url : str
-        Address of the service, e.g. "http://127.0.0.1:8000".
-    token : str
-        Sent with each request.
-    timeout_s : float
-        How long to wait for an answer.
+    `url`: of the service, e.g. "http://127.0.0.1:8000"; `token`: sent with each request; `timeout_s`: for an answer.
     """
 
     def __init__(self, url: str, token: str = "", timeout_s: float = 60.0) -> None:
@@ -113,10 +106,7 @@ class Connection:
         return ""
 
     def _take_etag(self, document: str, sent: str | None, answer: httpx.Response) -> None:
-        """Take over the version to which a decision has led, wherever the one before it was read.
-
-        A participant has one version with its models.
-        """
+        """Take over the version to which a decision has led wherever the one before it was read: with models, too."""
         of_rig = document or "/v1/rig"
         if of_rig.startswith("/v1/rig") or of_rig.endswith("/calibration"):  # there is another version now
             self._etags = {place: etag for place, etag in self._etags.items() if not place.startswith(of_rig)}

@@ -6,18 +6,9 @@ from typing import Any
 
 
 class ServiceError(Exception):
-    """Root of the client's errors.
+    """Root of the client's errors, with the `request` that failed, `title`, `detail` and `status` of its problem.
 
-    Parameters
-    ----------
-    request : str
-        Method and path of the request that failed; empty if none failed.
-    title, detail : str
-        What is wrong, and what to do.
-    status : int or None
-        HTTP status; None if there was no answer.
-    document : dict
-        The whole answer: a problem, or what did not complete.
+    `status` is None if there was no answer. `document` is the whole answer: a problem, or what did not complete.
     """
 
     def __init__(

@@ -32,16 +32,9 @@ D = TypeVar("D", bound=Document)
 
 @dataclass(frozen=True)
 class ApprovedModel:
-    """The approved model of a participant, as a controller fetches it.
+    """The approved model of a participant, as a controller fetches it: the `document` MODEL.json and its `etag`.
 
-    Parameters
-    ----------
-    document : dict
-        MODEL.json.
-    etag : str
-        Its version. With it the service answers 304 while nothing has changed.
-    changed : bool
-        False if this fetch was answered with 304.
+    `changed` is False if the service has answered with 304: nothing has changed since the one that was known.
     """
 
     document: dict[str, Any]
@@ -260,9 +253,11 @@ class Client(Connection):
 
         Raises NotFound: no model is approved today.
         """
-        headers = {"If-None-Match": known.etag} if known else {}
-        params = {"tracked": True} if tracked else {}
-        answer = self.request("GET", f"/v1/participants/{participant}/model", headers=headers, params=params)
+        more = {
+            "headers": {"If-None-Match": known.etag} if known else {},
+            "params": {"tracked": True} if tracked else {},
+        }
+        answer = self.request("GET", f"/v1/participants/{participant}/model", **more)
         if known and answer.status_code == 304:
             return ApprovedModel(known.document, known.etag, changed=False)
         return ApprovedModel(answer.json(), answer.headers["etag"])
