@@ -1,4 +1,4 @@
-"""The experiment that decides: asked of the rig as any test, and all recordings are then diagnosed together."""
+"""`stimrig test`: the experiment that decides is asked of the rig as any test, and nobody else is stimulated for it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from stimrig.api.cli import deciding
 from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.cli.errors import InputError
-from stimrig.api.client.errors import NotFound
+from stimrig.api.client.errors import NotFound, ServiceError
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.verbs import experiment
 from stimrig.api.models import explanation
@@ -35,16 +35,14 @@ DECIDING: dict[str, Any] = {
     "decides": False,
     "text": "Held random levels should teach most: 40 % of what the model is unsure of at held levels should go.",
 }
-OWNER, FOUND = "P1", {"verdict": "unexplained_structure"}
-MISSING = [{"effect": "fatigue", "confused_with": ["potentiation"], "next_experiment_plan": {}}]
+OWNER = "P1"
 
 
-def test_it_goes_before_the_test_between_rivals_and_the_page_shows_it() -> None:
-    found = experiment(MISSING, DECIDING)
+def test_it_goes_before_the_test_between_rivals_and_is_shown() -> None:
+    found = experiment([{"effect": "fatigue", "confused_with": ["potentiation"], "next_experiment_plan": {}}], DECIDING)
     assert found is not None and found["effect"] == "" and found["text"] == DECIDING["text"]
     ExperimentOut.model_validate(found)
-    shown = explanation.tidy_experiment(found, {})
-    assert shown["shown"] == ["Levels held at random", "Rest 2 s"] and shown["text"] == DECIDING["text"]
+    assert explanation.tidy_experiment(found, {})["shown"] == ["Levels held at random", "Rest 2 s"]
     left = {"verdict": "unexplained_structure", "deciding_experiment": DECIDING, "base": {}, "probability": 1.0,
             "structure": [], "noise_sd_nm": 0.05}  # fmt: skip
     said = diagnosis_lines(left)[-1]
@@ -65,93 +63,116 @@ def test_the_page_asks_for_it_at_the_rate_of_the_recording(monkeypatch: pytest.M
     context: Any = SimpleNamespace(analyses=SimpleNamespace(known_diagnosis=lambda _: {"experiment": known}))
     row: Any = SimpleNamespace(id="M1", method="", participant="P1")
     monkeypatch.setattr(model_view.starting, "ask", ask)
-    for rate_hz in (25.0, 40.0):  # a diagnosis that was kept by an earlier version tells none
-        asyncio.run(model_view.run_experiment(context, SimpleNamespace(name="B"), row))  # pyright: ignore[reportArgumentType]
-        assert bodies[-1].pulse_rate_hz == rate_hz and bodies[-1].joins == "M1"
-        assert [one.model_dump(exclude_unset=True) for one in bodies[-1].segments] == DECIDING["segments"]
-        known.pop("pulse_rate_hz", None)
+    asyncio.run(model_view.run_experiment(context, SimpleNamespace(name="B"), row))  # pyright: ignore[reportArgumentType]
+    assert bodies[-1].pulse_rate_hz == 25.0 and bodies[-1].joins == "M1"
+    assert [one.model_dump(exclude_unset=True) for one in bodies[-1].segments] == DECIDING["segments"]
+
+
+class Recordings:
+    """Files that are read, with the sources that they name; what is played is kept, and answered by a recording."""
+
+    def __init__(self) -> None:
+        self.loaded: list[list[Path]] = []
+        self.played: list[dict[str, Any]] = []
+        self.source, self.rate_hz = Source(participant=OWNER, current_ma=16.0), 400.0
+        self.open = True
+
+    def load(self, data: list[Path]) -> Any:
+        self.loaded.append(list(data))
+        return SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=self.rate_hz, source=self.source)
+
+    def explain(self, *_: object) -> Any:
+        found, left = SimpleNamespace(to_dict=lambda: {"verdict": "nothing_missing"}), SimpleNamespace(to_dict=dict)
+        return SimpleNamespace(diagnosis=found, left=left, improvement=SimpleNamespace(models=[None]))
+
+    def next_experiment(self, diagnosis: Any) -> Any:
+        """Of the first model nothing is open, of the last one something is."""
+        return SimpleNamespace(segments=DECIDING["segments"]) if self.open and diagnosis.to_dict is dict else None
+
+    def play(self, _rig: object, _data: object, _emulate: str, participant: str, request: Any) -> dict[str, Any]:
+        self.played.append({"participant": participant, **request})
+        return {"test": {}, "model": {}, "recording": b"second"}
 
 
 @pytest.fixture
-def recordings(monkeypatch: pytest.MonkeyPatch) -> list[list[Path]]:
-    """The files of each record that is diagnosed; structure is left in the first one."""
-    loaded: list[list[Path]] = []
-    found = SimpleNamespace(to_dict=lambda: {"verdict": "nothing_missing"})
-    planned = SimpleNamespace(segments=DECIDING["segments"])
-
-    def load(data: list[Path]) -> Any:
-        assert all(path.exists() for path in data)
-        loaded.append(list(data))
-        source = Source(participant=OWNER, current_ma=16.0)
-        return SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=source)
-
-    monkeypatch.setattr(deciding, "load_record", load)
-    left = SimpleNamespace(to_dict=dict)  # of the first model nothing is open, of the last one something is
-    explained = SimpleNamespace(diagnosis=found, left=left, improvement=SimpleNamespace(models=[None]))
+def recordings(monkeypatch: pytest.MonkeyPatch) -> Recordings:
+    made = Recordings()
+    monkeypatch.setattr(deciding, "load_record", made.load)
     monkeypatch.setattr(deciding, "held_by", lambda *_: [])
-    monkeypatch.setattr(deciding.identify, "explain", lambda *_: explained, raising=False)
-    monkeypatch.setattr(
-        deciding.identify, "next_experiment", lambda one: planned if one is left else None, raising=False
-    )
-    return loaded
+    monkeypatch.setattr(verb, "on_own_services", made.play)
+    for name in ("explain", "next_experiment"):
+        monkeypatch.setattr(deciding.identify, name, getattr(made, name), raising=False)
+    return made
 
 
-def test_the_verb_asks_for_it_and_diagnoses_all_together(
-    recordings: list[list[Path]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_the_verb_asks_for_it_and_diagnoses_both_together(
+    recordings: Recordings, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    first, told, sent = tmp_path / "first.h5", [], {}
-    first.write_bytes(b"first")
-
-    def play(_rig: object, _data: object, _emulate: str, participant: str, asked: dict[str, Any]) -> dict[str, Any]:
-        sent.update(asked, participant=participant)
-        return {"test": {}, "model": {}, "recording": b"second"}
-
-    monkeypatch.setattr(verb, "on_own_services", play)
+    first, output, told, diagnose = tmp_path / "first.h5", tmp_path / "second.h5", [], deciding.diagnose_together
     monkeypatch.setattr(verb, "say_json", told.append)
-    output = tmp_path / "second.h5"
-    monkeypatch.setattr(
-        deciding, "diagnose_together", lambda *_: pytest.fail("not written") if not output.exists() else FOUND
-    )
+
+    def diagnose_together(*given: Any) -> Any:
+        assert output.read_bytes() == b"second", "written before the long work that may fail"
+        return diagnose(*given)
+
+    monkeypatch.setattr(deciding, "diagnose_together", diagnose_together)
     verb.test(decide=[first], output=output, as_json=True)
-    assert output.read_bytes() == b"second", "written before the long work that may fail"
-    assert sent == {
-        "participant": OWNER, "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0,
-        "recorded_ma": 16.0,
-    }  # fmt: skip
-    assert recordings == [[first]] and told[0]["diagnosis"] == FOUND and "recording" not in told[0]
-
-
-def test_both_are_diagnosed_together(recordings: list[list[Path]], tmp_path: Path) -> None:
-    first = tmp_path / "first.h5"
-    first.touch()
-    found = deciding.diagnose_together([first], b"second")
-    assert found["verdict"] == "nothing_missing" and found["left"]["structure"] == []
-    assert recordings[0][0] == first and len(recordings[0]) == 2
+    assert recordings.played == [
+        {"participant": OWNER, "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0,
+         "recorded_ma": 16.0}
+    ]  # fmt: skip
+    assert recordings.loaded[0] == [first] and recordings.loaded[1][0] == first and len(recordings.loaded[1]) == 2
+    assert told[0]["diagnosis"]["verdict"] == "nothing_missing" and told[0]["diagnosis"]["left"]["structure"] == []
+    assert "recording" not in told[0]
 
 
 @pytest.mark.parametrize(
-    ("sources", "rate_hz", "participant", "said"),
+    ("sources", "rate_hz", "options", "said"),
     [
-        ([OWNER], 400.0, "P2", "a recording of P1; --participant is P2"),
-        ([""], 400.0, None, "does not say whose it is. Give --participant"),
-        ([OWNER, "P2"], 400.0, None, "of several people: P1, P2"),
-        ([OWNER, ""], 400.0, None, "second.csv does not say whose it is"),
-        ([OWNER], 30.0, None, "joined from 50 Hz on"),
-        ([OWNER], 400.0, None, "does not say with what current it was made"),
-        (["", ""], 400.0, OWNER, "does not say with what current it was made"),
+        ([OWNER], 400.0, {"participant": "P2"}, "a recording of P1; --participant is P2"),
+        ([""], 400.0, {}, "does not say whose it is. Give --participant"),
+        ([OWNER, "P2"], 400.0, {}, "of several people: P1, P2"),
+        ([OWNER, ""], 400.0, {}, "second.csv does not say whose it is"),
+        ([OWNER], 30.0, {}, "joined from 50 Hz on"),
+        ([OWNER], 400.0, {}, "does not say with what current it was made"),
+        (["", ""], 400.0, {"participant": OWNER}, "does not say with what current it was made"),
+        ([(OWNER, 16.0), (OWNER, 20.0)], 400.0, {}, "made with 16 mA and 20 mA"),
+        ([(OWNER, 16.0)], 400.0, {}, "nothing is left to decide"),
+        ([(OWNER, 16.0)], 400.0, {"adaptive": True}, "leave out --adaptive"),
+        ([(OWNER, 16.0)], 400.0, {"output": Path("/dev/null/second.h5")}, "in a folder that can be written"),
+        ([(OWNER, 16.0)], 400.0, {"output": Path("/")}, "in a folder that can be written"),
     ],
 )
-def test_nobody_is_stimulated_for_a_recording_that_is_anothers_or_cannot_be_joined(
-    sources: list[str], rate_hz: float, participant: str | None, said: str, monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path, recordings: list[list[Path]],
-) -> None:  # fmt: skip
-    (tmp_path / "first.h5").touch()
-    source = Source(parts=tuple(Source(participant=one) for one in sources))
-    record = SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=rate_hz, source=source)
-    monkeypatch.setattr(deciding, "load_record", lambda _: record)
-    monkeypatch.setattr(verb, "on_own_services", lambda *_: pytest.fail("it played"))
+def test_nobody_is_stimulated_where_it_is_not_theirs_cannot_be_joined_or_decides_nothing(
+    sources: list[Any], rate_hz: float, options: dict[str, Any], said: str, tmp_path: Path, recordings: Recordings
+) -> None:
+    recordings.open, recordings.rate_hz = False, rate_hz
+    named = [source if isinstance(source, tuple) else (source, None) for source in sources]
+    recordings.source = Source(parts=tuple(Source(participant=who, current_ma=ma) for who, ma in named))
     with pytest.raises(InputError, match=said):
-        verb.test(participant=participant, decide=[tmp_path / "first.h5", tmp_path / "second.csv"])
+        verb.test(decide=[tmp_path / "first.h5", tmp_path / "second.csv"], **options)
+    assert recordings.played == []
+
+
+class Answers:
+    """Stands for a client of the service."""
+
+    def __init__(self, known: bool = True, fails: bool = False) -> None:
+        self.known, self.fails = known, fails
+        self.improved: list[str] = []
+
+    def participant(self, _code: str) -> dict[str, Any]:
+        if not self.known:
+            raise NotFound("GET", "not found")
+        return {"profile": {"current_ma": 16.0}}
+
+    def improve(self, model_id: str, _progress: object) -> dict[str, Any]:
+        self.improved.append(model_id)
+        if self.fails:
+            raise ServiceError("", "failed")
+        return {"id": "best"}
+
+    model_file, recording = staticmethod(str), staticmethod(bytes)
 
 
 @pytest.mark.parametrize(
@@ -165,14 +186,8 @@ def test_nobody_is_stimulated_for_a_recording_that_is_anothers_or_cannot_be_join
 def test_nobody_is_made_anew_or_stimulated_with_another_current_for_a_recording(
     recorded_ma: float | None, known: bool, said: str | None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def participant(_code: str) -> dict[str, Any]:
-        if not known:
-            raise NotFound("GET", "not found")
-        return {"profile": {"current_ma": 16.0}}
-
-    client = SimpleNamespace(participant=participant, model_file=str, recording=bytes)
     started: list[dict[str, Any]] = []
-    monkeypatch.setattr(verb, "Client", lambda *_: nullcontext(client))
+    monkeypatch.setattr(verb, "Client", lambda *_: nullcontext(Answers(known)))
     monkeypatch.setattr(
         verb, "run_test", lambda *_, **more: started.append(more) or {"model_id": "", "recording_id": 0}
     )
@@ -181,25 +196,18 @@ def test_nobody_is_made_anew_or_stimulated_with_another_current_for_a_recording(
     assert started == ([] if said else [{"kind": "next-experiment"}])
 
 
-def test_recordings_of_two_currents_are_not_continued(
-    recordings: list[list[Path]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+@pytest.mark.parametrize(
+    ("problem", "fails", "model"), [("", False, "plain"), ("misfit", False, "best"), ("misfit", True, "plain")]
+)
+def test_where_an_adaptive_tests_structure_does_not_fit_the_best_model_is_given(
+    problem: str, fails: bool, model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parts = tuple(Source(participant=OWNER, current_ma=one) for one in (16.0, 20.0))
-    record = SimpleNamespace(pulse_rate_hz=25.0, sample_rate_hz=400.0, source=Source(parts=parts))
-    monkeypatch.setattr(deciding, "load_record", lambda _: record)
-    with pytest.raises(InputError, match="made with 16 mA and 20 mA"):
-        deciding.plan_experiment([tmp_path / "first.h5", tmp_path / "second.h5"], None)
-
-
-def test_where_the_recording_cannot_be_written_is_said_before_anything_is_played(
-    recordings: list[list[Path]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.setattr(verb, "on_own_services", lambda *_: pytest.fail("it played"))
-    (tmp_path / "file").touch()
-    for output in (tmp_path, tmp_path / "file" / "second.h5"):
-        with pytest.raises(InputError, match="in a folder that can be written"):
-            verb.test(decide=[tmp_path / "first.h5"], output=output)
-    assert recordings == []
+    service = Answers(fails=fails)
+    document = {"model_id": "plain", "recording_id": 0, "adaptive": {"problem": problem}}
+    monkeypatch.setattr(verb, "Client", lambda *_: nullcontext(service))
+    monkeypatch.setattr(verb, "run_test", lambda *_, **__: document)
+    assert verb.through("url", "token", "P1")["model"] == model
+    assert service.improved == (["plain"] if problem else [])
 
 
 SITE = ("right", "biceps brachii", None)
@@ -220,22 +228,6 @@ def test_what_cannot_be_joined_is_refused_before_it_is_played(measured_at: Any, 
     participant: Any = SimpleNamespace(code="P1", side=SITE[0], muscle=SITE[1], placement=SITE[2])
     plan: Any = SimpleNamespace(profile=SimpleNamespace(current_ma=20.0))
     check = partial(Runner._check_joins, SimpleNamespace(versions=versions), "M1", participant, plan)  # pyright: ignore
-    if kind is None:
+    with pytest.raises(ApiError) if kind else nullcontext() as refused:
         check()
-        return
-    with pytest.raises(ApiError) as refused:
-        check()
-    assert refused.value.status == 409 and refused.value.code == kind
-
-
-def test_the_verb_plays_nothing_where_nothing_is_left(
-    recordings: list[list[Path]], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    (tmp_path / "first.h5").touch()
-    monkeypatch.setattr(deciding.identify, "next_experiment", lambda _: None, raising=False)
-    monkeypatch.setattr(verb, "on_own_services", lambda *_: pytest.fail("it played"))
-    with pytest.raises(InputError, match="nothing is left to decide"):
-        verb.test(decide=[tmp_path / "first.h5"])
-    with pytest.raises(InputError, match="leave out --adaptive"):
-        verb.test(decide=[tmp_path / "first.h5"], adaptive=True)
-    assert len(recordings) == 1
+    assert kind is None or (refused and (refused.value.status, refused.value.code) == (409, kind))
