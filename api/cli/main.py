@@ -41,7 +41,7 @@ INPUT_AT_FAULT = (Unreachable, Unauthorized, Forbidden, NotFound, Invalid)
 
 
 def build(verb: str = "") -> typer.Typer:
-    """The command line with the verb's file in `api/cli/commands`; with every file where none bears its name.
+    """Make the command line with the verb's file in `api/cli/commands`; with every file where none bears its name.
 
     No verb waits until the libraries of all others are loaded.
     """
@@ -56,25 +56,13 @@ def build(verb: str = "") -> typer.Typer:
 
 
 def _overview() -> typer.Typer:
-    """The command line as its help lists it: what each verb does, read from its file and not loaded."""
-    app, groups = _empty(), {}
+    """Make the command line as its help lists it: each verb with the first line of its file, which is not loaded."""
+    app = _empty()
     for name in VERBS:
-        tree = ast.parse((Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8"))
-        defined = [node for node in tree.body if isinstance(node, ast.FunctionDef)]
-        does = {node.name: ast.get_docstring(node) for node in defined}
-        if name in does:
-            app.command(name, help=does[name])(_nothing)
-        else:
-            calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-            made = next(call for call in calls if ast.unparse(call.func) == "typer.Typer")
-            groups[name] = next(ast.literal_eval(word.value) for word in made.keywords if word.arg == "help")
-    for name, words in groups.items():  # verbs with verbs of their own stand behind the others
-        app.command(name, help=words)(_nothing)
+        text = (Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8")
+        does = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0].partition(": ")[2]
+        app.command(name, help=does[:1].upper() + does[1:])(lambda: None)
     return app
-
-
-def _nothing() -> None:
-    """Stands for a verb that is only listed."""
 
 
 def _empty() -> typer.Typer:
@@ -91,16 +79,17 @@ def _empty() -> typer.Typer:
     return app
 
 
-def _version(asked: bool) -> None:
-    if asked:
+def _print_version(wanted: bool) -> None:
+    if wanted:
         print(f"stimrig {software_version()}")
         raise typer.Exit
 
 
 def _options(
-    _version: Annotated[bool, typer.Option("--version", callback=_version, is_eager=True, help="print it")] = False,
-) -> None:
-    pass
+    _version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="print it")
+    ] = False,
+) -> None: ...
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -119,7 +108,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def run(arguments: list[str] | None = None) -> int:
-    """Run a verb; its exit code."""
+    """Run a verb; return its exit code."""
     # Matrices of a fit are small: a second BLAS thread only waits for the first, and on a busy machine for long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _keep_compiled()
@@ -131,17 +120,17 @@ def run(arguments: list[str] | None = None) -> int:
         if code == INTERRUPTED:  # typer has caught it
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
-    except (KeyboardInterrupt, typer.Abort):
-        print("stimrig: interrupted", file=sys.stderr)
-        return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the reader has gone; nothing to say to nobody
         return 0
-    except Exception as error:
-        if interrupted.is_set():  # a library made another error of it
+    except (Exception, KeyboardInterrupt) as error:
+        if isinstance(error, KeyboardInterrupt | typer.Abort) or interrupted.is_set():  # a library may have changed it
             print("stimrig: interrupted", file=sys.stderr)
             return INTERRUPTED
-        return _one_line(verb, given, error)
+        name = f"stimrig {verb}" if verb in VERBS else "stimrig"
+        line, code = _explain(name, given, error)
+        print(line, file=sys.stderr)
+        return code
 
 
 def _keep_compiled() -> None:
@@ -164,41 +153,28 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _one_line(verb: str, given: list[str], error: Exception) -> int:
-    """The error's line, and the exit code it stands for."""
-    name = f"stimrig {verb}" if verb in VERBS else "stimrig"
+def _explain(name: str, given: list[str], error: BaseException) -> tuple[str, int]:
+    """Return the error's line, and the exit code it stands for."""
     if isinstance(error, TyperException):
         message = error.format_message().strip()
         if not message or message.startswith("Usage:"):  # no verb was given: the help itself, not in one line
-            print(message, file=sys.stderr)
-            return 2
-        print(f"{name}: {flat(message)} (see {name} --help)", file=sys.stderr)
-        return 2
+            return message, 2
+        return f"{name}: {flat(message)} (see {name} --help)", 2
     if isinstance(error, CommandError | IdentifyError | ApiError | SettingsError):
-        print(f"{name}: {flat(_naming(given, error))}", file=sys.stderr)
-        return error.exit_code if isinstance(error, CommandError) else 2
+        # the files of the command line, where it is of what they hold and names none of them
+        files = [word for word in given if word[:1] != "-" and Path(word).is_file()]
+        about = f"{', '.join(files)}: " if isinstance(error, IdentifyError) and not error.place and files else ""
+        return f"{name}: {flat(f'{about}{error}')}", error.exit_code if isinstance(error, CommandError) else 2
     if isinstance(error, ServiceError):
-        print(f"{name}: {flat(str(error))}", file=sys.stderr)
-        return 2 if isinstance(error, INPUT_AT_FAULT) or error.code == "rig-disconnected" else 1
+        at_fault = isinstance(error, INPUT_AT_FAULT) or error.code == "rig-disconnected"
+        return f"{name}: {flat(str(error))}", 2 if at_fault else 1
     if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in PAGE:
-        print(
-            f"{name}: needs rig, service and page: pip install 'stimrig[page]' ({error.name} is missing)",
-            file=sys.stderr,
-        )
-        return 2
+        return f"{name}: needs rig, service and page: pip install 'stimrig[page]' ({error.name} is missing)", 2
     log = Path(tempfile.gettempdir()) / f"stimrig-error-{os.getpid()}.log"
     log.write_text("".join(traceback.format_exception(error)))
-    print(f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", file=sys.stderr)
-    return 1
-
-
-def _naming(given: list[str], error: Exception) -> str:
-    """What went wrong, with the files of the command line where it is of what they hold and names none of them."""
-    files = [word for word in given if word[:1] != "-" and Path(word).is_file()]
-    about = isinstance(error, IdentifyError) and not error.place and files
-    return f"{', '.join(files)}: {error}" if about else str(error)
+    return f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", 1
 
 
 def flat(text: str) -> str:
-    """Text on one line."""
+    """Write text on one line."""
     return " ".join(text.split())

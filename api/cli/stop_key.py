@@ -8,16 +8,13 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import httpx
 
 from stimrig.rig import keys
 from stimrig.rig.messages import StopEvidence
 from stimrig.rig.requests import StatusRequest, StopRequest
-
-if TYPE_CHECKING:
-    from stimrig.api.sessions.rig_client import RigClient
 
 REASON, BY = "a key was pressed", "terminal"
 IDLE = ("ready", "latched", "disconnected")
@@ -46,7 +43,7 @@ class StopKey(keys.StopKey):
 
 
 def standard_input() -> int:
-    """Its descriptor, or -1 where it has none."""
+    """Return its descriptor, or -1 where it has none."""
     try:
         return sys.stdin.fileno()
     except (AttributeError, OSError, ValueError):
@@ -54,7 +51,7 @@ def standard_input() -> int:
 
 
 def in_foreground(descriptor: int) -> bool:
-    """Whether it is a terminal whose keys are for this program."""
+    """Tell whether it is a terminal whose keys are for this program."""
     try:
         return os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp()
     except OSError:  # not the controlling terminal: nobody takes turns on it
@@ -62,48 +59,46 @@ def in_foreground(descriptor: int) -> bool:
 
 
 def at_rig(path: Path, stray: Callable[[], bool] = lambda: True) -> Callable[[], str]:
-    """What stops the rig at a socket, past the service: it need not be alive.
+    """Return what stops the rig at a socket, past the service: it need not be alive.
 
     `stray`: whether a key may be a stray one while the rig plays nothing. A program that has asked for a test says no:
     the key is to stop what is about to begin.
     """
     from stimrig.api.clock import Clock
+    from stimrig.api.errors import ApiError
     from stimrig.api.sessions.rig_client import RigClient
 
-    rig = RigClient(path, Clock())
-    return lambda: asyncio.run(_stop(rig, stray()))
+    async def stop() -> str:
+        rig = RigClient(path, Clock())
+        with contextlib.suppress(Exception):  # one that does not say what it does is stopped
+            if stray() and (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:
+                return NOTHING
+        try:
+            evidence = await rig.ask_for(StopEvidence, StopRequest(reason=REASON, by=BY), STOP_S)
+        except ApiError as error:
+            return f"{DOUBT} {error.title}: {error.detail}"
+        return CONFIRMED if evidence.confirmed else f"{DOUBT} The rig says: {evidence.detail}"
 
-
-async def _stop(rig: RigClient, stray: bool) -> str:
-    from stimrig.api.errors import ApiError
-
-    with contextlib.suppress(Exception):  # who does not say what it does is stopped
-        if stray and (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:
-            return NOTHING
-    try:
-        evidence = await rig.ask_for(StopEvidence, StopRequest(reason=REASON, by=BY), STOP_S)
-    except ApiError as error:
-        return f"{DOUBT} {error.title}: {error.detail}"
-    return CONFIRMED if evidence.confirmed else f"{DOUBT} The rig says: {evidence.detail}"
+    return lambda: asyncio.run(stop())
 
 
 def at_service(url: str, token: str, stray: Callable[[], bool] = lambda: True) -> Callable[[], str]:
-    """What stops the rig of a service elsewhere; `stray` as in `at_rig`."""
-    return lambda: _stop_through(url, token, stray())
+    """Return what stops the rig of a service elsewhere; `stray` as in `at_rig`."""
+
+    def stop() -> str:
+        with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}) as client:
+            with contextlib.suppress(Exception):  # nothing in a look may prevent a stop
+                if stray() and _rests(client.get("/v1/rig", timeout=STATUS_S).raise_for_status().json()):
+                    return NOTHING
+            try:
+                answer = client.post("/v1/stop", json={"reason": REASON}, timeout=STOP_S + 1.0)
+            except httpx.HTTPError as error:
+                return f"{DOUBT} {url}: {error}"
+        return CONFIRMED if answer.is_success else f"{DOUBT} {url}: {answer.text[:300]}"
+
+    return stop
 
 
 def _rests(rig: dict[str, Any]) -> bool:
-    """Whether a service knows that its rig plays nothing: what the rig says may come late, and not at all."""
+    """Tell whether a service knows that its rig plays nothing: what the rig says may come late, and not at all."""
     return rig["state"] in IDLE and rig["connected"] and rig["age_s"] < HEARD_S and rig["holder"] is None
-
-
-def _stop_through(url: str, token: str, stray: bool) -> str:
-    with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}) as client:
-        with contextlib.suppress(Exception):  # nothing in a look may prevent a stop
-            if stray and _rests(client.get("/v1/rig", timeout=STATUS_S).raise_for_status().json()):
-                return NOTHING
-        try:
-            answer = client.post("/v1/stop", json={"reason": REASON}, timeout=STOP_S + 1.0)
-        except httpx.HTTPError as error:
-            return f"{DOUBT} {url}: {error}"
-    return CONFIRMED if answer.is_success else f"{DOUBT} {url}: {answer.text[:300]}"
