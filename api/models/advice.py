@@ -17,13 +17,12 @@ Act = Literal["approve", "add", "improve", "experiment", "look", "test", "fit", 
 
 
 class Gate(NamedTuple):
-    """Texts of a failed check: the finding, what to do with a model that is usable with care and with one that is not
-    usable, and what the controller would do wrong."""
+    """Texts of a failed check."""
 
     found: str
-    look: str
-    test: str
-    risk: str
+    risk: str  # what the controller would do wrong
+    look: str = "look at where the error sits first"  # with a model that is usable with care
+    test: str = "the limb held still and relaxed"  # test again with, for a model that is not usable
 
 
 @dataclass(frozen=True)
@@ -45,90 +44,81 @@ class Advice:
     words: str
 
 
+_CURVE = "look at the recruitment curve first"
+_WIRES = "electrodes, current and load cell checked"
 GATES: dict[str, Gate] = {
     "stable": Gate(
         "The dynamics are unstable: in the model the torque grows without end.",
-        "Usable with care: look at the step response first.",
-        "Not usable: test again with the limb held still and relaxed.",
         "The controller would expect torque that grows without end, and may switch between no and full pulses.",
+        "look at the step response first",
     ),
     "converged": Gate(
         "The search for the muscle's speed did not come to its end.",
-        "Usable with care: look at the step response first.",
-        "Not usable: test again with the limb held still and relaxed.",
         "The speed of the muscle is not certain: the controller may react too early or too late.",
+        "look at the step response first",
     ),
     "torque": Gate(
         "The pulses hardly change the torque, or the recruitment curve is far outside what was measured.",
-        "Usable with care: look at the recruitment curve first.",
-        "Not usable: test again with electrodes, current and load cell checked.",
         "The controller would set too wide pulses: the recruitment curve is not identified.",
+        _CURVE,
+        _WIRES,
     ),
     "monotone": Gate(
         "The recruitment curve falls at one place.",
-        "Usable with care: look at the recruitment curve first.",
-        "Not usable: test again with electrodes, current and load cell checked.",
         "The controller's pulse width jumps where the curve falls: two widths belong to one torque there.",
+        _CURVE,
+        _WIRES,
     ),
     "range": Gate(
         "Only a few pulse widths were measured; between them the recruitment curve is a guess.",
-        "Usable with care: look at the recruitment curve first; a test with a ramp makes it sure.",
-        "Not usable: test again with a ramp.",
         "The controller would set pulse widths that were never measured: the plateau is not identified.",
+        f"{_CURVE}; a test with a ramp makes it sure",
+        "a ramp",
     ),
     "ceiling": Gate(
         "The fit is less than the noise would allow.",
-        "Usable with care: look at where the error sits first.",
-        "Not usable: test again with electrodes checked and the limb relaxed: the torque hardly follows.",
-        ("The model does not follow the torque: the controller's pulses would be too wide at one time and too "
-             "narrow at another."),
+        "The model does not follow the torque: the controller's pulses would be too wide at one time and too narrow at "
+        "another.",
+        test="electrodes checked and the limb relaxed: the torque hardly follows",
     ),
     "held_out": Gate(
         "The error on held-out pulses is clearly larger than on the others.",
-        "Usable with care: look at the check in the chart first.",
-        "Not usable: test again with the limb held still and relaxed.",
         "On other pulses the controller would be further off than the fit says.",
+        "look at the check in the chart first",
     ),
     "gap": Gate(
         "The fit on held-out pulses is less than the noise would allow.",
-        "Usable with care: look at where the error sits first.",
-        "Not usable: test again with the limb held still and relaxed, or add what is missing.",
         "The controller works with pulses that the model has not seen: its torque there would be far off.",
+        test="the limb held still and relaxed, or add what is missing",
     ),
     "residual": Gate(
         "What the model leaves over is not only noise.",
-        "Usable with care: look at where the error sits first.",
-        "Not usable: test again with the limb held still and relaxed.",
         "The error follows a pattern, and the controller repeats it in each trial.",
     ),
     "joint": Gate(
         "The joint moved during the test, and the model does not know of it.",
-        "Usable with care: hold the joint still and test again, or add what depends on the joint.",
-        "Not usable: test again with the limb held still and relaxed.",
         "At another angle the muscle is stronger or weaker: the controller's pulses would not fit.",
+        "hold the joint still and test again, or add what depends on the joint",
     ),
     "joint_seen": Gate(
         "The joint hardly moved in these tests: how the torque depends on it is a guess.",
-        "Usable with care: at the angle of these tests only.",
-        "Not usable: record again while the joint moves.",
         "At another angle the torque that the controller expects is a guess.",
+        "at the angle of these tests only",
+        "the joint moving",
     ),
     "evidence": Gate(
         "It holds an effect that was added without evidence.",
-        "Usable with care: the recording does not ask for an effect in it. Compare it with the version before.",
-        "Not usable: go back to the version before.",
         "The controller would rely on an effect of which the recording gives no evidence.",
+        "the recording does not ask for an effect in it. Compare it with the version before",
     ),
     "sensor": Gate(
         "The load cell shows the same torque again and again: it clips, or it is not connected.",
-        "Usable with care: look at the highest torques in the chart first; the load cell clips.",
-        "Not usable: test again with the load cell checked.",
-        ("The controller would set too wide pulses: the plateau is not identified, as the load cell could not "
-             "show it."),
+        "The controller would set too wide pulses: the plateau is not identified, as the load cell could not show it.",
+        "look at the highest torques in the chart first; the load cell clips",
+        "the load cell checked",
     ),
-}  # fmt: skip
-"""Each check of `stimrig.identify.estimation.quality`, and `stored_model.without_evidence`."""
-
+}
+"""Each check of `stimrig.identify.estimation.quality`, and `stored_model.without_evidence`, which never refuses."""
 
 BESIDE: dict[str, str] = {
     "unsure": "Usable: approve it. Whether something is missing, this recording cannot tell.",
@@ -140,13 +130,12 @@ BESIDE: dict[str, str] = {
 
 def findings(document: dict[str, Any]) -> list[Finding]:
     """List the failed checks, those that make a model not usable first; empty for models without stored checks."""
-    gates = (document.get("quality") or {}).get("gates") or {}
-    failed = [(name, gate) for name, gate in gates.items() if not gate.get("passed", True)]
-    failed.sort(key=lambda pair: (pair[1].get("severity") != "refuse", pair[0] != "evidence"))
+    gates = (document.get("quality") or {}).get("gates", {})
+    failed = [(name, gate) for name, gate in gates.items() if not gate["passed"]]
+    failed.sort(key=lambda pair: (pair[1]["severity"] != "refuse", pair[0] != "evidence"))
     return [
-        Finding(name, GATES[name].found, GATES[name].risk, gate.get("says", ""), gate.get("severity") == "refuse")
+        Finding(name, GATES[name].found, GATES[name].risk, gate["says"], gate["severity"] == "refuse")
         for name, gate in failed
-        if name in GATES
     ]
 
 
@@ -188,7 +177,7 @@ def advice(
     if verdict == "usable with care":
         if missing:
             return Advice(add, f"Usable with care: add {effects} first.")
-        words = worst.look if worst else "Usable with care: look at where the error sits first."
+        words = f"Usable with care: {worst.look if worst else 'look at where the error sits first'}."
         if kind in ("nothing", "unsure") and not (failed and failed[0].gate == "evidence"):
             return Advice("approve", words)
         if experiment:
@@ -197,8 +186,8 @@ def advice(
     if verdict == "not usable":
         if missing and all(finding.gate in ("gap", "ceiling") for finding in failed if finding.severe):
             return Advice(add, f"Not usable as it is: add {effects}, or test again.")
-        again = "Not usable: test again with electrodes, fixture and load cell checked."
-        return Advice("test", worst.test if worst else again)
+        again = worst.test if worst else "electrodes, fixture and load cell checked"
+        return Advice("test", f"Not usable: test again with {again}.")
     return Advice("fit", "There is no verdict on this model: test again, or fit the recording again.")
 
 

@@ -114,40 +114,29 @@ def carried_context(versions: Versions, row: Model, diagnosis: dict[str, Any] | 
     """What `model.html` shows of what was carried over: to the plain version, or to its child in that structure.
 
     None where its recording was asked nothing of the kind. `new` is None as long as there is no diagnosis; `again`:
-    those left out that the diagnosis asks for; `offered`: this version is the one; `better`: the carried one is.
+    those left out that the diagnosis asks for; `better`: the carried version is.
     """
     found = row.carried
     if found is None or found["why"] == "plain-before":
         return None
-    carried = row.carried_from_id is not None
-    earlier = versions.get(found["from_model_id"])
-    missing = None
-    if diagnosis is not None:  # what the diagnosis wants to be added: what it only names, it does not ask for
-        wanted = asked_for(diagnosis)
-        missing = [entry for entry in diagnosis["missing"] if entry["effect"] in wanted]
+    is_plain, earlier = row.carried_from_id is None, versions.get(found["from_model_id"])
+    wanted = set() if diagnosis is None else asked_for(diagnosis)  # what it only names, it does not ask for
+    missing = [entry for entry in (diagnosis or {}).get("missing", []) if entry["effect"] in wanted]
     known = [effect["effect"] for effect in found["effects"]]
-    again = {entry["effect"] for entry in missing or []} & {*found["no_longer_needed"], *found["undecided"]}
+    again = {entry["effect"] for entry in missing} & {*found["no_longer_needed"], *found["undecided"]}
     left = [effect for effect in found["effects"] if effect["effect"] not in again]
+    below = [other for other in versions.lineage(row) if other.parent_id == row.id and other.carried_from_id]
     return {
         "earlier": {"id": earlier.id, "created_utc": earlier.created_utc},
         "kept": [effect for effect in found["effects"] if effect["needed"]],
         "dropped": [effect for effect in left if effect["needed"] is False],
         "undecided": [effect for effect in left if effect["needed"] is None],
         "new": None
-        if missing is None
+        if diagnosis is None
         else [name_of(entry["effect"], {entry["effect"]: entry}) for entry in missing if entry["effect"] not in known],
         "again": [effect["name"] for effect in found["effects"] if effect["effect"] in again],
-        "offered": carried == (found["offered"] == "carried"),
-        "other": _other(versions, row, carried),
+        "other": next((other.id for other in below), None) if is_plain else row.parent_id,
         "better": found["offered"] == "carried",
-        "is_plain": not carried,
+        "is_plain": is_plain,
         "reason": found["reason"],
     }
-
-
-def _other(versions: Versions, row: Model, carried: bool) -> str | None:
-    """The plain version of a carried one; the carried one of a plain one, where there is one."""
-    if carried:
-        return row.parent_id
-    below = [other for other in versions.lineage(row) if other.parent_id == row.id and other.carried_from_id]
-    return below[0].id if below else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 REASONS: dict[str, str] = {
@@ -15,22 +14,6 @@ REASONS: dict[str, str] = {
 }
 
 COLUMNS = ("pulse_width_us", "reference_torque_nm", "predicted_torque_nm")
-
-
-def rows(found: Sequence[dict[str, Any]]) -> list[dict[str, str]]:
-    """A row for each stretch: when, how much lacks, why."""
-    return [
-        {
-            "when": f"{_number(one['begin_s'])} to {_number(one['end_s'])} s",
-            "lacks": f"{_number(one['shortfall_nm'])} N·m",
-            "why": str(REASONS.get(one["reason"], one["reason"])),
-        }
-        for one in found
-    ]
-
-
-def _number(value: float) -> str:
-    return f"{value:.2f}"
 
 
 def table(found: dict[str, Any]) -> str:
