@@ -10,7 +10,7 @@ import httpx
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from stimrig.api import decisions
+from stimrig.api.client import decisions
 from stimrig.api.client.errors import Unreachable, refused
 
 

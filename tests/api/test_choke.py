@@ -154,7 +154,7 @@ def test_who_leaves_in_the_middle_of_a_form_is_no_error_of_ours(
 
     with caplog.at_level(logging.INFO, logger="stimrig.api"):
         service.run(service.app(scope, receive, send))
-    assert "unexpected" not in caplog.text and "left before" in caplog.text
+    assert "unexpected" not in caplog.text and "the client left" in caplog.text
 
 
 def test_too_many_previews_at_once_are_refused_before_they_are_read(

@@ -12,7 +12,7 @@ import httpx
 import pytest
 from fastapi.routing import APIRoute
 
-from stimrig.api.decisions import DECISIONS
+from stimrig.api.client.decisions import DECISIONS
 from stimrig.api.web import routes
 from stimrig.api.web.app import routers
 from tests.api.conftest import Service, run_test, shared_service, soon

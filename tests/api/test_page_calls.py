@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from stimrig.api import decisions
+from stimrig.api.client import decisions
 from tests.api.conftest import HTML, Service, play_test, shared_service
 from tests.api.fake_arm import still
 from tests.api.forms import Control, Form, forms
