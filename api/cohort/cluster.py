@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import importlib.metadata
 import logging
-import platform
 import signal
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
-from typing import Any
 
 from dask import config
 from dask.utils import parse_bytes
@@ -19,7 +16,6 @@ from distributed.comm.core import CommClosedError
 from distributed.security import Security
 
 from stimrig.api.cohort.errors import SCHEDULER_GONE, CohortError, InterruptedRunError
-from stimrig.api.version import software_version
 
 CONNECT_S = 15.0
 MIN_MEMORY_BYTES = 256 * 2**20
@@ -43,11 +39,11 @@ def parse_memory(text: str) -> int:
 
 @contextmanager
 def connect(scheduler: str = "", workers: int = 2, wait_s: float = 60.0) -> Iterator[Client]:
-    """Give a client whose workers are there and have this version; end all that was started.
+    """Give a client whose workers are there; end all that was started.
 
     `scheduler`: its address; empty: this many `workers` of this machine; `wait_s`: for the first worker of a scheduler.
 
-    Raises CohortError: no scheduler, no worker, or workers of another version. InterruptedRunError: the scheduler went.
+    Raises CohortError: no scheduler, or no worker. InterruptedRunError: the scheduler went.
     """
     _silence_dask()
     with warnings.catch_warnings(), config.set(SETTINGS):
@@ -103,24 +99,4 @@ def _connect_to(address: str, wait_s: float) -> Iterator[Client]:
         except TimeoutError:
             remedy = "Start some with `dask worker`, or give more time with --wait."
             raise CohortError(f"--scheduler {address}: no worker within {wait_s:g} s. {remedy}") from None
-        check_versions(client)
         yield client
-
-
-def check_versions(client: Client) -> None:
-    """Raise CohortError if stimrig or Python of a worker is another version."""
-    for package, ask, arguments, here in (
-        ("stimrig", importlib.metadata.version, ("stimrig",), software_version()),
-        ("Python", _python_version, (), _python_version()),
-    ):
-        versions: Any = client.run(ask, *arguments, on_error="return")
-        for worker, version in versions.items():
-            if not isinstance(version, str):
-                raise CohortError(f"worker {worker}: no {package} there. Install stimrig[cohort] {software_version()}.")
-            if version != here:
-                remedy = "Install the same version there."
-                raise CohortError(f"worker {worker}: {package} {version}, here {here}. {remedy}")
-
-
-def _python_version() -> str:
-    return ".".join(platform.python_version_tuple()[:2])

@@ -155,27 +155,20 @@ def _list_bucket(url: str) -> Iterator[Entry]:
     try:
         if files.isfile(path):
             yield _object_entry(files, files.info(path), url)
-        elif files.exists(path):
-            yield from _list_prefix(files, path, url)
-        else:
+            return
+        if not files.exists(path):
             raise CohortError(f"{url}: nothing is there. Check the address.")
+        for _, folders, objects in files.walk(path, detail=True, on_error="raise"):
+            for hidden in [name for name in folders if name.startswith(".")]:
+                del folders[hidden]
+            exported = set(EXPORT_TABLES) <= objects.keys()
+            for name, item in sorted(objects.items()):
+                if _is_record(name, exported):
+                    yield _object_entry(files, item, url)
     except CohortError:
         raise
     except Exception as error:  # each protocol has errors of its own
         raise CohortError(f"{url}: {_one_line(error)}. Check the address, the network and the keys.") from error
-
-
-def _list_prefix(files: Any, folder: str, url: str) -> Iterator[Entry]:
-    items = {item["name"].rstrip("/").rpartition("/")[2]: item for item in files.ls(folder, detail=True)}
-    exported = set(EXPORT_TABLES) <= items.keys()
-    for name, item in sorted(items.items()):
-        if item["name"].rstrip("/") == folder.rstrip("/"):
-            continue
-        if item["type"] == "directory":
-            if not name.startswith("."):
-                yield from _list_prefix(files, item["name"], url)
-        elif _is_record(name, exported):
-            yield _object_entry(files, item, url)
 
 
 def _object_entry(files: Any, item: dict[str, Any], url: str) -> Entry:

@@ -73,7 +73,7 @@ def test_wrong_key_of_the_rig_file_is_named(tmp_path: Path) -> None:
 
 
 def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
-    assert doctor.port_finding("stimulator", Path(__file__)).verdict == "fails"
+    assert doctor.examine_port("stimulator", Path(__file__)).verdict == "fails"
 
 
 def test_little_room_and_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

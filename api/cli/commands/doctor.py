@@ -1,4 +1,4 @@
-"""`stimrig doctor`: what on this machine keeps a rig from working, and how to fix it."""
+"""`stimrig doctor`: check what this machine needs for a rig, and say how to fix what is missing."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import sys
 import tempfile
 import time
 import tomllib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args
@@ -31,7 +32,7 @@ LATE_MS, SLOW_DISK_MS = 5.0, 200.0
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing looked at."""
+    """The result of one check."""
 
     check: str
     verdict: Verdict
@@ -41,29 +42,20 @@ class Finding:
 
 
 def examine(settings: Settings) -> list[Finding]:
-    """All checks; one that breaks is a finding, too."""
-    found: list[Finding] = []
-    for name, check in checks().items():
-        try:
-            found += check(settings)
-        except Exception as error:
-            found.append(Finding(name, "care", f"could not be checked: {type(error).__name__}: {error}"))
-    return found
-
-
-def checks() -> dict[str, Callable[[Settings], Iterator[Finding]]]:
-    """The checks of this module, in the order they are written."""
-    return {name.removeprefix("check_"): check for name, check in globals().items() if name.startswith("check_")}
-
-
-def as_dict(found: list[Finding]) -> dict[str, Any]:
-    """The findings as one object."""
-    worst = max((finding.verdict for finding in found), key=get_args(Verdict).index, default="ok")
-    return {"verdict": worst, "findings": [asdict(finding) for finding in found]}
+    """Run all checks in the order in which they are written; one that raises an error is a finding, too."""
+    findings: list[Finding] = []
+    for name, check in globals().items():
+        if name.startswith("check_"):
+            try:
+                findings += check(settings)
+            except Exception as error:
+                says = f"could not be checked: {type(error).__name__}: {error}"
+                findings.append(Finding(name.removeprefix("check_"), "care", says))
+    return findings
 
 
 def check_rig_file(settings: Settings) -> Iterator[Finding]:
-    """The rig file, read by the rig's own reader, in a process of its own."""
+    """Read the rig file with the rig's own reader, in a process of its own."""
     if settings.rig_file is None:
         yield Finding("rig file", "ok", "none given: the emulated rig will be used")
         return
@@ -78,59 +70,58 @@ def check_rig_file(settings: Settings) -> Iterator[Finding]:
 
 
 def check_devices(settings: Settings) -> Iterator[Finding]:
-    """Are the stimulator's port and the load cell's bus there, and may this user use them?"""
+    """Check that the stimulator's port and the load cell's bus are there, and that this user may use them."""
     if settings.rig_file is None or not settings.rig_file.is_file():
         return
     content = tomllib.loads(settings.rig_file.read_text("utf-8"))
-    port = (content.get("stimulator") or {}).get("port")
-    if port:
-        yield port_finding("stimulator", Path(port))
-    bus = (content.get("load_cell") or {}).get("bus") or {}
-    if bus:
-        yield bus_finding(bus)
+    if port := (content.get("stimulator") or {}).get("port"):
+        yield examine_port("stimulator", Path(port))
+    if bus := (content.get("load_cell") or {}).get("bus"):
+        yield examine_bus(bus)
 
 
-def port_finding(what: str, port: Path) -> Finding:
-    """A serial port: there, a device, and ours to use."""
+def examine_port(device: str, port: Path) -> Finding:
+    """Check a serial port."""
     if not port.exists():
         fix = "plug it in and switch it on; `ls -l /dev/serial/by-id /dev/stimrig` shows what is there"
-        return Finding(what, "fails", f"{port} is not there", fix)
-    mode = port.stat().st_mode
-    if not stat.S_ISCHR(mode):
-        return Finding(what, "fails", f"{port} is no serial port", "give its name under /dev in the rig file")
+        return Finding(device, "fails", f"{port} is not there", fix)
+    if not stat.S_ISCHR(port.stat().st_mode):
+        return Finding(device, "fails", f"{port} is no serial port", "give its name under /dev in the rig file")
     if not os.access(port, os.R_OK | os.W_OK):
         fix = "add this user to the port's group (dialout), or install deploy/udev/70-stimrig.rules; sign in again"
-        return Finding(what, "fails", f"{port} may not be read and written by this user", fix)
-    return Finding(what, "ok", f"{port} is there and may be used")
+        return Finding(device, "fails", f"{port} may not be read and written by this user", fix)
+    return Finding(device, "ok", f"{port} is there and may be used")
 
 
-def bus_finding(bus: dict[str, Any]) -> Finding:
-    """A CAN bus by its kind."""
+def examine_bus(bus: dict[str, Any]) -> Finding:
+    """Check the load cell's CAN bus, as far as its kind allows without opening it."""
     kind, channel = str(bus.get("interface", "")), str(bus.get("channel", ""))
     if kind == "slcan":
-        return port_finding("load cell", Path(channel.partition("@")[0]))
+        return examine_port("load cell", Path(channel.partition("@")[0]))
+    verdict, says, fix = "care", f"a {kind} bus cannot be checked without opening it", ""
     if kind == "socketcan":
         link = Path("/sys/class/net") / channel
         if not link.exists():
+            verdict, says = "fails", f"there is no interface {channel}"
             fix = f"plug the adapter in; systemctl start stimrig-can@{channel} brings it up"
-            return Finding("load cell", "fails", f"there is no interface {channel}", fix)
-        if not int((link / "flags").read_text(), 16) & 1:
+        elif not int((link / "flags").read_text(), 16) & 1:
+            verdict, says = "fails", f"{channel} is down"
             fix = f"ip link set {channel} up type can bitrate …, or systemctl start stimrig-can@{channel}"
-            return Finding("load cell", "fails", f"{channel} is down", fix)
-        return Finding("load cell", "ok", f"{channel} is up")
-    if kind == "socketcand":
+        else:
+            verdict, says = "ok", f"{channel} is up"
+    elif kind == "socketcand":
         host, port = str(bus.get("host", "127.0.0.1")), int(bus.get("port", 29536))
         try:
             socket.create_connection((host, port), timeout=2).close()
+            verdict, says = "ok", f"socketcand answers at {host}:{port}"
         except OSError as error:
-            says = f"socketcand at {host}:{port}: {error.strerror or error}"
-            return Finding("load cell", "fails", says, "start socketcand on that machine")
-        return Finding("load cell", "ok", f"socketcand answers at {host}:{port}")
-    return Finding("load cell", "care", f"a {kind} bus cannot be checked without opening it")
+            verdict, says = "fails", f"socketcand at {host}:{port}: {error.strerror or error}"
+            fix = "start socketcand on that machine"
+    return Finding("load cell", verdict, says, fix)
 
 
 def check_rig(settings: Settings) -> Iterator[Finding]:
-    """Does the rig's process answer, and does it stand still?"""
+    """Check that the rig's process answers, and is not latched."""
     if settings.rig_socket is None:
         return
     try:
@@ -138,22 +129,22 @@ def check_rig(settings: Settings) -> Iterator[Finding]:
             line.settimeout(3)
             line.connect(str(settings.rig_socket))
             line.sendall(b'{"kind": "status", "id": 1}\n')
-            body = json.loads(line.makefile().readline())["body"]
+            status = json.loads(line.makefile().readline())["body"]
     except (OSError, ValueError, KeyError) as error:
         fix = "systemctl status stimrig-rig; its journal says why"
         yield Finding("rig", "fails", f"{settings.rig_socket}: no answer ({error})", fix)
         return
-    if body["state"] in ("latched", "uncertain", "disconnected"):
+    if status["state"] in ("latched", "uncertain", "disconnected"):
         fix = "check the participant and the rig, then re-arm it on the page"
-        yield Finding("rig", "fails", f"{body['state']}: {body['reason']}", fix)
+        yield Finding("rig", "fails", f"{status['state']}: {status['reason']}", fix)
     else:
-        yield Finding("rig", "ok", body["state"])
+        yield Finding("rig", "ok", status["state"])
 
 
 def check_data(settings: Settings) -> Iterator[Finding]:
-    """The data folder: ours to write, closed to others, with room, on a disk that keeps pace."""
+    """Check the data folder: writable, closed to others, with room, on a disk that is fast enough."""
     folder = settings.data_dir.absolute()
-    nearest = next(place for place in (folder, *folder.parents) if place.exists())
+    nearest = nearest_folder(folder)
     if not os.access(nearest, os.W_OK | os.X_OK):
         fix = f"chown it to this user, or set STIMRIG_DATA_DIR; deploy/install.sh makes {folder} as it should be"
         yield Finding("data folder", "fails", f"{nearest} may not be written by this user", fix)
@@ -163,17 +154,22 @@ def check_data(settings: Settings) -> Iterator[Finding]:
     else:
         yield Finding("data folder", "ok", f"{folder} may be written, by this user and its group")
     free_gb = shutil.disk_usage(nearest).free / 1e9
-    says, fix = f"{free_gb:.1f} GB free; a test takes 5 MB", "make room, or move old recordings to the backup"
-    yield Finding("disk", "fails" if free_gb < LEAST_FREE_GB else "care" if free_gb < GOOD_FREE_GB else "ok", says, fix)
+    verdict = "fails" if free_gb < LEAST_FREE_GB else "care" if free_gb < GOOD_FREE_GB else "ok"
+    fix = "make room, or move old recordings to the backup"
+    yield Finding("disk", verdict, f"{free_gb:.1f} GB free; a test takes 5 MB", fix)
     slowest_ms = max(synced_ms(nearest) for _ in range(5))
     says = f"slowest of five writes to the disk: {slowest_ms:.0f} ms"
-    yield Finding(
-        "disk speed", "care" if slowest_ms > SLOW_DISK_MS else "ok", says, "use a local disk, not a network disk"
-    )
+    verdict = "care" if slowest_ms > SLOW_DISK_MS else "ok"
+    yield Finding("disk speed", verdict, says, "use a local disk, not a network disk")
+
+
+def nearest_folder(path: Path) -> Path:
+    """Return the path, or the nearest folder above it that exists."""
+    return next(place for place in (path, *path.parents) if place.exists())
 
 
 def synced_ms(folder: Path) -> float:
-    """A journal's second of data, brought to the disk, ms."""
+    """Return the time to bring one second of a journal to the disk, ms."""
     with tempfile.TemporaryFile(dir=folder) as file:
         began = time.perf_counter()
         file.write(b"\0" * 65536)
@@ -183,7 +179,7 @@ def synced_ms(folder: Path) -> float:
 
 
 def check_database(settings: Settings) -> Iterator[Finding]:
-    """Does the database open, and does its audit trail hold?"""
+    """Check that the database opens, and that the chain of its audit trail is complete."""
     if settings.database_url is None and not (settings.data_dir / "stimrig.db").exists():
         yield Finding("database", "ok", "not there yet; the first start makes it")
         return
@@ -192,14 +188,12 @@ def check_database(settings: Settings) -> Iterator[Finding]:
     from stimrig.api.store.tables import AuditEntry
 
     try:
-        store = Store(settings.database)
+        with closing(Store(settings.database)) as store:
+            entries = store.all(AuditEntry, order=AuditEntry.seq)
     except ApiError as error:
         yield Finding("database", "fails", str(error), "restore it from the backup (docs/install.md)")
         return
-    entries = store.all(AuditEntry, order=AuditEntry.seq)
-    broken = audit.first_broken(entries)
-    store.close()
-    if broken is None:
+    if (broken := audit.first_broken(entries)) is None:
         yield Finding("database", "ok", f"opens; the chain of the audit trail's {len(entries)} entries is complete")
     else:
         fix = "compare with the backup: the database was changed outside the service"
@@ -207,7 +201,7 @@ def check_database(settings: Settings) -> Iterator[Finding]:
 
 
 def check_wake_up(_settings: Settings) -> Iterator[Finding]:
-    """Does this machine wake up in time?"""
+    """Check that this machine wakes up in time."""
     late_ms = []
     for _ in range(200):
         began = time.perf_counter()
@@ -219,39 +213,41 @@ def check_wake_up(_settings: Settings) -> Iterator[Finding]:
     yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, fix)
 
 
+RIGHTS = {
+    "priority": (
+        f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({SENDER_PRIORITY}))",
+        ("real-time priority is granted", "no real-time priority for this user"), "LimitRTPRIO=60", "rtprio 60",
+    ),
+    "memory": (
+        "import ctypes, sys; sys.exit(-ctypes.CDLL(None).mlockall(7))",
+        ("the rig's memory may be kept from the disk", "this user may not lock memory: after a rest it may be read "
+         "back from the disk, and a pulse is late"), "LimitMEMLOCK=infinity", "memlock unlimited",
+    ),
+}  # fmt: skip
+"""By check: a program that needs the right, what to say with and without it, and the lines that grant it."""
+
+
 def check_rights(_settings: Settings) -> Iterator[Finding]:
-    """May the rig's sender run before everything else, from memory that stays?"""
-    rights = {
-        "priority": (
-            f"import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param({SENDER_PRIORITY}))",
-            ("real-time priority is granted", "no real-time priority for this user"), "LimitRTPRIO=60", "rtprio 60",
-        ),
-        "memory": (
-            "import ctypes, sys; sys.exit(-ctypes.CDLL(None).mlockall(7))",
-            ("the rig's memory may be kept from the disk", "this user may not lock memory: after a rest it may be read "
-             "back from the disk, and a pulse is late"), "LimitMEMLOCK=infinity", "memlock unlimited",
-        ),
-    }  # fmt: skip
-    for name, (code, says, unit, line) in rights.items():
+    """Check that the rig's sender may run before everything else, from memory that stays."""
+    for name, (code, says, unit, line) in RIGHTS.items():
         allowed = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=30).returncode == 0
         fix = f"{unit} as in deploy/systemd/stimrig-rig.service, or `USER - {line}` in /etc/security/limits.d"
         yield Finding(name, "ok" if allowed else "care", says[not allowed], "" if allowed else fix)
 
 
 def check_compiled(_settings: Settings) -> Iterator[Finding]:
-    """Can what numba compiles be kept, so that the first fit is not a slow one?"""
+    """Check that what numba compiles is kept, so that the first fit is not a slow one."""
     from stimrig import identify
 
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(str(identify.__file__)).parent)
-    nearest = next(folder for folder in (place, *place.parents) if folder.exists())
-    kept = os.access(nearest, os.W_OK | os.X_OK)
+    kept = os.access(nearest_folder(place), os.W_OK | os.X_OK)
     says = f"{place} {'may' if kept else 'may not'} be written"
     fix = "set NUMBA_CACHE_DIR to a folder of this user; otherwise each start compiles again, for about ten seconds"
     yield Finding("compiled code", "ok" if kept else "care", says, "" if kept else fix)
 
 
 def check_door(settings: Settings) -> Iterator[Finding]:
-    """Is the service closed to the network unless TLS stands in front?"""
+    """Check that the service is closed to the network unless TLS stands in front."""
     from stimrig.api.web.server import refuse_open_door
 
     try:
@@ -276,14 +272,14 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check devices, permissions, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
-    found = examine(Settings(**given(rig_file=rig, data_dir=data, rig_socket=socket)))
-    report = as_dict(found)
+    findings = examine(Settings(**given(rig_file=rig, data_dir=data, rig_socket=socket)))
+    worst = max((finding.verdict for finding in findings), key=get_args(Verdict).index, default="ok")
     if as_json:
-        say_json(report)
+        say_json({"verdict": worst, "findings": [asdict(finding) for finding in findings]})
     else:
-        for finding in found:
+        for finding in findings:
             say(f"{MARKS[finding.verdict]}  {finding.check:14} {finding.says}")
             if finding.verdict != "ok" and finding.fix:
                 say(f"{'':23}-> {finding.fix}")
-    if report["verdict"] == "fails":
+    if worst == "fails":
         raise typer.Exit(1)
