@@ -73,7 +73,7 @@ async def start(
         try:
             _refuse_kind(who, body)
             participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
-            model = await asyncio.to_thread(_model_sent, runner, body.participant, tags or ())
+            model = await asyncio.to_thread(_model_sent, runner, body, tags or ())
             body = await _within_plan(runner, store, who, body, participant)
             version = (str(participant.version),)  # what the plan and the model were looked at with
             return await runner.start(body, who.name, holder=who.token_hash, tags=version, model=model)
@@ -89,7 +89,6 @@ async def start(
 async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestIn, participant: Participant) -> TestIn:
     """The test with the plan's limits, where the plan allows it."""
     plan = who.plan or {}
-    await asyncio.to_thread(_refuse_other_rate, runner, body)
     begun = (Test.requested_by == who.name, Test.state != "refused")  # what the rig refused was no trial
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
         raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
@@ -100,11 +99,7 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
         if asked is not None and not asked <= plan[name]:
             raise beyond(f"{name} {asked:g} {unit} is above the plan's {plan[name]:g} {unit}")
         limits[name] = min(value for value in (asked, plan[name], participant.profile.get(name)) if value is not None)
-    if body.profile and body.profile.max_torque_nm:
-        limits["max_torque_nm"] = body.profile.max_torque_nm
-    if body.profile and body.profile.angle_range_rad:
-        limits["angle_range_rad"] = body.profile.angle_range_rad
-    narrowed = body.model_copy(update={"profile": ProfileIn(**limits)})
+    narrowed = body.model_copy(update={"profile": (body.profile or ProfileIn()).model_copy(update=limits)})
     preview = await runner.preview(narrowed)
     if not preview["duration_s"] <= plan["max_duration_s"] + 1e-9:
         raise beyond(f"{preview['duration_s']:g} s is longer than the plan's {plan['max_duration_s']:g} s")
@@ -126,29 +121,24 @@ def _refuse_kind(who: Principal, body: TestIn) -> None:
         raise beyond(f"A key sends no {wrong[0]}. Leave it out")
 
 
-def _model_sent(runner: Runner, participant: str, sent: Tags) -> str:
+def _model_sent(runner: Runner, body: TestIn, sent: Tags) -> str:
     """The tag, of those that were sent, of the model that is served now: the approved one, or what was tracked from it.
 
-    Raises ApiError: 412 none of them is; 409 no model is approved.
+    A key plays at the rate of the approved model: a person who made the key chose no other.
+
+    Raises ApiError: 412 none of them is; 409 no model is approved; 403 another rate.
     """
-    served = [runner.versions.served(participant), runner.trials.tracked.served(participant)]
-    if served[0] is None:
-        raise unapproved(participant)
-    for one in served:
-        if one is not None and (tag := one.etag.strip('"')) in sent:
-            return tag
-    raise trial_overtaken()
-
-
-def _refuse_other_rate(runner: Runner, body: TestIn) -> None:
-    """A key plays at the rate of the approved model: a person who made the key chose no other."""
     served = runner.versions.served(body.participant)
     if served is None:
         raise unapproved(body.participant)
+    tags = [found.etag.strip('"') for found in (served, runner.trials.tracked.served(body.participant)) if found]
+    if (tag := next((tag for tag in tags if tag in sent), None)) is None:
+        raise trial_overtaken()
     own_hz = float(json.loads(served.body)["pulse_rate_hz"])
     if not abs(body.pulse_rate_hz - own_hz) <= SAME_RATE * own_hz:
         asked = f"pulse_rate_hz {body.pulse_rate_hz:g} is not the approved model's {own_hz:g}"
         raise beyond(f"{asked} (40, where none is sent). Send the model's pulse_rate_hz")
+    return tag
 
 
 def unapproved(participant: str) -> ApiError:

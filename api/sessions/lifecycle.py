@@ -23,10 +23,8 @@ from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
 from stimrig.rig.messages import LABEL_TITLES, FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
-ROW = (
-    "id", "participant", "kind", "reason", "requested_by", "requested_utc", "finished_utc", "recording_id", "model_id"
-)  # fmt: skip
-"""What a test's document has of its row as it is."""
+NOT_SHOWN = ("plan", "summary", "version")
+"""Columns of a test that clients do not see as they are."""
 
 
 class Lifecycle:
@@ -63,7 +61,7 @@ class Lifecycle:
         if fits is None and row.model_id:
             fits = {row.model_id: self.versions.document(self.versions.get(row.model_id))}
         return {
-            **{name: getattr(row, name) for name in ROW},
+            **{name: value for name, value in row.as_dict().items() if name not in NOT_SHOWN},
             "state": "sealing" if sealing else row.state,
             "done": row.state not in OPEN_STATES,
             "segment": segment,
@@ -131,23 +129,19 @@ class Lifecycle:
     async def identify(self, test_id: str, last_sample_unix_s: float | None = None) -> None:
         """Identify a test's recording in a worker and store the model."""
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
-        parent = None
-        try:
-            recording, parent = await self._record_of(row)
-        except ApiError as error:
-            reason = f"joining the recordings: {error.detail or error.title}"
-            await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
-            return
 
         def take(job: Job) -> None:
             self.jobs[test_id] = job
 
         how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.on_progress(test_id)}
+        step = "joining the recordings"
         try:
+            recording, parent = await self._record_of(row)
+            step = "identification"
             model = await self._first_version(row, recording, parent, take, dict(how))
             model = await carried_structure.carry(self.analyses, model, recording.path, take, **how)
         except ApiError as error:
-            reason = f"identification: {error.detail or error.title}"
+            reason = f"{step}: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
             return
         finally:
@@ -204,14 +198,10 @@ class Lifecycle:
         status = self.rig.status
         if status is not None and status.finished is not None and status.finished.test_id == test_id:
             return status.finished
-        found = await self._find_recording(test_id)
         event = FinishedEvent(test_id=test_id, outcome="fault", reason=why, last_sample_unix_s=None)
-        return event.model_copy(update=found)
-
-    async def _find_recording(self, test_id: str) -> dict[str, Any]:
         job = self.pool.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
         try:
-            return (await job.result).get("found") or {}
+            return event.model_copy(update=(await job.result).get("found") or {})
         except ApiError as error:
             log.warning("looking for the recording of %s: %s", test_id, error)
-            return {}
+            return event
