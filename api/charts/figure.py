@@ -17,9 +17,10 @@ SHEET = Path(__file__).parents[1] / "web" / "pages" / "static" / "page.css"
 
 
 def _read_light() -> dict[str, str]:
-    """Read the colours of `page.css` by role; a role that refers to another one has that one's colour."""
+    """Read the light colours of `page.css` by role; a role that refers to another one has that one's colour."""
     sheet = SHEET.read_text("utf-8")
-    colours = dict(re.findall(r"--([\w-]+): ([^;]+);", sheet[: sheet.index("\n}")]))
+    values = re.findall(r"--([\w-]+): ([^;]+);", sheet[: sheet.index("\n}")])
+    colours = {name: value.removeprefix("light-dark(").partition(", ")[0] for name, value in values}
     return {name: colours.get(value.removeprefix("var(--").rstrip(")"), value) for name, value in colours.items()}
 
 

@@ -12,19 +12,18 @@ STATIC = HERE / "static"
 LUMINANCE = (0.2126, 0.7152, 0.0722)
 
 
-def variables(sheet: str) -> dict[str, str]:
-    """Names and values of a style sheet's first `:root`; one that points to another has that one's value."""
-    body = re.search(r":root \{(.*?)\n\}", (STATIC / sheet).read_text("utf-8"), re.DOTALL)
-    assert body is not None
-    found = dict(re.findall(r"--([\w-]+): ([^;]+);", body[1]))
-    return {name: found.get(value[6:-1], value) if value.startswith("var(") else value for name, value in found.items()}
-
-
 def modes() -> dict[str, dict[str, str]]:
-    """Both sets; the dark one in full."""
-    light = variables("page.css")
-    dark = {**light, **variables("dark.css")}
-    return {"light": light, "dark": {**dark, "torque": dark["model"]}}
+    """The colours of the style sheet's first `:root`, in light and in dark."""
+    body = (STATIC / "page.css").read_text("utf-8").partition(":root {")[2].partition("\n}")[0]
+    pairs = {
+        name: re.fullmatch(r"light-dark\((\S+), (\S+)\)", value)
+        for name, value in re.findall(r"--([\w-]+): ([^;]+);", body)
+    }
+    same = dict(re.findall(r"--([\w-]+): (#[0-9a-f]+);", body))
+    return {
+        mode: same | {name: pair[number] for name, pair in pairs.items() if pair}
+        for number, mode in enumerate(("light", "dark"), start=1)
+    }
 
 
 def linear(colour: str) -> tuple[float, float, float]:
@@ -46,14 +45,15 @@ SURFACES = ("card", "paper", "soft", "chosen", "chart")
 TEXT = [
     *((ink, surface) for surface in SURFACES for ink in ("ink", "dim", "accent", "accent-dark")),
     *((ink, kind + "-bg") for kind in ("good", "warn", "bad") for ink in (kind, kind + "-ink", "ink", "dim")),
-    *((f"on-{name}", name) for name in ("primary", "stimulate", "stop", "tag", "running", "unknown", "emulated")),
-    *((f"on-{name}", f"{name}-hover") for name in ("primary", "stimulate", "stop")),
+    *((f"on-{name}", name) for name in ("stimulate", "stop", "tag", "running", "unknown", "emulated")),
+    *((f"on-{name}", f"{name}-hover") for name in ("stimulate", "stop")),
+    ("on-primary", "accent"), ("on-primary", "accent-dark"),
     ("ink", "field"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"), ("card", "good"),
 ]  # fmt: skip
 """Ink and what it stands on."""
 SEEN = [
-    *((part, surface) for part in ("edge", "focus", "stop", "stimulate", "primary") for surface in ("card", "paper")),
-    *((lamp, "card") for lamp in ("lamp-good", "lamp-warn", "lamp-off", "running", "unknown")), ("edge", "field"),
+    *((part, surface) for part in ("edge", "focus", "stop", "stimulate", "accent") for surface in ("card", "paper")),
+    *((lamp, "card") for lamp in ("lamp-good", "lamp-warn", "cursor", "running", "unknown")), ("edge", "field"),
     *((f"series-{k}", "chart") for k in range(1, 7)),
     *((role, "chart") for role in ("measured", "model", "residual", "width", "rising", "falling", "limit", "worst")),
 ]  # fmt: skip

@@ -34,7 +34,7 @@ def running(tab: Any, service: Service) -> Any:
 
 LIMIT_PIXELS = """(id) => { const c = document.getElementById(id), pen = c.getContext('2d');
   const probe = document.createElement('canvas').getContext('2d');
-  probe.fillStyle = getComputedStyle(document.documentElement).getPropertyValue('--limit'); probe.fillRect(0, 0, 1, 1);
+  probe.fillStyle = colourOf('limit'); probe.fillRect(0, 0, 1, 1);
   const [r, g, b] = probe.getImageData(0, 0, 1, 1).data, d = pen.getImageData(0, 0, c.width, c.height).data;
   let n = 0; for (let i = 0; i < d.length; i += 4)
     if (Math.abs(d[i] - r) + Math.abs(d[i + 1] - g) + Math.abs(d[i + 2] - b) < 60 && d[i + 3] > 100) n++;

@@ -117,7 +117,16 @@ def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service
         look_closer(tab, *names)
         press_everything(tab, len(names))
         seen |= set(names)
-    assert seen == {"overview", "comparison", "recruitment", "step", "residual", "falling", "signature-fatigue"}
+    assert seen == {
+        "overview",
+        "curve",
+        "comparison",
+        "recruitment",
+        "step",
+        "residual",
+        "falling",
+        "signature-fatigue",
+    }
 
 
 @pytest.fixture(scope="module")

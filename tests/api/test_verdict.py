@@ -217,43 +217,41 @@ def found(*gates: tuple[str, str]) -> list[advice.Finding]:
     return advice.findings({"quality": {"gates": {"range": {"passed": True}, **stored}}})
 
 
+FATIGUE, BOTH = ["Fatigue"], ["Fatigue", "Tremor"]
+
+
 @pytest.mark.parametrize(
-    ("verdict", "gates", "missing", "act", "words"),
+    ("verdict", "gates", "missing", "more", "act", "words"),
     [
-        ("usable", [], [], "approve", "Usable: approve it."),
-        ("usable", [], ["Fatigue"], "add", "Usable, and better with “Fatigue”: add that first."),
-        ("usable", [], ["Fatigue", "Tremor"], "improve", "“Fatigue” and “Tremor”: add that first."),
-        ("usable with care", [("ceiling", "care")], [], "approve", "look at where the error sits first"),
-        ("usable with care", [("sensor", "care")], [], "approve", "look at the highest torques"),
-        ("usable with care", [("gap", "care"), ("evidence", "care")], [], "look", "Compare it with the version before"),
-        ("usable with care", [("gap", "care")], ["Fatigue"], "add", "add “Fatigue” first"),
-        ("usable with care", [], [], "approve", "look at where the error sits first"),
-        ("not usable", [("torque", "refuse")], [], "test", "test again with electrodes, current and load cell"),
-        ("not usable", [("gap", "refuse"), ("range", "care")], ["Fatigue"], "add", "add “Fatigue”, or test again"),
-        ("not usable", [("torque", "refuse"), ("gap", "refuse")], ["Fatigue"], "test", "test again with electrodes"),
-        ("not usable", [], [], "test", "test again"),
-        ("unknown", [], [], "fit", "There is no verdict"),
+        ("usable", [], [], {}, "approve", "Usable: approve it."),
+        ("usable", [], [], {"kind": "unsure"}, "approve", "this recording cannot tell"),
+        ("usable", [], [], {"kind": "unexplained"}, "approve", "that is not explained"),
+        ("usable", [], [], {"kind": "missing", "experiment": True}, "approve", "possibly missing"),
+        ("usable", [], [], {"diagnosing": True}, "wait", "still being looked for"),
+        ("usable", [], FATIGUE, {}, "add", "Usable, and better with “Fatigue”: add that first."),
+        ("usable", [], BOTH, {}, "improve", "“Fatigue” and “Tremor”: add that first."),
+        ("usable with care", [("ceiling", "care")], [], {}, "approve", "look at where the error sits first"),
+        ("usable with care", [("sensor", "care")], [], {}, "approve", "look at the highest torques"),
+        ("usable with care", [("gap", "care"), ("evidence", "care")], [], {}, "look", "Compare it with the version"),
+        ("usable with care", [("gap", "care")], FATIGUE, {}, "add", "add “Fatigue” first"),
+        ("usable with care", [], [], {}, "approve", "look at where the error sits first"),
+        ("usable with care", [], [], {"kind": "unsure"}, "approve", "look at where the error sits first"),
+        ("usable with care", [], [], {"kind": "unexplained"}, "look", "look at where the error sits first"),
+        ("usable with care", [], [], {"kind": "unexplained", "experiment": True}, "experiment", "the next experiment"),
+        ("usable with care", [], [], {"kind": None}, "look", "look at where the error sits first"),
+        ("usable with care", [], [], {"diagnosing": True}, "wait", "still being looked for"),
+        ("not usable", [("torque", "refuse")], [], {}, "test", "test again with electrodes, current and load cell"),
+        ("not usable", [("gap", "refuse"), ("range", "care")], FATIGUE, {}, "add", "add “Fatigue”, or test again"),
+        ("not usable", [("torque", "refuse"), ("gap", "refuse")], FATIGUE, {}, "test", "test again with electrodes"),
+        ("not usable", [], [], {"diagnosing": True}, "test", "test again"),
+        ("unknown", [], [], {}, "fit", "There is no verdict"),
     ],
 )
-def test_the_verdict_says_what_to_do(
-    verdict: str, gates: list[tuple[str, str]], missing: list[str], act: str, words: str
+def test_verdict_and_diagnosis_give_one_advice(
+    verdict: str, gates: list[tuple[str, str]], missing: list[str], more: dict[str, Any], act: str, words: str
 ) -> None:
-    said = advice.advice(verdict, found(*gates), missing)
+    said = advice.advice(verdict, found(*gates), missing, **more)
     assert said.act == act and words in said.words
-
-
-def test_verdict_and_diagnosis_are_one_sentence() -> None:
-    """Beside "this record cannot tell" the page said no more than that the model is to be approved, and said so
-    before anybody had looked for what is missing."""
-    unsure = advice.advice("usable", [], [], "unsure")
-    assert unsure.act == "approve" and "this recording cannot tell" in unsure.words
-    assert "that is not explained" in advice.advice("usable", [], [], "unexplained").words
-    assert "possibly missing" in advice.advice("usable", [], [], "missing").words
-    for kind, act in (("unsure", "approve"), ("unexplained", "look"), (None, "look")):
-        assert advice.advice("usable with care", [], [], kind).act == act
-    for verdict in ("usable", "usable with care"):
-        assert advice.advice(verdict, [], [], None, diagnosing=True).act == "wait"
-    assert advice.advice("not usable", [], [], None, diagnosing=True).act == "test"
 
 
 def test_the_worst_finding_comes_first_and_risks_are_said_once() -> None:

@@ -51,7 +51,7 @@ def test_new_test_ends_the_diagnosis_in_the_background(client: httpx.Client, ser
     assert analyses.known(model, "diagnosis") is None
 
 
-def test_who_asks_does_not_wait_for_low_priority(client: httpx.Client, service: Service, participant: str) -> None:
+def test_a_request_does_not_wait_for_low_priority(client: httpx.Client, service: Service, participant: str) -> None:
     marker = make_slow(service, 0.2)
     model = run_test(client, participant)["model_id"]
     analyses = service.context.analyses
@@ -60,7 +60,7 @@ def test_who_asks_does_not_wait_for_low_priority(client: httpx.Client, service: 
     assert client.get(f"/v1/models/{model}/diagnosis").json()["verdict"] == "effect_missing"
 
 
-def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, service: Service, model: str) -> None:
+def test_job_reports_progress_and_can_be_cancelled(client: httpx.Client, service: Service, model: str) -> None:
     soon(lambda: service.context.analyses.known(model, "diagnosis"))
     body = {"effects": ["slow"], "force": True, "reason": "x"}
     begun, again = (client.post(f"/v1/models/{model}/effects?wait=false", json=body) for _ in range(2))
@@ -74,54 +74,68 @@ def test_job_tells_how_far_it_is_and_can_be_cancelled(client: httpx.Client, serv
     assert client.get("/v1/jobs/J999").status_code == 404
 
 
-def test_job_leads_to_its_result(client: httpx.Client, model: str) -> None:
-    begun = client.post(f"/v1/models/{model}/improve?wait=false")
-    assert begun.status_code == 202
-    job = soon(lambda: (found := client.get(begun.headers["location"]).json())["done"] and found)
-    assert job["state"] == "completed" and job["progress"] == 1.0
+def test_pages_of_jobs_lead_to_the_result_or_say_why_there_is_none(
+    client: httpx.Client, pages: httpx.Client, model: str
+) -> None:
+    def ended(ask: str, body: dict[str, Any]) -> tuple[dict[str, Any], httpx.Response]:
+        url = client.post(f"/v1/models/{model}/{ask}?wait=false", json=body).headers["location"]
+        job = soon(lambda: (found := client.get(url).json())["done"] and found)
+        return job, pages.get(url.removeprefix("/v1"))
+
+    job, page = ended("improve", {})
     assert client.get(job["result_url"]).json()["effects"] == ["fatigue"]
+    assert page.status_code == 303 and page.headers["location"] == job["result_url"].removeprefix("/v1")
+    _, page = ended("effects", {"effects": ["tremor"]})
+    assert page.status_code == 409
+    assert "gives no evidence for this effect" in page.text and "Back to the model" in page.text
+
+
+def test_cancelled_diagnosis_offers_to_begin_anew(client: httpx.Client, service: Service, participant: str) -> None:
+    make_slow(service)
+    model = run_test(client, participant)["model_id"]
+    with signed_in(service) as browser:
+        job = re.findall(r'data-call="DELETE (/v1/jobs/\w+)"', browser.get(f"/models/{model}").text)[0]
+        assert client.delete(job).json()["state"] == "cancelled"
+        page = browser.get(f"/models/{model}").text
+        assert "Diagnose now" in page and "data-job" not in page
 
 
 # ---- effects ------------------------------------------------------------------------------------------------
 
 
-def test_effect_that_is_not_there_is_refused_with_the_reason(
-    service: Service, client: httpx.Client, model: str
+def test_effect_without_evidence_needs_force_and_a_reason_and_is_marked(
+    pages: httpx.Client, client: httpx.Client, model: str
 ) -> None:
-    refused = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"]})
+    def add(to: str, *effects: str, **more: Any) -> httpx.Response:
+        return client.post(f"/v1/models/{to}/effects", json={"effects": effects, **more})
+
+    because = {"force": True, "reason": "seen with the eye"}
+    refused = add(model, "tremor")
     assert refused.status_code == 409 and refused.json()["type"] == "/problems/effect-not-there"
     assert "log evidence changes by -4.0" in refused.json()["reasons"]["tremor"]
-    silent = client.post(f"/v1/models/{model}/effects", json={"effects": ["tremor"], "force": True})
+    silent = add(model, "tremor", force=True)
     assert silent.status_code == 422 and "Give a reason" in silent.json()["detail"]
-    body = {"effects": ["tremor"], "force": True, "reason": "seen with the eye"}
-    forced = client.post(f"/v1/models/{model}/effects", json=body)
-    assert forced.status_code == 201 and forced.json()["effects"] == ["tremor"]
+    forced = add(model, "tremor", **because).json()
     entries = [entry for entry in client.get("/v1/audit").json()["entries"] if entry["action"] == "force effect"]
     assert [entry["detail"]["reason"] for entry in entries] == ["seen with the eye"]
-    assert forced.json()["without_evidence"] == ["tremor"] and forced.json()["verdict"] == "usable with care"
-    stored = client.get(f"/v1/models/{forced.json()['id']}").json()["model"]["quality"]
+    assert (forced["effects"], forced["without_evidence"]) == (["tremor"], ["tremor"])
+    stored = client.get(f"/v1/models/{forced['id']}").json()["model"]["quality"]
     assert stored["verdict"] == "usable with care" and not stored["gates"]["evidence"]["passed"]
-    with signed_in(service) as page:
-        html = page.get(f"/models/{forced.json()['id']}").text
-    assert "It holds an effect that was added without evidence" in html and "(without evidence)" in html
-    body |= {"effects": ["fatigue"]}  # the recording asks for it: to force it changes nothing
-    asked = client.post(f"/v1/models/{model}/effects", json=body)
-    assert asked.json()["without_evidence"] == []
-    with signed_in(service) as page:
-        client.post(f"/v1/models/{forced.json()['id']}/approve")
-        beside = f"/compare?model={model}&model={forced.json()['id']}"
-        for path in ("/participants/P017", "/participants/P017/trend", beside):
-            assert "tremor (without evidence)" in page.get(path).text, path
-        for path in (f"/models/{forced.json()['id']}", f"/models/{forced.json()['id']}/report"):
-            assert "with tremor (without evidence)" in page.get(path).text, path
-    both = client.post(f"/v1/models/{forced.json()['id']}/effects", json=body)
-    assert both.json()["without_evidence"][0] == "tremor", "a later version still holds it"
+    assert add(model, "fatigue", **because).json()["without_evidence"] == [], "the recording asks for it"
+    later = add(forced["id"], "fatigue", **because).json()
+    assert later["without_evidence"][0] == "tremor", "a later version still holds it"
+    at = f"/models/{forced['id']}"
+    assert "It holds an effect that was added without evidence" in pages.get(at).text
+    client.post(f"/v1{at}/approve")
+    places = ("/participants/P017", "/participants/P017/trend", f"/compare?model={model}&model={forced['id']}")
+    for path in (*places, at, f"{at}/report"):
+        assert "tremor (without evidence)" in pages.get(path).text, path
 
 
 def test_an_effect_added_before_anybody_had_looked_is_not_marked_for_good(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
-    marker = make_slow(service, 0.2)  # not half done: who asks later does not wait for it
+    marker = make_slow(service, 0.2)  # not half done: a later request does not wait for it
     model = run_test(client, participant)["model_id"]
     body = {"effects": ["fatigue", "fatigue"], "force": True, "reason": "seen with the eye"}
     hasty = client.post(f"/v1/models/{model}/effects", json=body).json()
@@ -140,7 +154,8 @@ def test_improve_makes_a_version_a_step_and_undo_goes_back(client: httpx.Client,
     better = versions[-1]["id"]
     assert versions[-1]["parent_id"] == model and done.headers["location"] == f"/v1/models/{better}"
     assert client.get(f"/v1/models/{better}").json()["model"]["extra"]["parent"] == model
-    assert client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"] == better
+    client.post(f"/v1/models/{better}/undo")
+    assert client.get("/v1/participants/P017/model").status_code == 404, "what was not in use brings nothing into use"
     client.post(f"/v1/models/{better}/approve")
     assert client.post(f"/v1/models/{better}/undo", json={"reason": "not plausible"}).json()["id"] == model
     assert client.get("/v1/participants/P017/model").json()["model_id"] == model
@@ -151,34 +166,14 @@ def test_improve_makes_a_version_a_step_and_undo_goes_back(client: httpx.Client,
     assert refused.status_code == 409 and "it is rejected. Approve it anew" in refused.json()["detail"]
 
 
-def test_undo_of_what_was_not_in_use_approves_nothing(client: httpx.Client, model: str) -> None:
-    better = client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"]
-    client.post(f"/v1/models/{better}/undo")
-    assert client.get("/v1/participants/P017/model").status_code == 404
-
-
-# ---- a version's own structure ------------------------------------------------------------------------------
-
-
-def with_fatigue(client: httpx.Client, model: str) -> str:
-    return client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
-
-
 def test_version_with_effects_is_criticised_with_them(client: httpx.Client, pages: httpx.Client, model: str) -> None:
-    better = with_fatigue(client, model)
+    better = client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()["id"]
     plain, own = (client.get(f"/v1/models/{name}/diagnosis").json() for name in (model, better))
     assert (plain["structure"], [entry["effect"] for entry in plain["missing"]]) == ([], ["fatigue"])
     assert (own["structure"], [entry["effect"] for entry in own["missing"]]) == (["fatigue"], ["threshold_drift"])
     page = pages.get(f"/models/{better}").text
     assert "Structure of the model: fatigue" in page and 'id="effect-threshold_drift"' in page
     assert 'id="effect-fatigue"' not in page
-    assert "Structure of the model: plain" in pages.get(f"/models/{model}").text
-    added = client.post(f"/v1/models/{better}/effects", json={"effects": ["threshold_drift"]})
-    assert added.status_code == 201 and added.json()["effects"] == ["fatigue", "threshold_drift"]
-
-
-def test_improving_a_version_adds_to_what_it_holds(client: httpx.Client, model: str) -> None:
-    better = with_fatigue(client, model)
     rows = client.post(f"/v1/models/{better}/improve").json()["versions"]
     assert rows[0]["id"] == better and rows[-1]["parent_id"] == better
     assert rows[-1]["effects"] == ["fatigue", "threshold_drift"]
@@ -190,6 +185,10 @@ def test_reasons_against_an_effect() -> None:
     found = {"missing": [fatigue], "free": free, "refused": [{"effect": "tremor", "reason": against}]}
     asked = ["fatigue", "drift", "free_level", "tremor", "torque_angle"]  # drift cannot be told apart from fatigue
     assert explanation.refusals(found, asked) == {"tremor": against, "torque_angle": explanation.NOT_TESTED}
+    objected = {**FATIGUE, "objection": "On held-out pulses the error would rise."}
+    with pytest.raises(ApiError) as refused:
+        explanation.require_evidence({"missing": [objected]}, ["fatigue"])
+    assert refused.value.detail.startswith("fatigue: On held-out pulses the error would rise.")
 
 
 # ---- the next experiment ------------------------------------------------------------------------------------
@@ -249,7 +248,7 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
     assert identify.read(exported).parts == joined.parts
 
 
-# ---- what the page says -------------------------------------------------------------------------------------
+# ---- words of a diagnosis -----------------------------------------------------------------------------------
 
 WORDS = "falling ramp, 120-180 µs: model too high by 0.4 N·m"
 PLACE = {
@@ -257,11 +256,11 @@ PLACE = {
     "direction": "falling", "text": f"{WORDS}, 31 % of the error above the noise",
 }  # fmt: skip
 FATIGUE = {"effect": "fatigue", "name": "Fatigue", "probability": 0.97, "rms_before_nm": 0.2, "rms_after_nm": 0.05}
-
-
-def shown(verdict: str, missing: list[dict[str, Any]], times: float) -> dict[str, Any]:
-    diagnosis = {"verdict": verdict, "missing": missing, "where": [PLACE], "noise_sd_nm": 0.04}
-    return explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04 * times})
+NOTHING = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": [PLACE]}
+MISSING = {"verdict": "effect_missing", "missing": [FATIGUE], "noise_sd_nm": 0.04}
+PART = {"verdict": "unexplained_structure", "missing": [{**FATIGUE, "probability": 0.45}], "noise_sd_nm": 0.04}
+FREE = {"effect": "free_level", "name": "Free level", "words": "", "parameters": {}}
+PLAN = {"deciding_experiment": {"text": "x"}}
 
 
 @pytest.mark.parametrize(
@@ -274,46 +273,52 @@ def shown(verdict: str, missing: list[dict[str, Any]], times: float) -> dict[str
     ],
 )
 def test_what_may_be_more_than_noise_is_not_called_noise(more: dict[str, Any], kind: str) -> None:
-    diagnosis = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": [], **more}
+    diagnosis = NOTHING | {"where": []} | more
     assert explanation.view(diagnosis, {"noise_sd_nm": 0.04, "rms_nm": 0.04})["kind"] == kind
     assert ("left is noise" in conclude(diagnosis).title) == (kind == "nothing")
 
 
-def test_effects_are_advised_in_the_order_in_which_improve_adds_them() -> None:
+@pytest.mark.parametrize(
+    ("diagnosis", "title", "advice", "ended"),
+    [
+        (PART | {"add": ["fatigue"]}, "explain a part of the error only", "Add “Fatigue”: it explains a part.",
+         "More can be learnt from this record."),
+        (PART | {"add": ["fatigue", "free_level"], "free": [FREE]} | PLAN, "a part of the error only",
+         "Add “Fatigue”: it explains a part. Add “Free level”: it describes what is left, and names no cause. "
+         "The next experiment teaches most about it.", "More"),
+        (PART | {"add": ["fatigue"]} | PLAN, "a part of the error only",
+         "Add “Fatigue”: it explains a part. Play the next experiment: it teaches most about what is left.", "More"),
+        (PART | {"add": []}, "structure that no effect of the library explains",
+         "Look at the worst places and at electrodes, load cell and fixture, and record again.",
+         "Nothing more can be learnt from this record alone."),
+        (MISSING | {"add": [], "missing": [{**FATIGUE, "next_experiment": "The ramp again."}]}, "An effect is missing",
+         "Add nothing yet: held-out pulses speak against adding any. The ramp again.", "Nothing more can be learnt"),
+    ],
+)  # fmt: skip
+def test_a_conclusion_advises_what_the_diagnosis_asks_for(
+    diagnosis: dict[str, Any], title: str, advice: str, ended: str
+) -> None:
+    said = conclude(diagnosis)
+    assert title in said.title and said.advice == advice and why_ended(diagnosis).startswith(ended)
+
+
+def test_effects_are_shown_in_the_order_in_which_improve_adds_them() -> None:
     rows = [{**FATIGUE, "effect": name, "name": name.title()} for name in ("tremor", "fatigue", "potentiation")]
-    diagnosis = {"verdict": "effect_missing", "missing": rows, "noise_sd_nm": 0.04, "add": ["fatigue", "tremor"]}
-    view = explanation.view(diagnosis, None)
+    view = explanation.view(MISSING | {"missing": rows, "add": ["fatigue", "tremor"]}, None)
     assert [entry["id"] for entry in view["missing"]] == ["fatigue", "tremor", "potentiation"]
     assert view["advice"] == "Add “Fatigue”, then “Tremor” to the model."
-    nothing = diagnosis | {"add": [], "missing": [{**FATIGUE, "next_experiment": "The ramp again."}]}
-    said = explanation.view(nothing, None)["advice"]
-    assert said.startswith("Add nothing yet") and said.endswith("The ramp again.")
-    assert why_ended(nothing).startswith("Nothing more can be learnt"), "there is nothing to be done with this record"
 
 
-def test_an_effect_that_explains_a_part_is_advised_and_not_denied() -> None:
-    """The title told that no effect explains the error, beside one that lowered it by 78 % and was to be added."""
-    part = {"verdict": "unexplained_structure", "missing": [{**FATIGUE, "probability": 0.45}], "noise_sd_nm": 0.04}
-    said = conclude(part | {"add": ["fatigue"]})
-    assert said.title == "Effects of the library explain a part of the error only"
-    assert said.advice == "Add “Fatigue”: it explains a part."
-    assert why_ended(part | {"add": ["fatigue"]}).startswith("More can be learnt from this record.")
-    free = {"effect": "free_level", "name": "Free level"}
-    both = conclude(part | {"add": ["fatigue", "free_level"], "free": [free], "deciding_experiment": {"text": "x"}})
-    assert both.advice.startswith("Add “Fatigue”: it explains a part. Add “Free level”: it describes what is left")
-    assert both.advice.endswith("The next experiment teaches most about it.")
-    planned = conclude(part | {"add": ["fatigue"], "deciding_experiment": {"text": "x"}})
-    assert planned.advice.endswith("it explains a part. Play the next experiment: it teaches most about what is left.")
-    refused = part | {"add": []}
-    assert conclude(refused).title == "The error has structure that no effect of the library explains"
-    assert conclude(refused).advice.startswith("Look at the worst places")
-    assert why_ended(refused).startswith("Nothing more can be learnt from this record alone.")
+def test_only_what_is_likely_missing_is_advised() -> None:
+    perhaps = {**FATIGUE, "effect": "tremor", "name": "Tremor", "probability": 0.45}
+    both, alone = (explanation.view(MISSING | {"missing": rows}, None) for rows in ([FATIGUE, perhaps], [perhaps]))
+    assert both["likely"] == ["Fatigue"] and both["title"] == "An effect is missing in this model"
+    assert alone["likely"] == [] and "possibly missing" in alone["title"] and len(alone["missing"]) == 1
 
 
 def test_what_is_left_to_add_is_said_by_the_diagnosis_that_named_it(
     client: httpx.Client, service: Service, model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Once one of two missing effects was added, a second search told that no effect explains the error."""
     rows = [{**FATIGUE, "effect": name, "name": name} for name in ("tremor", "fatigue")]
     found = {"verdict": "effect_missing", "missing": rows, "noise_sd_nm": 0.04, "add": ["fatigue", "tremor"],
              "base": {"held_out_rms_nm": 0.2, "rms_nm": 0.3}, "plain": ["as it was"]}  # fmt: skip
@@ -356,26 +361,19 @@ def test_a_free_effect_that_is_forced_and_asked_for_has_the_form_that_was_found(
 
 
 def test_a_free_effect_that_is_left_to_add_is_no_nothing() -> None:
-    """Once the named effect was added the same document said "nothing to add" and asked for the free one."""
-    free = {"effect": "free_level", "name": "Free level", "words": "", "parameters": {}}
-    found = {"verdict": "effect_missing", "missing": [FATIGUE], "free": [free], "add": ["fatigue", "free_level"],
-             "noise_sd_nm": 0.04, "base": {"held_out_rms_nm": 0.2}}  # fmt: skip
+    found = MISSING | {"free": [FREE], "add": ["fatigue", "free_level"], "base": {"held_out_rms_nm": 0.2}}
     left = explanation.remaining(found, ["fatigue"], {"held_out_rms_nm": 0.08})
     assert left["conclusion"]["kind"] == "unexplained" and "Free level" in left["conclusion"]["advice"]
 
 
-def test_where_something_is_left_its_places_are_shown() -> None:
-    """The verdict sent the reader to where the error sits, and there no place stood out."""
-    found = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": [PLACE]}
+def test_places_are_shown_where_something_is_left() -> None:
     rows = [{"label": "ramp", "share_of_excess": 1.0}]
     comparison = {"noise_sd_nm": 0.04, "rms_nm": 0.04, "where": [PLACE], "by": {"segment": rows}}
     for check, count in ((True, 0), (False, 1)):
-        view = explanation.view({**found, "residual_check": check}, comparison)
-        shown = missing_parts(view, comparison)
+        shown = missing_parts(explanation.view(NOTHING | {"residual_check": check}, comparison), comparison)
         assert len(shown["places"]) == len(shown["splits"]) == count
-    for passed, count in ((True, 0), (False, 1)):  # before a diagnosis is there
-        tests = {"tests": [{"passed": passed}]}
-        assert len(missing_parts(None, {**comparison, "tests": tests})["places"]) == count
+        before = missing_parts(None, {**comparison, "tests": {"tests": [{"passed": check}]}})
+        assert len(before["places"]) == count, "before a diagnosis is there"
 
 
 def test_a_further_test_is_told_what_it_decided() -> None:
@@ -394,50 +392,14 @@ def test_a_further_test_is_told_what_it_decided() -> None:
     )
 
 
-def test_what_left_out_or_held_out_rows_say_is_the_reason_at_every_door() -> None:
-    """The page added what rows of `validate` objected to."""
-    objected = {**FATIGUE, "objection": "On held-out pulses the error would rise."}
-    with pytest.raises(ApiError) as refused:
-        explanation.require_evidence({"missing": [objected]}, ["fatigue"])
-    assert refused.value.detail.startswith("fatigue: On held-out pulses the error would rise.")
-    assert explanation.refusals({"missing": [FATIGUE]}, ["fatigue"]) == {}
-
-
 def test_an_error_that_is_shown_of_a_model_is_its_own() -> None:
-    """Of a model with 0.056 N·m a second effect was shown to take it from 0.102 to 0.057, 44 % less: it was more."""
+    """A second effect is fitted beside the first: its error without itself is not that of the model on the page."""
     first = {**FATIGUE, "held_out_rms_before_nm": 0.056, "held_out_rms_after_nm": 0.05}
     second = {**FATIGUE, "effect": "tremor", "held_out_rms_before_nm": 0.102, "held_out_rms_after_nm": 0.057}
     base = {"held_out_rms_nm": 0.0555, "rms_nm": 0.2}
-    diagnosis = {"verdict": "effect_missing", "missing": [first, second], "noise_sd_nm": 0.04, "base": base, "add": []}
-    view = explanation.view(diagnosis, None)
+    view = explanation.view(MISSING | {"missing": [first, second], "base": base, "add": []}, None)
     assert [error[1] for error in view["missing"][0]["errors"]] == [0.2, 0.056]
     assert [error[1] for error in view["missing"][1]["errors"]] == [0.2] and view["to_add"] == []
-
-
-def test_only_what_is_likely_missing_is_advised() -> None:
-    """A person who adds whatever is possible ends with a model that is no better on new pulses."""
-    sure, perhaps = FATIGUE, {**FATIGUE, "effect": "tremor", "name": "Tremor", "probability": 0.45}
-    both = shown("effect_missing", [sure, perhaps], 6)
-    assert both["likely"] == ["Fatigue"] and both["title"] == "An effect is missing in this model"
-    found = shown("effect_missing", [perhaps], 6)
-    assert found["likely"] == [] and "possibly missing" in found["title"] and len(found["missing"]) == 1
-
-
-def test_a_job_that_fails_has_a_page_that_says_why(client: httpx.Client, pages: httpx.Client, model: str) -> None:
-    job = client.post(f"/v1/models/{model}/effects?wait=false", json={"effects": ["tremor"]}).json()["id"]
-    page = soon(lambda: (found := pages.get(f"/jobs/{job}")).status_code != 200 and found)
-    assert page.status_code == 409
-    assert "gives no evidence for this effect" in page.text and "Back to the model" in page.text
-
-
-def test_cancelled_diagnosis_offers_to_begin_anew(client: httpx.Client, service: Service, participant: str) -> None:
-    make_slow(service)
-    model = run_test(client, participant)["model_id"]
-    with signed_in(service) as browser:
-        job = re.findall(r'data-call="DELETE (/v1/jobs/\w+)"', browser.get(f"/models/{model}").text)[0]
-        assert client.delete(job).json()["state"] == "cancelled"
-        page = browser.get(f"/models/{model}").text
-        assert "Diagnose now" in page and "data-job" not in page
 
 
 def test_a_model_on_another_recording(client: httpx.Client, pages: httpx.Client, model: str, participant: str) -> None:

@@ -24,9 +24,7 @@ from stimrig.api.web.pages.environment import environment
 
 COLOURS = "stimrig_colours"
 """The choice; it says nothing about who chose. `colours.js` writes it, too: then no page has to be loaded again."""
-MEDIA = {"light": "not all", "dark": "screen", "system": "screen and (prefers-color-scheme: dark)"}
-"""For which media `dark.css` holds. Never for print."""
-environment.globals["colours_media"] = MEDIA
+CHOICES = ("light", "dark", "system")
 LOOK_S = 1.0
 
 
@@ -63,7 +61,7 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     shown["version_of"] = lambda _document: version
     shown["csrf"] = (looking.csrf if looking else None) or ""
     kept = request.cookies.get(COLOURS, "")
-    shown["colours"] = kept if kept in MEDIA else "system"
+    shown["colours"] = kept if kept in CHOICES else "system"
     html = environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
 

@@ -124,5 +124,5 @@ def story_html(
 
 
 def _write(**values: Any) -> str:
-    style = Markup("").join(Markup((HERE / "static" / name).read_text("utf-8")) for name in ("page.css", "lead.css"))
+    style = Markup((HERE / "static" / "page.css").read_text("utf-8"))
     return environment.get_template("report.html").render(**PARTS | values, style=style, policy=POLICY)

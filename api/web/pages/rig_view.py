@@ -14,7 +14,7 @@ from stimrig.api.services.rig import rearm as rearm_rig
 from stimrig.api.web.dependencies import Anyone, Ctx, Rearmer
 from stimrig.api.web.guards import local, same_origin
 from stimrig.api.web.pages import render
-from stimrig.api.web.pages.render import COLOURS, MEDIA, fragment, look, page
+from stimrig.api.web.pages.render import CHOICES, COLOURS, fragment, look, page
 from stimrig.api.web.pages.typed import Text
 
 router = APIRouter(include_in_schema=False)
@@ -73,7 +73,7 @@ KEPT_S = 365 * 24 * 3600
 @router.post("/colours")
 async def choose_colours(request: Request, colours: Text = "", back: Text = "/") -> Response:
     """Show the pages in these colours from now on."""
-    answer = _back(request, colours, MEDIA, back, ("no-such-colours", "There are no such colours"))
+    answer = _back(request, colours, CHOICES, back, ("no-such-colours", "There are no such colours"))
     answer.set_cookie(COLOURS, colours, KEPT_S, samesite="lax")
     return answer
 

@@ -2,7 +2,7 @@
 "use strict";
 {
   const { plotly, failed } = document.currentScript.dataset;
-  const NAMED = /^var\((--[\w-]+)\)$/;
+  const NAMED = /^var\(--([\w-]+)\)$/;
   const coarse = matchMedia("(pointer: coarse)");
   const boxes = [...document.querySelectorAll("[data-still]")];
   const plots = new Map(); // of each box that is looked at closely: its figure, and the part that plotly draws in
@@ -49,22 +49,22 @@
   // ---- looking closer --------------------------------------------------------------------------------------------
 
   // A copy with the value of each var(--name): Plotly knows no style sheets, and writes into what it is given.
-  function coloured(part, style) {
+  function coloured(part) {
     if (typeof part === "string") {
       const name = NAMED.exec(part);
-      return name ? style.getPropertyValue(name[1]).trim() : part;
+      return name ? colourOf(name[1]) : part;
     }
-    if (Array.isArray(part)) return typeof part[0] === "number" || part[0] === null ? part.slice() : part.map((entry) => coloured(entry, style));
+    if (Array.isArray(part)) return typeof part[0] === "number" || part[0] === null ? part.slice() : part.map(coloured);
     if (part === null || typeof part !== "object") return part;
-    return Object.fromEntries(Object.entries(part).map(([key, value]) => [key, coloured(value, style)]));
+    return Object.fromEntries(Object.entries(part).map(([key, value]) => [key, coloured(value)]));
   }
 
   function paint(box) {
-    const { figure, plot } = plots.get(box), style = getComputedStyle(document.documentElement);
+    const { figure, plot } = plots.get(box);
     const dragmode = plot.layout ? plot.layout.dragmode : coarse.matches ? false : "zoom";
-    const layout = { ...coloured(figure.layout, style), dragmode };
+    const layout = { ...coloured(figure.layout), dragmode };
     if (box.clientWidth < 560) layout.annotations = (layout.annotations || []).filter((note) => note.name); // no room for the segments' names
-    return Plotly.react(plot, coloured(figure.data, style), layout, { ...figure.config });
+    return Plotly.react(plot, coloured(figure.data), layout, { ...figure.config });
   }
 
   // A finger scrolls the page; the zoom button takes it for one zoom. The style says so to the browser beforehand: a

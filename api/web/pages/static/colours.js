@@ -1,28 +1,26 @@
 // Light, dark or as the system: switched in place. Charts draw themselves again on the window's event "colours".
 "use strict";
+function colourOf(name) { // the custom property itself keeps its light-dark() as it is written
+  document.head.style.color = `var(--${name})`;
+  return getComputedStyle(document.head).color;
+}
 {
-  const sheet = document.getElementById("dark");
-  const media = JSON.parse(sheet.dataset.media);
-  const tell = () => dispatchEvent(new Event("colours"));
+  const page = document.documentElement, tell = () => dispatchEvent(new Event("colours"));
 
   function choose(name) {
     document.cookie = `stimrig_colours=${name}; path=/; max-age=31536000; samesite=lax`;
-    sheet.media = media[name];
+    page.dataset.colours = name;
     for (const button of document.querySelectorAll("[name=colours]")) button.setAttribute("aria-pressed", String(button.value === name));
     tell();
   }
 
-  addEventListener("submit", (event) => { // where scripts are off the form is sent
-    const button = event.submitter;
-    if (!button || button.name !== "colours") return;
-    event.preventDefault();
-    event.stopImmediatePropagation(); // nobody leaves the page
-    choose(button.value);
-  }, true);
+  document.addEventListener("click", (event) => {
+    const button = event.target.closest?.("[name=colours]");
+    if (button) { event.preventDefault(); choose(button.value); }
+  });
 
-  let kept = sheet.media;
-  addEventListener("beforeprint", () => { kept = sheet.media; sheet.media = "not all"; tell(); }); // paper is white
-  addEventListener("afterprint", () => { sheet.media = kept; tell(); });
+  let kept = page.dataset.colours;
+  addEventListener("beforeprint", () => { kept = page.dataset.colours; page.dataset.colours = "light"; tell(); }); // paper is white
+  addEventListener("afterprint", () => { page.dataset.colours = kept; tell(); });
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", tell);
-  sheet.addEventListener("load", tell);
 }

@@ -262,8 +262,7 @@ function connect() {
 // ---- colours and the window --------------------------------------------------------------------
 
 function readColours() {
-  const style = getComputedStyle(document.documentElement);
-  for (const name of ["ink", "dim", "grid", "torque", "torque-band", "width", "plan", "limit", "cursor", "held-out", "zero", "mark", "chart"]) colours[name] = style.getPropertyValue("--" + name).trim();
+  for (const name of ["ink", "dim", "grid", "torque", "torque-band", "width", "plan", "limit", "cursor", "held-out", "zero", "mark", "chart"]) colours[name] = colourOf(name);
   state.dirty = true;
 }
 

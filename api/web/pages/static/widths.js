@@ -45,17 +45,16 @@
 
   async function draw(found) {
     if (!window.Plotly) await new Promise((done, failed) => document.head.append(Object.assign(document.createElement("script"), { src: plotly, onload: done, onerror: failed })));
-    const style = getComputedStyle(result), x = times(found), shade = { type: "rect", xref: "x", yref: "paper", y0: 0, y1: 1, line: { width: 0 }, fillcolor: colour("worst-band") };
-    const line = (name, y, axis, color, dash) => ({ x, y, name, yaxis: axis, mode: "lines", line: { color: colour(color), dash, width: 1.8, shape: axis === "y2" ? "hv" : "linear" }, hovertemplate: `%{y:.2f}` });
-    const axis = (title, domain) => ({ title: { text: title }, domain, gridcolor: colour("grid"), zerolinecolor: colour("zero") });
+    const style = getComputedStyle(result), x = times(found), shade = { type: "rect", xref: "x", yref: "paper", y0: 0, y1: 1, line: { width: 0 }, fillcolor: colourOf("worst-band") };
+    const line = (name, y, axis, color, dash) => ({ x, y, name, yaxis: axis, mode: "lines", line: { color: colourOf(color), dash, width: 1.8, shape: axis === "y2" ? "hv" : "linear" }, hovertemplate: `%{y:.2f}` });
+    const axis = (title, domain) => ({ title: { text: title }, domain, gridcolor: colourOf("grid"), zerolinecolor: colourOf("zero") });
     Plotly.react(at("widths-plot"), [
       line("reference", found.reference_torque_nm, "y", "measured", "dash"), line("predicted", found.predicted_torque_nm, "y", "model"), { ...line("pulse width", found.pulse_width_us, "y2", "width"), showlegend: false },
     ], {
       height: 460, margin: { l: 64, r: 14, t: 30, b: 44 }, paper_bgcolor: "rgba(0,0,0,0)", plot_bgcolor: "rgba(0,0,0,0)", hovermode: "x unified", font: { color: style.color, family: style.fontFamily },
-      hoverlabel: { bgcolor: colour("card") }, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, separators: ". ", shapes: found.unreachable.map((part) => ({ ...shade, x0: part.begin_s, x1: part.end_s })),
+      hoverlabel: { bgcolor: colourOf("card") }, legend: { orientation: "h", y: 1.02, yanchor: "bottom" }, separators: ". ", shapes: found.unreachable.map((part) => ({ ...shade, x0: part.begin_s, x1: part.end_s })),
       xaxis: { ...axis("Time (s)"), anchor: "y2" }, yaxis: axis("Torque above rest (N·m)", [0.36, 1]), yaxis2: axis("Pulse width (µs)", [0, 0.28]),
     }, { displaylogo: false, responsive: true, modeBarButtons: [["toImage"], ["zoom2d", "pan2d", "resetScale2d"]] });
   }
-  const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
   addEventListener("colours", () => { if (!result.hidden && window.Plotly) form.requestSubmit(); });
 }
