@@ -82,18 +82,18 @@ class Cohort:
 
     def ranked_parameters(self) -> list[tuple[str, str]]:
         """List the parameters that most records have, those of the model first."""
-        count = {key: sum(map(len, one.sessions.values())) for key, one in self.parameters.items()}
+        count = {key: sum(map(len, entry.sessions.values())) for key, entry in self.parameters.items()}
         return sorted(count, key=lambda key: (key[0] != MODEL, -count[key], key))[:MAX_PARAMETERS]
 
     def repeatability(self) -> list[dict[str, Any]]:
         """Return the rows of the table of repeatability: parameters of which somebody has two sessions."""
         rows = []
         for key in self.ranked_parameters():
-            one = self.parameters[key]
-            values = [[value for _, value, _ in sessions] for sessions in one.sessions.values()]
+            parameter = self.parameters[key]
+            values = [[value for _, value, _ in sessions] for sessions in parameter.sessions.values()]
             if figures := repeatability(values):
                 few = figures["participants"] < FEW_CASES
-                rows.append({"parameter": title_of(key), "unit": one.unit, "few": few, **figures})
+                rows.append({"parameter": title_of(key), "unit": parameter.unit, "few": few, **figures})
         return rows
 
 
@@ -206,8 +206,8 @@ def draw_sessions(cohort: Cohort, key: tuple[str, str]) -> Figure | None:
     figure = Figure((8, 3.6), layout="constrained")
     axes = figure.add_subplot()
     styles = cycle((f"C{number % 10}", STYLES[number // 10]) for number in range(40))
-    drawn = sorted(several, key=lambda code: (-len(parameter.sessions[code]), code))[:MAX_LINES]
-    for code, (colour, style) in zip(drawn, styles, strict=False):
+    longest = sorted(several, key=lambda code: (-len(parameter.sessions[code]), code))[:MAX_LINES]
+    for code, (colour, style) in zip(longest, styles, strict=False):
         times, values, sds = zip(*sorted(parameter.sessions[code]), strict=True)
         axes.errorbar(times, values, yerr=sds, label=code, color=colour, linestyle=style, marker=".", elinewidth=1)
     axes.set(xlabel="day of the session (date, UTC)", ylabel=f"{title_of(key)} ({parameter.unit})")
@@ -221,8 +221,8 @@ def page(cohort: Cohort, name: str) -> str:
     of_what, total, counts = cohort.prevalence()
     with mpl.rc_context(SETTINGS):  # pyright: ignore[reportArgumentType]
         prevalence = _svg(draw_prevalence(cohort))
-        drawn = ((title_of(key), _svg(draw_sessions(cohort, key))) for key in cohort.ranked_parameters())
-        sessions = [(title, svg) for title, svg in drawn if svg]
+        images = ((title_of(key), _svg(draw_sessions(cohort, key))) for key in cohort.ranked_parameters())
+        sessions = [(title, image) for title, image in images if image]
     environment = jinja2.Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True)
     environment.filters["words"] = lambda text: text.replace("_", " ")
     environment.filters["number"] = lambda value: "–" if value is None or not math.isfinite(value) else f"{value:.3g}"

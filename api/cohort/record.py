@@ -164,9 +164,9 @@ def _model_parameters(document: Mapping[str, Any]) -> list[Row]:
     return rows
 
 
-def _parameters(of: str, given: Mapping[str, Any]) -> list[Row]:
+def _parameters(of: str, parameters: Mapping[str, Any]) -> list[Row]:
     rows = []
-    for name, entry in given.items():
+    for name, entry in parameters.items():
         if isinstance(entry.get("value"), int | float):  # a parameter in several values has no figure
             sd = entry.get("sd")
             sd = sd if isinstance(sd, int | float) else None

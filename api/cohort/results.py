@@ -179,9 +179,9 @@ class Results:
             with pq.ParquetFile(file) as rows:
                 for batch in rows.iter_batches(table.BATCH_ROWS):
                     counted = pa.array([next(current) for _ in range(len(batch))])
-                    kept = pa.Table.from_batches([batch]).filter(counted).cast(table.SCHEMA)
-                    counts.update(kept["status"].to_pylist())
-                    waiting.append(kept)
+                    current_rows = pa.Table.from_batches([batch]).filter(counted).cast(table.SCHEMA)
+                    counts.update(current_rows["status"].to_pylist())
+                    waiting.append(current_rows)
                     if sum(map(len, waiting)) >= GROUP_ROWS:
                         yield pa.concat_tables(waiting)
                         waiting = []

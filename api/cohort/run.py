@@ -131,15 +131,15 @@ def run_records(
 
     with progress_of(selected) as bar:
         send()
-        most = len(sent)
+        batch_size = len(sent)
         for future in pending:
             row = _result(client, future, sent.pop(future.key), task)
             counts[results.add({**row, "computed_utc": datetime.now(UTC)})] += 1
             bar.set_postfix_str(f"{counts['error']} failed" if counts["error"] else "", refresh=False)
             bar.update()
-            if len(sent) <= most // 2:
+            if len(sent) <= batch_size // 2:
                 send()
-                most = max(most, len(sent))
+                batch_size = max(batch_size, len(sent))
     return counts
 
 

@@ -50,7 +50,7 @@ Condition = Callable[[Mapping[str, Any]], bool | None]
 
 
 def _if_given(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:
-    return lambda given, value: given is not None and compare(given, value)
+    return lambda content, value: content is not None and compare(content, value)
 
 
 COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
@@ -107,17 +107,19 @@ def _condition(node: ast.expr) -> Condition:
             if not isinstance(choices, ast.Tuple | ast.List | ast.Set):
                 raise _refusal(choices, 'after `in` stands a list, as participant in ("P001", "P002")')
             values = {_value(name, item) for item in choices.elts}
-            return _of_field(name, lambda given: (given in values) is isinstance(op, ast.In))
+            return _of_field(name, lambda content: (content in values) is isinstance(op, ast.In))
         case ast.Compare(left=part, ops=[ast.In() | ast.NotIn() as op], comparators=[ast.Name() as name]):
             text = _literal(part)
             if not isinstance(text, str) or _field(name).type == "number":
                 raise _refusal(node, "`in` looks for a text in quotes within a text")
-            return _of_field(name, lambda given: (given is not None and text in str(given)) is isinstance(op, ast.In))
+            return _of_field(
+                name, lambda content: (content is not None and text in str(content)) is isinstance(op, ast.In)
+            )
         case ast.Compare(left=ast.Name() as name, ops=[op], comparators=[right]) if type(op) in COMPARISONS:
             compare, value = COMPARISONS[type(op)], _value(name, right)
             if value is None and not isinstance(op, ast.Eq | ast.NotEq):
                 raise _refusal(right, "None has no order; compare with == or !=")
-            return _of_field(name, lambda given: compare(given, value))
+            return _of_field(name, lambda content: compare(content, value))
     raise _refusal(node, "only comparisons of a field, on their left, and, or, not and brackets can be used")
 
 
@@ -125,7 +127,7 @@ def _joined(conditions: list[Condition], decisive: bool) -> Condition:
     """Join by `or` (decisive: True) or `and` (False); unknown where none is decisive and one is unknown."""
 
     def condition(fields: Mapping[str, Any]) -> bool | None:
-        results = [one(fields) for one in conditions]
+        results = [test(fields) for test in conditions]
         if decisive in results:
             return decisive
         return None if None in results else not decisive

@@ -42,20 +42,20 @@ def verify(
     broken = audit.first_broken(entries)
     missing = bool(head) and head not in {entry.hash for entry in entries}
     last = entries[-1].hash if entries else audit.GENESIS
-    found = {
+    report = {
         "whole": broken is None and not missing, "first_broken": broken, "head_found": not missing,
         "entries": len(entries), "head": last,
     }  # fmt: skip
     if as_json:
-        say_json(found)
+        say_json(report)
     else:
-        lines = [f"{'whole: ' if found['whole'] else ''}{len(entries)} entries; head {last}"]
+        lines = [f"{'whole: ' if report['whole'] else ''}{len(entries)} entries; head {last}"]
         if missing:
             lines.insert(0, f"{head}: {NO_HEAD}")
         if broken is not None:
             lines.insert(0, f"broken at entry {broken}: it, or one before it, was changed, taken out or put in")
         say("\n".join(lines))
-    if not found["whole"]:
+    if not report["whole"]:
         raise typer.Exit(1)
 
 

@@ -23,7 +23,7 @@ NEEDED = ("dask", "distributed", "fsspec", "pyarrow")
 MAX_LISTED = 40
 """Changed records that are shown; --json gives all."""
 
-Given = Annotated[
+Addresses = Annotated[
     list[str],
     typer.Argument(
         help="files, folders, addresses that fsspec knows (s3://…)",
@@ -66,8 +66,8 @@ def _run_of(verb: str) -> Callable[..., None]:
     without = ("verb",) if verb == "fit" else ("verb", "method", "effects")
     options = [option for name, option in signature.parameters.items() if name not in without]
 
-    def command(**given: Any) -> None:
-        run(verb, **given)
+    def command(**options: Any) -> None:
+        run(verb, **options)
 
     command.__signature__ = signature.replace(parameters=options)  # pyright: ignore[reportFunctionMemberAccess]
     return command
@@ -75,7 +75,7 @@ def _run_of(verb: str) -> Callable[..., None]:
 
 def run(
     verb: str,
-    data: Given,
+    data: Addresses,
     output: Annotated[
         Path,
         typer.Option("-o", "--output", help="results (Parquet); a run that is cut off goes on with the same command"),

@@ -49,8 +49,8 @@ def examine(settings: Settings) -> list[Finding]:
             try:
                 findings += check(settings)
             except Exception as error:
-                says = f"could not be checked: {type(error).__name__}: {error}"
-                findings.append(Finding(name.removeprefix("check_"), "care", says))
+                text = f"could not be checked: {type(error).__name__}: {error}"
+                findings.append(Finding(name.removeprefix("check_"), "care", text))
     return findings
 
 
@@ -98,26 +98,26 @@ def examine_bus(bus: dict[str, Any]) -> Finding:
     kind, channel = str(bus.get("interface", "")), str(bus.get("channel", ""))
     if kind == "slcan":
         return examine_port("load cell", Path(channel.partition("@")[0]))
-    verdict, says, fix = "care", f"a {kind} bus cannot be checked without opening it", ""
+    verdict, text, fix = "care", f"a {kind} bus cannot be checked without opening it", ""
     if kind == "socketcan":
         link = Path("/sys/class/net") / channel
         if not link.exists():
-            verdict, says = "fails", f"there is no interface {channel}"
+            verdict, text = "fails", f"there is no interface {channel}"
             fix = f"plug the adapter in; systemctl start stimrig-can@{channel} brings it up"
         elif not int((link / "flags").read_text(), 16) & 1:
-            verdict, says = "fails", f"{channel} is down"
+            verdict, text = "fails", f"{channel} is down"
             fix = f"ip link set {channel} up type can bitrate …, or systemctl start stimrig-can@{channel}"
         else:
-            verdict, says = "ok", f"{channel} is up"
+            verdict, text = "ok", f"{channel} is up"
     elif kind == "socketcand":
         host, port = str(bus.get("host", "127.0.0.1")), int(bus.get("port", 29536))
         try:
             socket.create_connection((host, port), timeout=2).close()
-            verdict, says = "ok", f"socketcand answers at {host}:{port}"
+            verdict, text = "ok", f"socketcand answers at {host}:{port}"
         except OSError as error:
-            verdict, says = "fails", f"socketcand at {host}:{port}: {error.strerror or error}"
+            verdict, text = "fails", f"socketcand at {host}:{port}: {error.strerror or error}"
             fix = "start socketcand on that machine"
-    return Finding("load cell", verdict, says, fix)
+    return Finding("load cell", verdict, text, fix)
 
 
 def check_rig(settings: Settings) -> Iterator[Finding]:
@@ -158,9 +158,9 @@ def check_data(settings: Settings) -> Iterator[Finding]:
     fix = "make room, or move old recordings to the backup"
     yield Finding("disk", verdict, f"{free_gb:.1f} GB free; a test takes 5 MB", fix)
     slowest_ms = max(synced_ms(nearest) for _ in range(5))
-    says = f"slowest of five writes to the disk: {slowest_ms:.0f} ms"
+    text = f"slowest of five writes to the disk: {slowest_ms:.0f} ms"
     verdict = "care" if slowest_ms > SLOW_DISK_MS else "ok"
-    yield Finding("disk speed", verdict, says, "use a local disk, not a network disk")
+    yield Finding("disk speed", verdict, text, "use a local disk, not a network disk")
 
 
 def nearest_folder(path: Path) -> Path:
@@ -209,8 +209,8 @@ def check_wake_up(_settings: Settings) -> Iterator[Finding]:
         late_ms.append(1000 * (time.perf_counter() - began) - 2)
     worst_ms = sorted(late_ms)[-3]
     fix = "end other programs on this machine; give the rig real-time priority"
-    says = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 3.75 ms)"
-    yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", says, fix)
+    text = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 3.75 ms)"
+    yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", text, fix)
 
 
 RIGHTS = {
@@ -229,10 +229,10 @@ RIGHTS = {
 
 def check_rights(_settings: Settings) -> Iterator[Finding]:
     """Check that the rig's sender may run before everything else, from memory that stays."""
-    for name, (code, says, unit, line) in RIGHTS.items():
+    for name, (code, text, unit, line) in RIGHTS.items():
         allowed = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=30).returncode == 0
         fix = f"{unit} as in deploy/systemd/stimrig-rig.service, or `USER - {line}` in /etc/security/limits.d"
-        yield Finding(name, "ok" if allowed else "care", says[not allowed], "" if allowed else fix)
+        yield Finding(name, "ok" if allowed else "care", text[not allowed], "" if allowed else fix)
 
 
 def check_compiled(_settings: Settings) -> Iterator[Finding]:
@@ -240,10 +240,10 @@ def check_compiled(_settings: Settings) -> Iterator[Finding]:
     from stimrig import identify
 
     place = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(str(identify.__file__)).parent)
-    kept = os.access(nearest_folder(place), os.W_OK | os.X_OK)
-    says = f"{place} {'may' if kept else 'may not'} be written"
+    writable = os.access(nearest_folder(place), os.W_OK | os.X_OK)
+    text = f"{place} {'may' if writable else 'may not'} be written"
     fix = "set NUMBA_CACHE_DIR to a folder of this user; otherwise each start compiles again, for about ten seconds"
-    yield Finding("compiled code", "ok" if kept else "care", says, "" if kept else fix)
+    yield Finding("compiled code", "ok" if writable else "care", text, "" if writable else fix)
 
 
 def check_door(settings: Settings) -> Iterator[Finding]:
@@ -257,9 +257,9 @@ def check_door(settings: Settings) -> Iterator[Finding]:
         return
     with socket.socket(socket.AF_INET6 if ":" in settings.host else socket.AF_INET) as line:
         line.settimeout(1)
-        taken = line.connect_ex((settings.host, settings.port)) == 0
-    says = f"{settings.host}:{settings.port} {'is in use, by the service or another program' if taken else 'is free'}"
-    yield Finding("address", "ok", says)
+        in_use = line.connect_ex((settings.host, settings.port)) == 0
+    text = f"{settings.host}:{settings.port} {'is in use, by the service or another program' if in_use else 'is free'}"
+    yield Finding("address", "ok", text)
 
 
 MARKS = {"ok": "ok   ", "care": "care ", "fails": "FAILS"}

@@ -89,12 +89,12 @@ def find_files(store: Store, code: str, folders: list[Path], now_utc: str) -> li
     names = {path.name for path in named}
     roots = [(folder / kind).resolve() for folder in folders for kind in ("recordings", "journals")]
     below = [path for root in roots for path in root.rglob("*") if path.resolve() == path]  # through no link
-    found = {path for path in below if path.name in names or test_of(path) in tests}
+    files = {path for path in below if path.name in names or test_of(path) in tests}
     for path in named:
-        if path.is_file() and path.resolve() not in found:
+        if path.is_file() and path.resolve() not in files:
             raise InputError(f"{path}: it is in none of the data folders. Name its folder with --rig-data.")
     database = store.engine.url.database
-    return sorted(found.union((Path(database).parent / migrations.BEFORE).glob("*")) if database else found)
+    return sorted(files.union((Path(database).parent / migrations.BEFORE).glob("*")) if database else files)
 
 
 def test_of(path: Path) -> str:
@@ -106,13 +106,13 @@ def find_rows(session: Session, code: str) -> dict[sa.Table, list[Any]]:
     """Return the keys of the participant's rows, and of rows that refer to them, by table; parents first."""
     rows: dict[sa.Table, list[Any]] = {}
     for table in Table.metadata.sorted_tables:
-        own = [column == code for column in table.c if column.name == "participant"]
+        conditions = [column == code for column in table.c if column.name == "participant"]
         keys = [(column, key.column.table) for column in table.c for key in column.foreign_keys]
-        own += [column.in_(rows[parent]) for column, parent in keys if parent in rows]
+        conditions += [column.in_(rows[parent]) for column, parent in keys if parent in rows]
         if table.name == Participant.__tablename__:
-            own = [table.c.code == code]
-        if own:
-            rows[table] = list(session.scalars(sa.select(key_of(table)).where(sa.or_(*own)).distinct()))
+            conditions = [table.c.code == code]
+        if conditions:
+            rows[table] = list(session.scalars(sa.select(key_of(table)).where(sa.or_(*conditions)).distinct()))
     return rows
 
 

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig.api.cli.commands.cohort import Columns, Given, Select, refuse_undone, skipped_lines
+from stimrig.api.cli.commands.cohort import Addresses, Columns, Select, refuse_undone, skipped_lines
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.options import Json
 from stimrig.api.cli.terminal import say, say_json
@@ -17,7 +17,7 @@ from stimrig.api.export.record_file import WRITERS
 
 
 def export(
-    data: Given,
+    data: Addresses,
     output: Annotated[Path, typer.Option("-o", "--output", help="folder to write, new or empty", show_default=False)],
     format: Annotated[str, typer.Option(help=f"one of {', '.join(WRITERS)}")] = "csv",
     select: Select = "",
@@ -26,9 +26,9 @@ def export(
     as_json: Json = False,
 ) -> None:
     """Write records as CSV, MAT or Parquet, one file each, with a table of them."""
-    found = exported(data, output, format, select, no_dates, columns)
-    say_json(found) if as_json else say(*report(found))
-    refuse_undone(found["records"], found["errors"], f"{found['errors_file']} says of each why")
+    report = exported(data, output, format, select, no_dates, columns)
+    say_json(report) if as_json else say(*_report_lines(report))
+    refuse_undone(report["records"], report["errors"], f"{report['errors_file']} says of each why")
 
 
 def exported(
@@ -53,9 +53,8 @@ def exported(
     }
 
 
-def report(found: dict[str, Any]) -> list[str]:
-    """Say an export for people."""
-    lines = [f"records        {found['records']}, listed in {Path(found['output']) / 'records.csv'}"]
-    if found["errors"]:
-        lines.append(f"not exported   {found['errors']}; {found['errors_file']} says why")
-    return [*lines, *skipped_lines(found, "exported"), f"written to     {found['output']}"]
+def _report_lines(report: dict[str, Any]) -> list[str]:
+    lines = [f"records        {report['records']}, listed in {Path(report['output']) / 'records.csv'}"]
+    if report["errors"]:
+        lines.append(f"not exported   {report['errors']}; {report['errors_file']} says why")
+    return [*lines, *skipped_lines(report, "exported"), f"written to     {report['output']}"]
