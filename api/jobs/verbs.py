@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
-from stimrig.api.jobs import adaptive_verbs, tracking_verbs
+from stimrig.api.jobs import adaptive, tracking
 from stimrig.api.jobs.curves import comparison, page_curves, recorded
 from stimrig.api.record_files import Progress, export_csv, find_recording, joined, plain_csv
 from stimrig.api.structure import held_by
@@ -43,7 +43,7 @@ def fit(
         progress(0.2 + 0.8 * share, text)
 
     options: dict[str, Any] = {} if recruitment is None else {"recruitment": recruitment}
-    if earlier := adaptive_verbs.known(models):
+    if earlier := adaptive.known(models):
         options["earlier"] = earlier.model
     model = identify.fit(record, method=method, effects=tuple(effects), fit_on=fit_on, progress=further, **options)
     return {
@@ -199,7 +199,7 @@ def warm(progress: Progress) -> dict[str, Any]:
     """Load identify and its compiled parts, so that the fit after a test starts at once."""
     progress(0.1, "loading")
     identify.fit(_warm_record())
-    adaptive_verbs.warm()
+    adaptive.warm()
     return {}
 
 
@@ -216,14 +216,11 @@ def _warm_record() -> Any:
     return identify.Record.from_arrays(time_s, width_us, torque_nm, segment, segment_names=["rest", "prbs", "ramp"])
 
 
-OWN = (
-    fit, carry, comparison, diagnosis, effects, warm, forecast, invert, export_csv, plain_csv,
-    find_recording, recorded,
-)  # fmt: skip
-VERBS: dict[str, Callable[..., dict[str, Any]]] = {
-    **{verb.__name__: verb for verb in OWN},
-    "curves": page_curves,
-    "join": joined,
-    **adaptive_verbs.VERBS,
-    **tracking_verbs.VERBS,
-}
+VERBS: dict[str, Callable[..., dict[str, Any]]] = {"curves": page_curves, "join": joined} | {
+    verb.__name__: verb
+    for verb in (
+        fit, carry, comparison, diagnosis, effects, warm, forecast, invert, export_csv, plain_csv, find_recording,
+        recorded, adaptive.adaptive_outlook, adaptive.adaptive_begin, adaptive.adaptive_advise, tracking.track,
+        tracking.track_warm,
+    )
+}  # fmt: skip

@@ -22,21 +22,13 @@ VERBS = "stimrig.api.jobs.verbs"
 PROCESSOR_S = {
     "fit": 300.0,
     "carry": 300.0,
-    "effects": 60.0,
-    "export_csv": 120.0,
-    "plain_csv": 120.0,
-    "find_recording": 120.0,
-    "join": 120.0,
-    "invert": 60.0,
-    "adaptive_outlook": 60.0,
+    "diagnosis": 1200.0,  # of a long record on a slow machine
     "adaptive_begin": 10.0,
     "adaptive_advise": 5.0,
     "track": 10.0,
-    "track_warm": 60.0,
 }
-"""Processor time that a job may take."""
-LONGEST_PROCESSOR_S = 1200.0
-"""Of a verb that is not in the table: improving a long record takes minutes on a slow machine."""
+USUAL_PROCESSOR_S = 120.0
+"""Processor time that a job may take; of a verb that is in the table, that one."""
 WALL_FACTOR = 3.0
 """A machine that does other things, too, takes longer; then the worker is ended."""
 ENVIRONMENT = (
@@ -86,7 +78,7 @@ class Worker:
 
     async def run(self, job: Job) -> dict[str, Any]:
         """Do a job to its end and return its result; its error is raised."""
-        processor_s = PROCESSOR_S.get(job.kind, LONGEST_PROCESSOR_S)
+        processor_s = PROCESSOR_S.get(job.kind, USUAL_PROCESSOR_S)
         try:
             await self.start()
             if job.state == "cancelled":

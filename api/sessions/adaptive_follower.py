@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import logging
 import secrets
+from base64 import b64decode
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -21,7 +22,6 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.pool import Pool
 from stimrig.api.sessions.kinds import SERVICE, Watcher
-from stimrig.api.sessions.live import samples_of
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.rig.messages import AHEAD, SAFE_END_S, LiveEvent, SegmentPlan, TestPlan
 from stimrig.rig.requests import EnoughRequest, ExtendRequest
@@ -51,16 +51,16 @@ class Answer:
 
 @dataclass
 class News:
-    """What the rig has told since the last question: samples, and what became of pulses, column by column."""
+    """What the rig has sent since the last question: samples as they came, and the outcomes of pulses by column."""
 
-    samples: dict[str, list[Any]] = field(default_factory=dict)
+    samples: bytes = b""
     outcomes: dict[str, list[Any]] = field(default_factory=dict)
 
     def take(self, event: LiveEvent) -> None:
-        """Take one event's."""
-        for held, new in ((self.samples, samples_of(event)), (self.outcomes, event.outcomes.model_dump())):
-            for name, values in new.items():
-                held.setdefault(name, []).extend(values)
+        """Add one event's."""
+        self.samples += b64decode(event.torque)
+        for name, values in event.outcomes.model_dump().items():
+            self.outcomes.setdefault(name, []).extend(values)
 
 
 @dataclass
@@ -183,8 +183,8 @@ class Follower(Watcher):
         assert event is not None
         widths, segments = self._played_so_far(event)
         advice = self.adviser.submit(
-            "adaptive_advise", samples=news.samples, outcomes=news.outcomes, laid_us=widths, segments=segments,
-            torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
+            "adaptive_advise", samples=news.samples, zero_s=event.zero_s, outcomes=news.outcomes, laid_us=widths,
+            segments=segments, torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
         )  # fmt: skip
         said = await advice.result
         self._took_s = self.clock.monotonic_s() - heard_s

@@ -56,17 +56,6 @@ def frame_of(event: LiveEvent) -> LiveOut:
     )
 
 
-def samples_of(event: LiveEvent) -> dict[str, list[Any]]:
-    """Return an event's torque samples as columns, on the test's clock; None for a torque that is no number."""
-    rows = list(event.torque_rows())
-    return {
-        "host_time_s": [round(row[0] - event.zero_s, 6) for row in rows],
-        "counter": [row[3] for row in rows],
-        "torque_nm": [round(row[2], 6) if isfinite(row[2]) else None for row in rows],
-        "sync": [row[4] for row in rows],
-    }
-
-
 class Hub:
     """Keeps the current test's drawn history, so that a page opened late sees all of it, and the newest torque."""
 

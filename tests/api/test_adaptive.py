@@ -20,6 +20,7 @@ from stimrig.api.store.tables import Test
 from stimrig.identify.experiments.knowledge import LEAST_PERCENT, MOST_PERCENT, Target
 from stimrig.rig.messages import (
     AHEAD,
+    TORQUE_ROW,
     AdaptivePlan,
     FinishedEvent,
     LaidSegment,
@@ -79,7 +80,7 @@ def test_only_new_samples_are_sent_and_none_is_lost(client: httpx.Client, servic
     adviser.submit = listening
     assert played(client)["adaptive"]["ended"] == "known-enough"
     advised = [arguments for arguments in asked if arguments]
-    counters = [number for arguments in advised for number in arguments["samples"]["counter"]]
+    counters = [row[3] for arguments in advised for row in TORQUE_ROW.iter_unpack(arguments["samples"])]
     assert counters == list(range(len(counters))) and len(counters) > 800
     for arguments in advised:
         assert len(arguments["laid_us"]) == arguments["segments"][-1][2]

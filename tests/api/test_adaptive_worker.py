@@ -12,7 +12,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.errors import ApiError
-from stimrig.api.jobs import adaptive_verbs as verbs
+from stimrig.api.jobs import adaptive as verbs
 from stimrig.api.jobs.pool import Pool
 from stimrig.identify.experiments import adaptive
 from stimrig.identify.experiments.adaptive import Decision
@@ -27,6 +27,7 @@ HOW: dict[str, Any] = {
     "largest_us": 300.0,
     "pulse_rate_hz": PULSE_RATE_HZ,
 }
+ZERO_S = 500.0
 OPENING = [0.0] * 20 + [7.5 * k for k in range(1, 41)] + [300.0] * 12 + [0.0] * 36
 
 
@@ -41,21 +42,20 @@ class Cell:
         self.muscle, self.rate_hz, self.way_s, self.seed = muscle, rate_hz, way_s, seed
         self.sent = 0
 
-    def news(self, widths: list[float], until_s: float, lost: tuple[int, int] = (0, 0)) -> dict[str, Any]:
-        """The samples that are new, as a live event tells them."""
+    def news(self, widths: list[float], until_s: float, lost: tuple[int, int] = (0, 0)) -> np.ndarray:
+        """The samples that are new, as the rig sends them."""
         rng = np.random.default_rng([self.seed, 7])
         torque = self.muscle.torque(np.array(widths), self.rate_hz)
         noise = 0.01 * np.random.default_rng(self.seed).standard_normal(200_000)[: torque.size]
         late = self.way_s + rng.exponential(0.0005, 200_000)[: torque.size]
         late[::400] += 0.08
-        numbers = [k for k in range(self.sent, int(until_s * self.rate_hz)) if not lost[0] <= k < lost[1]]
+        numbers = np.arange(self.sent, int(until_s * self.rate_hz))
+        numbers = numbers[(numbers < lost[0]) | (numbers >= lost[1])]
         self.sent = int(until_s * self.rate_hz)
-        return {
-            "host_time_s": [float(k / self.rate_hz + late[k]) for k in numbers],
-            "counter": [k + 4000 for k in numbers],
-            "torque_nm": [float(torque[k] + noise[k]) for k in numbers],
-            "sync": [255] * len(numbers),
-        }
+        found = np.zeros(numbers.size, verbs.SAMPLE)
+        found["host_time_s"] = ZERO_S + numbers / self.rate_hz + late[numbers]
+        found["counter"], found["torque_nm"], found["sync"] = numbers + 4000, (torque + noise)[numbers], 255
+        return found
 
 
 def felt(widths: list[float], until: int, not_sent: Sequence[int] = (), late_s: dict[int, float] | None = None) -> Any:
@@ -73,7 +73,7 @@ def felt(widths: list[float], until: int, not_sent: Sequence[int] = (), late_s: 
 
 def test_times_are_those_of_the_samples_that_waited_nowhere() -> None:
     news = Cell(sigmoid(71), 1).news([0.0] * 120, 3.0)
-    time_s = verbs.sample_times(news["host_time_s"], news["counter"])
+    time_s = verbs.sample_times(news["host_time_s"] - ZERO_S, news["counter"])
     assert np.abs(time_s - 0.0024 - np.arange(4800) / 1600.0).max() < 0.0003
 
 
@@ -83,8 +83,8 @@ def test_lost_samples_and_none_move_nothing() -> None:
     records = []
     for lost in ((0, 0), (1600, 1900)):
         news = Cell(muscle, 2).news(widths, 2.5, lost)
-        news["torque_nm"][100] = None
-        records.append(verbs.record_of(news, felt(widths, 100), widths, segments, PULSE_RATE_HZ))
+        news["torque_nm"][100] = np.nan
+        records.append(verbs.record_of(news, ZERO_S, felt(widths, 100), widths, segments, PULSE_RATE_HZ))
     whole, holed = records
     assert whole.time_s.size - holed.time_s.size == pytest.approx(300 / 8, abs=2)
     kept = np.isin(whole.time_s, holed.time_s)
@@ -96,7 +96,7 @@ def test_lost_samples_and_none_move_nothing() -> None:
 def test_a_late_pulse_is_late_in_the_record() -> None:
     news = Cell(sigmoid(72), 2).news(OPENING, 2.5)
     told = felt(OPENING, 100, late_s={30: 0.004})
-    record = verbs.record_of(news, told, OPENING, [("opening", 0, len(OPENING))], 40.0)
+    record = verbs.record_of(news, ZERO_S, told, OPENING, [("opening", 0, len(OPENING))], 40.0)
     late = (record.time_s >= 30 / 40.0) & (record.time_s < 31 / 40.0)
     assert late.sum() == verbs.BINS
     assert np.allclose(record.late_s, np.where(late, 0.004, 0.0))
@@ -106,7 +106,7 @@ def test_a_late_pulse_is_late_in_the_record() -> None:
 def test_a_pause_is_a_gap_in_the_record_and_what_is_not_told_yet_is_doubted() -> None:
     """The muscle felt nothing in it, whatever was planned; the newest pulses may still be on their way."""
     news, gap = Cell(sigmoid(72), 2).news(OPENING, 2.0), range(40, 56)
-    record = verbs.record_of(news, felt(OPENING, 70, gap), OPENING, [("opening", 0, len(OPENING))], 40.0)
+    record = verbs.record_of(news, ZERO_S, felt(OPENING, 70, gap), OPENING, [("opening", 0, len(OPENING))], 40.0)
     inside = (record.time_s >= 40 / 40.0) & (record.time_s < 56 / 40.0)
     after = (record.time_s > 56 / 40.0) & (record.time_s < 72 / 40.0)
     assert not record.pulse_width_us[inside].any() and record.pulse_width_us[after].all()
@@ -122,8 +122,8 @@ def test_a_sync_line_tells_when_a_pulse_was_felt_whose_acknowledgement_was_read_
     rising = {round((t + 0.0005) * 1600) + 1 for t in told["written_time_s"]}
     for line, doubts in ((False, True), (True, False)):
         if line:
-            news["sync"] = [int(k in rising) for k in range(len(news["sync"]))]
-        record = verbs.record_of(news, told, OPENING, [("opening", 0, len(OPENING))], 40.0)
+            news["sync"] = np.isin(np.arange(news.size), list(rising))
+        record = verbs.record_of(news, ZERO_S, told, OPENING, [("opening", 0, len(OPENING))], 40.0)
         assert (record.doubted is not None and bool(record.doubted.any())) is doubts
 
 
@@ -137,7 +137,7 @@ def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
     """Also where a busy machine drops pulses: the muscle did not feel them, which is no misfit of the structure."""
     muscle = sigmoid(seed)
     cell = Cell(muscle, seed)
-    verbs.begin(quiet, **HOW)
+    verbs.adaptive_begin(quiet, **HOW)
     widths, segments, told_before = list(OPENING), [("opening", 0, len(OPENING))], 0
     for _ in range(30):
         end_s = len(widths) / PULSE_RATE_HZ
@@ -149,7 +149,15 @@ def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
         new = {name: values[told_before:] for name, values in felt(widths, until, not_sent).items()}
         told_before += len(new["index"])
         laid = {"laid_us": list(widths), "segments": segments}
-        told = verbs.advise(quiet, samples=news, outcomes=new, **laid, torque_time_nm_s=dose, measured_s=end_s - 0.4)
+        told = verbs.adaptive_advise(
+            quiet,
+            samples=news.tobytes(),
+            zero_s=ZERO_S,
+            outcomes=new,
+            **laid,
+            torque_time_nm_s=dose,
+            measured_s=end_s - 0.4,
+        )
         json.dumps(told, allow_nan=False)
         if told["kind"] != "next":
             break
@@ -174,17 +182,20 @@ def test_what_was_late_or_not_sent_reaches_the_decision(monkeypatch: pytest.Monk
         return Decision("spent")
 
     monkeypatch.setattr(adaptive, "decide", decide)
-    verbs.begin(quiet, **HOW)
+    verbs.adaptive_begin(quiet, **HOW)
     laid = {"laid_us": list(OPENING), "segments": [("opening", 0, len(OPENING))]}
-    news = {"samples": Cell(sigmoid(72), 2).news(OPENING, 2.5), "outcomes": felt(OPENING, 100, [31], {30: 0.004})}
-    verbs.advise(quiet, **news, **laid, torque_time_nm_s=1.0, measured_s=2.5)
+    news = {
+        "samples": Cell(sigmoid(72), 2).news(OPENING, 2.5).tobytes(),
+        "outcomes": felt(OPENING, 100, [31], {30: 0.004}),
+    }
+    verbs.adaptive_advise(quiet, **news, **laid, zero_s=ZERO_S, torque_time_nm_s=1.0, measured_s=2.5)
     assert seen == [(0.004, 0.0)]
 
 
 def test_a_new_test_forgets_the_one_before() -> None:
-    verbs.begin(quiet, **HOW)
+    verbs.adaptive_begin(quiet, **HOW)
     first = verbs._running[0]
-    verbs.begin(quiet, **HOW)
+    verbs.adaptive_begin(quiet, **HOW)
     assert verbs._running != [first] and len(verbs._running) == 1
 
 
@@ -198,8 +209,6 @@ def test_a_model_that_cannot_be_read_here_keeps_nobody_from_a_test() -> None:
 
 
 def test_a_worker_that_died_or_a_begin_that_failed_leaves_no_test_to_advise() -> None:
-    news = Cell(sigmoid(71), 1).news([0.0] * 80, 2.0)
-
     async def asked() -> None:
         adviser = Pool(1)
         try:
@@ -207,11 +216,11 @@ def test_a_worker_that_died_or_a_begin_that_failed_leaves_no_test_to_advise() ->
             with pytest.raises(ApiError):
                 await adviser.submit("adaptive_begin", **HOW, models=7).result
             with pytest.raises(ApiError, match="started again during the test"):
-                await adviser.submit("adaptive_advise", **news).result
+                await adviser.submit("adaptive_advise").result
             assert await adviser.submit("adaptive_begin", **HOW).result == {}
             adviser.workers[0].end()
             with pytest.raises(ApiError, match="started again during the test"):
-                await adviser.submit("adaptive_advise", **news).result
+                await adviser.submit("adaptive_advise").result
             assert await adviser.submit("adaptive_begin", **HOW).result == {}
         finally:
             await adviser.close()

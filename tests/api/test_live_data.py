@@ -1,4 +1,4 @@
-"""What the service makes of the rig's numbers: bins for pages, columns for who follows a test."""
+"""What the service makes of the rig's numbers: bins for pages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from math import nan
 
 import pytest
 
-from stimrig.api.sessions.live import frame_of, samples_of
+from stimrig.api.jobs import adaptive
+from stimrig.api.sessions.live import frame_of
 from stimrig.rig.messages import TORQUE_ROW, LiveEvent, PulseOutcomes
 from stimrig.rig.signals import SAMPLE
 
@@ -28,7 +29,7 @@ def event(rows: list[tuple[float, float]], test_id: str | None = "T1") -> LiveEv
 
 
 def test_a_row_is_a_sample_as_the_rig_holds_it() -> None:
-    assert TORQUE_ROW.size == SAMPLE.itemsize == 33
+    assert SAMPLE == adaptive.SAMPLE and TORQUE_ROW.size == SAMPLE.itemsize
 
 
 def test_pages_get_the_lowest_and_highest_torque_of_each_bin_and_the_pulses() -> None:
@@ -41,9 +42,3 @@ def test_pages_get_the_lowest_and_highest_torque_of_each_bin_and_the_pulses() ->
 @pytest.mark.parametrize(("test_id", "shown"), [("T1", [-0.5, 0.5]), (None, [-40.0, -0.5, 0.5, 3.0])])
 def test_what_was_measured_far_from_the_test_is_not_drawn_in_it(test_id: str | None, shown: list[float]) -> None:
     assert frame_of(event([(-40.0, 1.0), (-0.495, 1.0), (0.505, 1.0), (3.0, 1.0)], test_id)).time_s == shown
-
-
-def test_who_follows_gets_every_sample_on_the_tests_clock() -> None:
-    assert samples_of(event([(0.1, 1.5), (0.2, nan)])) == {
-        "host_time_s": [0.1, 0.2], "counter": [0, 1], "torque_nm": [1.5, None], "sync": [255, 255],
-    }  # fmt: skip

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.api.jobs import tracking_verbs
+from stimrig.api.jobs import tracking as tracking_verbs
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store.tables import Recording
 from stimrig.identify import tracking
@@ -114,7 +114,7 @@ def test_another_pulse_rate_and_other_dynamics_are_no_trial(model_json: str, tmp
     other = identify.fit(record(Planned(PATIENT, 0.0), 3), method="narx").to_json()
     found = follow(recorded(tmp_path, 0.96), other)
     assert "cannot be tracked" in found["reason"] and "step" not in found
-    assert tracking_verbs.warm(silent, other) == {}, "that is said after a trial, not before"
+    assert tracking_verbs.track_warm(silent, other) == {}, "that is said after a trial, not before"
 
 
 def test_a_recording_that_cannot_be_read_is_told_as_such(model_json: str, tmp_path: Path) -> None:
@@ -156,7 +156,7 @@ def test_warming_follows_a_trial_of_its_own(model_json: str, monkeypatch: pytest
         return own(model, state, record)
 
     monkeypatch.setattr(tracking, "follow", noted)
-    assert tracking_verbs.warm(silent, model_json) == {}
+    assert tracking_verbs.track_warm(silent, model_json) == {}
     assert len(followed) == 1 and followed[0] > 1.0
 
 

@@ -1,12 +1,11 @@
-"""What the adviser's worker does: what an adaptive test can reach, and what to play next in one that runs.
+"""Verbs of adaptive tests: what a test can reach, and what to play next in the one that runs.
 
-The test that runs stays in this process between two calls: a call brings only the samples that are new.
+That test stays in this process between two jobs: a job brings only the samples that are new.
 """
 
 from __future__ import annotations
 
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
 from functools import lru_cache
@@ -24,9 +23,15 @@ DIGITS = 4
 BINS = 5
 """Means for each pulse interval, where a load cell gives at least twice as many samples: the delay of a sample's way to
 the host, some milliseconds that only a sealed recording corrects, is then within the one sample that the fit allows."""
+SAMPLE = np.dtype(
+    [("host_time_s", "<f8"), ("stamp_s", "<f8"), ("torque_nm", "<f8"), ("counter", "<i8"), ("sync", "u1")]
+)
+"""As `stimrig.rig.messages.TORQUE_ROW`."""
+Segments = Sequence[tuple[str, int, int]]
+"""Name, first pulse and end of each."""
 
 
-def outlook(
+def adaptive_outlook(
     progress: Progress,
     target: dict[str, float],
     playable_s: float,
@@ -36,7 +41,7 @@ def outlook(
     pulse_rate_hz: float,
     models: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """The opening's pulse widths, and what the test will probably reach.
+    """Return the opening's pulse widths, and what the test will probably reach.
 
     `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
@@ -44,21 +49,21 @@ def outlook(
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.1, "playing the test on a simulated muscle")
-    asked = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models))
-    opening = decide(None, (), asked)
+    limits = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models))
+    opening = decide(None, (), limits)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
-    found = reach(asked, NEW_PERSON_SHARE * max_torque_nm)
-    return json_value({"opening_us": widths, "reach": asdict(found), "known": asked.earlier is not None})
+    outlook = reach(limits, NEW_PERSON_SHARE * max_torque_nm)
+    return json_value({"opening_us": widths, "reach": asdict(outlook), "known": limits.earlier is not None})
 
 
 def warm() -> None:
     """Have the compiled parts compiled: on a new installation this takes longer than anybody waits at a question."""
     target = {"curve_percent": 0.2, "step_percent": 0.2}
-    outlook(lambda _share, _text: None, target, 6.0, 100.0, largest_us=300.0, max_torque_nm=15.0, pulse_rate_hz=40.0)
+    adaptive_outlook(lambda *_: None, target, 6.0, 100.0, largest_us=300.0, max_torque_nm=15.0, pulse_rate_hz=40.0)
 
 
 def known(models: Sequence[str]) -> Any:
-    """The last model and how much the person changes between sessions, `Earlier`; None of a new person.
+    """Return the last model and how much the person changes between sessions, `Earlier`; None of a new person.
 
     A model that cannot be read here is left out. A last model that cannot be read, or that is of another kind than the
     adaptive test fits, is no help, and none is taken in its place.
@@ -78,12 +83,14 @@ def known(models: Sequence[str]) -> Any:
 
 @lru_cache(maxsize=32)
 def model_of(text: str) -> identify.Model:
-    """The model. It is kept, so that a test begins at once with those that its outlook has read."""
+    """Read a model. It is kept, so that a test begins at once with those that its outlook has read."""
     return identify.Model.from_json(text)
 
 
-def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any) -> dict[str, Any]:
-    """A test begins, within the limits that `Running` has: what was known of another one is forgotten."""
+def adaptive_begin(
+    progress: Progress, target: dict[str, float], models: Sequence[str] = (), **limits: Any
+) -> dict[str, Any]:
+    """Begin a test within the limits that `Running` has, and forget the one before."""
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.5, "beginning")
@@ -92,8 +99,8 @@ def begin(progress: Progress, target: dict[str, float], models: Sequence[str] = 
     return {}
 
 
-def advise(progress: Progress, **news: Any) -> dict[str, Any]:
-    """What to play after everything that is laid; see `Running.advise`."""
+def adaptive_advise(progress: Progress, **news: Any) -> dict[str, Any]:
+    """Decide what to play after everything that is laid; see `Running.advise`."""
     progress(0.1, "deciding")
     if not _running:
         raise RuntimeError("the worker process was started again during the test")
@@ -105,79 +112,76 @@ class Running:
     """One adaptive test, as far as it was measured."""
 
     target: Any
-    known: Any
+    earlier: Any
     playable_s: float
     max_torque_time_nm_s: float
     largest_us: float
     pulse_rate_hz: float
-    samples: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
-    outcomes: dict[str, list[Any]] = field(default_factory=lambda: defaultdict(list))
-    before: Any = None
+    samples: bytes = b""
+    outcomes: dict[str, list[Any]] = field(default_factory=dict)
+    decision: Any = None
 
     def advise(
         self,
-        samples: dict[str, list[Any]],
-        outcomes: dict[str, list[Any]],
+        samples: bytes,
+        zero_s: float,
+        outcomes: Mapping[str, list[Any]],
         laid_us: list[float],
-        segments: list[tuple[str, int, int]],
+        segments: Segments,
         torque_time_nm_s: float,
         measured_s: float,
     ) -> dict[str, Any]:
-        """The decision, and where the curves are known least.
+        """Return the decision, and where the curves are known least.
 
         Parameters
         ----------
         samples, outcomes
-            Samples that are new, and what became of pulses since, as the rig tells both.
+            Samples that are new, and what became of pulses since, as the rig sends both.
+        zero_s
+            Begin of the test on the clock of the samples, s.
         laid_us, segments
-            Widths of all pulses that are laid, µs; name, first pulse and end of each segment.
+            Widths of all pulses that are laid, µs, and their segments.
         torque_time_nm_s, measured_s
             Torque-time that was measured, N·m·s, and until when, s.
         """
         from stimrig.identify.experiments.adaptive import Asked, decide
 
-        for held, news in ((self.samples, samples), (self.outcomes, outcomes)):
-            for name, new in news.items():
-                held[name].extend(new)
-        record = record_of(self.samples, self.outcomes, laid_us, segments, self.pulse_rate_hz)
+        self.samples += samples
+        for name, column in outcomes.items():
+            self.outcomes.setdefault(name, []).extend(column)
+        rows = np.frombuffer(self.samples, SAMPLE)
+        record = record_of(rows, zero_s, self.outcomes, laid_us, segments, self.pulse_rate_hz)
         played_us = np.array(laid_us, float)
         played_us[self.outcomes["index"]] = self.outcomes["pulse_width_us"]
-        committed_nm_s = self._expected(laid_us[round(measured_s * self.pulse_rate_hz) :])
+        committed_nm_s = self._expected_nm_s(laid_us[round(measured_s * self.pulse_rate_hz) :])
         left_s = max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz)
         left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
-        asked = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.known)
-        found = decide(record, played_us, asked, self.before)
-        self.before = found if found.short is not None else self.before
-        told = found.to_dict()
-        for number, segment in enumerate(
-            told["segments"], start=len(segments) + 1
-        ):  # laid ones may not be measured yet
+        limits = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.earlier)
+        decision = decide(record, played_us, limits, self.decision)
+        self.decision = decision if decision.short is not None else self.decision
+        document = decision.to_dict()
+        for number, segment in enumerate(document["segments"], start=len(segments) + 1):  # not all laid are measured
             segment["name"] = f"{segment['name'].rpartition(' ')[0]} {number}"
-        if found.knowledge is not None:
-            told["knowledge"] = rounded(told["knowledge"])
-            told["least_known"] = least_known(found.knowledge)
-        return told
+        if (knowledge := decision.knowledge) is not None:
+            curve, step = knowledge.curve, knowledge.step
+            document["knowledge"] = rounded(document["knowledge"])
+            document["least_known"] = {
+                "pulse_width_us": round(float(curve.at[int(np.argmax(curve.half))]), 1),
+                "time_s": round(float(step.at[int(np.argmax(step.half))]), 3),
+            }
+        return document
 
-    def _expected(self, widths_us: list[float]) -> float:
-        """Torque-time of pulses that are laid and not yet measured, N·m·s, by the mean curve; 0 before there is one."""
-        if self.before is None or self.before.knowledge is None:
+    def _expected_nm_s(self, widths_us: list[float]) -> float:
+        """Estimate the torque-time of pulses that are not yet measured by the mean curve; 0 before there is one."""
+        if self.decision is None or self.decision.knowledge is None:
             return 0.0
-        knowledge = self.before.knowledge
+        knowledge = self.decision.knowledge
         shares = np.interp(widths_us, knowledge.curve.at, knowledge.curve.value)
         return float(np.sum(shares)) * knowledge.plateau_nm / self.pulse_rate_hz
 
 
-def least_known(knowledge: Any) -> dict[str, Any]:
-    """Where each curve is known least: pulse width, µs, and time after a step, s."""
-    curve, step = knowledge.curve, knowledge.step
-    return {
-        "pulse_width_us": round(float(curve.at[int(np.argmax(curve.half))]), 1),
-        "time_s": round(float(step.at[int(np.argmax(step.half))]), 3),
-    }
-
-
 def rounded(value: Any) -> Any:
-    """Numbers short enough for a page, however deep they lie."""
+    """Round all numbers in a document to what a page shows."""
     if isinstance(value, dict):
         return {key: rounded(item) for key, item in value.items()}
     if isinstance(value, list):
@@ -186,59 +190,51 @@ def rounded(value: Any) -> Any:
 
 
 def record_of(
-    samples: Mapping[str, Any], outcomes: Mapping[str, Any], laid_us: list[float], segments: list[tuple[str, int, int]],
-    rate_hz: float,
-) -> Any:  # fmt: skip
-    """The record of what was measured since the first pulse, for `decide`; None where there is nothing yet.
+    samples: Any, zero_s: float, outcomes: Mapping[str, Any], laid_us: list[float], segments: Segments, rate_hz: float
+) -> Any:
+    """Return the record of what was measured since the first pulse, for `decide`; None where there is nothing yet.
 
     Pulses are those that were felt, by the same rules as in a sealed recording.
     """
     from stimrig.identify.records.pulse_times import in_force, locate_pulses
     from stimrig.identify.records.record import Record
 
-    if len(samples["host_time_s"]) < 2:
+    if samples.size < 2:
         return None
-    time_s, torque = sample_times(samples["host_time_s"], samples["counter"]), np.array(samples["torque_nm"], float)
+    time_s = sample_times(samples["host_time_s"] - zero_s, samples["counter"])
     whole_s = min(np.floor(time_s[-1] * rate_hz), len(laid_us)) / rate_hz  # of an interval's begin a mean is noisy
-    inside = np.isfinite(torque) & (time_s >= 0) & (time_s < whole_s - 1e-9)
+    inside = np.isfinite(samples["torque_nm"]) & (time_s >= 0) & (time_s < whole_s - 1e-9)
     if not inside.any():
         return None
-    time_s, torque, sync = time_s[inside], torque[inside], np.array(samples["sync"])[inside]
+    time_s, torque, sync = time_s[inside], samples["torque_nm"][inside], samples["sync"][inside]
     came = int(time_s[-1] * rate_hz) + 1
     pulses, doubted = locate_pulses(_sent(outcomes, laid_us[:came], rate_hz), time_s, sync)
     even_s, torque = means(time_s, torque, BINS * rate_hz)
     width_us, late_s = in_force(pulses, even_s, rate_hz)
     code = np.searchsorted([start for _, start, _ in segments], even_s * rate_hz + 1e-9, side="right") - 1
     return Record.from_arrays(
-        even_s,
-        width_us,
-        torque,
-        code,
-        segment_names=[name for name, _, _ in segments],
-        late_s=late_s,
-        doubted=np.interp(even_s, time_s, doubted) > 0,
-        pulses=pulses,
-        pulse_rate_hz=rate_hz,
-    )
+        even_s, width_us, torque, code, segment_names=[name for name, _, _ in segments], late_s=late_s,
+        doubted=np.interp(even_s, time_s, doubted) > 0, pulses=pulses, pulse_rate_hz=rate_hz,
+    )  # fmt: skip
 
 
 def _sent(outcomes: Mapping[str, Any], laid_us: list[float], rate_hz: float) -> Any:
-    """What is known of each pulse; one of which nothing was told yet is on its way."""
+    """Return what is known of each pulse; one whose outcome is not known yet is on its way."""
     from stimrig.identify.records.pulse_times import ON_ITS_WAY, RESTS, Sent
 
     widths_us = np.array(laid_us, float)
     written_s, acknowledged_s = np.full(widths_us.size, np.nan), np.full(widths_us.size, np.nan)
     status = np.where(widths_us > 0, ON_ITS_WAY, RESTS)
     index = np.array(outcomes["index"], int)
-    told = index < widths_us.size
+    laid = index < widths_us.size
     columns = {"pulse_width_us": widths_us, "written_time_s": written_s, "acknowledged_time_s": acknowledged_s}
     for name, column in {**columns, "status": status}.items():
-        column[index[told]] = np.array(outcomes[name], float)[told]
+        column[index[laid]] = np.array(outcomes[name], float)[laid]
     return Sent(np.arange(widths_us.size) / rate_hz, widths_us, written_s, acknowledged_s, status, 1.0 / rate_hz)
 
 
 def means(time_s: Any, torque_nm: Any, rate_hz: float) -> tuple[Any, Any]:
-    """Means over even bins, each at the middle of its bin; the samples themselves where there are not two for each."""
+    """Average over even bins, each at its middle; return the samples where there are not two for each bin."""
     if time_s.size < 2 * rate_hz * (time_s[-1] - time_s[0]):
         return time_s, torque_nm
     number = np.floor(time_s * rate_hz + 1e-9).astype(int)
@@ -247,19 +243,19 @@ def means(time_s: Any, torque_nm: Any, rate_hz: float) -> tuple[Any, Any]:
     return (filled + 0.5) / rate_hz, (np.bincount(number, torque_nm)[filled] / count[filled])
 
 
-def sample_times(host_time_s: list[float], counter: list[int]) -> Any:
-    """When the samples were taken, on the test's clock: evenly by the cell's counter, set by those that came earliest.
+def sample_times(host_s: Any, counter: Any) -> Any:
+    """Estimate when the samples were taken: evenly by the cell's counter, on the line below all arrivals.
 
     Samples arrive late and never early, after a pause of the computer all of it at once: so no arrival lies below the
     line. Of such lines it is the highest one in the record's middle, an edge of the arrivals' lower convex hull.
     """
-    host, number = np.array(host_time_s, float), np.array(counter, float)
+    number = np.array(counter, float)
     if number.min() < 0:  # the cell has none
-        number = np.arange(host.size, dtype=float)
+        number = np.arange(host_s.size, dtype=float)
     number -= number[0]
     hull: list[Any] = []
-    latest = np.r_[np.diff(host) > 0, True]  # of those that came at once
-    for point in np.column_stack([number, host])[latest].tolist():
+    latest = np.r_[np.diff(host_s) > 0, True]  # of those that came at once
+    for point in np.column_stack([number, host_s])[latest].tolist():
         while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
             hull.pop()
         hull.append(point)
@@ -270,14 +266,9 @@ def sample_times(host_time_s: list[float], counter: list[int]) -> Any:
 
 
 def _turn(one: Any, two: Any, three: Any) -> float:
-    """Above 0: the way from one point to the third turns upwards at the second."""
+    """Return a value above 0 where the way from one point to the third turns upwards at the second."""
     return (two[0] - one[0]) * (three[1] - one[1]) - (two[1] - one[1]) * (three[0] - one[0])
 
 
 _running: list[Running] = []
 """The test that runs; at most one."""
-VERBS: dict[str, Callable[..., dict[str, Any]]] = {
-    "adaptive_outlook": outlook,
-    "adaptive_begin": begin,
-    "adaptive_advise": advise,
-}

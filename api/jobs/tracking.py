@@ -1,9 +1,9 @@
-"""What the worker does after a controller's trial: read the recording, follow the muscle, move the approved model."""
+"""Verbs of a controller's trials: read the recording, follow the muscle, move the approved model."""
 
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -131,7 +131,7 @@ def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> f
     return float(100.0 * np.sqrt(np.mean((reference[count > 0] - (mean_nm - offset_nm)) ** 2)) / size_nm)
 
 
-def warm(progress: Progress, model_json: str) -> dict[str, Any]:
+def track_warm(progress: Progress, model_json: str) -> dict[str, Any]:
     """Load all that `track` needs, and follow two seconds of the model's own torque: then a trial waits for nothing."""
     import importlib
 
@@ -150,6 +150,3 @@ def warm(progress: Progress, model_json: str) -> dict[str, Any]:
         step = follow(model, None, identify.Record.from_arrays(time_s, widths_us, torque_nm, **own))
         model_for_next(model, step).to_json(None)
     return {}
-
-
-VERBS: dict[str, Callable[..., dict[str, Any]]] = {"track": track, "track_warm": warm}
