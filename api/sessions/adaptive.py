@@ -19,7 +19,7 @@ from stimrig.api.jobs.pool import Pool
 from stimrig.api.models import stored_model
 from stimrig.api.models.places import Place, differ, place_of, site_of
 from stimrig.api.models.registry import Versions
-from stimrig.api.sessions.adaptive_follower import Follower, Told
+from stimrig.api.sessions.adaptive_follower import AdaptiveStatus, Follower
 from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Tell, Watched, begun
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
@@ -137,9 +137,9 @@ class AdaptiveTests(Watched):
         await super().close()
         await self.adviser.close()
 
-    def end_of(self, row: Test, event: FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
+    def end_of(self, row: Test, event: FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
         """Where another piece of the fixed plan would have been too long, the time has ended it."""
-        by_time = rigs == "limit" and told["max_duration_s"] - event.summary["duration_s"] < PIECE_S
+        by_time = rigs == "limit" and standing["max_duration_s"] - event.summary["duration_s"] < PIECE_S
         return "time" if by_time else ""
 
     def fit_options(self, row: Test) -> dict[str, Any]:
@@ -162,7 +162,7 @@ class AdaptiveTests(Watched):
             "max_duration_s": bounds.get("max_duration_s"),
             "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
             "torque_time_nm_s": None,
-            **asdict(Told(row.plan.get("target") or {}, row.plan.get("reach"), state="fixed", problem=why)),
+            **asdict(AdaptiveStatus(row.plan.get("target") or {}, row.plan.get("reach"), state="fixed", problem=why)),
         }
 
 

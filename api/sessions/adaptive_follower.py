@@ -75,7 +75,7 @@ class Turn:
 
 
 @dataclass
-class Told:
+class AdaptiveStatus:
     """What is known of the test, for pages and for its document."""
 
     target: dict[str, float]
@@ -104,7 +104,7 @@ class Follower(Watcher):
         self, plan: TestPlan, how: dict[str, Any], reach: dict[str, Any], rig: RigClient, adviser: Pool,
         clock: Clock, tell: Callable[[], None],
     ) -> None:  # fmt: skip
-        super().__init__(plan, Told(how["target"], reach), rig, clock, tell)
+        super().__init__(plan, AdaptiveStatus(how["target"], reach), rig, clock, tell)
         self.how, self.adviser = how, adviser
         self.key = secrets.token_urlsafe(24)
         self._fixed = [segment.settings["pulse_width_us"] for segment in plan.segments or []]
@@ -142,7 +142,7 @@ class Follower(Watcher):
         assert bounds is not None
         limits = {"max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms}
         measured_nm_s = 0.0 if self._newest is None else self._newest.torque_time_nms
-        return {**limits, "torque_time_nm_s": measured_nm_s, **asdict(self.told)}
+        return {**limits, "torque_time_nm_s": measured_nm_s, **asdict(self.status)}
 
     # ---- what the rig says ----------------------------------------------------------------------------------
 
@@ -152,7 +152,7 @@ class Follower(Watcher):
         self._new.take(event)
         if event.laid != self._turn.laid:
             self._turn = Turn(event.laid)
-        if event.ended_by or self.told.state != "choosing":
+        if event.ended_by or self.status.state != "choosing":
             return
         left_s = self._left_s(event.elapsed_s)
         idle = self._asking is None or self._asking.done()
@@ -197,11 +197,11 @@ class Follower(Watcher):
             await self._carry_out(turn, answer)
 
     def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
-        told, known = self.told, said["knowledge"]
+        status, known = self.status, said["knowledge"]
         # a misfit is told as the problem, and its bands mean nothing; at the end those stay on which it was decided
-        fits = said["kind"] != "misfit" and not self.told.ended
+        fits = said["kind"] != "misfit" and not self.status.ended
         if fits:
-            told.words = said["words"]
+            status.words = said["words"]
         row = {
             "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
             "segments": [segment["name"] for segment in said["segments"]],
@@ -210,15 +210,15 @@ class Follower(Watcher):
         }  # fmt: skip
         if known is not None:
             if fits:
-                told.knowledge, told.least_known = known, said["least_known"]
+                status.knowledge, status.least_known = known, said["least_known"]
             row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
-        told.decisions.append(row)
+        status.decisions.append(row)
         self.tell()
-        return Answer(said, heard_s, len(told.decisions) - 1)
+        return Answer(said, heard_s, len(status.decisions) - 1)
 
     def _write(self, answer: Answer, **more: Any) -> None:
         """More of a decision. Its line is replaced: a page's thread may be copying the old one."""
-        rows = self.told.decisions
+        rows = self.status.decisions
         rows[answer.number] = rows[answer.number] | more
 
     async def _carry_out(self, turn: Turn, answer: Answer) -> None:
@@ -227,20 +227,20 @@ class Follower(Watcher):
         if kind == "misfit":
             self.give_up(answer.said["words"])
             return
-        before = self.told.state, self.told.ended
+        before = self.status.state, self.status.ended
         chosen = [SegmentPlan(**segment) for segment in answer.said["segments"]]
         ended = {"enough": "known-enough", "spent": self._spent()}.get(kind, "")
         request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.laid, segments=chosen)
         if ended:
             request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
             # at once: what comes while the rig answers is neither asked about, nor told as what the end was decided on
-            self.told.state, self.told.ended = "ending", self.told.ended or ended
+            self.status.state, self.status.ended = "ending", self.status.ended or ended
         self._added += (widths := [segment.settings["pulse_width_us"] for segment in chosen])
         try:
             await self.rig.ask(request)
         except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, and then it is asked again
             if ended:
-                self.told.state, self.told.ended = before
+                self.status.state, self.status.ended = before
             if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
                 raise
             del self._added[len(self._added) - len(widths) :]

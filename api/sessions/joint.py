@@ -8,7 +8,6 @@ import math
 import secrets
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import isfinite
 from typing import Any, ClassVar
 
 from stimrig.api.errors import ApiError
@@ -47,23 +46,23 @@ class JointTests(Watched):
         asked, longest_s = body.angle or AngleIn(), body.max_duration_s
         shared = await self._layout(plan, range_rad, longest_s, preview_s)
         angle = messages.AnglePlan(range_rad=range_rad, tolerance_rad=asked.tolerance_rad)
-        told = {
+        shown = {
             "kind": plan.kind, "doses": shared.doses, "known": shared.known, "longest_s": None, "target_rad": None,
             "tolerance_rad": asked.tolerance_rad,
         }  # fmt: skip
         if plan.kind == HELD:
             target = await asyncio.to_thread(self._target, plan, asked, shared)
-            angle.target_rad = told["target_rad"] = target
+            angle.target_rad = shown["target_rad"] = target
             segments, bounds = shared.held, None
         else:
             angle.still_s = joint_plan.STILL_S[plan.kind] if asked.still_s is None else asked.still_s
             bounds = self._bounds(body, plan, shared)
             quiet_s = bounds.max_duration_s - messages.SAFE_END_S
             segments = shared.moving if plan.kind == MOVING else joint_plan.passive(quiet_s, plan.pulse_rate_hz)
-            told["longest_s"] = bounds.max_duration_s
+            shown["longest_s"] = bounds.max_duration_s
         chosen = [messages.SegmentPlan(**segment) for segment in segments]
         plan = plan.model_copy(update={"segments": chosen, "angle": angle, "adaptive": bounds})
-        return Planned(plan, {"joint": told})
+        return Planned(plan, {"joint": shown})
 
     async def _layout(
         self, plan: messages.TestPlan, range_rad: tuple[float, float], longest_s: float | None, preview_s: float
@@ -112,11 +111,11 @@ class JointTests(Watched):
         plan = planned.plan
         if plan.adaptive is None or plan.angle is None:
             return ""
-        cells = joint_plan.coverage_grid(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
-        self.watch(JointWatcher(plan, Seen(Coverage(cells)), self.rig, self.clock, self.tell_now))
+        coverage = Coverage(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
+        self.watch(JointWatcher(plan, JointStatus(coverage), self.rig, self.clock, self.tell_now))
         return secrets.token_urlsafe(24)
 
-    def end_of(self, row: Test, event: messages.FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
+    def end_of(self, row: Test, event: messages.FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
         """A held test has no other end than its outcome; a moving one's levels are as many as its share allows."""
         if row.kind == HELD:
             return event.outcome
@@ -135,7 +134,7 @@ class JointTests(Watched):
         lost = begun(row) and row.kind != HELD
         why = "What is seen is not counted any more: the service was restarted during the test." if lost else ""
         state = {"state": "alone" if lost else "watching", "problem": why, "ended": ""}
-        return dict.fromkeys(Seen.__dataclass_fields__) | state
+        return dict.fromkeys(JointStatus.__dataclass_fields__) | state
 
     # ---- today's ---------------------------------------------------------------------------------------------
 
@@ -185,8 +184,8 @@ def target_of(row: Test) -> float:
 
 
 @dataclass
-class Seen:
-    """What is known of the test, for pages and for its document."""
+class JointStatus:
+    """State of a guided test for pages and its document."""
 
     coverage: Coverage
     state: str = "watching"
@@ -201,7 +200,7 @@ class Seen:
 class JointWatcher(Watcher):
     """Counts what was seen of angle and velocity in a test in which a joint moves; ends it well when that is enough."""
 
-    told: Seen
+    status: JointStatus
     log = logging.getLogger("stimrig.joint")
 
     def __init__(self, *given: Any) -> None:
@@ -209,7 +208,7 @@ class JointWatcher(Watcher):
         self._since_s: float | None = None
         """Since when pulses follow one another, and the newest one, on the test's clock."""
         self._last_s = 0.0
-        self._told_s = -TELL_S
+        self._shown_s = -TELL_S
 
     def problem(self, why: str) -> str:
         """As `Watcher`."""
@@ -217,12 +216,12 @@ class JointWatcher(Watcher):
 
     def document(self) -> dict[str, Any]:
         """As `Watcher`."""
-        return {**vars(self.told), "coverage": self.told.coverage.document()}
+        return {**vars(self.status), "coverage": self.status.coverage.document()}
 
     def hear(self, event: messages.LiveEvent) -> None:
         """As `Watcher`; where the samples are enough, have the rig end the test well."""
-        told = self.told
-        told.torque_time_nm_s = event.torque_time_nms
+        status = self.status
+        status.torque_time_nm_s = event.torque_time_nms
         for index, width_us in zip(event.outcomes.index, event.outcomes.pulse_width_us, strict=True):
             at_s = index / event.pulse_rate_hz
             if not (width_us > 0.0):
@@ -230,25 +229,23 @@ class JointWatcher(Watcher):
             else:
                 self._since_s, self._last_s = at_s if self._since_s is None else self._since_s, at_s
         for host_s, angle_rad, velocity_rad_s in event.angle_rows():
-            if isfinite(angle_rad) and isfinite(velocity_rad_s):
-                self._take(host_s - event.zero_s, angle_rad, velocity_rad_s)
-        if told.state == "watching" and told.coverage.enough and not event.ended_by:
-            told.state, told.ended = "ending", "covered"
+            if math.isfinite(angle_rad) and math.isfinite(velocity_rad_s):
+                status.angle_rad, status.velocity_rad_s = angle_rad, velocity_rad_s
+                at_s = host_s - event.zero_s
+                status.coverage.add(at_s, angle_rad, velocity_rad_s, self._counts(at_s))
+        if status.state == "watching" and status.coverage.enough and not event.ended_by:
+            status.state, status.ended = "ending", "covered"
             self.begin(self._say_enough())
         now_s = self.clock.monotonic_s()
-        if now_s - self._told_s >= TELL_S or told.state == "ending":
-            self._told_s = now_s
+        if now_s - self._shown_s >= TELL_S or status.state == "ending":
+            self._shown_s = now_s
             self.tell()
-
-    def _take(self, time_s: float, angle_rad: float, velocity_rad_s: float) -> None:
-        self.told.angle_rad, self.told.velocity_rad_s = angle_rad, velocity_rad_s
-        self.told.coverage.add(time_s, angle_rad, velocity_rad_s, self._counts(time_s))
 
     def _counts(self, time_s: float) -> bool:
         """Without stimulation everything counts in a passive test, and nothing in another one."""
         if self.plan.kind == PASSIVE:
             return True
-        flows = time_s - self._last_s <= NEXT_PULSES / self.plan.pulse_rate_hz  # else what became of it is not told yet
+        flows = time_s - self._last_s <= NEXT_PULSES / self.plan.pulse_rate_hz  # else its outcome is not known yet
         return flows and self._since_s is not None and time_s - self._since_s >= SETTLED_S
 
     async def _say_enough(self) -> None:
@@ -256,5 +253,5 @@ class JointWatcher(Watcher):
             await self.rig.ask(requests.EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
         except ApiError as error:  # it has ended by itself, or a person was quicker
             if error.code != "rig-late":
-                self.told.state, self.told.ended = "watching", ""
+                self.status.state, self.status.ended = "watching", ""
                 raise

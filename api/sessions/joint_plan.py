@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_right
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from typing import Any
 
 from stimrig.api.sessions.profiles import TOLERANCE_RAD
@@ -230,6 +231,8 @@ SLOW_RAD_S, FAST_RAD_S = 0.15, 0.7
 VELOCITY_EDGES_RAD_S = (-FAST_RAD_S, -SLOW_RAD_S, SLOW_RAD_S, FAST_RAD_S)
 ROWS = (("extension", "fast"), ("extension", "slow"), None, ("flexion", "slow"), ("flexion", "fast"))
 """What each row of velocities is: direction and speed; None: nearly still."""
+MISSING_ORDER = (("flexion", "slow"), ("extension", "slow"), ("flexion", "fast"), ("extension", "fast"))
+"""As it is to be done."""
 BIN_RAD = math.radians(15)
 LEAST_BINS, MOST_BINS = 3, 8
 MARGIN_RAD, MARGIN_SHARE = math.radians(3), 0.05
@@ -240,62 +243,27 @@ ENOUGH = 0.9
 """Share of the cells that are asked for."""
 
 
-@dataclass(frozen=True)
-class Grid:
-    """Cells of angle and velocity: fast and slow in both directions, and nearly still.
+class Coverage:
+    """How long the joint was in each cell of angle and velocity: fast and slow in both directions, and nearly still.
 
-    A cell is seen once the joint was in it for long enough. Nearly still is not asked for, nor fast at the ends of the
-    range, where a movement turns round.
+    A cell is seen once the joint was in it for long enough. Nearly still is not needed, nor fast at the ends of the
+    range, where a movement turns round. The columns of angle are of about 15°, from 3 to 8 of them.
+
+    `range_rad`: lowest and highest angle; `seen_s`: time in a cell after which it is seen.
     """
 
-    angle_rad: tuple[float, ...]  # edges of the A columns, rad, rising; angles beyond belong to the outer columns
-    seen_s: float  # time in a cell after which it is seen, s
-
-    @property
-    def columns(self) -> int:
-        """How many bins of angle."""
-        return len(self.angle_rad) - 1
-
-    def asked(self, row: int, column: int) -> bool:
-        """Whether a cell is asked for."""
-        kind = ROWS[row]
-        return kind is not None and (kind[1] == "slow" or 0 < column < self.columns - 1)
-
-    def cell(self, angle_rad: float, velocity_rad_s: float) -> tuple[int, int]:
-        """Row and column of a sample."""
-        column = min(max(bisect_right(self.angle_rad, angle_rad) - 1, 0), self.columns - 1)
-        return bisect_right(VELOCITY_EDGES_RAD_S, velocity_rad_s), column
-
-
-@dataclass(frozen=True)
-class Missing:
-    """A stretch of angles that was not seen yet in one direction and at one speed."""
-
-    direction: str
-    speed: str
-    from_rad: float
-    to_rad: float
-
-
-def coverage_grid(range_rad: Sequence[float], seen_s: float) -> Grid:
-    """The cells for a range of angles (lowest, highest, rad): columns of about 15°, from 3 to 8 of them."""
-    low, high = range_rad
-    margin = max(MARGIN_RAD, MARGIN_SHARE * (high - low))
-    first, last = (low + margin, high - margin) if high - low > 4 * margin else (low, high)
-    count = min(max(round((last - first) / BIN_RAD), LEAST_BINS), MOST_BINS)
-    return Grid(tuple(first + (last - first) * k / count for k in range(count + 1)), seen_s)
-
-
-class Coverage:
-    """What was seen of a grid; grows sample by sample."""
-
-    def __init__(self, cells: Grid) -> None:
-        self.grid = cells
-        self.time_s = [[0.0] * cells.columns for _ in ROWS]
+    def __init__(self, range_rad: Sequence[float], seen_s: float) -> None:
+        low, high = range_rad
+        margin = max(MARGIN_RAD, MARGIN_SHARE * (high - low))
+        first, last = (low + margin, high - margin) if high - low > 4 * margin else (low, high)
+        self.columns = min(max(round((last - first) / BIN_RAD), LEAST_BINS), MOST_BINS)
+        self.edges_rad = [first + (last - first) * k / self.columns for k in range(self.columns + 1)]
+        self.seen_s = seen_s
+        self.time_s = [[0.0] * self.columns for _ in ROWS]
         self._last_s: float | None = None
 
     def add(self, time_s: float, angle_rad: float, velocity_rad_s: float, counts: bool = True) -> None:
-        """Take a sample; one that does not count (no stimulation, say) only moves the time on.
+        """Add a sample; one that does not count (no stimulation, say) only moves the time on.
 
         A sample that is no number is left out.
         """
@@ -304,63 +272,58 @@ class Coverage:
         last_s, self._last_s = self._last_s, time_s
         if not counts or last_s is None or not (0.0 < time_s - last_s <= LONGEST_STEP_S):
             return
-        row, column = self.grid.cell(angle_rad, velocity_rad_s)
+        row, column = self.cell(angle_rad, velocity_rad_s)
         self.time_s[row][column] += time_s - last_s
 
+    def cell(self, angle_rad: float, velocity_rad_s: float) -> tuple[int, int]:
+        """Return row and column of a sample; angles beyond the edges belong to the outer columns."""
+        column = min(max(bisect_right(self.edges_rad, angle_rad) - 1, 0), self.columns - 1)
+        return bisect_right(VELOCITY_EDGES_RAD_S, velocity_rad_s), column
+
+    def needed(self, row: int, column: int) -> bool:
+        """Return whether a cell is needed."""
+        kind = ROWS[row]
+        return kind is not None and (kind[1] == "slow" or 0 < column < self.columns - 1)
+
     def seen(self, row: int, column: int) -> bool:
-        """Whether the joint was in a cell for long enough; a hair less, for sums of samples."""
-        return self.time_s[row][column] >= self.grid.seen_s - 1e-6
+        """Return whether the joint was in a cell for long enough; a hair less, for sums of samples."""
+        return self.time_s[row][column] >= self.seen_s - 1e-6
 
     @property
     def share(self) -> float:
-        """Share of the cells that are asked for which were seen, 0 to 1."""
-        asked = [(row, column) for row, column in self._cells() if self.grid.asked(row, column)]
-        return sum(self.seen(*cell) for cell in asked) / len(asked)
+        """Share of the needed cells that were seen, 0 to 1."""
+        needed = [cell for cell in product(range(len(ROWS)), range(self.columns)) if self.needed(*cell)]
+        return sum(self.seen(*cell) for cell in needed) / len(needed)
 
     @property
     def enough(self) -> bool:
         """Whether a test may end: at most a tenth is missing."""
         return self.share >= ENOUGH - 1e-9
 
-    def missing(self) -> list[Missing]:
-        """What was not seen yet, neighbours taken together: slow before fast, as it is to be done."""
+    def missing(self) -> list[dict[str, Any]]:
+        """Return the stretches of angles that were not seen yet in a direction at a speed: slow before fast."""
         found = []
-        for row in sorted(range(len(ROWS)), key=_order):
-            kind = ROWS[row]
-            open_ones = [k for k in range(self.grid.columns) if self.grid.asked(row, k) and not self.seen(row, k)]
-            for first, last in _runs(open_ones):
-                assert kind is not None
-                found.append(Missing(*kind, self.grid.angle_rad[first], self.grid.angle_rad[last + 1]))
+        for kind in MISSING_ORDER:
+            row, edge = ROWS.index(kind), None
+            for column in range(self.columns + 1):
+                is_open = column < self.columns and self.needed(row, column) and not self.seen(row, column)
+                if is_open and edge is None:
+                    edge = self.edges_rad[column]
+                elif not is_open and edge is not None:
+                    stretch = {"from_rad": edge, "to_rad": self.edges_rad[column]}
+                    found.append({"direction": kind[0], "speed": kind[1], **stretch})
+                    edge = None
         return found
 
     def document(self) -> dict[str, Any]:
-        """As clients see it."""
+        """Return it as clients see it."""
         return {
-            "angle_edges_rad": [round(edge, 4) for edge in self.grid.angle_rad],
+            "angle_edges_rad": [round(edge, 4) for edge in self.edges_rad],
             "velocity_edges_rad_s": list(VELOCITY_EDGES_RAD_S),
             "time_s": [[round(value, 3) for value in row] for row in self.time_s],
-            "asked": [[self.grid.asked(row, k) for k in range(self.grid.columns)] for row in range(len(ROWS))],
-            "seen_s": self.grid.seen_s,
+            "asked": [[self.needed(row, k) for k in range(self.columns)] for row in range(len(ROWS))],
+            "seen_s": self.seen_s,
             "share": round(self.share, 4),
             "enough": self.enough,
-            "missing": [dict(vars(each)) for each in self.missing()],
+            "missing": self.missing(),
         }
-
-    def _cells(self) -> Iterable[tuple[int, int]]:
-        return ((row, column) for row in range(len(ROWS)) for column in range(self.grid.columns))
-
-
-def _order(row: int) -> tuple[bool, int]:
-    kind = ROWS[row]
-    return (kind is not None and kind[1] == "fast", -row)
-
-
-def _runs(numbers: Sequence[int]) -> list[tuple[int, int]]:
-    """First and last of each run of neighbours."""
-    runs: list[tuple[int, int]] = []
-    for number in numbers:
-        if runs and runs[-1][1] == number - 1:
-            runs[-1] = (runs[-1][0], number)
-        else:
-            runs.append((number, number))
-    return runs

@@ -118,9 +118,9 @@ class Kinds:
 
 
 class Watcher:
-    """A test from its first sample to its end. Whatever goes wrong in watching leaves it to its plan, told.
+    """A test from its first sample to its end. Whatever goes wrong in watching leaves it to its plan, status.
 
-    `plan`: as the rig plays it. `told`: what is known of the test, for pages and its document; has `state`, `problem`
+    `plan`: as the rig plays it. `status`: what is known of the test, for pages and its document; has `state`, `problem`
     and `ended`. `tell`: called whenever there is something new for pages.
     """
 
@@ -128,8 +128,8 @@ class Watcher:
     """States: while all goes well, and after it did not."""
     log = logging.getLogger("stimrig.sessions")
 
-    def __init__(self, plan: TestPlan, told: Any, rig: RigClient, clock: Clock, tell: Callable[[], None]) -> None:
-        self.plan, self.told, self.rig, self.clock, self.tell = plan, told, rig, clock, tell
+    def __init__(self, plan: TestPlan, status: Any, rig: RigClient, clock: Clock, tell: Callable[[], None]) -> None:
+        self.plan, self.status, self.rig, self.clock, self.tell = plan, status, rig, clock, tell
         self._tasks = Tasks(self.log)
 
     async def run(self, path: Path | None) -> None:
@@ -163,9 +163,9 @@ class Watcher:
 
     def give_up(self, why: str) -> None:
         """Watch no more."""
-        if self.told.state == self.watches:
-            self.told.state, self.told.problem = self.left, self.problem(why)
-            self.log.warning("%s", self.told.problem, extra={"test_id": self.plan.test_id})
+        if self.status.state == self.watches:
+            self.status.state, self.status.problem = self.left, self.problem(why)
+            self.log.warning("%s", self.status.problem, extra={"test_id": self.plan.test_id})
             self.tell()
 
     def problem(self, why: str) -> str:
@@ -213,7 +213,7 @@ class Watched(Kind):
     def said_enough(self, test_id: str) -> None:
         """As `Kind`."""
         if (watcher := self._watcher_of(test_id)) is not None:
-            watcher.told.state, watcher.told.ended = "ending", watcher.told.ended or "enough"
+            watcher.status.state, watcher.status.ended = "ending", watcher.status.ended or "enough"
             self.tell_now()
 
     def leave(self) -> None:
@@ -231,13 +231,13 @@ class Watched(Kind):
 
     def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
         """As `Kind`."""
-        rigs, told = str(event.summary.get("ended_by") or event.outcome), self._standing(row)
-        ended = told["ended"] if rigs == "enough" and told["ended"] else self.ends.get(rigs, rigs)
-        ended = self.end_of(row, event, rigs, told) or ended
-        measured = event.summary.get("torque_time_nms", told["torque_time_nm_s"])
-        return {self.part: {**told, "torque_time_nm_s": measured, "state": "ended", "ended": ended}}
+        rigs, standing = str(event.summary.get("ended_by") or event.outcome), self._standing(row)
+        ended = standing["ended"] if rigs == "enough" and standing["ended"] else self.ends.get(rigs, rigs)
+        ended = self.end_of(row, event, rigs, standing) or ended
+        measured = event.summary.get("torque_time_nms", standing["torque_time_nm_s"])
+        return {self.part: {**standing, "torque_time_nm_s": measured, "state": "ended", "ended": ended}}
 
-    def end_of(self, row: Test, event: FinishedEvent, rigs: str, told: Mapping[str, Any]) -> str:  # noqa: ARG002
+    def end_of(self, row: Test, event: FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
         """Why it ended, where more than the rig's reason says it."""
         return ""
 

@@ -401,7 +401,7 @@ def test_the_early_answer_is_sent_before_the_rig_decides(monkeypatch: pytest.Mon
     assert isinstance(request, ExtendRequest) and request.after == 30
     decided_s = FIRST_S - AHEAD / rate_hz
     assert decided_s - adaptive_follower.SEND_S - 0.03 < at_s < decided_s
-    assert follower.told.problem == ""
+    assert follower.status.problem == ""
 
 
 def test_the_newest_answer_is_sent_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -418,7 +418,7 @@ def test_the_end_is_told_with_what_it_was_decided_on(monkeypatch: pytest.MonkeyP
     known, less = ({"curve_percent": percent, "step_percent": 1.0} for percent in (1.5, 2.5))
     enough = {**SAID, "kind": "enough", "segments": [], "knowledge": known}
     world = World([enough, {**SAID, "knowledge": less, "late": True}])
-    told = followed(world, 40.0, monkeypatch).told
+    told = followed(world, 40.0, monkeypatch).status
     assert len(world.asked) == 2 and [type(request) for _, request in world.requests] == [EnoughRequest]
     assert (told.ended, told.knowledge, len(told.decisions)) == ("known-enough", known, 2)
     assert told.decisions[1]["late"]
@@ -460,6 +460,6 @@ def test_an_answer_that_cannot_be_used_is_told(
     monkeypatch: pytest.MonkeyPatch, answer: dict[str, Any], why: str
 ) -> None:
     world = World([answer])
-    told = followed(world, 40.0, monkeypatch).told
+    told = followed(world, 40.0, monkeypatch).status
     assert told.state == "fixed" and told.problem.startswith("The fixed plan plays on: ") and why in told.problem
     assert [request for _, request in world.requests if request.segments] == []

@@ -24,7 +24,6 @@ from stimrig.api.sessions.joint_plan import (
     torque_time,
     widths_of,
 )
-from stimrig.api.sessions.joint_plan import coverage_grid as grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.rig.limits import HARD_LIMITS, for_profile
@@ -148,7 +147,7 @@ def sweep(speed_rad_s: float, times: int, begin_s: float = 0.0) -> Iterator[Samp
 
 
 def moved(*speeds: float, seen_s: float = 0.2) -> Coverage:
-    found, time_s = Coverage(grid(RANGE_RAD, seen_s)), 0.0
+    found, time_s = Coverage(RANGE_RAD, seen_s), 0.0
     for speed in speeds:
         for sample in sweep(speed, 2, time_s):
             found.add(*sample)
@@ -157,17 +156,17 @@ def moved(*speeds: float, seen_s: float = 0.2) -> Coverage:
 
 
 def test_columns_lie_within_the_range() -> None:
-    cells = grid(RANGE_RAD, 0.2)
+    cells = Coverage(RANGE_RAD, 0.2)
     assert cells.columns == 5
-    assert RANGE_RAD[0] < cells.angle_rad[0] < cells.angle_rad[-1] < RANGE_RAD[1]
-    assert [grid((0.0, width), 0.2).columns for width in (0.3, 0.9, 6.0)] == [3, 3, 8]
+    assert RANGE_RAD[0] < cells.edges_rad[0] < cells.edges_rad[-1] < RANGE_RAD[1]
+    assert [Coverage((0.0, width), 0.2).columns for width in (0.3, 0.9, 6.0)] == [3, 3, 8]
 
 
 def test_slow_alone_leaves_the_fast_ones_missing() -> None:
     found = moved(0.4)
     assert not found.enough and 0.4 < found.share < ENOUGH
-    assert {each.speed for each in found.missing()} == {"fast"}
-    assert {each.direction for each in found.missing()} == {"flexion", "extension"}
+    assert {each["speed"] for each in found.missing()} == {"fast"}
+    assert {each["direction"] for each in found.missing()} == {"flexion", "extension"}
 
 
 def test_slow_and_fast_is_enough() -> None:
@@ -176,25 +175,25 @@ def test_slow_and_fast_is_enough() -> None:
 
 
 def test_a_small_movement_misses_the_ends_in_one_stretch_each() -> None:
-    found = Coverage(grid(RANGE_RAD, 0.2))
+    found = Coverage(RANGE_RAD, 0.2)
     middle = sum(RANGE_RAD) / 2
     for k in range(4000):
         found.add(k / SAMPLES_HZ, middle + 0.1 * math.sin(4 * k / SAMPLES_HZ), 0.4 * math.cos(4 * k / SAMPLES_HZ))
-    slow = [each for each in found.missing() if (each.direction, each.speed) == ("flexion", "slow")]
-    assert len(slow) == 2 and slow[0].to_rad <= middle <= slow[1].from_rad
-    assert found.missing()[0].speed == "slow", "what is to be done first comes first"
+    slow = [each for each in found.missing() if (each["direction"], each["speed"]) == ("flexion", "slow")]
+    assert len(slow) == 2 and slow[0]["to_rad"] <= middle <= slow[1]["from_rad"]
+    assert found.missing()[0]["speed"] == "slow", "what is to be done first comes first"
 
 
 def test_a_still_joint_shows_nothing() -> None:
-    found = Coverage(grid(RANGE_RAD, 0.2))
+    found = Coverage(RANGE_RAD, 0.2)
     for k in range(2000):
         found.add(k / SAMPLES_HZ, 1.0, 0.0)
     assert found.share == 0.0
 
 
 def test_a_cell_is_seen_after_its_time_and_not_before() -> None:
-    found = Coverage(grid(RANGE_RAD, 0.2))
-    row, column = found.grid.cell(1.0, 0.4)
+    found = Coverage(RANGE_RAD, 0.2)
+    row, column = found.cell(1.0, 0.4)
     for k in range(40):
         found.add(k / SAMPLES_HZ, 1.0, 0.4)
     assert not found.seen(row, column)
@@ -206,14 +205,14 @@ def test_a_cell_is_seen_after_its_time_and_not_before() -> None:
     "odd", [(math.nan, 1.0, 0.4), (0.01, math.nan, 0.4), (0.01, 1.0, math.inf), (-5.0, 1.0, 0.4), (9.0, 1.0, 0.4)]
 )
 def test_no_number_a_gap_or_a_step_back_counts_for_nothing(odd: Sample) -> None:
-    found = Coverage(grid(RANGE_RAD, 0.2))
+    found = Coverage(RANGE_RAD, 0.2)
     found.add(0.0, 1.0, 0.4)
     found.add(*odd)
     assert found.share == 0.0 and sum(map(sum, found.time_s)) == 0.0
 
 
 def covered(samples: list[Sample], counts: Callable[[Sample], bool] = lambda _: True) -> Coverage:
-    found = Coverage(grid(RANGE_RAD, 0.1))
+    found = Coverage(RANGE_RAD, 0.1)
     for sample in samples:
         found.add(*sample, counts(sample))
     return found
@@ -225,7 +224,7 @@ def test_what_does_not_count_is_passed_over() -> None:
     assert covered(samples).enough
     assert covered(samples, lambda _: False).share == 0.0
     only_flexion = covered(samples, lambda sample: sample[2] > 0)
-    assert {each.direction for each in only_flexion.missing()} == {"extension"}
+    assert {each["direction"] for each in only_flexion.missing()} == {"extension"}
 
 
 def test_the_document_says_it_all() -> None:
