@@ -110,12 +110,12 @@ def svg(
     right : float
         px; room on the right.
     """
-    shown = figure if height is None else replace(figure, height=height)
-    body = _draw_cached("light" if light else "page", shown, width, right).decode()
+    sized = figure if height is None else replace(figure, height=height)
+    body = _draw_cached("light" if light else "page", sized, width, right).decode()
     words = f'role="img" aria-label="{escape(label)}"' if label else 'aria-hidden="true"'
     return Markup(
         '<svg xmlns="http://www.w3.org/2000/svg" xmlns:xlink="http://www.w3.org/1999/xlink" class="still" '
-        f'viewBox="0 0 {width:g} {shown.height:g}" {words} font-family="system-ui, \'DejaVu Sans\', sans-serif" '
+        f'viewBox="0 0 {width:g} {sized.height:g}" {words} font-family="system-ui, \'DejaVu Sans\', sans-serif" '
         f'font-size="{FONT_PX}" stroke-linejoin="round"{body}</svg>'
     )
 
@@ -167,10 +167,10 @@ def decimate(x: Sequence[float], y: Sequence[float | None], most: int = MOST_POI
         return at, value
     gaps = np.isnan(value)
     low, high = np.where(gaps, np.inf, value), np.where(gaps, -np.inf, value)
-    kept = set(np.flatnonzero(gaps))
+    chosen = set(np.flatnonzero(gaps))
     for part in np.array_split(np.arange(at.size), most // 2):
-        kept |= {part[np.argmin(low[part])], part[np.argmax(high[part])]}
-    rows = sorted(kept)
+        chosen |= {part[np.argmin(low[part])], part[np.argmax(high[part])]}
+    rows = sorted(chosen)
     return at[rows], value[rows]
 
 
@@ -221,19 +221,19 @@ def _lay_out(
 
 def _add_parts(figure: Figure, panels: Sequence[Any], colours: Mapping[str, Any], width: float) -> None:
     for shade in figure.shades:
-        look = {"facecolor": colours[shade.colour], "linewidth": 0, "zorder": 0.5}
+        style = {"facecolor": colours[shade.colour], "linewidth": 0, "zorder": 0.5}
         if shade.low is not None:
-            panels[shade.panel].axhspan(shade.low, shade.high, **look)
+            panels[shade.panel].axhspan(shade.low, shade.high, **style)
         for axes in panels if shade.low is None else ():
-            axes.axvspan(shade.start, shade.end, **look)
+            axes.axvspan(shade.start, shade.end, **style)
     for band in figure.bands:
-        look = {"facecolor": colours[band.colour], "linewidth": 0, "zorder": 1.5}
+        style = {"facecolor": colours[band.colour], "linewidth": 0, "zorder": 1.5}
         few = slice(None, None, 1 + len(band.x) // MOST_BAND)
-        panels[band.panel].fill_between(band.x[few], band.lower[few], band.upper[few], **look)
+        panels[band.panel].fill_between(band.x[few], band.lower[few], band.upper[few], **style)
     most = min(MOST_POINTS, int(1.5 * width))
     for number, curve in enumerate(figure.curves):
-        look = {**_look(curve, colours), "markevery": curve.every, "zorder": 2 + 0.01 * number}
-        panels[curve.panel].plot(*decimate(curve.x, curve.y, most), **look)
+        style = {**_style(curve, colours), "markevery": curve.every, "zorder": 2 + 0.01 * number}
+        panels[curve.panel].plot(*decimate(curve.x, curve.y, most), **style)
     for rule in figure.rules:
         draw = [axes.axvline for axes in panels] if rule.vertical else [panels[0].axhline]
         for line in draw:
@@ -243,15 +243,15 @@ def _add_parts(figure: Figure, panels: Sequence[Any], colours: Mapping[str, Any]
         panels[0].annotate(rule.text, at, (-4 if rule.right else 4, 4), frame, "offset points",
                            color=colours[rule.colour], ha="right" if rule.right else "left")  # fmt: skip
     for label in figure.labels if width >= NARROW else [label for label in figure.labels if label.badge]:
-        look = {"color": colours["mark"], "va": "bottom"}
+        style = {"color": colours["mark"], "va": "bottom"}
         if label.badge:
             ground = {"facecolor": colours[label.badge], "edgecolor": "none", "pad": 3}
-            look = {"color": colours["on-worst"], "va": "top", "bbox": ground}
+            style = {"color": colours["on-worst"], "va": "top", "bbox": ground}
         panels[0].annotate(label.text, (label.x, 1), (0, -6 if label.badge else 3), ("data", "axes fraction"),
-                           "offset points", ha="center", annotation_clip=False, **look)  # fmt: skip
+                           "offset points", ha="center", annotation_clip=False, **style)  # fmt: skip
 
 
-def _look(curve: Curve, colours: Mapping[str, Any]) -> dict[str, Any]:
+def _style(curve: Curve, colours: Mapping[str, Any]) -> dict[str, Any]:
     colour = colours[curve.colour]
     return {
         "color": colour, "linewidth": curve.width, "linestyle": DASHES[curve.dash] if curve.width else "none",
@@ -266,7 +266,7 @@ def _handle(entry: Curve | Band, colours: Mapping[str, Any]) -> Any:
     from matplotlib.patches import Patch
 
     if isinstance(entry, Curve):
-        return Line2D([], [], **_look(entry, colours))
+        return Line2D([], [], **_style(entry, colours))
     return Patch(facecolor=colours[entry.colour], linewidth=0)
 
 

@@ -75,9 +75,9 @@ def plotly_figure(figure: Figure, colour: Colour = variable) -> dict[str, Any]:
 
 def page_figure(figure: Figure, file_name: str) -> dict[str, Any]:
     """Return a figure with what a page's script passes on to plotly; `file_name`: of a picture that is saved."""
-    made = plotly_figure(figure)
-    made["layout"]["separators"] = ". "
-    return {**made, "config": {**PAGE_CONFIG, "toImageButtonOptions": {"filename": file_name, "scale": 2}}}
+    content = plotly_figure(figure)
+    content["layout"]["separators"] = ". "
+    return {**content, "config": {**PAGE_CONFIG, "toImageButtonOptions": {"filename": file_name, "scale": 2}}}
 
 
 def _axis_id(letter: str, number: int) -> str:
@@ -95,16 +95,16 @@ def _value(letter: str, value: Value) -> str:
 
 def _axis(axis: Axis, colour: Colour) -> dict[str, Any]:
     title = {"text": _text(axis.label), "standoff": 8, "font": {"size": 12}}
-    made: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "title": title, "gridcolor": colour("grid"), "zerolinecolor": colour("zero"), "automargin": True,
     }  # fmt: skip
     if axis.limits:
-        made["range"] = list(axis.limits)
+        settings["range"] = list(axis.limits)
     if axis.from_zero:
-        made["rangemode"] = "tozero"
+        settings["rangemode"] = "tozero"
     if axis.ticks:
-        made |= {"tickvals": [at for at, _ in axis.ticks], "ticktext": [_text(words) for _, words in axis.ticks]}
-    return made
+        settings |= {"tickvals": [at for at, _ in axis.ticks], "ticktext": [_text(words) for _, words in axis.ticks]}
+    return settings
 
 
 def _curve(curve: Curve, colour: Colour) -> dict[str, Any]:
@@ -146,8 +146,8 @@ def _shapes(figure: Figure, colour: Colour) -> list[dict[str, Any]]:
         if shade.low is not None:
             yref = _axis_id("y", shade.panel)
             place = {"xref": "paper", "yref": yref, "x0": 0, "x1": 1, "y0": shade.low, "y1": shade.high}
-        look = {"fillcolor": colour(shade.colour), "line": {"width": 0}, "layer": "below"}
-        shapes.append({"type": "rect", **place, **look})
+        style = {"fillcolor": colour(shade.colour), "line": {"width": 0}, "layer": "below"}
+        shapes.append({"type": "rect", **place, **style})
     for rule in figure.rules:
         place = {"xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": rule.at, "y1": rule.at}
         if rule.vertical:
@@ -175,6 +175,6 @@ def _annotations(figure: Figure, colour: Colour) -> list[dict[str, Any]]:
                  "y": rule.at, "yanchor": "bottom"}  # fmt: skip
         if rule.vertical:
             place = {"xref": "x", "yref": "paper", "x": rule.at, "xanchor": "left", "y": 0.42}
-        look = {"showarrow": False, "font": {"color": colour(rule.colour)}, "name": "rule"}
-        notes.append({**place, **look, "text": _text(rule.text)})
+        style = {"showarrow": False, "font": {"color": colour(rule.colour)}, "name": "rule"}
+        notes.append({**place, **style, "text": _text(rule.text)})
     return notes

@@ -63,18 +63,18 @@ def columns(joint: dict[str, Any], table: str) -> list[tuple[Way, int, list[bool
     """
     velocity, angle_rad = joint["velocity_rad_s"], joint["angle_rad"]
     counts = [sum(row[k] for name in ("seen_g", "seen_h") for row in joint[name]) for k in range(len(velocity))]
-    drawn = []
+    selected = []
     for way in WAYS:
         inside = [k for k, value in enumerate(velocity) if way.low <= value < way.high]
-        there = [
+        angles = [
             angle for angle, row in zip(angle_rad, joint[f"seen_{table}"], strict=True) if sum(row[k] for k in inside)
         ]
-        if not there:
+        if not angles:
             continue
         still = way.name == "still"
         column = min(inside, key=lambda k: abs(velocity[k])) if still else max(inside, key=counts.__getitem__)
-        drawn.append((way, column, [any(abs(angle - other) <= NEAR_RAD for other in there) for angle in angle_rad]))
-    return drawn
+        selected.append((way, column, [any(abs(angle - other) <= NEAR_RAD for other in angles) for angle in angle_rad]))
+    return selected
 
 
 def _figure(joint: dict[str, Any], name: str, unit: str, value: Value, title: str) -> Figure:
@@ -93,7 +93,7 @@ def _figure(joint: dict[str, Any], name: str, unit: str, value: Value, title: st
         if not all(seen):
             label = "" if dotted else "dotted: not seen"
             dotted.append(Curve(angle_deg, y, label, way.colour, 1.2, "dot", listed=not dotted))
-        solid = [at if there else None for at, there in zip(y, seen, strict=True)]
+        solid = [value if was_seen else None for value, was_seen in zip(y, seen, strict=True)]
         lines.append(Curve(angle_deg, solid, _label(way, joint["velocity_rad_s"][column]), way.colour, way.width,
                            marker=way.marker, size=7, every=MARK_EVERY, value=value, notes=notes))  # fmt: skip
     x = Axis("Joint angle (°)", fig.AT_ANGLE, (angle_deg[0], angle_deg[-1]))

@@ -17,31 +17,31 @@ BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]
 """Widths of the measurement and of the recruitment curve beside it."""
 
 
-def _with(config: dict[str, Any] | None) -> dict[str, Any]:
-    return {**(config or {}), **CHART_CONFIG}  # a copy: plotly takes entries out of what it is given
+def _local(options: dict[str, Any]) -> dict[str, Any]:
+    return {**options, "config": {**(options.get("config") or {}), **CHART_CONFIG}}
 
 
 class LocalFigure(go.Figure):
     """A plotly figure without a button to upload it, whose HTML loads nothing from elsewhere."""
 
-    def show(self, *args: Any, config: dict[str, Any] | None = None, **kwargs: Any) -> None:
+    def show(self, *args: Any, **options: Any) -> None:
         """Show it."""
-        super().show(*args, config=_with(config), **kwargs)
+        super().show(*args, **_local(options))
 
-    def to_html(self, *args: Any, config: dict[str, Any] | None = None, **kwargs: Any) -> str:
-        """As HTML."""
-        return super().to_html(*args, config=_with(config), **kwargs)
+    def to_html(self, *args: Any, **options: Any) -> str:
+        """Return it as HTML."""
+        return super().to_html(*args, **_local(options))
 
-    def write_html(self, *args: Any, config: dict[str, Any] | None = None, **kwargs: Any) -> None:
-        """Into an HTML file."""
-        super().write_html(*args, config=_with(config), **kwargs)
+    def write_html(self, *args: Any, **options: Any) -> None:
+        """Write it into an HTML file."""
+        super().write_html(*args, **_local(options))
 
     def _repr_html_(self) -> str:
         bundle = self._repr_mimebundle_()
         return bundle.get("text/html") or self.to_html(full_html=False, include_plotlyjs=True)
 
-    def _repr_mimebundle_(self, *args: Any, **kwargs: Any) -> Any:
-        return super()._repr_mimebundle_(*args, config=_with(None), **kwargs)
+    def _repr_mimebundle_(self, *args: Any, **options: Any) -> Any:
+        return super()._repr_mimebundle_(*args, **_local(options))
 
     def _ipython_display_(self) -> None:
         import plotly.io as pio
@@ -95,10 +95,12 @@ def _show(figure: Figure) -> LocalFigure:
 
 def _model(model: Model, record: Record) -> LocalFigure:
     """Draw measurement and model with residual and pulse widths, and the recruitment curve beside them."""
-    drawn = curves(model, record)
+    page_curves = curves(model, record)
     series = rounded(compare(model, record).to_dict())["series"]
-    large = plotly_figure(model_charts.measurement(drawn, model.fit.get("noise_sd_nm"), series), LIGHT.__getitem__)
-    curve = plotly_figure(model_charts.recruitment(model.to_dict(), drawn), LIGHT.__getitem__)
+    large = plotly_figure(
+        model_charts.measurement(page_curves, model.fit.get("noise_sd_nm"), series), LIGHT.__getitem__
+    )
+    curve = plotly_figure(model_charts.recruitment(model.to_dict(), page_curves), LIGHT.__getitem__)
     large["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in curve["data"]]
     large["layout"]["xaxis"]["domain"] = BESIDE
     large["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": ALONE, "anchor": "y4"}

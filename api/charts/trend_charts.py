@@ -104,8 +104,8 @@ def _panel_of(
     points: Sequence[Point], title: str, unit: str, x: Axis, levels: Sequence[float] = (), breaks: bool = False
 ) -> dict[str, Any]:
     known = [point for point in points if point.value is not None]
-    drawn = svg(history(points, unit, x, levels, breaks), WIDE_PX, label=f"{title}, {unit}") if known else ""
-    return {"title": title, "unit": unit, "latest": known[-1].text if known else "–", "svg": drawn}
+    picture = svg(history(points, unit, x, levels, breaks), WIDE_PX, label=f"{title}, {unit}") if known else ""
+    return {"title": title, "unit": unit, "latest": known[-1].text if known else "–", "svg": picture}
 
 
 def history(points: Sequence[Point], unit: str, x: Axis, levels: Sequence[float] = (), breaks: bool = False) -> Figure:
@@ -125,13 +125,13 @@ def history(points: Sequence[Point], unit: str, x: Axis, levels: Sequence[float]
     known = np.nan_to_num(half)
     limits = span(value - known, value + known, value)
     gap = np.isnan(np.pad(value, 1, constant_values=np.nan))
-    alone = np.where(gap[:-2] & gap[2:], half, np.nan)  # a band needs two points
+    isolated = np.where(gap[:-2] & gap[2:], half, np.nan)  # a band needs two points
     flags = np.array([point.x for point in points if point.flagged])
     high = np.full(flags.size, limits[1] - 0.04 * (limits[1] - limits[0]))
     open_rows = np.isin(at, [point.x for point in points if not point.approved])
     curves = (
         Curve(at.tolist(), value.tolist(), "", "model"),
-        _strokes(at, value - alone, value + alone, "model", 0.9),
+        _strokes(at, value - isolated, value + isolated, "model", 0.9),
         _strokes(at, value, value, "model", 7, "round"),
         _strokes(at[open_rows], value[open_rows], value[open_rows], "chart", 3.6, "round"),
         _strokes(flags, high, high, "width", 7, "projecting"),
@@ -181,12 +181,12 @@ def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[di
     numbers = [float(trial["number"]) for trial in trials]
     ticks = [(number, f"{number:.0f}") for number in numbers[:: -(-len(numbers) // MOST_NUMBERS)]]
     x = Axis("Number of the trial", limits=(numbers[0] - 0.5, numbers[-1] + 0.5), ticks=ticks)
-    drawn = []
+    pictures = []
     for name, (title, unit, factor) in TRIAL_FIGURES.items():
         if referred or name != "error_percent":
             points = [_trial_point(trial, name) for trial in trials]
-            drawn.append(_panel_of(points, title, unit, x, [factor * end for end in bounds.get(name, ())]))
-    return drawn
+            pictures.append(_panel_of(points, title, unit, x, [factor * end for end in bounds.get(name, ())]))
+    return pictures
 
 
 def _trial_point(trial: Mapping[str, Any], name: str) -> Point:

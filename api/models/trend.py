@@ -184,9 +184,9 @@ def _session(
     if approval is not None:
         candidates = [row for row in rows if row.id == approval.model_id]
     model = max(candidates, key=lambda row: (row.recorded_utc, row.created_utc))
-    own = [test for test in tests if test.id == model.test_id] or tests  # a joined recording is of all its tests
+    own_tests = [test for test in tests if test.id == model.test_id] or tests  # a joined recording is of all its tests
     charges = [test.charge_uc for test in tests if test.charge_uc is not None]
     return Session(
-        key, model.recorded_utc, model, len(rows), approval, own[-1].current_ma if own else None,
+        key, model.recorded_utc, model, len(rows), approval, own_tests[-1].current_ma if own_tests else None,
         sum(charges) if charges else None, tuple(test.id for test in tests),
     )  # fmt: skip

@@ -231,7 +231,7 @@ def test_the_models_page_says_what_changed(client: httpx.Client, days: list[str]
 def at(tab: Any, picture: Any, number: int) -> None:
     """The pointer at a session of a picture."""
     box = picture.bounding_box()
-    day = tab.evaluate("(number) => JSON.parse(document.getElementById('told').textContent)[number][0]", number)
+    day = tab.evaluate("(number) => JSON.parse(document.getElementById('session-rows').textContent)[number][0]", number)
     first, left, each = map(float, picture.get_attribute("data-x").split())
     x = left + (day - first) * each
     tab.mouse.move(box["x"] + x * box["width"] / WIDE_PX, box["y"] + box["height"] / 2)

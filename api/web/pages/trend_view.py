@@ -43,7 +43,7 @@ def trend(request: Request, context: Ctx, _who: ModelReader, code: str) -> Respo
         sessions=[{**session, "cells": _session_cells(session)} for session in rows],
         more=len(documents) > len(rows),
         panels=trend_charts.panels(documents),
-        told=trend_charts.session_rows(documents),
+        session_rows=trend_charts.session_rows(documents),
         changes=newest_changes(sessions),
         columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(changes.name_of, COLUMNS)],
         most=MOST,

@@ -3,7 +3,7 @@
 {
   const box = document.querySelector(".trends");
   const tip = document.getElementById("tip");
-  const sessions = JSON.parse(document.getElementById("told").textContent); // of each: day, when, what else, its page
+  const sessions = JSON.parse(document.getElementById("session-rows").textContent); // of each: day, when, what else, its page
   const stills = [...box.querySelectorAll("svg.still")];
   const left = (still, day) => { const [first, at, each] = still.dataset.x.split(" ").map(Number); return at + (day - first) * each; };
 
