@@ -172,7 +172,7 @@ class Client(Connection):
 
     def tests(self, participant: str) -> list[TestOut]:
         """The tests of a participant, newest first."""
-        return self._list(TestOut, f"/participants/{participant}/tests")
+        return self._list(TestOut, "/tests", params={"participant": participant, "limit": 500})
 
     def follow(self, test_id: str) -> Iterator[TestOut]:
         """A test ten times a second until it is done, whatever its end."""

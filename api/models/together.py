@@ -67,7 +67,7 @@ def _ids(effects: Sequence[str]) -> list[str]:
 def _find_recordings(analyses: Analyses, participant: str, recordings: Sequence[str]) -> list[Recording]:
     rows = []
     for identity in recordings:
-        fix = "GET /v1/participants/{code}/tests names those of its tests."
+        fix = "GET /v1/tests?participant={code} names those of its tests."
         row = require_found(analyses.store.get(Recording, identity), "recording", identity, fix)
         if row.participant != participant:
             detail = f"{identity} is a recording of {row.participant}, the model is to be one of {participant}."

@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig.api.clock import utc_label
-from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.people.auth import Principal, Scope
+from stimrig.api.errors import NotFoundError
+from stimrig.api.people.auth import Principal
 from stimrig.api.services import participants
 from stimrig.api.services.context import Context
 from stimrig.api.sessions import controllers
 from stimrig.api.sessions.controllers import KeyFor
 from stimrig.api.sessions.playing import refuse_archived
+from stimrig.api.sessions.requests import TokenIn
 from stimrig.api.store import locking
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Token
@@ -37,20 +38,12 @@ def revoke(context: Context, code: str, key_id: str, by: str) -> None:
         raise NotFoundError("key", key_id, f"The page of {code} lists its keys.")
 
 
-def make_reader(context: Context, name: str, days: int, by: str) -> dict[str, Any]:
-    """Make a key that only reads models, of all participants."""
-    expires_utc = utc_label(context.clock.unix_s() + 86400.0 * days)
-    text = context.auth.issue(name, [Scope.READ_MODEL], by, expires_utc=expires_utc)
-    return {"key": text, "prefix": text[:12], "scopes": [Scope.READ_MODEL], "expires_utc": expires_utc}
-
-
-def scopes_of(names: list[str]) -> list[Scope]:
-    """Return the scopes of these names. Raises ApiError (422): there is none of a name."""
-    known = {scope.value for scope in Scope}
-    if wrong := [name for name in names if name not in known]:
-        detail = f"Unknown: {', '.join(wrong)}. There are: {', '.join(sorted(known))}."
-        raise ApiError(422, "invalid-input", "No such scope", detail)
-    return [Scope(name) for name in names]
+def issue_token(context: Context, body: TokenIn, by: str) -> dict[str, Any]:
+    """Issue a token to a program; its text is shown this once."""
+    after_days = utc_label(context.clock.unix_s() + 86400.0 * body.days) if body.days else None
+    ends = body.expires_utc or after_days
+    text = context.auth.issue(body.name, body.scopes, by, expires_utc=ends)
+    return {"token": text, "name": body.name, "scopes": body.scopes, "expires_utc": ends}
 
 
 def all_tokens(context: Context) -> list[dict[str, Any]]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 from stimrig.api.errors import require_found
+from stimrig.api.services import participants
 from stimrig.api.services.context import Context
 from stimrig.api.sessions.playing import other_than
 from stimrig.api.store import locking
@@ -26,3 +29,12 @@ def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tag
 
 
 LISTED = "GET /v1/tests lists them."
+
+
+def newest(context: Context, limit: int, participant: str | None = None) -> list[dict[str, Any]]:
+    """List tests, the newest first. Raises NotFoundError: there is no such participant."""
+    if participant is None:
+        rows = context.store.all(Test, order=Test.requested_utc.desc(), limit=limit)
+        return [context.runner.document(row) for row in rows]
+    participants.find(context, participant)
+    return context.runner.documents(participant, context.versions.of(participant), limit)

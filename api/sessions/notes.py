@@ -79,7 +79,7 @@ class Notes:
             return
         test = session.get(Test, body.test_id)
         if test is None or test.participant != participant:
-            raise NotFoundError("test", body.test_id, f"GET /v1/participants/{participant}/tests lists them.")
+            raise NotFoundError("test", body.test_id, f"GET /v1/tests?participant={participant} lists them.")
         last_s = duration_s(test)
         if body.at_s is not None and not (body.at_s <= last_s):
             detail = f"The test lasts {last_s:.1f} s; {body.at_s:g} s is after its end."

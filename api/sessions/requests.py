@@ -22,6 +22,7 @@ from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.errors import ApiError
 from stimrig.api.models.tracking import Limits
 from stimrig.api.people import accounts
+from stimrig.api.people.auth import Scope
 from stimrig.api.schemas.shared import SETTINGS, NoteKind
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.profiles import LIMITS
@@ -370,7 +371,8 @@ class TokenIn(Body):
     """A token to be issued."""
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
-    scopes: Annotated[list[str], Field(min_length=1)]
+    scopes: Annotated[list[Annotated[Scope, Field(strict=False)]], Field(min_length=1)]
+    days: int | None = Field(None, ge=1, le=366, description="it expires after these, where no `expires_utc` is sent")
     expires_utc: (
         Annotated[
             str,

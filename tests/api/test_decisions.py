@@ -112,7 +112,7 @@ def user(world: World) -> None:
     assert world.me.post("/v1/users", json=added).is_success
 
 
-def tested(world: World) -> None:
+def played(world: World) -> None:
     world.names["test_id"] = run_test(world.me, world.code)["id"]
 
 
@@ -161,7 +161,7 @@ CASES = {
     "keys": Case(World.lower, KEY),
     "ran-by": Case(
         lambda world: world.colleague.put(f"/v1/tests/{world.names['test_id']}/ran-by", json={"ran_by": "Bea"}),
-        {"ran_by": "Cem"}, tested),
+        {"ran_by": "Cem"}, played),
     "pose": Case(
         lambda world: world.colleague.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}), {"angle_rad": 1.5}, sensor),
     "password": Case(

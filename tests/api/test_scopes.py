@@ -87,7 +87,6 @@ GET    /v1/participants                                    run-test       200
 POST   /v1/participants                                    run-test       422
 GET    /v1/participants/x                                  run-test       404
 PUT    /v1/participants/x/profile                          run-test       428
-GET    /v1/participants/x/tests                            run-test       404
 POST   /v1/participants/x/recordings                       run-test       428
 GET    /v1/participants/x/calibration                      run-test       404
 POST   /v1/participants/x/calibration                      run-test       428
@@ -151,7 +150,6 @@ POST   /v1/users                                           administer     422
 GET    /v1/users                                           administer     200
 PUT    /v1/users/x/password                                administer     428
 DELETE /v1/users/x                                         administer     404
-POST   /v1/controller-keys                                 administer     422
 GET    /administration                                     administer     200
 GET    /administration/audit.jsonl                         administer     200
 """

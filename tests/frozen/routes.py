@@ -182,7 +182,6 @@ def people(day: Day) -> None:
     day.name("token", made["token"])
     day.name("token_id", next(one["id"] for one in ask("GET", "/v1/tokens").json() if one["name"] == "script"))
     ask("POST", "/v1/tokens", {"name": "script", "scopes": ["everything"]})
-    ask("POST", "/v1/controller-keys", {"name": "controller"})
     with day.service.client(None) as http:
         ask("POST", "/v1/sessions", {"name": "Ada", "password": "wrong"}, http=http)
         ask("POST", "/v1/sessions", {"name": "Ada", "password": PASSWORD}, http=http)

@@ -41,10 +41,10 @@ class KeyOut(Document):
     prefix: str
     scopes: list[Scope]
     expires_utc: str
-    id: str | None = Field(None, description="of a key that plays trials: for `DELETE /v1/tokens/{id}`")
-    name: str | None = Field(None, description="under which its trials are kept")
-    participant: str | None = Field(None, description="the only one that it opens")
-    plan: dict[str, JsonValue] | None = Field(None, description="what trials it may play")
+    id: str = Field(description="for `DELETE /v1/participants/{code}/keys/{id}`")
+    name: str = Field(description="under which its trials are kept")
+    participant: str = Field(description="the only one that it opens")
+    plan: dict[str, JsonValue] = Field(description="what trials it may play")
 
 
 class TokenOut(Document):

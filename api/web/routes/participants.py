@@ -16,7 +16,6 @@ from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import PROBLEM, Ctx, ParticipantVersion, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
-from stimrig.api.web.responses.rig import TestOut
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
 MayVoid = Annotated[bool, Query(description="the change may void the calibration of the day")]
@@ -74,13 +73,6 @@ async def set_profile(
     """
     row = await participants.change_profile(context, code, body.sent(), who.name, void_calibration, confirm, ask, tags)
     return {**tagged(response, row), "meanwhile": participants.meanwhile(context, code)}
-
-
-@router.get("/{code}/tests", **describe_answer(list[TestOut]))
-def tests_of(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
-    """A participant's tests, newest first."""
-    participants.find(context, code)
-    return context.runner.documents(code, context.versions.of(code))
 
 
 @router.put("/{code}/muscle", **describe_answer(ParticipantOut))

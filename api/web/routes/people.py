@@ -79,13 +79,6 @@ class ConfirmIn(_Body):
     password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
 
 
-class KeyIn(_Body):
-    """A key for a controller."""
-
-    name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
-    days: Annotated[int, Field(strict=True, ge=1, le=366, description="it expires after these")] = 30
-
-
 @router.post("/users", status_code=201, **describe_answer(UserOut, 201, "added"))
 async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
     """Add a person; the default scopes are a clinician's."""
@@ -190,15 +183,6 @@ def sign_out(context: Ctx, request: Request, _who: EvenLocked) -> None:
     context.auth.sign_out(cookie)
 
 
-@router.post("/controller-keys", status_code=201, **describe_answer(KeyOut, 201, "issued"))
-def controller_key(context: Ctx, who: Administrator, body: KeyIn) -> dict[str, Any]:
-    """A key for an ILC controller that only reads models, of all participants. Its text is shown this once.
-
-    One that plays trials: `POST /v1/participants/{code}/keys`.
-    """
-    return keys.make_reader(context, body.name, body.days, who.name)
-
-
 @router.post("/participants/{code}/keys", status_code=201, **describe_answer(KeyOut, 201, "made"))
 def participant_key(
     context: Ctx, who: Approver, code: str, tags: ParticipantVersion, body: KeyFor, response: Response
@@ -226,8 +210,7 @@ token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLE
 @token_router.post("/tokens", status_code=201, **describe_answer(TokenOut, 201, "issued"))
 def issue_token(context: Ctx, who: Administrator, body: TokenIn) -> dict[str, Any]:
     """Issue a token; its text is shown this once."""
-    text = context.auth.issue(body.name, keys.scopes_of(body.scopes), who.name, expires_utc=body.expires_utc)
-    return {"token": text, "name": body.name, "scopes": body.scopes, "expires_utc": body.expires_utc}
+    return keys.issue_token(context, body, who.name)
 
 
 @token_router.get("/tokens", **describe_answer(list[ListedToken]))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Response, WebSocket, WebSocketDisconnect
+from fastapi import APIRouter, Query, Response, WebSocket, WebSocketDisconnect
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.clinical_words import missing_words
@@ -54,10 +54,11 @@ async def start_test(
 
 
 @router.get("", **describe_answer(list[TestOut]))
-def list_tests(context: Ctx, _who: LiveReader, limit: int = 50) -> list[dict[str, Any]]:
-    """The newest tests."""
-    rows = context.store.all(Test, order=Test.requested_utc.desc(), limit=max(1, min(limit, 500)))
-    return [context.runner.document(row) for row in rows]
+def list_tests(
+    context: Ctx, _who: LiveReader, limit: Annotated[int, Query(ge=1, le=500)] = 50, participant: str | None = None
+) -> list[dict[str, Any]]:
+    """The newest tests, of all participants or of one."""
+    return tests.newest(context, limit, participant)
 
 
 @router.get("/{test_id}", **describe_answer(TestOut))
