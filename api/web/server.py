@@ -1,4 +1,4 @@
-"""`python -m stimrig.api.web`: the web process. Prints one JSON line when it answers; ends at SIGTERM.
+"""The service as a process: `main` prints one JSON line when it answers, and ends at SIGTERM.
 
 Exit 2: a setting does not hold, another service holds the data, the port is taken, or the database does not open.
 """
@@ -28,11 +28,17 @@ from stimrig.api.settings import Settings, loopback
 from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.web.app import create_app
 
+REQUEST_S = 10.0
+MOST_SILENT = 256
+MOST_FILES = 65_536
+
 
 def main() -> int:
-    """Run the service; the exit code."""
+    """Run the service until SIGTERM or Ctrl-C; return the exit code."""
     logs.configure()
-    raise_file_limit()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)  # each connection is a file
+    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
     os.umask(os.umask(0o077) | 0o077)  # what the service and its workers write is for their user only
     try:
         settings = Settings()
@@ -40,30 +46,35 @@ def main() -> int:
         lock = ServiceLock(settings)  # before the port: who runs already says more than a port that is taken
         limit_environment()
         listener = bind(settings.host, settings.port)
-        lock.tell(address_of(listener))
+        host, port = listener.getsockname()[:2]
+        url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+        lock.tell(url)
         asyncio.run(carried_structure.refuse_unknown(settings))  # before a first token is drawn: it is told only once
         app = create_app(settings, lock=lock)
     except (ApiError, SettingsError, OSError) as error:
         print(f"stimrig: {error}", file=sys.stderr)
         return 2
-    run(app, listener)
+    with contextlib.suppress(KeyboardInterrupt):
+        asyncio.run(_serve(app, listener, {"url": url, "port": port, "drawn_token": app.state.context.drawn_token}))
     return 0
 
 
-def run(app: FastAPI, listener: socket.socket) -> None:
-    """Serve until SIGTERM or Ctrl-C; a JSON line says so once the first request would be answered."""
-    port, drawn = listener.getsockname()[1], app.state.context.drawn_token
-    ready = {"url": address_of(listener), "port": port, "drawn_token": drawn}
-    with contextlib.suppress(KeyboardInterrupt):
-        asyncio.run(serve(uvicorn.Server(configuration(app)), listener, ready))
+async def _serve(app: FastAPI, listener: socket.socket, ready: dict[str, object]) -> None:
+    server = uvicorn.Server(configuration(app))
+    running = asyncio.create_task(server.serve(sockets=[listener]))
+    while not server.started and not running.done():
+        await asyncio.sleep(0.01)
+    if server.started:  # the first request would be answered
+        print(json.dumps(ready), flush=True)
+    await running
 
 
 def configuration(app: ASGIApp, **more: Any) -> uvicorn.Config:
-    """How uvicorn runs the service.
+    """Return how uvicorn runs the service.
 
     `X-Forwarded-For` is believed of a proxy on this machine only: who signs in too often is told apart by address, and
     anybody could write another one into the header. Each request begins with no context variable set: on a connection
-    that stays open it would else take over those of an earlier one, and so what that one was shown.
+    that stays open it would else take over those of an earlier one.
     """
     usual: dict[str, Any] = {
         "log_config": None, "access_log": False, "timeout_graceful_shutdown": 2, "ws_max_size": 2**20,
@@ -74,7 +85,7 @@ def configuration(app: ASGIApp, **more: Any) -> uvicorn.Config:
 
 
 def refuse_open_door(settings: Settings) -> None:
-    """Passwords and tokens don't travel in the clear: another address than loopback only behind a TLS proxy.
+    """Refuse another address than loopback without a TLS proxy: passwords and tokens don't travel in the clear.
 
     Raises OSError: the host is not loopback, and TLS in front has not been vouched for.
     """
@@ -88,46 +99,24 @@ def refuse_open_door(settings: Settings) -> None:
 
 
 def bind(host: str, port: int) -> socket.socket:
-    """A listening address, or the reason why it cannot be had."""
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    listener = socket.socket(family, socket.SOCK_STREAM)
+    """Take an address. Raises OSError with the fix: it cannot be had."""
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
     except OSError as error:
         listener.close()
-        detail = f"{host}:{port}: {error.strerror or error}; take another port with --port"
-        raise OSError(detail) from error
+        raise OSError(f"{host}:{port}: {error.strerror or error}; take another port with --port") from error
     return listener
 
 
-def address_of(listener: socket.socket) -> str:
-    """Where the service answers."""
-    host, port = listener.getsockname()[:2]
-    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-
-
-async def serve(server: uvicorn.Server, listener: socket.socket, ready: dict[str, object]) -> None:
-    """Serve; say so once the first request would be answered."""
-    running = asyncio.create_task(server.serve(sockets=[listener]))
-    while not server.started and not running.done():
-        await asyncio.sleep(0.01)
-    if server.started:
-        print(json.dumps(ready), flush=True)
-    await running
-
-
-# A crowd of connections that say nothing does not keep out one who has something to say. A connection has `REQUEST_S`
-# for the head of its first request, and as long for that of each next one. Then it is closed. At most `MOST_SILENT`
-# connections are waited for. When one more comes, the one that has been silent for longest is closed. So a newcomer
-# always gets in, also with a stop, and the process does not run out of files.
-REQUEST_S = 10.0
-MOST_SILENT = 256
-MOST_FILES = 65_536
-
-
 def protocol(request_s: float = REQUEST_S, most_silent: int = MOST_SILENT) -> type[H11Protocol]:
-    """The protocol that uvicorn is to speak: its own, at such a door."""
+    """Return uvicorn's protocol, which closes connections that say nothing: they keep nobody out.
+
+    A connection has `request_s` for the head of its first request, and as long for that of each next one. At most
+    `most_silent` are waited for: when one more comes, the one that has been silent for longest is closed. So a newcomer
+    always gets in, also with a stop, and the process does not run out of files.
+    """
     silent: dict[asyncio.Transport, asyncio.TimerHandle] = {}
 
     class Visitor(H11Protocol):
@@ -169,11 +158,3 @@ def protocol(request_s: float = REQUEST_S, most_silent: int = MOST_SILENT) -> ty
                 timer.cancel()
 
     return Visitor
-
-
-def raise_file_limit() -> None:
-    """As many open files as this process may have: each connection is one."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
-    if soft < most:
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
