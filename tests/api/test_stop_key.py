@@ -123,19 +123,15 @@ def test_what_is_not_confirmed_says_what_to_do(
         assert "emergency switch" in said and "IndexError" in said
 
 
-def test_without_a_terminal_nothing_listens(tmp_path: Path) -> None:
+def test_without_a_terminal_nothing_listens_and_one_that_closes_ends_it(tmp_path: Path, terminal: Terminal) -> None:
     reading, writing = os.pipe()
     with StopKey(lambda: "never", print, reading) as key, (tmp_path / "file").open("w") as file:
-        assert not key.watched
         os.write(writing, b"x")
         with StopKey(lambda: "never", print, file.fileno()) as other:
-            assert not other.watched
+            assert not key.watched and not other.watched
     assert os.read(reading, 1) == b"x", "what is not a terminal is not read"
-    os.close(reading)
-    os.close(writing)
-
-
-def test_a_terminal_that_closes_ends_the_listening(terminal: Terminal) -> None:
+    for descriptor in (reading, writing):
+        os.close(descriptor)
     with StopKey(lambda: "never", print, terminal.program) as key:
         os.close(terminal.keyboard)
         assert key._thread is not None
@@ -143,46 +139,33 @@ def test_a_terminal_that_closes_ends_the_listening(terminal: Terminal) -> None:
         assert not key._thread.is_alive()
 
 
-def test_stimrig_test_stops_on_a_key(
-    service: Service, terminal: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+@pytest.mark.parametrize("plays", [True, False])
+def test_a_key_stops_stimrig_test_once_it_plays_and_keeps_it_from_beginning_before(
+    service: Service, terminal: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
+    plays: bool,
+) -> None:  # fmt: skip
     service.rig.speed = 1.0
     monkeypatch.setenv("STIMRIG_TOKEN", TOKEN)
     monkeypatch.setattr(stop_key, "standard_input", lambda: terminal.program)
-    real = test_verb.run_test
+    real, pressed = test_verb.run_test, []
 
-    def watched(client: httpx.Client, participant: str, watch: Any, over: Any, **more: Any) -> dict[str, Any]:
-        """A key as soon as the rig plays."""
+    def look() -> list[str]:
+        if service.rig.state == "running" and not pressed:
+            pressed.append(os.write(terminal.keyboard, b"q"))
+        return []
 
-        def look() -> list[str]:
-            if service.rig.state == "running" and not pressed:
-                pressed.append(os.write(terminal.keyboard, b"q"))
-            return []
+    def run_test(client: Any, participant: str, events: Any, over: Any, **more: Any) -> dict[str, Any]:
+        if not plays:
+            pressed.append(os.write(terminal.keyboard, b"q"))
+            soon(lambda: service.rig.state == "latched", 20)
+        return real(client, participant, look if plays else events, over, **more)
 
-        return real(client, participant, look, over, **more)
-
-    pressed: list[int] = []
-    monkeypatch.setattr(test_verb, "run_test", watched)
+    monkeypatch.setattr(test_verb, "run_test", run_test)
     assert main.run(["test", "--url", service.url, "--participant", "K1"]) == 1
     said = capsys.readouterr().err
-    assert "any key stops the test" in said and "ended as stopped" in said and "any key" not in said.splitlines()[-1]
-
-
-def test_a_key_before_the_rig_plays_keeps_the_test_from_beginning(
-    service: Service, terminal: Terminal, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setenv("STIMRIG_TOKEN", TOKEN)
-    monkeypatch.setattr(stop_key, "standard_input", lambda: terminal.program)
-    real = test_verb.run_test
-
-    def asked(*given: Any, **more: Any) -> dict[str, Any]:
-        os.write(terminal.keyboard, b"q")
-        soon(lambda: service.rig.state == "latched", 20)
-        return real(*given, **more)
-
-    monkeypatch.setattr(test_verb, "run_test", asked)
-    assert main.run(["test", "--url", service.url, "--participant", "K1"]) == 1
-    assert service.rig.starts == 0 and stop_key.CONFIRMED in capsys.readouterr().err
+    assert "any key stops the test" in said and "any key" not in said.splitlines()[-1]
+    assert "ended as stopped" in said if plays else stop_key.CONFIRMED in said
+    assert service.rig.starts == int(plays)
 
 
 @pytest.mark.parametrize("body", ["null", "[]", "{}", "<p>", '{"state": "ready", "connected": true, "age_s": 9.0}'])
@@ -202,21 +185,21 @@ def test_nothing_that_a_service_says_of_its_rig_keeps_a_key_from_stopping(monkey
 # ---- attaching ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("other", [["--rig", "rig.toml"], ["--emulate", "--hidden 7"]])
-def test_attaching_and_starting_a_rig_exclude_each_other(
-    other: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize(
+    ("socket", "other", "named"),
+    [
+        ("rig.sock", ["--rig", "rig.toml"], "--rig"),
+        ("rig.sock", ["--emulate", "--hidden 7"], "--emulate"),
+        ("none.sock", [], "python -m stimrig.rig"),
+    ],
+)
+def test_attaching_to_no_rig_or_beside_one_that_is_started_is_one_line(
+    socket: str, other: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main.run(["serve", "--rig-socket", "rig.sock", "--data", str(tmp_path / "data"), *other]) == 2
+    assert main.run(["serve", "--rig-socket", socket, "--data", str(tmp_path / "data"), *other]) == 2
     said = capsys.readouterr().err
-    assert said.count("\n") == 1 and "--rig-socket rig.sock" in said and other[0] in said
+    assert said.count("\n") == 1 and f"--rig-socket {socket}" in said and named in said
     assert not (tmp_path / "data").exists()
-
-
-def test_no_rig_at_the_socket_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "none.sock"
-    assert main.run(["serve", "--rig-socket", str(path), "--data", str(tmp_path / "data")]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and str(path) in said and "python -m stimrig.rig" in said
 
 
 @pytest.mark.slow
