@@ -28,8 +28,7 @@ HTML = {"Accept": "text/html"}
 PASSWORD = "correct horse battery"
 HEADS = "location", "etag", "content-disposition", "content-language", "allow", "retry-after", "www-authenticate"
 VOLATILE = (
-    (re.compile(r"\b[\w-]+\.[0-9a-f]{8}\.\d{4}-\d\d-\d\d(?:\.[0-9a-f]{8})?\b"), "<version>"),
-    (re.compile(r"(seen )[\w-]*\d[\w-]*\.[\w.-]*"), r"\1<version>"),
+    (re.compile(r'^"\d{6,}"$'), '"<version>"'),
     (re.compile(r"\b[A-Z]\d{8}T\d{6}(?:-\w+)*(?:\.\d+\.[0-9a-f]{8})?"), "<id>"),
     (re.compile(r"\b[MTRN]\w*-?[0-9a-f]{8,}|\b[0-9a-f]{12,}\b"), "<id>"),
     (re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+Z?"), "<time>"),
@@ -108,7 +107,8 @@ class Day:
 
     def masked(self, value: Any) -> Any:
         if isinstance(value, dict):
-            return {self.masked(name): self.masked(one) for name, one in value.items()}
+            versions = {name: "<version>" for name, one in value.items() if name == "version" and isinstance(one, int)}
+            return {self.masked(name): self.masked(one) for name, one in value.items()} | versions
         if isinstance(value, list):
             return [self.masked(one) for one in value]
         if not isinstance(value, str):
