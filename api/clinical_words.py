@@ -1,4 +1,4 @@
-"""What pages call things that programs call otherwise: a clinician's word first, the technical term one hover away."""
+"""Clinicians' words for what programs name otherwise; pages show the technical term as the title."""
 
 from __future__ import annotations
 
@@ -74,28 +74,28 @@ WORDS: dict[str, dict[str | None, str]] = {
 
 
 def words(name: str | None, kind: str) -> str:
-    """What people call a thing of a kind (of `WORDS`); a name that is not known as it is."""
+    """Return the word for a name of a kind of `WORDS`; an unknown name as it is."""
     return str(WORDS[kind].get(name, name))
 
 
 def segment_words(name: str | None) -> str:
-    """What a person calls a segment, a number behind it kept; a user's own name as it is."""
+    """Return the word for a segment and its number; a user's own name as it is."""
     kind, _space, number = (name or "").partition(" ")
     known = WORDS["segment"].get(kind if number.isdecimal() else name or "")
     return (name or "") if known is None else f"{known} {number}".strip()
 
 
 def label_rows(test: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Title and text of each label that somebody has said of a test; of its document, its plan, or its request."""
+    """Return title and text of each label of a test: of its document, its plan, or its request."""
     return [(title, test[name]) for name, title in LABEL_TITLES.items() if test.get(name) is not None]
 
 
 def missing_words(missing: Sequence[Mapping[str, Any]] | None) -> list[str]:
-    """What is still to be done with the joint, a sentence for each stretch of angles."""
-    return [_stretch(each) for each in missing or ()]
+    """Say what is still to be done with the joint, a sentence for each range of angles."""
+    return [_range_words(each) for each in missing or ()]
 
 
-def _stretch(each: Mapping[str, Any]) -> str:
+def _range_words(each: Mapping[str, Any]) -> str:
     low, high = (degrees(each[name]) for name in ("from_rad", "to_rad"))
     bends, slow = each["direction"] == "flexion", each["speed"] == "slow"
     if bends and slow:
@@ -108,5 +108,5 @@ def _stretch(each: Mapping[str, Any]) -> str:
 
 
 def degrees(angle_rad: float | None) -> str:
-    """An angle for people: whole degrees; a dash where there is none."""
+    """Write an angle in whole degrees; a dash for None."""
     return "–" if angle_rad is None else f"{math.degrees(angle_rad):.0f}°".replace("-", "−")

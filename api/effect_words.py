@@ -1,4 +1,4 @@
-"""What the library's effects say of themselves to people; ids are for programs."""
+"""Names of effects and of their parameters for people; programs use ids."""
 
 from __future__ import annotations
 
@@ -17,59 +17,57 @@ UNITS = (
 
 @cache
 def library() -> dict[str, dict[str, Any]]:
-    """What the library's effects say of themselves in `EFFECT = Effect(…)`, by id; no forms.
+    """Read the constants of each `EFFECT = Effect(…)` in the library, by id; without forms.
 
-    The files are read and not loaded: the web process does without their physics.
+    The files are parsed and not imported: the web process does without their physics.
     """
     spec = find_spec("stimrig.identify.effects")
     assert spec is not None and spec.origin is not None
-    found: dict[str, dict[str, Any]] = {}
+    effects: dict[str, dict[str, Any]] = {}
     for path in sorted(Path(spec.origin).parent.glob("*.py")):
         for line in ast.parse(path.read_text(encoding="utf-8")).body:
             match line:
-                case ast.Assign(targets=[ast.Name(name)], value=ast.Call(keywords=given)) if name == "EFFECT":
-                    plain = [part for part in given if isinstance(part.value, ast.Constant | ast.Dict)]
-                    said = {str(part.arg): ast.literal_eval(part.value) for part in plain}
-                    found[said["id"]] = said
-    return found
+                case ast.Assign(targets=[ast.Name(name)], value=ast.Call(keywords=keywords)) if name == "EFFECT":
+                    plain = [part for part in keywords if isinstance(part.value, ast.Constant | ast.Dict)]
+                    values = {str(part.arg): ast.literal_eval(part.value) for part in plain}
+                    effects[values["id"]] = values
+    return effects
 
 
 def fact_of(effect: str, key: str, otherwise: Any) -> Any:
-    """What an effect says of itself in its file; `otherwise` where it says nothing, or is a person's own."""
+    """Return a value of an effect's file; `otherwise` where it has none, or the effect is a person's own."""
     return library().get(effect, {}).get(key, otherwise)
 
 
 @cache
 def _short_names() -> dict[str, str]:
-    """The parameters that stand for their effects, without their units."""
+    """Return the names of main parameters, by parameter without its unit."""
     return {without_unit(key): words for effect in library().values() for key, words in effect.get("main", {}).items()}
 
 
 def effect_words(effect: str) -> str:
-    """An effect's title; the id of a person's own effect as words."""
+    """Return an effect's title; the id of a person's own effect as words."""
     return fact_of(effect, "name", "") or effect.replace("_", " ").capitalize()
 
 
 def within(effect: str) -> str:
-    """A title within a sentence: in English it begins with a small letter."""
+    """Return a title as it is written within a sentence."""
     words = effect_words(effect)
     return words[:1].lower() + words[1:]
 
 
 def effects_words(effects: Iterable[str], without_evidence: Collection[str] = ()) -> str:
-    """Titles, one after the other, those added without evidence marked; of an effect's form (`fatigue:fitness`) people
-    are told nothing."""
+    """Join titles, those added without evidence marked; an effect's form (`fatigue:fitness`) is left out."""
     named = ((effect, within(effect.partition(":")[0])) for effect in effects)
     return ", ".join(f"{words} (without evidence)" if effect in without_evidence else words for effect, words in named)
 
 
 def without_unit(parameter: str) -> str:
-    """A parameter's name without its unit."""
+    """Return a parameter's name without its unit."""
     return parameter.removesuffix(next((end for end in UNITS if parameter.endswith(end)), ""))
 
 
 def parameter_words(parameter: str) -> str:
-    """A parameter's name without its unit where it stands for its effect."""
+    """Return a parameter's name for people, without its unit."""
     name = without_unit(parameter)
-    known = _short_names().get(name)
-    return name.replace("_", " ") if known is None else known
+    return _short_names().get(name, name.replace("_", " "))

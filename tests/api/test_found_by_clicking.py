@@ -41,11 +41,11 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     first = tab.url.split("#")[0].split("?")[0]
     tab.locator("#missing-recruitment_hysteresis").get_by_role("link", name="Hysteresis of recruitment").click()
     chart(tab, "signature-recruitment_hysteresis")
-    card = tab.locator("#missing-recruitment_hysteresis")
-    assert "very probably missing" in card.inner_text()
+    assert "very probably missing" in tab.locator("#missing-recruitment_hysteresis + .about").inner_text()
     tab.locator("summary", has_text="Where the error sits").click()
     assert tab.locator(".places li").count() >= 3, "the worst places are named"
-    card.get_by_role("button", name="Add this effect").click()
+    tab.locator(".do").get_by_role("button", name="Add this effect").click()
+    tab.get_by_text("Error of each version").click(timeout=PATIENCE_MS)
     chart(tab, "falling")
     rows = tab.locator(".versions tbody tr")
     assert rows.count() == 2 and rows.nth(1).inner_text().startswith("2. + hysteresis of recruitment")
