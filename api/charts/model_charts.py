@@ -147,23 +147,6 @@ def recorded(recording: dict[str, Any], plan_us: list[float], rate_hz: float, st
     return Figure(x, tuple(panels), tuple(curves), shades=shades, rules=rules, labels=labels, height=460)
 
 
-def inversion(result: dict[str, Any]) -> Figure:
-    """Return the figure of what `POST /v1/models/{id}/widths` answers; what is out of reach is shaded."""
-    time_s = [round(k / result["pulse_rate_hz"], 6) for k in range(len(result["pulse_width_us"]))]
-    return Figure(
-        Axis("Time (s)", fig.AT_TIME, (0.0, result["duration_s"])),
-        (Axis("Torque above rest (N·m)", share=0.6), Axis("Pulse width (µs)", from_zero=True, share=0.34)),
-        (
-            Curve(time_s, result["predicted_torque_nm"], "predicted", "model", 2.2, value=fig.TORQUE),
-            Curve(time_s, result["reference_torque_nm"], "reference", "residual", 1.4, "dash", value=fig.TORQUE),
-            Curve(time_s, result["pulse_width_us"], "pulse width", "width", 1.2, step=True, panel=1, value=fig.WIDTH,
-                  listed=False),
-        ),
-        shades=tuple(Shade("worst-band", part["begin_s"], part["end_s"]) for part in result["unreachable"]),
-        height=460,
-    )  # fmt: skip
-
-
 # ---- the recruitment curve and the step response ------------------------------------------------------------------
 
 
