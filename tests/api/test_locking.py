@@ -16,13 +16,14 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions import controllers
+from stimrig.api.sessions import playing as playing_module
 from stimrig.api.store import Store, locking
 from stimrig.api.store.tables import Participant, Token
 from stimrig.rig import messages as m
 from stimrig.rig.requests import WithdrawRequest
 from tests.api.conftest import Service, run_test, soon
 from tests.api.fake_arm import still
-from tests.api.test_overtaken import TRIAL, key_of
+from tests.api.test_overtaken import CHANGES, RIGHTS, TRIAL, key_of
 from tests.api.test_profiles import mark_all
 
 QUIET: Any = None
@@ -248,16 +249,6 @@ def playing(service: Service, client: httpx.Client, code: str, maker: httpx.Clie
     return key
 
 
-def test_a_trial_ends_with_the_right_of_who_made_its_key(
-    service: Service, client: httpx.Client, participant: str, approved: str
-) -> None:
-    maker = service.client(service.token("clin", "approve-model", "run-test", "read-live", "read-model"))
-    playing(service, client, participant, maker)
-    of_maker = next(token["id"] for token in client.get("/v1/tokens").json() if token["name"] == "clin")
-    assert client.delete(f"/v1/tokens/{of_maker}").status_code == 204
-    assert [request.begun for request in service.rig.withdrawn] == [True] and approved
-
-
 def test_a_withdrawal_that_the_rig_does_not_take_is_repeated_and_stops_meanwhile(
     service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -286,24 +277,35 @@ def test_a_token_that_came_back_starts_tests(service: Service, participant: str,
     assert service.client(again).post("/v1/tests", json={"participant": participant}).status_code == 202
 
 
-@pytest.mark.parametrize("how", ["its day", "its right, while the store cannot be read", "set muscle", "archive"])
+@pytest.mark.parametrize("how", [
+    "its day", "its right, while the store cannot be read", "set muscle", "archive", "revoked elsewhere",
+    "its maker revoked", *RIGHTS,
+])  # fmt: skip
 def test_a_trial_that_plays_ends_with(
     service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch, how: str
 ) -> None:
-    """With the day of its key, its right, or a change of the participant that no request made."""
-    playing(service, client, participant)
-    context = service.context
+    """With the day of its key, its right, or a change of the participant, also one that no request made."""
+    maker = service.client(service.token("clin", "approve-model", "run-test", "read-live", "read-model"))
+    key, context = playing(service, client, participant, maker), service.context
     if how == "its day":
         context.runner.clock = Tomorrow(context.clock)
     elif how.startswith("its right"):
         monkeypatch.setattr(context.runner, "find_changes", Mock(side_effect=OSError("the disk is gone")))
         context.runner.current.until_utc = "2026-01-01T00:00:00.000Z"
+    elif how == "revoked elsewhere":
+        assert context.auth.revoke(key, "somebody elsewhere")
+    elif how == "its maker revoked":
+        of_maker = next(token["id"] for token in client.get("/v1/tokens").json() if token["name"] == "clin")
+        assert client.delete(f"/v1/tokens/{of_maker}").status_code == 204
+    elif how in RIGHTS:
+        assert CHANGES[how](client, participant, key, approved).is_success
+        assert service.rig.withdrawn, "the rig knows before the change is answered"
     else:
         with context.store.write() as session:
             row = session.get(Participant, participant)
             locking.write(session, row, context.clock.utc(), "somebody elsewhere", how, participant)
     soon(lambda: service.rig.withdrawn)
-    assert [request.begun for request in service.rig.withdrawn] == [True] and approved
+    assert [request.begun for request in service.rig.withdrawn] == [True] and playing_module.LOOK_AGAIN_S <= 0.25
 
 
 class Tomorrow(Clock):

@@ -14,7 +14,7 @@ import pytest
 from sqlalchemy.exc import OperationalError
 
 from stimrig.api.services import calibrations
-from stimrig.api.sessions import playing, runner
+from stimrig.api.sessions import runner
 from tests.api.conftest import Service, run_test, soon
 from tests.api.test_profiles import mark_all
 
@@ -156,17 +156,6 @@ def test_what_a_trial_rests_on_is_looked_at_again_until_its_first_pulse(
     assert told[0].test_id == service.rig.last_plan.test_id, test.text
 
 
-@pytest.mark.parametrize("what", RIGHTS)
-def test_a_trial_that_plays_ends_with_the_right_it_is_played_by(
-    service: Service, client: httpx.Client, participant: str, approved: str, what: str
-) -> None:
-    key, controller = key_of(service, client, participant)
-    service.rig.speed = 0.5
-    assert controller.post("/v1/tests", json={"participant": participant, **TRIAL}).status_code == 202
-    assert CHANGES[what](client, participant, key, approved).status_code in (200, 204)
-    assert [request.begun for request in service.rig.withdrawn] == [True]
-
-
 def test_a_trial_that_was_planned_with_another_model_is_not_played(
     service: Service, client: httpx.Client, participant: str, approved: str
 ) -> None:
@@ -182,18 +171,6 @@ def test_a_trial_that_was_planned_with_another_model_is_not_played(
     assert service.rig.starts == starts
     assert controller.post("/v1/tests", json=body).status_code == 202
     assert approved != another
-
-
-def test_a_change_that_no_request_made_is_noticed_within_the_bound(
-    service: Service, client: httpx.Client, participant: str, approved: str
-) -> None:
-    """As the end of a right by time: nothing here was asked, and so nothing is answered."""
-    key, controller = key_of(service, client, participant)
-    service.rig.speed = 0.1
-    assert controller.post("/v1/tests", json={"participant": participant, **TRIAL}).status_code == 202
-    assert service.context.auth.revoke(key, "somebody elsewhere")
-    soon(lambda: service.rig.withdrawn)
-    assert playing.LOOK_AGAIN_S <= 0.25
 
 
 def test_a_trial_that_outlives_its_service_ends_with_the_right_that_was_revoked_meanwhile(
