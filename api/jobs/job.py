@@ -41,7 +41,6 @@ class Job:
     # of a job that a person asked for, and that REST lists
     id: str = ""
     subject: str = ""
-    requested_by: str = ""
     part: Job | None = None
     """The job in a worker process that this one awaits now."""
 
@@ -119,7 +118,6 @@ class Job:
             "kind": self.kind,
             "model_id": None if self.kind == FIT_TOGETHER else self.subject,
             "participant": self.subject if self.kind == FIT_TOGETHER else None,
-            "requested_by": self.requested_by,
             "state": self.state,
             "done": self.result.done(),
             **self.progress_document(),

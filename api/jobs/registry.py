@@ -25,7 +25,7 @@ class Jobs:
         self._numbers = itertools.count(1)
         self._tasks = Tasks(log)
 
-    def start(self, kind: str, subject: str, by: str, work: Callable[[Job], Awaitable[str]]) -> Job:
+    def start(self, kind: str, subject: str, work: Callable[[Job], Awaitable[str]]) -> Job:
         """Start work that returns the address of its result, or return the same job that runs already.
 
         `subject`: the model's id, or the participant's code. The work calls `job.follow` with what it submits.
@@ -33,7 +33,7 @@ class Jobs:
         for job in self.all.values():
             if (job.kind, job.subject, job.state) == (kind, subject, "running"):
                 return job
-        job = Job(kind, id=f"J{next(self._numbers)}", subject=subject, requested_by=by)
+        job = Job(kind, id=f"J{next(self._numbers)}", subject=subject)
         job.start()
         self.all[job.id] = job
         for old in [known.id for known in self.all.values() if known.state != "running"][: -KEPT or None]:

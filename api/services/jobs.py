@@ -8,14 +8,14 @@ from stimrig.api.sessions.requests import EffectsIn
 from stimrig.api.store.tables import Model
 
 
-def begin_diagnosis(context: Context, model: Model, by: str) -> Job:
+def begin_diagnosis(context: Context, model: Model) -> Job:
     """Diagnose while the person looks on."""
 
     async def work(job: Job) -> str:
         await context.analyses.diagnosis(model, job.follow)
         return f"/v1/models/{model.id}/diagnosis"
 
-    return context.jobs.start("diagnosis", model.id, by, work)
+    return context.jobs.start("diagnosis", model.id, work)
 
 
 def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Job:
@@ -27,7 +27,7 @@ def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Jo
         )
         return f"/v1/models/{new.id}"
 
-    return context.jobs.start("add-effects", model.id, by, work)
+    return context.jobs.start("add-effects", model.id, work)
 
 
 def begin_improving(context: Context, model: Model, by: str) -> Job:
@@ -37,4 +37,4 @@ def begin_improving(context: Context, model: Model, by: str) -> Job:
         _, rows = await context.analyses.improve(model, by, job.follow)
         return f"/v1/models/{rows[-1].id}"
 
-    return context.jobs.start("improve", model.id, by, work)
+    return context.jobs.start("improve", model.id, work)

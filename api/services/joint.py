@@ -122,4 +122,4 @@ def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
         model = await together.fit(context.analyses, code, body.recordings, body.effects, by, job.follow)
         return f"/v1/models/{model.id}"
 
-    return context.jobs.start(FIT_TOGETHER, code, by, work)
+    return context.jobs.start(FIT_TOGETHER, code, work)

@@ -10,11 +10,12 @@ from typing import Any
 import httpx
 import pytest
 
+from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import Job
 from stimrig.api.sessions import adaptive_follower, kinds, runner
-from stimrig.api.sessions.adaptive import KEPT, AdaptiveTests
+from stimrig.api.sessions.adaptive import AdaptiveTests
 from stimrig.api.sessions.adaptive_follower import Follower
-from stimrig.api.sessions.requests import TargetIn, TestIn
+from stimrig.api.sessions.requests import TargetIn
 from stimrig.api.sessions.rig_client import no_rig
 from stimrig.api.store.tables import Test
 from stimrig.identify.experiments.knowledge import LEAST_PERCENT, MOST_PERCENT, Target
@@ -99,61 +100,6 @@ def test_a_start_that_took_long_is_not_played_and_is_quick_when_asked_again(
     client.post("/v1/stop")
 
 
-def test_another_start_does_not_wait_until_it_is_known_what_a_test_can_reach(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    context = service.context
-    looked: list[int] = []
-    planned = context.runner._planned
-
-    async def watched(body: TestIn, who: Any) -> Any:
-        found = await planned(body, who)
-        looked.append(context.runner.start_lock.locked())
-        return found
-
-    context.runner._planned = watched
-    assert start(client).status_code == 202
-    assert looked == [False, True]
-    client.post("/v1/stop")
-
-
-def test_previews_of_others_do_not_disturb_a_test_that_starts(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    context = service.context
-    previewed = context.runner._previewed
-
-    async def crowded(plan: Any) -> dict[str, Any]:
-        context.runner._previewed = previewed
-        for _ in range(2 * KEPT):
-            await context.runner.preview(TestIn(participant="P017", kind="adaptive"))
-        return await previewed(plan)
-
-    context.runner._previewed = crowded
-    answer = start(client)
-    assert answer.status_code == 202, answer.text
-    client.post("/v1/stop")
-
-
-def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    """Whether the rig laid it is not known; a record with the wrong widths would mislead."""
-    rig = service.context.rig
-    ask = rig.ask
-
-    async def deaf(message: Any, *more: Any, **how: Any) -> dict[str, Any]:
-        found = await ask(message, *more, **how)
-        if message.kind == "extend":
-            raise no_rig("It did not answer within 5 s.")
-        return found
-
-    rig.ask = deaf
-    service.rig.speed = 1.5
-    told = played(client, max_duration_s=11)["adaptive"]
-    assert "did not answer" in told["problem"] and told["ended"] == "fixed-rest"
-
-
 def test_a_model_of_another_arm_or_current_says_nothing_of_this_one(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
@@ -200,33 +146,6 @@ def test_after_its_workers_death_the_fixed_plan_plays_on_and_it_is_told(
     assert document["state"] == "completed" and told["ended"] == "fixed-rest"
     assert told["problem"].startswith("The fixed plan plays on") and "The worker process died" in told["problem"]
     assert document["summary"]["duration_s"] > 8
-
-
-def test_a_late_answer_falls_away_and_the_next_boundary_is_decided(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    document = played(client, target={"curve_percent": 44.0}, max_duration_s=13)
-    told = document["adaptive"]
-    assert document["state"] == "completed" and told["problem"] == ""
-    assert any(row.get("late") for row in told["decisions"])
-    assert {s["by"] for s in service.rig.last_segments} >= {"plan", "extension"}
-    assert any(s["name"] == "prbs" for s in service.rig.last_segments)
-
-
-def test_what_the_rig_refuses_is_not_played(client: httpx.Client, service: Service, participant: str) -> None:
-    service.rig.refuses_extensions = True
-    document = played(client, target={"curve_percent": 4.0}, max_duration_s=11)
-    told = document["adaptive"]
-    assert any("refused" in row for row in told["decisions"]) and told["ended"] == "known-enough"
-    assert all(s["by"] != "extension" for s in service.rig.last_segments)
-
-
-def test_a_stop_stops_it_like_any_test(client: httpx.Client, service: Service, participant: str) -> None:
-    test_id = start(client).json()["id"]
-    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] > 1)
-    assert client.post("/v1/stop").status_code == 200
-    document = wait_done(client, test_id)
-    assert (document["state"], document["adaptive"]["ended"]) == ("stopped", "stopped")
 
 
 def test_out_of_reach_is_said_before_the_first_pulse(client: httpx.Client, service: Service, participant: str) -> None:
@@ -340,12 +259,15 @@ class World:
         self.now_s, self.answers = 0.0, answers
         self.requests: list[tuple[float, Any]] = []
         self.asked: list[dict[str, Any]] = []
+        self.refusal: ApiError | None = None
 
     def monotonic_s(self) -> float:
         return self.now_s
 
     async def ask(self, request: Any) -> dict[str, Any]:
         self.requests.append((self.now_s, request))
+        if self.refusal is not None and request.segments:
+            raise self.refusal
         return {}
 
     def submit(self, kind: str, **arguments: Any) -> Any:
@@ -463,3 +385,19 @@ def test_an_answer_that_cannot_be_used_is_told(
     told = followed(world, 40.0, monkeypatch).status
     assert told.state == "fixed" and told.problem.startswith("The fixed plan plays on: ") and why in told.problem
     assert [request for _, request in world.requests if request.segments] == []
+
+
+def test_what_the_rig_refuses_is_noted_and_the_fixed_plans_next_piece_plays(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World([SAID])
+    world.refusal = ApiError(409, "rig-late", "Too late", "More was laid.")
+    status = followed(world, 40.0, monkeypatch).status
+    assert (status.state, status.decisions[0]["refused"], len(world.requests)) == ("choosing", "More was laid.", 1)
+
+
+def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether the rig laid it is not known; a record with the wrong widths would mislead."""
+    world = World([SAID])
+    world.refusal = no_rig("It did not answer within 5 s.")
+    status = followed(world, 40.0, monkeypatch).status
+    assert status.state == "fixed" and "did not answer" in status.problem
+    assert [request.segments for _, request in world.requests][1:] == [[]], "it plays on at once"

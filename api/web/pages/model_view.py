@@ -37,7 +37,7 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
     """Show a model. `diagnose`: 1 begins a diagnosis anew, 0 begins none."""
     document = stored_model.read(row)
     measured = await measurement(context, row)
-    diagnosis, job = await diagnosis_of(context, row, who.name, diagnose)
+    diagnosis, job = await diagnosis_of(context, row, diagnose)
     shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
     version = await asyncio.to_thread(context.versions.document, row)
     why, findings, fit_words = shown["why"], advice.findings(document), advice.fit_sentence(document.get("fit") or {})
@@ -106,7 +106,7 @@ async def measurement(context: Context, row: Model) -> dict[str, Any]:
 
 
 async def diagnosis_of(
-    context: Context, row: Model, by: str, diagnose: int
+    context: Context, row: Model, diagnose: int
 ) -> tuple[dict[str, Any] | None, Job | None]:  # fmt: skip
     """Return the diagnosis if it is there; else the job that makes it, begun if nobody has."""
     known = await asyncio.to_thread(context.analyses.known_diagnosis, row)
@@ -115,7 +115,7 @@ async def diagnosis_of(
     begun = [job for job in context.jobs.all.values() if (job.kind, job.subject) == ("diagnosis", row.id)]
     newest = begun[-1] if begun else None
     if diagnose == 1 or (newest is None and diagnose != 0):
-        newest = jobs.begin_diagnosis(context, row, by)
+        newest = jobs.begin_diagnosis(context, row)
         await asyncio.sleep(0.05)
     if newest is not None and newest.state == "completed":  # it ended between the two looks
         known = await asyncio.to_thread(context.analyses.known_diagnosis, row)

@@ -38,11 +38,11 @@ async def curves(context: Ctx, _who: ModelReader, row: Version) -> dict[str, Any
 
 
 @router.get("/models/{model_id}/diagnosis", response_model=DiagnosisOut, responses=LATER)
-async def diagnosis(context: Ctx, who: ModelReader, row: Version, wait: Wait = True) -> Any:
+async def diagnosis(context: Ctx, _who: ModelReader, row: Version, wait: Wait = True) -> Any:
     """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""
     if wait or await asyncio.to_thread(context.analyses.known_diagnosis, row) is not None:
         return await context.analyses.diagnosis(row)
-    return later(jobs.begin_diagnosis(context, row, who.name))
+    return later(jobs.begin_diagnosis(context, row))
 
 
 @router.post("/models/{model_id}/effects", status_code=201, response_model=VersionOut, responses=LATER)
