@@ -281,7 +281,6 @@ def _compact(text: str, axes: Any) -> str:
     body = re.sub(r">\s+<", "><", re.sub(r"<[^>]*>", lambda tag: _shorten(tag[0]), body)).strip()
     for name, stand_in in STAND_INS.items():
         body = body.replace(stand_in, variable(name))
-    body = re.sub(r'<g[^>]*>(?:<use [^>]* fill="([^"]*)"/>)+', lambda run: _colour_once(run[0], run[1]), body)
     body = re.sub(r"M ?([-\d.]+ [-\d.]+)L\1(?![\d.])", r"M\1h0", body)
     (low, high), (first_px, last_px) = axes.get_xlim(), axes.bbox.intervalx
     scale = f"{low:.6g} {first_px:.6g} {(last_px - first_px) / (high - low):.6g}"
@@ -294,11 +293,6 @@ def _shorten(tag: str) -> str:
     tag = re.sub(r' style="([^"]*)"', lambda style: _attributes(style[1]), tag)
     tag = re.sub(r"-?\d+\.\d{2,}", lambda value: f"{float(value[0]):.1f}", " ".join(tag.split()))
     return re.sub(r" ([ML]) (?=[-\d])", r"\1", tag)
-
-
-def _colour_once(markers: str, fill: str) -> str:
-    """Give the group of a curve's markers their colour in place of each marker."""
-    return markers.replace(f' fill="{fill}"/>', "/>").replace(">", f' fill="{fill}">', 1)
 
 
 def _attributes(style: str) -> str:

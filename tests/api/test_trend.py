@@ -43,14 +43,6 @@ def trend(client: httpx.Client, code: str) -> dict[str, Any]:
     return answer.json()
 
 
-def three(**last: Any) -> list[Planned]:
-    """Two equal sessions with another muscle in between that nobody approved, then one as told."""
-    muscle = Patient()
-    weaker = replace(muscle, gain=0.5 * muscle.gain)
-    end = Planned(muscle, 14.0, approved=False)
-    return [Planned(muscle, 0.0), Planned(weaker, 7.0, approved=False), replace(end, **last)]
-
-
 def test_figures_carry_deviations_that_agree_with_what_pages_show() -> None:
     document = identify.fit(sessions.record(Planned(Patient(), 0.0), 3)).to_dict()
     figures = document["uncertainty"]["figures"]
@@ -61,15 +53,19 @@ def test_figures_carry_deviations_that_agree_with_what_pages_show() -> None:
 
 
 def test_one_point_a_session_approved_first_and_the_newest_version_else(service: Service, client: httpx.Client) -> None:
-    ids = made(service, "ONE", three())
+    muscle = Patient()
+    unlike = Planned(replace(muscle, gain=0.5 * muscle.gain), 7.0, approved=False)
+    ids = made(service, "ONE", [Planned(muscle, 0.0), unlike, Planned(muscle, 14.0, approved=False)])
     context = service.context
     row = context.versions.get(ids[2])
     later = {**json.loads(row.document), "model_id": "a-second-version"}
     context.versions.add(json.dumps(later), "ONE", row.recording_id, "Ada", parent_id=row.id)
-    found = trend(client, "ONE")["sessions"]
-    assert [one["model_id"] for one in found] == [ids[0], ids[1], "a-second-version"]
-    assert [one["approved"] for one in found] == [True, False, False]
-    assert [one["versions"] for one in found] == [1, 1, 2]
+    answer = trend(client, "ONE")
+    answers = answer["sessions"]
+    assert [one["model_id"] for one in answers] == [ids[0], ids[1], "a-second-version"]
+    assert [(one["approved"], one["versions"]) for one in answers] == [(True, 1), (False, 1), (False, 2)]
+    assert answer["changes"]["sentences"] == ["Nothing changed beyond its uncertainty since 03 Aug 2026."]
+    assert (answer["changes"]["differences"], answer["changes"]["since_model_id"]) == ([], ids[0]), "the approved one"
     context.versions.decide(ids[2], True, "Ada", "the first one")
     last = trend(client, "ONE")["sessions"][2]
     assert (last["model_id"], last["approved_by"]) == (ids[2], "Ada")
@@ -77,63 +73,55 @@ def test_one_point_a_session_approved_first_and_the_newest_version_else(service:
     assert trend(client, "ONE")["sessions"][2]["model_id"] == "a-second-version"
 
 
+def figure(value: float, sd: float, unit: str) -> dict[str, Any]:
+    return {"value": value, "sd": sd, "unit": unit}
+
+
+BEFORE = State({"plateau_nm": figure(5.0, 0.01, "N·m"), "time_constant_s": figure(0.5, 0.001, "s")},
+               "maximum-likelihood", (), 20.0)  # fmt: skip
+MORE = {"plateau_nm": figure(5.9, 0.01, "N·m"), "time_constant_s": figure(0.55, 0.001, "s")}
+
+
 @pytest.mark.parametrize(
-    ("code", "last", "changed", "sentences", "doubts"),
+    ("now", "changed", "doubts"),
     [
-        ("SAME", {}, [], ["Nothing changed beyond its uncertainty since 03 Aug 2026."], []),
-        ("CHANGED", {"patient": WEAKER}, ["plateau_nm"],
-         ["Plateau 18\u00a0% lower than on 03 Aug 2026, more than twice its uncertainty."], []),
-        ("CURRENT", {"patient": replace(Patient(), gain=1.4 * Patient().gain, time_constant_s=0.7),
-                     "current_ma": 25.0, "notes": {"electrodes": "moved"}}, ["time_constant_s"], None,
+        ({}, [], []),
+        ({"figures": MORE}, ["plateau_nm", "time_constant_s"], []),
+        ({"figures": MORE, "current_ma": 25.0, "notes": (("electrodes", "moved"),)}, ["time_constant_s"],
          ["The current was 20.0\u00a0mA, now it is 25.0\u00a0mA: threshold and plateau are not compared.",
           "The notes on electrodes differ: “–”, then “moved”."]),
+        ({"figures": MORE, "structure": ("fatigue:fitness",)}, [],
+         ["The models' effects differ (none, then fatigue): only large differences are told."]),
     ],
 )  # fmt: skip
-def test_what_changed_is_said_against_the_last_approved_session(
-    service: Service, client: httpx.Client, code: str, last: Any, changed: list, sentences: list | None, doubts: list
-) -> None:
-    made(service, code, three(**last))
-    found = trend(client, code)["changes"]
-    assert [change["figure"] for change in found["differences"]] == changed and found["doubts"] == doubts
-    assert sentences is None or found["sentences"] == sentences
+def test_what_changed_and_what_is_in_doubt(now: dict[str, Any], changed: list[str], doubts: list[str]) -> None:
+    state = replace(BEFORE, **now)
+    assert sorted(change["figure"] for change in changes.changed(BEFORE, state)) == changed
+    assert changes.doubt_sentences(BEFORE, state) == doubts
+    other = replace(BEFORE, structure=("fatigue:two_pools",))
+    again = changes.doubt_sentences(replace(other, structure=("fatigue:fitness",)), other)
+    assert again[0].startswith("The models describe fatigue in different ways:")
 
 
-def test_other_effects_are_said_and_only_large_differences_told() -> None:
-    plateau = {"plateau_nm": {"value": 5.0, "sd": 0.01, "unit": "N·m"}}
-    more = {"plateau_nm": {"value": 5.9, "sd": 0.01, "unit": "N·m"}}
-    before = State(plateau, "maximum-likelihood", (), 20.0)
-    assert [one["figure"] for one in changes.changed(before, replace(before, figures=more))] == ["plateau_nm"]
-    other = replace(before, figures=more, structure=("fatigue:fitness",))
-    assert changes.changed(before, other) == []
-    (doubt,) = changes.doubt_sentences(before, other)
-    assert doubt.startswith("The models' effects differ (none, then fatigue):")
-    again = replace(other, structure=("fatigue:two_pools",))
-    assert changes.doubt_sentences(other, again)[0].startswith("The models describe fatigue in different ways:")
-
-
-def test_the_table_has_units_times_and_no_formulas(service: Service, client: httpx.Client) -> None:
-    made(service, "TABLE", three(notes={"electrodes": "=1+1"}, current_ma=21.5))
+def test_a_first_session_and_its_table_with_units_and_no_formulas(service: Service, client: httpx.Client) -> None:
+    made(service, "TABLE", [Planned(Patient(), 0.0, notes={"electrodes": "=1+1"}, current_ma=21.5)])
     answer = client.get("/v1/participants/TABLE/trend.csv")
     assert answer.headers["content-type"].startswith("text/csv")
-    head, *rows = csv.reader(io.StringIO(answer.text))
+    head, row = csv.reader(io.StringIO(answer.text))
     assert {"threshold_us (µs)", "threshold_us sd (µs)", "current_ma (mA)", "session_utc"} <= set(head)
-    last = dict(zip(head, rows[-1], strict=True))
+    last = dict(zip(head, row, strict=True))
     assert last["current_ma (mA)"] == "21.5" and last["session_utc"].endswith("Z")
-    assert last["notes"].endswith("electrodes: =1+1") and not last["notes"].startswith("=")
-    assert all(not cell.startswith(("=", "@", "+")) for row in rows for cell in row)
+    assert last["notes"].endswith("electrodes: =1+1") and not any(cell.startswith(("=", "@", "+")) for cell in row)
+    page = client.get("/participants/TABLE/trend").text
+    assert "The trend begins with the second one." in page and page.count('class="panel"') == 9
 
 
 def test_nobody_and_no_session(service: Service, client: httpx.Client) -> None:
-    participant = "NONE"
-    made(service, participant, [])
+    made(service, "NONE", [])
     assert client.get("/v1/participants/P999/trend").status_code == 404
-    assert trend(client, participant) == {"participant": participant, "sessions": [], "changes": None}
-    page = client.get(f"/participants/{participant}/trend")
-    assert "No session with a model yet." in page.text and 'class="panel"' not in page.text
-    made(service, "FIRST", three()[:1])
-    first = client.get("/participants/FIRST/trend").text
-    assert "A delay may be below zero by up to one sample" in first
-    assert "The trend begins with the second one." in first and first.count('class="panel"') == 9
+    assert trend(client, "NONE") == {"participant": "NONE", "sessions": [], "changes": None}
+    page = client.get("/participants/NONE/trend").text
+    assert "No session with a model yet." in page and 'class="panel"' not in page
 
 
 @pytest.mark.parametrize(
@@ -156,16 +144,16 @@ def test_a_panel_breaks_its_line_at_another_current_and_marks_what_is_noted() ->
               for k, (value, half, current_ma) in enumerate(
                   [(1.0, 0.1, 20.0), (1.1, 0.1, 20.0), (None, None, 20.0), (1.2, 0.1, 20.0), (2.0, 9.0, 25.0)])
               ]  # fmt: skip
-    figure = history(points, "N·m", Axis("", limits=(0.0, 4.0)), levels=[1.5, 99.0], breaks=True)
-    line, bars, dots, hollow, flags = figure.curves
+    drawn = history(points, "N·m", Axis("", limits=(0.0, 4.0)), levels=[1.5, 99.0], breaks=True)
+    line, bars, dots, hollow, flags = drawn.curves
     joined = [None if math.isnan(value) else value for value in line.y if value is not None]
     assert joined == [None, 1.0, 1.1, None, 1.2, None, 2.0] and hollow.x == [1.0] * 3
     assert flags.x == [2.0] * 3 and np.isfinite(dots.y).sum() == 2 * 4
     assert np.isfinite(bars.y).sum() == 2 * 2, "a value by itself has a bar"
-    assert [rule.at for rule in figure.rules] == [1.5]
-    low, high = figure.panels[0].limits or (0.0, 0.0)
+    assert [rule.at for rule in drawn.rules] == [1.5]
+    low, high = drawn.panels[0].limits or (0.0, 0.0)
     assert low > -1.0 and high < 4.0, "one wide band does not dwarf the values"
-    assert np.isnan(figure.bands[0].lower).sum() == 3
+    assert np.isnan(drawn.bands[0].lower).sum() == 3
 
 
 # ---- side by side, and what a model page says of the last approved session -------------------------------------------
@@ -240,13 +228,12 @@ def at(tab: Any, picture: Any, number: int) -> None:
 @pytest.mark.browser
 def test_a_session_is_told_as_text_and_leads_to_its_model(tab: Any, service: Service) -> None:
     evil = '"><script>document.title="x"</script><img src=x onerror="document.title=1">'
-    planned = [Planned(Patient(), 0.0), Planned(replace(Patient(), gain=5.0), 3.0, notes={"electrodes": evil})]
-    ids = made(service, "EVIL", planned)
+    ids = made(service, "EVIL", [Planned(Patient(), 0.0, notes={"electrodes": evil})])
     tab.goto(service.url + "/participants/EVIL/trend")
-    at(tab, tab.locator(".panel svg.still").first, 1)
+    at(tab, tab.locator(".panel svg.still").first, 0)
     assert "<script>" in tab.locator("#tip").inner_text()
     assert tab.title() == "Trend of EVIL · stimrig" and tab.locator("main img").count() == 0
     tab.mouse.down()
     tab.mouse.up()
-    tab.wait_for_url(f"**/models/{ids[1]}")
+    tab.wait_for_url(f"**/models/{ids[0]}")
     assert tab.errors == []
