@@ -10,7 +10,7 @@ import httpx
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
-from stimrig.api.client import decisions
+from stimrig.api.client.decisions import document_of
 from stimrig.api.client.errors import Unreachable, refused
 
 
@@ -47,7 +47,7 @@ class Connection:
         The answer has a status of success, or 304. Raises Unreachable: there was no answer. Raises Refused: the answer
         is a problem; its class tells the status: `NotFound`, `Conflict`, `Invalid`, …
         """
-        headers, document = httpx.Headers(more.pop("headers", None)), _document(method, path, more.get("json"))
+        headers, document = httpx.Headers(more.pop("headers", None)), document_of(method, path, more.get("json"))
         if document and "if-match" not in headers and (etag := self._etag(document, path)):
             headers["if-match"] = etag
         answer = self._send(method, path, headers=headers, **more)
@@ -117,14 +117,3 @@ class Connection:
     def _unreachable(self, error: Exception) -> Unreachable:
         why = str(error) or type(error).__name__
         return Unreachable(self.url, "the service cannot be reached", f"{why}. Is `stimrig serve` running there?")
-
-
-def _document(method: str, path: str, body: Any) -> str:
-    """Return the document whose version a request must name; empty where it decides nothing.
-
-    A test is begun on its participant; without one the service says what is wrong with the request.
-    """
-    decision, names = decisions.find(method, path.partition("?")[0]) or (None, {})
-    if decision and decision.path == "/v1/tests":
-        names = {"code": body["participant"]} if isinstance(body, dict) and "participant" in body else None
-    return decision.document.format(**names) if decision and names is not None else ""

@@ -3,36 +3,31 @@
 from __future__ import annotations
 
 import re
-from typing import NamedTuple
-
-
-class Decision(NamedTuple):
-    """A request that decides; names in braces stand for parts of its path."""
-
-    method: str
-    path: str
-    document: str
-
+from typing import Any
 
 PERSON, MODEL, CALIBRATION = "/v1/participants/{code}", "/v1/models/{model_id}", "/v1/participants/{code}/calibration"
-DECISIONS = (
-    *(Decision("POST", f"{MODEL}/{word}", MODEL) for word in ("approve", "reject", "undo")),
-    *(Decision("PUT", f"{PERSON}/{word}", PERSON) for word in ("profile", "muscle")),
-    *(Decision("POST", f"{PERSON}/{word}", PERSON)
-      for word in ("archive", "unarchive", "recordings", "calibration", "keys")),
-    *(Decision("POST", f"{CALIBRATION}/{word}", CALIBRATION) for word in ("step", "mark", "finish", "discard")),
-    Decision("POST", "/v1/tests", PERSON),
-    Decision("PUT", "/v1/tests/{test_id}/ran-by", "/v1/tests/{test_id}"),
-    Decision("POST", "/v1/rearm", "/v1/rig"),
-    Decision("POST", "/v1/rig/angle/pose", "/v1/rig/angle"),
-    Decision("PUT", "/v1/users/{name}/password", "/v1/users"),
-)  # fmt: skip
-_PATHS = [(one, re.compile(re.sub(r"\{(\w+)\}", r"(?P<\1>[^/]+)", one.path))) for one in DECISIONS]
+DECISIONS = {
+    **{f"POST {MODEL}/{word}": MODEL for word in ("approve", "reject", "undo")},
+    **{f"PUT {PERSON}/{word}": PERSON for word in ("profile", "muscle")},
+    **{f"POST {PERSON}/{word}": PERSON for word in ("archive", "unarchive", "recordings", "calibration", "keys")},
+    **{f"POST {CALIBRATION}/{word}": CALIBRATION for word in ("step", "mark", "finish", "discard")},
+    "POST /v1/tests": PERSON,
+    "PUT /v1/tests/{test_id}/ran-by": "/v1/tests/{test_id}",
+    "POST /v1/rearm": "/v1/rig",
+    "POST /v1/rig/angle/pose": "/v1/rig/angle",
+    "PUT /v1/users/{name}/password": "/v1/users",
+}
+_PATTERNS = [(re.compile(re.sub(r"\{(\w+)\}", r"(?P<\1>[^/]+)", one)), named) for one, named in DECISIONS.items()]
 
 
-def find(method: str, path: str) -> tuple[Decision, dict[str, str]] | None:
-    """Return the decision that a request makes, and the names in its path; None: it decides nothing."""
-    for decision, pattern in _PATHS:
-        if method == decision.method and (found := pattern.fullmatch(path)):
-            return decision, found.groupdict()
-    return None
+def document_of(method: str, path: str, body: Any = None) -> str:
+    """Return the document whose version a request must name; empty where it decides nothing.
+
+    A test is begun on the participant in its body; without one the service says what is wrong with the request.
+    """
+    for pattern, document in _PATTERNS:
+        if request := pattern.fullmatch(f"{method} {path.partition('?')[0]}"):
+            begun_on = {"code": body["participant"]} if isinstance(body, dict) and "participant" in body else {}
+            names = begun_on | request.groupdict()
+            return document.format(**names) if names or "{" not in document else ""
+    return ""

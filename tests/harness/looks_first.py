@@ -8,7 +8,7 @@ from collections.abc import Generator
 
 import httpx
 
-from stimrig.api.client.connection import _document
+from stimrig.api.client.decisions import document_of
 
 
 class LooksFirst(httpx.Auth):
@@ -47,7 +47,7 @@ class LooksFirst(httpx.Auth):
             body = json.loads(request.content)
         except ValueError:
             body = None
-        return _document(request.method, request.url.path, body)
+        return document_of(request.method, request.url.path, body)
 
 
 def _says_version(request: httpx.Request) -> bool:
