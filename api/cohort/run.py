@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from distributed import Client, Future, as_completed
+from distributed.comm.core import CommClosedError
 from distributed.scheduler import KilledWorker
 
 from stimrig.api.cohort.cluster import connect, parse_memory
@@ -65,8 +66,9 @@ def run_cohort(
     bounds = Bounds(limit, parse_memory(memory))
     check_addresses(data)
     began_s = time.monotonic()
-    with Results(output, task, again) as results, connect(scheduler, workers, wait) as client:
-        counts = run_records(client, lambda: list_records(data), task, bounds, results)
+    with Results(output, task, again) as results:
+        with connect(scheduler, workers, wait) as client:
+            counts = run_records(client, lambda: list_records(data), task, bounds, results)
         rows = results.join()
     return {
         "output": str(output),
@@ -152,7 +154,7 @@ def _result(client: Client, future: Future[Row], entry: Entry, task: Task) -> Ro
     except CohortError:
         raise
     except (Exception, CancelledError) as error:
-        if isinstance(error, CancelledError) or client.status != "running":
+        if isinstance(error, CancelledError | CommClosedError) or client.status != "running":
             raise InterruptedRunError(SCHEDULER_GONE) from None
         reason = " ".join(f"{type(error).__name__}: {error}".split())[:200]
         raise InterruptedRunError(f"a worker cannot compute ({reason}). {RESUMABLE}") from error

@@ -1,7 +1,7 @@
-"""Files that were taken in: in a folder of their own until the database names them, and never deleted after that.
+"""Uploaded files: in a folder of their own until the database names them, and never deleted after that.
 
-A service that is ended in between leaves a file in that folder. The next start takes it away, or moves it to its place
-where the database names it already. A whole file stays, whatever the database says: it may be the wrong database.
+A service that is killed in between leaves a file in that folder. The next start removes it, or moves it to its place if
+the database names it already. A whole file stays, whatever the database says: it may be the wrong database.
 """
 
 from __future__ import annotations
@@ -18,20 +18,20 @@ if TYPE_CHECKING:
 PREFIX, JOINED = "upload-", "joined-"
 PARTS = "parts"
 PLAIN = ".plain"
-"""What a table of another tool is turned into, until it takes its place."""
+"""Suffix of another tool's table while it is converted."""
 SUFFIXES = (".csv", ".h5", ".mat", ".parquet", PLAIN)
-MOST_TOLD = 10
+MAX_LISTED = 10
 log = logging.getLogger("stimrig.uploads")
 
 
 def part_of(whole: Path) -> Path:
-    """Where a file is until the database names it; its name is the same: models and messages tell it."""
+    """Return the place of a file until the database names it; the name is the same, for models and messages hold it."""
     return whole.parent / PARTS / whole.name
 
 
 @contextlib.contextmanager
 def taken_in(whole: Path) -> Iterator[None]:
-    """Around the writing of its row: a file comes to its place once that is committed, and goes where it fails."""
+    """Move a file to its place once its row, written within, is committed; delete it if that fails."""
     part = part_of(whole)
     try:
         yield
@@ -42,9 +42,9 @@ def taken_in(whole: Path) -> Iterator[None]:
 
 
 def settle(folder: Path, store: Store) -> None:
-    """At the start: end what an ended service had begun, and say which whole files the database does not name.
+    """Finish at the start what a killed service had begun, and log which whole files the database does not name.
 
-    Only files that this service itself writes are looked at, by their names.
+    Only files that this service itself writes count, by their names.
     """
     from stimrig.api.store.tables import Recording
 
@@ -58,9 +58,9 @@ def settle(folder: Path, store: Store) -> None:
             part.unlink(missing_ok=True)
             log.warning("removed what had not been taken in: %s", part.name)
     if unnamed := [path.name for path in _ours(folder) if path.name not in named]:
-        more = f" and {len(unnamed) - MOST_TOLD} more" if len(unnamed) > MOST_TOLD else ""
-        told = ", ".join(unnamed[:MOST_TOLD]) + more
-        log.warning("the database does not name %s; nothing of it was deleted. Is it the right database?", told)
+        more = f" and {len(unnamed) - MAX_LISTED} more" if len(unnamed) > MAX_LISTED else ""
+        names = ", ".join(unnamed[:MAX_LISTED]) + more
+        log.warning("the database does not name %s; nothing of it was deleted. Is it the right database?", names)
 
 
 def _ours(folder: Path) -> list[Path]:

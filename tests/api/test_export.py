@@ -188,11 +188,3 @@ def test_wrong_options_are_one_line(
     said = capsys.readouterr().err
     assert said.count("\n") == 1 and named in said
     assert not (tmp_path / "new").exists()
-
-
-def test_records_are_read_from_a_bucket_too(data: Path, tmp_path: Path) -> None:
-    fsspec = pytest.importorskip("fsspec", reason="pip install fsspec")
-    files = fsspec.filesystem("memory")
-    files.pipe("/export/session.h5", (data / "session-0.h5").read_bytes())
-    assert main.run(["export", "memory://export", "-o", str(tmp_path / "out")]) == 0
-    assert len(listed(tmp_path / "out")) == 1
