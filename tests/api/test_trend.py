@@ -148,8 +148,8 @@ def test_a_panel_breaks_its_line_at_another_current_and_marks_what_is_noted() ->
     line, bars, dots, hollow, flags = drawn.curves
     joined = [None if math.isnan(value) else value for value in line.y if value is not None]
     assert joined == [None, 1.0, 1.1, None, 1.2, None, 2.0] and hollow.x == [1.0] * 3
-    assert flags.x == [2.0] * 3 and np.isfinite(dots.y).sum() == 2 * 4
-    assert np.isfinite(bars.y).sum() == 2 * 2, "a value by itself has a bar"
+    assert flags.x == [2.0] * 3 and np.isfinite(np.array(dots.y, dtype=float)).sum() == 2 * 4
+    assert np.isfinite(np.array(bars.y, dtype=float)).sum() == 2 * 2, "a value by itself has a bar"
     assert [rule.at for rule in drawn.rules] == [1.5]
     low, high = drawn.panels[0].limits or (0.0, 0.0)
     assert low > -1.0 and high < 4.0, "one wide band does not dwarf the values"
