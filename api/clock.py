@@ -69,5 +69,5 @@ def zone_name() -> str:
     return name if mark else written.read_text("utf-8").strip() if written.is_file() else ""
 
 
-asked_s: ContextVar[float] = ContextVar("asked_s")
+request_received_s: ContextVar[float] = ContextVar("request_received_s")
 """When the request that is being answered came in, on the monotonic clock."""

@@ -56,12 +56,19 @@ def build(verb: str = "") -> typer.Typer:
 
 
 def _overview() -> typer.Typer:
-    """Make the command line as its help lists it: each verb with the first line of its file, which is not loaded."""
-    app = _empty()
+    """Make the command line as its help lists it: what each verb does, read from its file and not loaded."""
+    app, groups = _empty(), {}
     for name in VERBS:
-        text = (Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8")
-        does = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0].partition(": ")[2]
-        app.command(name, help=does[:1].upper() + does[1:])(lambda: None)
+        tree = ast.parse((Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8"))
+        does = {node.name: ast.get_docstring(node) for node in tree.body if isinstance(node, ast.FunctionDef)}
+        if name in does:
+            app.command(name, help=does[name])(lambda: None)
+        else:
+            calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
+            made = next(call for call in calls if ast.unparse(call.func) == "typer.Typer")
+            groups[name] = next(ast.literal_eval(word.value) for word in made.keywords if word.arg == "help")
+    for name, words in groups.items():  # verbs with verbs of their own stand behind the others
+        app.command(name, help=words)(lambda: None)
     return app
 
 

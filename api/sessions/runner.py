@@ -14,7 +14,7 @@ from typing import Any
 
 from sqlalchemy.exc import SQLAlchemyError
 
-from stimrig.api.clock import Clock, asked_s
+from stimrig.api.clock import Clock, request_received_s
 from stimrig.api.errors import ApiError, NotFoundError
 from stimrig.api.jobs.pool import Pool
 from stimrig.api.jobs.tasks import Tasks
@@ -180,7 +180,9 @@ class Runner(Playing):
                     raise right_ended()
                 if current.changes or version != current.version:
                     raise locking.ChangedError(version or 0, current.changes or changes)
-                self._refuse_overtaken(asked_s.get(self.clock.monotonic_s()))  # from here to the command nothing waits
+                self._refuse_overtaken(
+                    request_received_s.get(self.clock.monotonic_s())
+                )  # from here to the command nothing waits
                 key = self.kinds[plan.kind].begin(planned)
                 await self.rig.ask(requests.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:

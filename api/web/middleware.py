@@ -16,7 +16,7 @@ from starlette.requests import HTTPConnection
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from stimrig.api.clock import asked_s
+from stimrig.api.clock import request_received_s
 from stimrig.api.errors import ApiError
 from stimrig.api.logs import current_request
 from stimrig.identify.json_text import BadJson, NotJson, parse
@@ -127,7 +127,7 @@ class BodyLimit(HttpMiddleware):
 
     async def serve(self, scope: Scope, receive: Receive, send: Send) -> None:
         """As the base class."""
-        asked_s.set(self.context.clock.monotonic_s())  # before anything waits
+        request_received_s.set(self.context.clock.monotonic_s())  # before anything waits
         bounded = self._bounded(scope, receive)
         if scope["path"].rstrip("/") != PREVIEW:
             await self.app(scope, bounded, send)

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.options import DataDir, Emulate, RigFile, given
+from stimrig.api.cli.options import DataDir, RigFile, given
 from stimrig.api.cli.stop_key import StopKey, at_rig
 from stimrig.api.cli.supervisor import Services
 from stimrig.api.cli.terminal import say
@@ -27,7 +27,7 @@ def serve(
         Path | None, typer.Option(help="use the running rig that listens here; or STIMRIG_RIG_SOCKET")
     ] = None,
     data: DataDir = None,
-    emulate: Emulate = "",
+    emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
     settings = Settings(**given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
