@@ -45,7 +45,7 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     tab.locator("summary", has_text="Where the error sits").click()
     assert tab.locator(".places li").count() >= 3, "the worst places are named"
     tab.locator(".do").get_by_role("button", name="Add this effect").click()
-    tab.get_by_text("Error of each version").click(timeout=PATIENCE_MS)
+    tab.locator("summary", has_text="Error of each version").click(timeout=PATIENCE_MS)
     chart(tab, "falling")
     rows = tab.locator(".versions tbody tr")
     assert rows.count() == 2 and rows.nth(1).inner_text().startswith("2. + hysteresis of recruitment")

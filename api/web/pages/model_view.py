@@ -42,8 +42,8 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
     version = await asyncio.to_thread(context.versions.document, row)
     why, findings, fit_words = shown["why"], advice.findings(document), advice.fit_sentence(document.get("fit") or {})
     running = job is not None and diagnosis is None and job.state in ("running", "completed")
-    said_by_fit = ("gap", "ceiling") if fit_words else ()
-    shown_findings = [finding for finding in findings if finding.gate not in said_by_fit][:MOST_FINDINGS]
+    in_fit_words = ("gap", "ceiling") if fit_words else ()
+    others = [finding for finding in findings if finding.gate not in in_fit_words]
     return page(
         request,
         "model.html",
@@ -52,8 +52,8 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
             version["verdict"], findings, why["likely"] if why else [], why and why["kind"],
             diagnosing=running, experiment=bool(why and why["experiment"]),
         ),
-        shown_findings=shown_findings,
-        hidden_findings=[finding for finding in findings if finding not in shown_findings],
+        shown_findings=others[:MOST_FINDINGS],
+        hidden_findings=others[MOST_FINDINGS:],
         reasons=[] if findings else version["reasons"],
         fit_words=fit_words,
         # One that has just ended is shown as running once more: the page asks after it, and then shows the diagnosis.

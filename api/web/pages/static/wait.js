@@ -2,7 +2,7 @@
 "use strict";
 const said = JSON.parse(document.getElementById("rig-words").textContent);
 for (const box of document.querySelectorAll("[data-job]")) follow(box);
-for (const box of document.querySelectorAll("[data-next]")) watch(box);
+for (const box of document.querySelectorAll("[data-next][data-from]")) watch(box);
 
 // The line that says what is next: asked for again when the rig does something else, and every few seconds.
 function watch(box) {
