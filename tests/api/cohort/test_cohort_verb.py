@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import importlib.util
 import json
+import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
@@ -25,15 +27,21 @@ pytestmark = pytest.mark.slow
 
 PATIENCE_S = 240.0
 COMMAND = """
-import time
+import sys, time
 from stimrig.api.cohort import results
 from stimrig.api.cli.main import main
 
-add, results.PART_ROWS = results.Results.add, 1
-results.Results.add = lambda self, row: (time.sleep(0.1), add(self, row))[1]
+add, results.PART_ROWS, pause_s = results.Results.add, 1, float(sys.argv.pop())
+
+def add_slowly(self, row):
+    status = add(self, row)
+    time.sleep(pause_s if len(list(self.folder.glob('0*'))) == 3 else 0.1)
+    return status
+
+results.Results.add = add_slowly
 main()
 """
-"""Every row to the disk at once, and not too fast: the test sees how far it is, and is in time to disturb."""
+"""Every row to the disk at once; after the third it waits as long as the last word says, s."""
 
 
 @pytest.fixture
@@ -131,46 +139,67 @@ def test_reports(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert "Repeatability" in html.read_text()
 
 
-@pytest.mark.campaign
-def test_scheduler_elsewhere_computes_and_when_it_goes_what_is_done_is_kept(tmp_path: Path) -> None:
-    def until(reached: Callable[[], Any], what: str) -> None:
+class Processes:
+    """Processes of a test; they are killed at its end."""
+
+    def __init__(self, folder: Path) -> None:
+        self.output = folder / "r.parquet"
+        self.stack = ExitStack()
+        cohort(folder / "sessions", 30)
+        self.fit = ("cohort", "fit", str(folder / "sessions"), "-o", str(self.output))
+
+    def start(self, *words: str, out: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, *words], text=True, stdout=out, stderr=out, process_group=0, cwd=self.output.parent
+        )
+        self.stack.callback(lambda: (process.kill(), process.wait()))
+        return process
+
+    def begin(self, *options: str, pause_s: float) -> subprocess.Popen[str]:
+        """Start a run, and wait until it has three rows."""
+        run = self.start("-c", COMMAND, *self.fit, *options, f"{pause_s}", out=subprocess.PIPE)
+        self.until(lambda: self.rows() >= 3 or run.poll() is not None, "three rows")
+        return run
+
+    def until(self, reached: Callable[[], Any], what: str) -> None:
         ends_s = time.monotonic() + PATIENCE_S
         while not reached():
             assert time.monotonic() < ends_s, what
             time.sleep(0.01)
 
-    def start(*words: str, **options: Any) -> subprocess.Popen[str]:
-        process = subprocess.Popen([sys.executable, *words], text=True, **options)
-        stack.callback(lambda: (process.kill(), process.wait()))
-        return process
+    def rows(self) -> int:
+        parts = Path(f"{self.output}.parts").glob("[0-9]*.parquet")
+        return sum(pq.read_metadata(part).num_rows for part in parts)
 
-    def rows() -> int:
-        return sum(pq.read_metadata(part).num_rows for part in Path(f"{output}.parts").glob("[0-9]*.parquet"))
 
-    quiet: dict[str, Any] = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-    cohort(tmp_path / "sessions", 30)
-    file, output = tmp_path / "scheduler.json", tmp_path / "r.parquet"
-    with ExitStack() as stack:
-        options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
-        scheduler = start("-m", "distributed.cli.dask_scheduler", *options, **quiet)
-        until(lambda: file.exists() and file.read_text().rstrip().endswith("}"), "a scheduler")
-        address = json.loads(file.read_text())["address"]
-        for nanny in ("--nanny", "--no-nanny"):
-            start("-m", "distributed.cli.dask_worker", address, "--nthreads", "1", nanny, "--no-dashboard", **quiet)
-        words = (
-            "cohort",
-            "fit",
-            str(tmp_path / "sessions"),
-            "-o",
-            str(output),
-            "--scheduler",
-            address,
-            "--wait",
-            "200",
-        )
-        run = start("-c", COMMAND, *words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
-        until(lambda: rows() >= 3 or run.poll() is not None, "three rows")
-        scheduler.kill()
-        _, err = run.communicate(timeout=PATIENCE_S)
+@pytest.fixture
+def processes(tmp_path: Path) -> Iterator[Processes]:
+    started = Processes(tmp_path)
+    with started.stack:
+        yield started
+
+
+def test_ctrl_c_ends_a_run_and_all_its_processes_in_one_line(processes: Processes) -> None:
+    run = processes.begin(pause_s=600.0)
+    os.killpg(run.pid, signal.SIGINT)  # as a terminal does
+    out, err = run.communicate(timeout=PATIENCE_S)
+    assert (run.returncode, out) == (130, "") and err.count("\n") == 1 and "the same command goes on" in err, err
+    assert processes.rows() >= 3 and not processes.output.exists()
+    with pytest.raises(ProcessLookupError):
+        os.killpg(run.pid, 0)
+
+
+@pytest.mark.campaign
+def test_scheduler_elsewhere_computes_and_when_it_goes_what_is_done_is_kept(processes: Processes) -> None:
+    file = processes.output.with_name("scheduler.json")
+    options = ("--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file))
+    scheduler = processes.start("-m", "distributed.cli.dask_scheduler", *options)
+    processes.until(lambda: file.exists() and file.read_text().rstrip().endswith("}"), "a scheduler")
+    address = json.loads(file.read_text())["address"]
+    for nanny in ("--nanny", "--no-nanny"):
+        processes.start("-m", "distributed.cli.dask_worker", address, "--nthreads", "1", nanny, "--no-dashboard")
+    run = processes.begin("--scheduler", address, "--wait", "200", pause_s=0.1)
+    scheduler.kill()
+    _, err = run.communicate(timeout=PATIENCE_S)
     assert run.returncode == 1 and err.count("\n") == 1 and "the scheduler is gone" in err, err
-    assert rows() >= 3
+    assert processes.rows() >= 3
