@@ -207,8 +207,8 @@ def record_of(
     if not inside.any():
         return None
     time_s, torque, sync = time_s[inside], samples["torque_nm"][inside], samples["sync"][inside]
-    came = int(time_s[-1] * rate_hz) + 1
-    pulses, doubted = locate_pulses(_sent(outcomes, laid_us[:came], rate_hz), time_s, sync)
+    pulse_count = int(time_s[-1] * rate_hz) + 1
+    pulses, doubted = locate_pulses(_sent(outcomes, laid_us[:pulse_count], rate_hz), time_s, sync)
     even_s, torque = means(time_s, torque, BINS * rate_hz)
     width_us, late_s = in_force(pulses, even_s, rate_hz)
     code = np.searchsorted([start for _, start, _ in segments], even_s * rate_hz + 1e-9, side="right") - 1
@@ -226,10 +226,10 @@ def _sent(outcomes: Mapping[str, Any], laid_us: list[float], rate_hz: float) -> 
     written_s, acknowledged_s = np.full(widths_us.size, np.nan), np.full(widths_us.size, np.nan)
     status = np.where(widths_us > 0, ON_ITS_WAY, RESTS)
     index = np.array(outcomes["index"], int)
-    laid = index < widths_us.size
+    is_laid = index < widths_us.size
     columns = {"pulse_width_us": widths_us, "written_time_s": written_s, "acknowledged_time_s": acknowledged_s}
     for name, column in {**columns, "status": status}.items():
-        column[index[laid]] = np.array(outcomes[name], float)[laid]
+        column[index[is_laid]] = np.array(outcomes[name], float)[is_laid]
     return Sent(np.arange(widths_us.size) / rate_hz, widths_us, written_s, acknowledged_s, status, 1.0 / rate_hz)
 
 
@@ -261,13 +261,13 @@ def sample_times(host_s: Any, counter: Any) -> Any:
         hull.append(point)
     corners = np.array(hull)
     after = int(np.clip(np.searchsorted(corners[:, 0], number.mean()), 1, len(corners) - 1))
-    (left, left_s), (right, right_s) = corners[after - 1], corners[after]
-    return left_s + (right_s - left_s) / (right - left) * (number - left)
+    (start, start_s), (end, end_s) = corners[after - 1], corners[after]
+    return start_s + (end_s - start_s) / (end - start) * (number - start)
 
 
-def _turn(one: Any, two: Any, three: Any) -> float:
-    """Return a value above 0 where the way from one point to the third turns upwards at the second."""
-    return (two[0] - one[0]) * (three[1] - one[1]) - (two[1] - one[1]) * (three[0] - one[0])
+def _turn(first: Any, second: Any, third: Any) -> float:
+    """Return a value above 0 where the way from the first point to the third turns upwards at the second."""
+    return (second[0] - first[0]) * (third[1] - first[1]) - (second[1] - first[1]) * (third[0] - first[0])
 
 
 _running: list[Running] = []

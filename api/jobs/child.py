@@ -55,16 +55,16 @@ def begin(progress: Connection, verbs: str, nice: int) -> None:
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
     os.close(forkserver._forkserver._forkserver_alive_fd)  # pyright: ignore[reportAttributeAccessIssue]
     os.nice(nice)
-    for kind, most in LIMITS.items():
-        _limit(kind, most)
+    for kind, limit in LIMITS.items():
+        _limit(kind, limit)
     _State.verbs, _State.progress = verbs, progress
     import_module(verbs)
 
 
-def _limit(kind: int, most: int) -> None:
+def _limit(kind: int, limit: int) -> None:
     hard = resource.getrlimit(kind)[1]
-    least = most if hard == resource.RLIM_INFINITY else min(most, hard)
-    resource.setrlimit(kind, (least, least))
+    value = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+    resource.setrlimit(kind, (value, value))
 
 
 def limit_processor_time(seconds: float) -> None:

@@ -41,11 +41,11 @@ def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]
     return rounded(identify.compare(model, record).to_dict())
 
 
-def rounded(found: dict[str, Any]) -> dict[str, Any]:
+def rounded(comparison: dict[str, Any]) -> dict[str, Any]:
     """A comparison whose series hold five digits each."""
-    series = found.get("series") or {}
+    series = comparison.get("series") or {}
     short = {key: _rounded(values) if isinstance(values, list) else values for key, values in series.items()}
-    return {**found, "series": short}
+    return {**comparison, "series": short}
 
 
 def _rounded(values: list[Any]) -> list[Any]:
@@ -75,12 +75,12 @@ def segments_of(record: Any) -> list[dict[str, Any]]:
 
 def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:
     """Stretches of rows that carry the same segment's name."""
-    found: list[dict[str, Any]] = []
+    stretches: list[dict[str, Any]] = []
     for index, label in enumerate(labels):
-        if not found or found[-1]["name"] != label:
-            found.append({"name": label, "start_s": float(time_s[index])})
-        found[-1]["end_s"] = float(time_s[index])
-    return found
+        if not stretches or stretches[-1]["name"] != label:
+            stretches.append({"name": label, "start_s": float(time_s[index])})
+        stretches[-1]["end_s"] = float(time_s[index])
+    return stretches
 
 
 def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, list[float]]:
@@ -103,19 +103,19 @@ def recorded(data: str, progress: Progress) -> dict[str, Any]:
     With an angle sensor also the joint's angle, °.
     """
     progress(0.1, "reading the recording")
-    held = _columns(Path(data))
-    time_s, torque_nm = held["torque/time_s"], held["torque/torque_nm"]
+    columns = _columns(Path(data))
+    time_s, torque_nm = columns["torque/time_s"], columns["torque/torque_nm"]
     known = np.isfinite(torque_nm) & np.isfinite(time_s)
     time_s, torque_nm = _envelope(time_s[known], torque_nm[known])
-    pulses = _changes(held["pulses/planned_time_s"], held["pulses/sent_pulse_width_us"], held["rate_hz"])
-    rows = zip(held["segments/name"], held["segments/start_s"], held["segments/end_s"], strict=True)
+    pulses = _changes(columns["pulses/planned_time_s"], columns["pulses/sent_pulse_width_us"], columns["rate_hz"])
+    rows = zip(columns["segments/name"], columns["segments/start_s"], columns["segments/end_s"], strict=True)
     return {
         "time_s": time_s,
         "torque_nm": torque_nm,
         "pulse_time_s": [at_s for at_s, _ in pulses],
         "sent_pulse_width_us": [width_us for _, width_us in pulses],
         "pulses_end_s": pulses[-1][0] if pulses else 0.0,
-        **_angle(held),
+        **_angle(columns),
         "segments": [{"name": str(name), "start_s": float(start), "end_s": float(end)} for name, start, end in rows],
     }
 
@@ -123,22 +123,22 @@ def recorded(data: str, progress: Progress) -> dict[str, Any]:
 def _columns(path: Path) -> dict[str, Any]:
     import h5py
 
-    found: dict[str, Any] = {}
+    columns: dict[str, Any] = {}
     with h5py.File(path) as file:
         for name in NUMBERS:
-            found[name] = np.asarray(file[name], float)
-        found |= {name: np.asarray(file[name], float) for name in ANGLES if name in file}
+            columns[name] = np.asarray(file[name], float)
+        columns |= {name: np.asarray(file[name], float) for name in ANGLES if name in file}
         names: Any = file["segments/name"]
-        found["segments/name"] = names.asstr()[:]
-        found["rate_hz"] = float(np.asarray(file.attrs["pulse_rate_hz"]))
-    return found
+        columns["segments/name"] = names.asstr()[:]
+        columns["rate_hz"] = float(np.asarray(file.attrs["pulse_rate_hz"]))
+    return columns
 
 
-def _angle(held: dict[str, Any]) -> dict[str, Any]:
+def _angle(columns: dict[str, Any]) -> dict[str, Any]:
     """The joint's angle, °, rounded; nothing where it was not recorded."""
-    if not set(held) >= set(ANGLES) or not held[ANGLES[0]].size:
+    if not set(columns) >= set(ANGLES) or not columns[ANGLES[0]].size:
         return {}
-    time_s, angle_rad = (held[name] for name in ANGLES)
+    time_s, angle_rad = (columns[name] for name in ANGLES)
     known = np.isfinite(time_s) & np.isfinite(angle_rad)
     time_s, angle_deg = _envelope(time_s[known], np.degrees(angle_rad[known]))
     return {"angle_time_s": time_s, "angle_deg": angle_deg}
@@ -149,14 +149,14 @@ def _changes(due_s: Any, sent_us: Any, rate_hz: float) -> list[tuple[float, floa
     reaches to it."""
     if not due_s.size:
         return []
-    kept = np.flatnonzero(np.append(True, np.diff(np.nan_to_num(sent_us, nan=-1.0)) != 0))
-    widths_us = [float(sent_us[k]) if np.isfinite(sent_us[k]) else None for k in kept]
-    times_s = [float(due_s[k]) for k in kept]
-    found = list(zip(times_s, widths_us, strict=True))
-    for k in reversed(range(1, len(found))):
-        if found[k][1] is None:
-            found.insert(k, (found[k][0], found[k - 1][1]))
-    return [*found, (float(due_s[-1]) + 1.0 / rate_hz, widths_us[-1])]
+    changed = np.flatnonzero(np.append(True, np.diff(np.nan_to_num(sent_us, nan=-1.0)) != 0))
+    widths_us = [float(sent_us[k]) if np.isfinite(sent_us[k]) else None for k in changed]
+    times_s = [float(due_s[k]) for k in changed]
+    changes = list(zip(times_s, widths_us, strict=True))
+    for k in reversed(range(1, len(changes))):
+        if changes[k][1] is None:
+            changes.insert(k, (changes[k][0], changes[k - 1][1]))
+    return [*changes, (float(due_s[-1]) + 1.0 / rate_hz, widths_us[-1])]
 
 
 def _envelope(time_s: Any, torque_nm: Any) -> tuple[list[float], list[float]]:

@@ -102,12 +102,12 @@ class Job:
 
     def progress_document(self) -> dict[str, Any]:
         """Return how far it is, as clients see it."""
-        shown = self.part or self
-        left_s = shown.time_left_s
+        current = self.part or self
+        left_s = current.time_left_s
         return {
-            "progress": 1.0 if self.state == "completed" else round(shown.progress, 3),
-            "text": shown.text,
-            "elapsed_s": round(shown.elapsed_s, 1),
+            "progress": 1.0 if self.state == "completed" else round(current.progress, 3),
+            "text": current.text,
+            "elapsed_s": round(current.elapsed_s, 1),
             "time_left_s": None if left_s is None else round(left_s, 1),
         }
 

@@ -12,7 +12,7 @@ from stimrig.api.jobs.pool import Pool
 from stimrig.api.jobs.tasks import Tasks
 
 log = logging.getLogger("stimrig.jobs")
-KEPT = 200
+MOST_FINISHED = 200
 """Finished jobs that are remembered."""
 
 
@@ -36,7 +36,7 @@ class Jobs:
         job = Job(kind, id=f"J{next(self._numbers)}", subject=subject)
         job.start()
         self.all[job.id] = job
-        for old in [known.id for known in self.all.values() if known.state != "running"][: -KEPT or None]:
+        for old in [known.id for known in self.all.values() if known.state != "running"][: -MOST_FINISHED or None]:
             del self.all[old]
         self._tasks.begin(self._run(job, work))
         return job

@@ -75,12 +75,12 @@ def track(
         moved = model_for_next(model, step, bounds)
     except identify.IdentifyError as problem:
         return {"error_percent": error, "reason": " ".join(str(problem).split())}
-    told = json_value(step.to_dict()) | {"moved": list(bounds)}
-    return {"error_percent": error, "step": told, "model": moved.to_json(None)}
+    document = json_value(step.to_dict()) | {"moved": list(bounds)}
+    return {"error_percent": error, "step": document, "model": moved.to_json(None)}
 
 
 def dated(path: Path) -> Any:
-    """A recording that knows when it began, if its file says so."""
+    """Read a recording that knows when it began, if its file says so."""
     record = identify.read(path)
     part = record.parts[0]
     if len(record.parts) > 1 or part.begun_s is not None:
@@ -89,7 +89,7 @@ def dated(path: Path) -> Any:
 
 
 def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
-    """The state after what the muscle did in these recordings; of one that cannot be read nobody knows what it did."""
+    """Carry the state through what the muscle did in these recordings; one that cannot be read is left out."""
     from stimrig.identify.tracking import passed, slow_forms
 
     for path in between if slow_forms(model) else ():
@@ -99,7 +99,7 @@ def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
 
 
 def second_order(model: Any) -> Any:
-    """The model, if it can be followed. Raises BadModel: its dynamics are not of second order."""
+    """Return the model. Raises BadModel: its dynamics are not of second order, so it cannot be followed."""
     from stimrig.identify.dynamics.linear import SecondOrder
 
     if not isinstance(model.linear, SecondOrder):
@@ -109,7 +109,7 @@ def second_order(model: Any) -> Any:
 
 
 def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> float | None:
-    """Root mean square of reference minus torque, % of the reference's; None without one.
+    """Return the root mean square of reference minus torque, % of the reference's; None without one.
 
     The torque is its mean in each pulse's period, above the rest before the first pulse.
     """
@@ -144,9 +144,9 @@ def track_warm(progress: Progress, model_json: str) -> dict[str, Any]:
         widest_us = float(model.recruitment.basis.largest_us)
         time_s = np.arange(800) / 400.0
         widths_us = np.where((time_s > 0.5) & (time_s < 1.2), 0.7 * widest_us, 0.0)
-        own = {"pulse_rate_hz": model.pulse_rate_hz}
-        empty = identify.Record.from_arrays(time_s, widths_us, np.zeros(time_s.size), **own)
+        rate = {"pulse_rate_hz": model.pulse_rate_hz}
+        empty = identify.Record.from_arrays(time_s, widths_us, np.zeros(time_s.size), **rate)
         torque_nm = identify.predict(model, empty)
-        step = follow(model, None, identify.Record.from_arrays(time_s, widths_us, torque_nm, **own))
+        step = follow(model, None, identify.Record.from_arrays(time_s, widths_us, torque_nm, **rate))
         model_for_next(model, step).to_json(None)
     return {}

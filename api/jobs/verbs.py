@@ -1,4 +1,4 @@
-"""What a worker process does, verb by verb: paths and plain objects in, plain objects out.
+"""Verbs of the worker processes: paths and plain objects in, plain objects out.
 
 Imported by the worker and the command line only; the web process never loads numpy, and never fits.
 """
@@ -31,7 +31,7 @@ def fit(
     recruitment: str | None = None,
     models: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Read a recording and identify; the model document as JSON text and as an object, and what was assumed.
+    """Identify a recording; return the model as JSON text and as an object, and what was assumed.
 
     With `recruitment` near-sigmoid, `models` are the person's approved ones, oldest first.
     """
@@ -55,16 +55,17 @@ def fit(
 
 
 def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
-    """The structure of an earlier model on a new recording: the finding, and the carried model where there is one."""
+    """Fit the structure of an earlier model to a new recording; return the finding, and the model if there is one."""
     record = identify.read(Path(data))
-    found = identify.carry(record, identify.Model.from_json(model_json), progress)
-    return {"json": found.models[1].to_json() if len(found.models) > 1 else None, "found": json_value(found.finding())}
+    carried = identify.carry(record, identify.Model.from_json(model_json), progress)
+    text = carried.models[1].to_json() if len(carried.models) > 1 else None
+    return {"json": text, "found": json_value(carried.finding())}
 
 
 def diagnosis(
     data: str, progress: Progress, model_json: str | None = None, columns: Sequence[str] | None = None
 ) -> dict[str, Any]:
-    """What is missing in a model's structure, what each effect would explain, and the test that decides.
+    """Diagnose what is missing in a model's structure, what each effect would explain, and the test that decides.
 
     Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis.
     """
@@ -72,67 +73,67 @@ def diagnosis(
 
 
 def diagnosed(record: Any, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
-    """The same of a record that was read; `improvement` holds the models that come of it."""
+    """Diagnose a record; `improvement` holds the models that come of it."""
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
     return finding_of(record, *identify.diagnose_and_improve(record, progress, model), structure)
 
 
 def finding_of(record: Any, diagnosis: Any, improvement: Any, structure: Sequence[str]) -> dict[str, Any]:
-    """A diagnosis as it is kept, with the improvement that was found by the way."""
-    found = with_experiment(record, diagnosis, structure)
-    found["signatures"] = signatures(record, improvement)
-    found["refused"] = list(improvement.refused)
-    found["improvement"] = {**improvement.to_dict(), "structure": list(structure)}
-    return json_value(found)
+    """Return a diagnosis as it is stored, with the improvement that the same search gives."""
+    document = with_experiment(record, diagnosis, structure)
+    document["signatures"] = signatures(record, improvement)
+    document["refused"] = list(improvement.refused)
+    document["improvement"] = {**improvement.to_dict(), "structure": list(structure)}
+    return json_value(document)
 
 
 def with_experiment(record: Any, diagnosis: Any, structure: Sequence[str]) -> dict[str, Any]:
-    """A diagnosis with what the library says of its effects, and the experiment that comes next."""
+    """Return a diagnosis with the library's entries of its effects, and the next experiment."""
     from stimrig.identify import effects
 
-    found = {**diagnosis.to_dict(), "structure": list(structure)}
-    found["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(found)}
-    planned = experiment(found["missing"], found["deciding_experiment"])
+    document = {**diagnosis.to_dict(), "structure": list(structure)}
+    document["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(document)}
+    planned = experiment(document["missing"], document["deciding_experiment"])
     # A list of widths is one of pulses: at another rate it would be another test, and could not be joined.
-    found["experiment"] = planned and {**planned, "pulse_rate_hz": record.pulse_rate_hz}
-    return found
+    document["experiment"] = planned and {**planned, "pulse_rate_hz": record.pulse_rate_hz}
+    return document
 
 
-def mentioned(found: dict[str, Any]) -> set[str]:
-    named = {entry["effect"] for entry in found["missing"]}
-    named |= {rival for entry in found["missing"] for rival in entry.get("confused_with") or []}
-    named |= {entry["effect"] for entry in found["free"]}
-    return named | {row["effect"] for rows in found.get("candidates") or [] for row in rows}
+def mentioned(document: dict[str, Any]) -> set[str]:
+    named = {entry["effect"] for entry in document["missing"]}
+    named |= {rival for entry in document["missing"] for rival in entry.get("confused_with") or []}
+    named |= {entry["effect"] for entry in document["free"]}
+    return named | {row["effect"] for rows in document.get("candidates") or [] for row in rows}
 
 
 def signatures(record: Any, improvement: Any) -> dict[str, Any]:
-    """What each effect explains of what the model before it leaves: seen beside expected.
+    """Return what each effect explains of the residual of the model before it: measured beside expected.
 
     ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
     """
     pick = slice(None, None, max(1, -(-record.time_s.size // SIGNATURE_POINTS)))
-    found: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
+    curves: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
     torques = [np.asarray(identify.predict(model, record)) for model in improvement.models]
     for step, before, after in zip(improvement.steps[1:], torques, torques[1:], strict=False):
-        seen, expected = smooth(record, record.torque_nm - before), after - before
-        found[step["added"]] = {"seen_nm": seen[pick].round(4), "expected_nm": expected[pick].round(4)}
-    return found
+        measured_nm, expected_nm = smooth(record, record.torque_nm - before), after - before
+        curves[step["added"]] = {"seen_nm": measured_nm[pick].round(4), "expected_nm": expected_nm[pick].round(4)}
+    return curves
 
 
 def smooth(record: Any, values: Any) -> Any:
-    """Running mean over a tenth of a second, so that a slow signature is seen through the noise."""
+    """Return the running mean over a tenth of a second: a slow signature shows through the noise."""
     width = max(1, round(0.1 * record.sample_rate_hz))
     padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
     return np.convolve(padded, np.ones(width) / width, "valid")
 
 
 def experiment(missing: Sequence[dict[str, Any]], further: dict[str, Any] | None = None) -> dict[str, Any] | None:
-    """The `further` test for what is left, or the one that separates the first effect with rivals from them."""
+    """Return the `further` test for what is left, or the one that separates the first effect from its rivals."""
     from stimrig.identify.diagnosis import planned
 
-    found = planned(missing, further)
-    return found and {**found.to_dict(), "effect": next(iter(found.rivals), "")}
+    plan = planned(missing, further)
+    return plan and {**plan.to_dict(), "effect": next(iter(plan.rivals), "")}
 
 
 def forecast(
@@ -142,7 +143,7 @@ def forecast(
     pulse_rate_hz: float | None = None,
     angle_rad: list[float] | None = None,
 ) -> dict[str, Any]:
-    """Mean torque that the pulses give in each pulse's period, N·m, effects included, after one second of rest.
+    """Predict the mean torque in each pulse's period, N·m, effects included, after one second of rest.
 
     `angle_rad`: of the joint in each pulse's period, where it moves.
     """
@@ -169,7 +170,7 @@ def invert(
     whole: bool = True,
     shortest_us: float = 0.0,
 ) -> dict[str, Any]:
-    """The pulse widths whose predicted torque follows a reference best, and where it cannot be reached and why.
+    """Return the pulse widths whose predicted torque follows a reference best, and where it cannot be reached and why.
 
     The reference comes as numbers, or as the text of a CSV file (`table`).
     """
@@ -184,8 +185,8 @@ def invert(
         reference = read_reference(table.encode(), "the upload", rate_hz)
     else:
         reference = Reference.of(reference_torque_nm, time_s, angle_rad=angle_rad, pulse_rate_hz=rate_hz)
-    found = widths_for(model, reference, largest_us=largest_us, rise_us=rise_us, whole=whole, shortest_us=shortest_us)
-    return json_value(found.to_dict())
+    bounds: dict[str, Any] = {"largest_us": largest_us, "rise_us": rise_us, "shortest_us": shortest_us}
+    return json_value(widths_for(model, reference, whole=whole, **bounds).to_dict())
 
 
 def effects(progress: Progress) -> dict[str, Any]:

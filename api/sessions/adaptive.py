@@ -30,7 +30,7 @@ from stimrig.rig.requests import PreviewRequest
 
 ADAPTIVE = "adaptive"
 """Kind of test."""
-KEPT = 20
+MOST_OUTLOOKS = 20
 """Outlooks that are remembered: the question before a test and its start need the same one."""
 MOST_MODELS = 10
 """Sessions from which is learnt how much a person changes between two."""
@@ -54,7 +54,7 @@ class AdaptiveTests(Watched):
         super().__init__(clock, rig, versions, tell)
         self.adviser = adviser
         self._outlooks: OrderedDict[str, dict[str, Any]] = OrderedDict()
-        self._looking = asyncio.Lock()
+        self._outlook_lock = asyncio.Lock()
 
     # ---- before ----------------------------------------------------------------------------------------------
 
@@ -76,13 +76,13 @@ class AdaptiveTests(Watched):
             "largest_us": plan.largest_us, "pulse_rate_hz": plan.pulse_rate_hz,
             "models": await asyncio.to_thread(self._known, plan),
         }  # fmt: skip
-        found = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
+        outlook = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
         default = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None), timeout_s=preview_s)
-        segments = fixed_plan(found["opening_us"], default, plan.pulse_rate_hz, bounds)
-        if not found["reach"]["reachable"] and not body.anyway:
-            raise out_of_reach(found["reach"])
+        segments = fixed_plan(outlook["opening_us"], default, plan.pulse_rate_hz, bounds)
+        if not outlook["reach"]["reachable"] and not body.anyway:
+            raise out_of_reach(outlook["reach"])
         plan = plan.model_copy(update={"segments": segments, "adaptive": bounds})
-        reach = {**found["reach"], "known": found["known"]}
+        reach = {**outlook["reach"], "known": outlook["known"]}
         return Planned(plan, {"target": how["target"], "reach": reach, "bounds": bounds.model_dump()}, how)
 
     async def _outlook(self, wanted: dict[str, Any]) -> dict[str, Any]:
@@ -90,13 +90,13 @@ class AdaptiveTests(Watched):
         name = hashlib.sha256(repr(wanted).encode()).hexdigest()
         if name in self._outlooks:
             return self._outlooks[name]
-        async with self._looking:
+        async with self._outlook_lock:
             if name not in self._outlooks:
                 if self.watching:
                     detail = "What a test can reach is computed once the one that runs has ended."
                     raise ApiError(409, "rig-busy", "Another test is running", detail)
                 self._outlooks[name] = await self.adviser.submit("adaptive_outlook", **wanted).result
-                while len(self._outlooks) > KEPT:
+                while len(self._outlooks) > MOST_OUTLOOKS:
                     self._outlooks.popitem(last=False)
             return self._outlooks[name]
 
@@ -113,13 +113,13 @@ class AdaptiveTests(Watched):
         rows = self.versions.all_approved_ones(participant)
         of_rows = self.versions.store.all(Test, Test.recording_id.in_([row.recording_id for row in rows]))
         tests = {test.recording_id: test for test in of_rows}
-        found = []
+        texts = []
         pairs = [(row, tests.get(row.recording_id)) for row in rows]
         here = [row for row, test in pairs if test is None or not differ(place_of(test), place)]
         for row in here[-MOST_MODELS:]:
             with contextlib.suppress(ApiError):
-                found.append(stored_model.text(row))
-        return found
+                texts.append(stored_model.text(row))
+        return texts
 
     # ---- while it plays, and after it ------------------------------------------------------------------------
 
@@ -182,23 +182,23 @@ def fixed_plan(
             "first look at the muscle. Nothing was started. Allow more."
         )
         raise ApiError(422, "out-of-reach", "The target cannot be reached", detail)
-    found = [_segment("opening", opening)]
+    segments = [_segment("opening", opening)]
     for name, widths in _pieces(default, rate_hz):
         room -= len(widths)
         if room < 0:
             break
-        found.append(_segment(name, widths))
-    return found
+        segments.append(_segment(name, widths))
+    return segments
 
 
 def _pieces(default: dict[str, Any], rate_hz: float) -> Iterator[tuple[str, list[float]]]:
     """Name and widths of each piece, the rest at the start left out: the opening ends with one."""
-    widths, most = default["pulse_width_us"], round(PIECE_S * rate_hz)
+    widths, piece = default["pulse_width_us"], round(PIECE_S * rate_hz)
     for number, segment in enumerate(default["segments"]):
         first, end = round(segment["start_s"] * rate_hz), round(segment["end_s"] * rate_hz)
         if number or any(widths[first:end]):
-            for start in range(first, end, most):
-                yield segment["name"], widths[start : min(start + most, end)]
+            for start in range(first, end, piece):
+                yield segment["name"], widths[start : min(start + piece, end)]
 
 
 def _segment(name: str, widths: list[float]) -> SegmentPlan:

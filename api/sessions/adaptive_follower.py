@@ -41,11 +41,11 @@ SHORTEST_PIECE_S = 1.0
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What the adviser says, when its newest sample was heard (monotonic, s), and which decision it is."""
+class Advice:
+    """The adviser's decision, when its newest sample was received (monotonic, s), and its number."""
 
-    said: dict[str, Any]
-    heard_s: float
+    document: dict[str, Any]
+    received_s: float
     number: int
 
 
@@ -56,7 +56,7 @@ class News:
     samples: bytes = b""
     outcomes: dict[str, list[Any]] = field(default_factory=dict)
 
-    def take(self, event: LiveEvent) -> None:
+    def add(self, event: LiveEvent) -> None:
         """Add one event's."""
         self.samples += b64decode(event.torque)
         for name, values in event.outcomes.model_dump().items():
@@ -68,9 +68,9 @@ class Turn:
     """One boundary: what is asked, and what came of it."""
 
     laid: int
-    asked: int = 0
+    questions: int = 0
     """1: with early samples; 2: with the newest ones."""
-    answer: Answer | None = None
+    advice: Advice | None = None
     sent: bool = False
 
 
@@ -111,13 +111,13 @@ class Follower(Watcher):
         self._added: list[list[float]] = []
         self._new = News()
         self._newest: LiveEvent | None = None
-        self._heard_s = 0.0
+        self._received_s = 0.0
         self._took_s = 0.0
         self._turn = Turn(-1)
-        self._asking: asyncio.Task[None] | None = None
+        self._deciding: asyncio.Task[None] | None = None
 
     async def _listen(self, path: Path | None) -> None:
-        self._asking = self.begin(self._begin())
+        self._deciding = self.begin(self._begin())
         await super()._listen(path)
 
     async def _begin(self) -> None:
@@ -148,22 +148,22 @@ class Follower(Watcher):
 
     def hear(self, event: LiveEvent) -> None:
         """As `Watcher`."""
-        self._newest, self._heard_s = event, self.clock.monotonic_s()
-        self._new.take(event)
+        self._newest, self._received_s = event, self.clock.monotonic_s()
+        self._new.add(event)
         if event.laid != self._turn.laid:
             self._turn = Turn(event.laid)
         if event.ended_by or self.status.state != "choosing":
             return
         left_s = self._left_s(event.elapsed_s)
-        idle = self._asking is None or self._asking.done()
+        idle = self._deciding is None or self._deciding.done()
         turn = self._turn
         early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
         least_s = LEAST_S + 2.0 / self.plan.pulse_rate_hz
-        if idle and not turn.sent and event.elapsed_s >= least_s and left_s <= (early_s, LATE_S, -1.0)[turn.asked]:
-            turn.asked = 2 if left_s <= LATE_S else 1
-            self._asking = self.begin(self._ask(turn))
-        elif turn.answer is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
-            self.begin(self._carry_out(turn, turn.answer))
+        if idle and not turn.sent and event.elapsed_s >= least_s and left_s <= (early_s, LATE_S, -1.0)[turn.questions]:
+            turn.questions = 2 if left_s <= LATE_S else 1
+            self._deciding = self.begin(self._decide(turn))
+        elif turn.advice is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
+            self.begin(self._carry_out(turn, turn.advice))
 
     def _left_s(self, now_s: float) -> float:
         """From a time on the test's clock until the rig decides what follows what is laid, s."""
@@ -173,62 +173,64 @@ class Follower(Watcher):
     def _now_s(self) -> float:
         """The time on the test's clock."""
         assert self._newest is not None
-        return self._newest.elapsed_s + self.clock.monotonic_s() - self._heard_s
+        return self._newest.elapsed_s + self.clock.monotonic_s() - self._received_s
 
     # ---- deciding ------------------------------------------------------------------------------------------
 
-    async def _ask(self, turn: Turn) -> None:
+    async def _decide(self, turn: Turn) -> None:
         # the newest event of all that were heard until now: news of pulses and what is laid belong together
-        event, heard_s, news, self._new = self._newest, self._heard_s, self._new, News()
+        event, received_s, news, self._new = self._newest, self._received_s, self._new, News()
         assert event is not None
         widths, segments = self._played_so_far(event)
-        advice = self.adviser.submit(
+        job = self.adviser.submit(
             "adaptive_advise", samples=news.samples, zero_s=event.zero_s, outcomes=news.outcomes, laid_us=widths,
             segments=segments, torque_time_nm_s=event.torque_time_nms, measured_s=event.elapsed_s,
         )  # fmt: skip
-        said = await advice.result
-        self._took_s = self.clock.monotonic_s() - heard_s
-        answer = self._take(said, event, heard_s)
+        document = await job.result
+        self._took_s = self.clock.monotonic_s() - received_s
+        advice = self._note(document, event, received_s)
         if turn is not self._turn or turn.sent:
-            self._write(answer, late=True)
+            self._write(advice, late=True)
             return
-        turn.answer = answer
-        if turn.asked == 2 or self._left_s(self._now_s()) <= SEND_S:
-            await self._carry_out(turn, answer)
+        turn.advice = advice
+        if turn.questions == 2 or self._left_s(self._now_s()) <= SEND_S:
+            await self._carry_out(turn, advice)
 
-    def _take(self, said: dict[str, Any], event: LiveEvent, heard_s: float) -> Answer:
-        status, known = self.status, said["knowledge"]
+    def _note(self, document: dict[str, Any], event: LiveEvent, received_s: float) -> Advice:
+        status, known = self.status, document["knowledge"]
         # a misfit is told as the problem, and its bands mean nothing; at the end those stay on which it was decided
-        fits = said["kind"] != "misfit" and not self.status.ended
+        fits = document["kind"] != "misfit" and not self.status.ended
         if fits:
-            status.words = said["words"]
+            status.words = document["words"]
         row = {
-            "at_s": round(event.elapsed_s, 3), "kind": said["kind"], "words": said["words"],
-            "segments": [segment["name"] for segment in said["segments"]],
-            "expected_torque_time_nm_s": said["expected_torque_time_nm_s"],
+            "at_s": round(event.elapsed_s, 3), "kind": document["kind"], "words": document["words"],
+            "segments": [segment["name"] for segment in document["segments"]],
+            "expected_torque_time_nm_s": document["expected_torque_time_nm_s"],
             "answer_ms": round(1e3 * self._took_s, 1),
         }  # fmt: skip
         if known is not None:
             if fits:
-                status.knowledge, status.least_known = known, said["least_known"]
+                status.knowledge, status.least_known = known, document["least_known"]
             row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
         status.decisions.append(row)
         self.tell()
-        return Answer(said, heard_s, len(status.decisions) - 1)
+        return Advice(document, received_s, len(status.decisions) - 1)
 
-    def _write(self, answer: Answer, **more: Any) -> None:
+    def _write(self, advice: Advice, **more: Any) -> None:
         """More of a decision. Its line is replaced: a page's thread may be copying the old one."""
         rows = self.status.decisions
-        rows[answer.number] = rows[answer.number] | more
+        rows[advice.number] = rows[advice.number] | more
 
-    async def _carry_out(self, turn: Turn, answer: Answer) -> None:
+    async def _carry_out(self, turn: Turn, advice: Advice) -> None:
+        if turn.sent:  # the newest advice came between
+            return
         turn.sent = True
-        kind, test_id = answer.said["kind"], self.plan.test_id
+        kind, test_id = advice.document["kind"], self.plan.test_id
         if kind == "misfit":
-            self.give_up(answer.said["words"])
+            self.give_up(advice.document["words"])
             return
         before = self.status.state, self.status.ended
-        chosen = [SegmentPlan(**segment) for segment in answer.said["segments"]]
+        chosen = [SegmentPlan(**segment) for segment in advice.document["segments"]]
         ended = {"enough": "known-enough", "spent": self._spent()}.get(kind, "")
         request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.laid, segments=chosen)
         if ended:
@@ -244,10 +246,10 @@ class Follower(Watcher):
             if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
                 raise
             del self._added[len(self._added) - len(widths) :]
-            self._write(answer, refused=error.detail)
+            self._write(advice, refused=error.detail)
             log.info("not laid: %s", error.detail, extra={"test_id": test_id})
             return
-        self._write(answer, sample_to_plan_ms=round(1e3 * (self.clock.monotonic_s() - answer.heard_s), 1))
+        self._write(advice, sample_to_plan_ms=round(1e3 * (self.clock.monotonic_s() - advice.received_s), 1))
         self.tell()
 
     def _spent(self) -> str:

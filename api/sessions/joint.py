@@ -43,26 +43,26 @@ class JointTests(Watched):
         of angles, or one that is too small, or the target is not in it; what the rig refuses.
         """
         range_rad = self.range_of(plan)
-        asked, longest_s = body.angle or AngleIn(), body.max_duration_s
+        angle_in, longest_s = body.angle or AngleIn(), body.max_duration_s
         shared = await self._layout(plan, range_rad, longest_s, preview_s)
-        angle = messages.AnglePlan(range_rad=range_rad, tolerance_rad=asked.tolerance_rad)
-        shown = {
+        angle = messages.AnglePlan(range_rad=range_rad, tolerance_rad=angle_in.tolerance_rad)
+        document = {
             "kind": plan.kind, "doses": shared.doses, "known": shared.known, "longest_s": None, "target_rad": None,
-            "tolerance_rad": asked.tolerance_rad,
+            "tolerance_rad": angle_in.tolerance_rad,
         }  # fmt: skip
         if plan.kind == HELD:
-            target = await asyncio.to_thread(self._target, plan, asked, shared)
-            angle.target_rad = shown["target_rad"] = target
+            target = await asyncio.to_thread(self._target, plan, angle_in, shared)
+            angle.target_rad = document["target_rad"] = target
             segments, bounds = shared.held, None
         else:
-            angle.still_s = joint_plan.STILL_S[plan.kind] if asked.still_s is None else asked.still_s
+            angle.still_s = joint_plan.STILL_S[plan.kind] if angle_in.still_s is None else angle_in.still_s
             bounds = self._bounds(body, plan, shared)
             quiet_s = bounds.max_duration_s - messages.SAFE_END_S
             segments = shared.moving if plan.kind == MOVING else joint_plan.passive(quiet_s, plan.pulse_rate_hz)
-            shown["longest_s"] = bounds.max_duration_s
+            document["longest_s"] = bounds.max_duration_s
         chosen = [messages.SegmentPlan(**segment) for segment in segments]
         plan = plan.model_copy(update={"segments": chosen, "angle": angle, "adaptive": bounds})
-        return Planned(plan, {"joint": shown})
+        return Planned(plan, {"joint": document})
 
     async def _layout(
         self, plan: messages.TestPlan, range_rad: tuple[float, float], longest_s: float | None, preview_s: float
@@ -80,23 +80,22 @@ class JointTests(Watched):
     def _bounds(self, body: TestIn, plan: messages.TestPlan, shared: Layout) -> messages.AdaptivePlan:
         longest_s = {PASSIVE: joint_plan.PASSIVE_S, MOVING: joint_plan.MOVING_S}[plan.kind]
         expected = shared.doses["paper"] if shared.known else AT_STOPPING_TORQUE_S * plan.stopping_torque_nm
-        most = body.max_torque_time_nm_s or expected
-        return messages.AdaptivePlan(max_duration_s=body.max_duration_s or longest_s, max_torque_time_nms=most)
+        largest_nm_s = body.max_torque_time_nm_s or expected
+        return messages.AdaptivePlan(max_duration_s=body.max_duration_s or longest_s, max_torque_time_nms=largest_nm_s)
 
-    def _target(self, plan: messages.TestPlan, asked: AngleIn, shared: Layout) -> float:
-        """The angle to hold: the one that is asked for, or the next that is open."""
+    def _target(self, plan: messages.TestPlan, angle_in: AngleIn, shared: Layout) -> float:
+        """Return the angle to hold: the requested one, or the next that is open."""
         range_rad = plan.profile.angle_range_rad
         assert range_rad is not None
-        if asked.target_rad is not None:
-            if not (range_rad[0] <= asked.target_rad <= range_rad[1]):
-                detail = (
-                    f"angle.target_rad {asked.target_rad:g} is not within the range {profiles.range_words(range_rad)}."
-                )
+        words = profiles.range_words(range_rad)
+        if angle_in.target_rad is not None:
+            if not (range_rad[0] <= angle_in.target_rad <= range_rad[1]):
+                detail = f"angle.target_rad {angle_in.target_rad:g} is not within the range {words}."
                 raise ApiError(422, "invalid-input", "The angle is not in the participant's range", detail)
-            return asked.target_rad
+            return angle_in.target_rad
         if not shared.targets_rad:
-            least = math.degrees(joint_plan.LEAST_RANGE_RAD)
-            detail = f"The range {profiles.range_words(range_rad)} is smaller than {least:.0f}°. Send angle.target_rad."
+            smallest = math.degrees(joint_plan.LEAST_RANGE_RAD)
+            detail = f"The range {words} is smaller than {smallest:.0f}°. Send angle.target_rad."
             raise ApiError(422, "small-range", "The range is too small", detail)
         open_ones = [row["angle_rad"] for row in self.targets(plan.participant, shared) if not row["done"]]
         if not open_ones:
@@ -140,12 +139,12 @@ class JointTests(Watched):
 
     def targets(self, participant: str, shared: Layout) -> list[dict[str, Any]]:
         """The angles to hold, and which of them were held today."""
-        found = []
+        targets = []
         rows = [row for row in self.today(participant) if row.kind == HELD]
         for target in shared.targets_rad:
             near = [row for row in rows if abs(target_of(row) - target) <= SAME_ANGLE_RAD]
-            found.append({"angle_rad": target, "done": bool(near), "test_id": near[0].id if near else None})
-        return found
+            targets.append({"angle_rad": target, "done": bool(near), "test_id": near[0].id if near else None})
+        return targets
 
     def today(self, participant: str) -> list[Test]:
         """Guided tests of today that ended well, newest first."""

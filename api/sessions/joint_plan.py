@@ -138,21 +138,21 @@ def held(curve: Curve, largest_us: float, stair_s: float, rate_hz: float) -> lis
     ]
 
 
-def moving(curve: Curve, largest_us: float, most: float, longest_s: float, rate_hz: float) -> list[Segment]:
+def moving(curve: Curve, largest_us: float, most_nm_s: float, longest_s: float, rate_hz: float) -> list[Segment]:
     """Steady levels with pauses, until their torque-time or the time is used up."""
-    top, found = curve.torque(largest_us), [_still("passive", QUIET_S, rate_hz)]
+    top, segments = curve.torque(largest_us), [_still("passive", QUIET_S, rate_hz)]
     widths = [curve.width(share * top, largest_us) for share in LEVELS]
-    left, left_s, number = most, longest_s - QUIET_S, 0
+    left_nm_s, left_s, number = most_nm_s, longest_s - QUIET_S, 0
     while True:
         width_us = widths[number % len(widths)]
-        hold_s = min(LEVEL_S, left / max(curve.torque(width_us), 1e-9), left_s)
+        hold_s = min(LEVEL_S, left_nm_s / max(curve.torque(width_us), 1e-9), left_s)
         if hold_s < 2 * RISE_S:
-            return found
+            return segments
         number += 1
         (level,) = _levels("moving", [width_us], [hold_s], rate_hz, number)
         spent = torque_time(level["settings"]["pulse_width_us"], rate_hz, curve)
-        found += [level, _still("passive", PAUSE_S, rate_hz)]
-        left, left_s = left - spent, left_s - hold_s - PAUSE_S
+        segments += [level, _still("passive", PAUSE_S, rate_hz)]
+        left_nm_s, left_s = left_nm_s - spent, left_s - hold_s - PAUSE_S
 
 
 def passive(longest_s: float, rate_hz: float) -> list[Segment]:
@@ -164,13 +164,13 @@ def _levels(
     name: str, widths_us: Sequence[float], each_s: Sequence[float], rate_hz: float, number: int = 1
 ) -> list[Segment]:
     """Steps one after the other, each reached within its own time."""
-    found, before = [], 0.0
+    segments, before = [], 0.0
     for k, (width_us, hold_s) in enumerate(zip(widths_us, each_s, strict=True)):
         count, rise = math.floor(hold_s * rate_hz + 1e-6), max(round(RISE_S * rate_hz), 1)
         rising = [before + (width_us - before) * min((i + 1) / rise, 1.0) for i in range(count)]
-        found.append(_segment(f"{name} {number + k}", [math.floor(10.0 * value) / 10.0 for value in rising]))
+        segments.append(_segment(f"{name} {number + k}", [math.floor(10.0 * value) / 10.0 for value in rising]))
         before = width_us
-    return found
+    return segments
 
 
 def _still(name: str, seconds: float, rate_hz: float) -> Segment:
@@ -214,9 +214,9 @@ def layout(
     limits, µs; `moving_s`: the longest moving test without its safe end, s.
     """
     angles, paper = targets(range_rad), torque_time(paper_us, rate_hz, curve)
-    one = torque_time(widths_of(held(curve, largest_us, LONGEST_STAIR_S, rate_hz)), rate_hz, curve)
+    full = torque_time(widths_of(held(curve, largest_us, LONGEST_STAIR_S, rate_hz)), rate_hz, curve)
     planned = PLANNED_SHARE * paper
-    fits = HELD_SHARE * planned / (one * len(angles)) if angles and one > 0 else 0.0
+    fits = HELD_SHARE * planned / (full * len(angles)) if angles and full > 0 else 0.0
     stairs = held(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
     each = torque_time(widths_of(stairs), rate_hz, curve)
     levels = moving(curve, largest_us, max(planned - each * len(angles), 0.0), moving_s, rate_hz)
@@ -302,7 +302,7 @@ class Coverage:
 
     def missing(self) -> list[dict[str, Any]]:
         """Return the stretches of angles that were not seen yet in a direction at a speed: slow before fast."""
-        found = []
+        stretches = []
         for kind in MISSING_ORDER:
             row, edge = ROWS.index(kind), None
             for column in range(self.columns + 1):
@@ -311,9 +311,9 @@ class Coverage:
                     edge = self.edges_rad[column]
                 elif not is_open and edge is not None:
                     stretch = {"from_rad": edge, "to_rad": self.edges_rad[column]}
-                    found.append({"direction": kind[0], "speed": kind[1], **stretch})
+                    stretches.append({"direction": kind[0], "speed": kind[1], **stretch})
                     edge = None
-        return found
+        return stretches
 
     def document(self) -> dict[str, Any]:
         """Return it as clients see it."""

@@ -42,7 +42,7 @@ class Lifecycle:
         self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
         self.kinds = kinds
         self.jobs: dict[str, Job] = {}
-        self._ahead = Tasks(log)
+        self._tasks = Tasks(log)
 
     def document(
         self, row: Test, position: tuple[float, float, str | None] | None, fits: Mapping[str, Any] | None = None
@@ -130,7 +130,7 @@ class Lifecycle:
         """Identify a test's recording in a worker and store the model."""
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
 
-        def take(job: Job) -> None:
+        def follow(job: Job) -> None:
             self.jobs[test_id] = job
 
         how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.on_progress(test_id)}
@@ -138,8 +138,8 @@ class Lifecycle:
         try:
             recording, parent = await self._record_of(row)
             step = "identification"
-            model = await self._first_version(row, recording, parent, take, dict(how))
-            model = await carried_structure.carry(self.analyses, model, recording.path, take, **how)
+            model = await self._first_version(row, recording, parent, follow, dict(how))
+            model = await carried_structure.carry(self.analyses, model, recording.path, follow, **how)
         except ApiError as error:
             reason = f"{step}: {error.detail or error.title}"
             await asyncio.to_thread(self.update, test_id, state="failed", reason=reason)
@@ -150,18 +150,18 @@ class Lifecycle:
         if last_sample_unix_s is not None:
             summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)
-        self._ahead.begin(self.analyses.diagnose_ahead(model))
+        self._tasks.begin(self.analyses.diagnose_ahead(model))
 
     async def _first_version(
-        self, row: Test, recording: Recording, parent: str | None, take: Callable[[Job], None], how: dict[str, Any]
+        self, row: Test, recording: Recording, parent: str | None, follow: Callable[[Job], None], how: dict[str, Any]
     ) -> Model:
         """The first version of a test's recording, named by the test at once: it is there whatever comes after it."""
         if row.model_id is not None:
             return await asyncio.to_thread(self.versions.get, row.model_id)
         how |= await asyncio.to_thread(self.kinds[row.kind].fit_options, row)
-        found, warning = await carried_structure.fit(self.analyses, row.participant, recording.path, take, **how)
+        fit, warning = await carried_structure.fit(self.analyses, row.participant, recording.path, follow, **how)
         by = f"test {row.id}"
-        model = await asyncio.to_thread(self.versions.add, found["json"], row.participant, recording.id, by, parent)
+        model = await asyncio.to_thread(self.versions.add, fit["json"], row.participant, recording.id, by, parent)
         summary = dict(row.summary)
         if warning:
             summary["warnings"] = [*(summary.get("warnings") or []), warning]

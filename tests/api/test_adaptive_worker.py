@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import json
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,8 +13,6 @@ from stimrig import identify
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs import adaptive as verbs
 from stimrig.api.jobs.pool import Pool
-from stimrig.identify.experiments import adaptive
-from stimrig.identify.experiments.adaptive import Decision
 from tests.harness.adaptive import PULSE_RATE_HZ, Muscle, recorded, sigmoid
 
 pytestmark = pytest.mark.slow
@@ -130,73 +127,6 @@ def test_a_sync_line_tells_when_a_pulse_was_felt_whose_acknowledgement_was_read_
 def test_a_slow_cell_keeps_its_samples() -> None:
     time_s = np.arange(300) / 100.0
     assert verbs.means(time_s, time_s, 5 * PULSE_RATE_HZ)[0].size == 300
-
-
-@pytest.mark.parametrize(("seed", "dropped"), [(73, 0.05), pytest.param(74, 0.0, marks=pytest.mark.campaign)])
-def test_a_test_is_advised_to_its_end(seed: int, dropped: float) -> None:
-    """Also where a busy machine drops pulses: the muscle did not feel them, which is no misfit of the structure."""
-    muscle = sigmoid(seed)
-    cell = Cell(muscle, seed)
-    verbs.adaptive_begin(quiet, **HOW)
-    widths, segments, told_before = list(OPENING), [("opening", 0, len(OPENING))], 0
-    for _ in range(30):
-        end_s = len(widths) / PULSE_RATE_HZ
-        not_sent = np.flatnonzero(np.random.default_rng(seed).random(2000)[: len(widths)] < dropped).tolist()
-        felt_us = [0.0 if index in not_sent else width for index, width in enumerate(widths)]
-        dose = float(np.sum(muscle.curve(np.array(felt_us)))) / PULSE_RATE_HZ
-        news = cell.news(felt_us, end_s - 0.4)
-        until = round((end_s - 0.4) * PULSE_RATE_HZ) + 1
-        new = {name: values[told_before:] for name, values in felt(widths, until, not_sent).items()}
-        told_before += len(new["index"])
-        laid = {"laid_us": list(widths), "segments": segments}
-        told = verbs.adaptive_advise(
-            quiet,
-            samples=news.tobytes(),
-            zero_s=ZERO_S,
-            outcomes=new,
-            **laid,
-            torque_time_nm_s=dose,
-            measured_s=end_s - 0.4,
-        )
-        json.dumps(told, allow_nan=False)
-        if told["kind"] != "next":
-            break
-        for segment in told["segments"]:
-            segments.append((segment["name"], len(widths), len(widths) + len(segment["settings"]["pulse_width_us"])))
-            widths += segment["settings"]["pulse_width_us"]
-    assert told["kind"] == "enough", told["words"]
-    assert [int(name.split()[1]) for name, _, _ in segments[1:]] == list(range(2, len(segments) + 1))
-    assert len(widths) / PULSE_RATE_HZ < 30
-    known = told["knowledge"]["recruitment"]
-    truth = muscle.curve(np.array(known["pulse_width_us"]))
-    plateau = told["knowledge"]["plateau_nm"]
-    assert np.abs(np.array(known["torque_nm"]) - truth).max() < 0.06 * plateau
-    assert 0 <= told["least_known"]["pulse_width_us"] <= 300
-
-
-def test_what_was_late_or_not_sent_reaches_the_decision(monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[Any] = []
-
-    def decide(record: Any, laid_us: Any, *_: Any) -> Decision:
-        seen.append((round(record.pulses.late_s[30], 6), laid_us[31]))
-        return Decision("spent")
-
-    monkeypatch.setattr(adaptive, "decide", decide)
-    verbs.adaptive_begin(quiet, **HOW)
-    laid = {"laid_us": list(OPENING), "segments": [("opening", 0, len(OPENING))]}
-    news = {
-        "samples": Cell(sigmoid(72), 2).news(OPENING, 2.5).tobytes(),
-        "outcomes": felt(OPENING, 100, [31], {30: 0.004}),
-    }
-    verbs.adaptive_advise(quiet, **news, **laid, zero_s=ZERO_S, torque_time_nm_s=1.0, measured_s=2.5)
-    assert seen == [(0.004, 0.0)]
-
-
-def test_a_new_test_forgets_the_one_before() -> None:
-    verbs.adaptive_begin(quiet, **HOW)
-    first = verbs._running[0]
-    verbs.adaptive_begin(quiet, **HOW)
-    assert verbs._running != [first] and len(verbs._running) == 1
 
 
 def test_a_model_that_cannot_be_read_here_keeps_nobody_from_a_test() -> None:

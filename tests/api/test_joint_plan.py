@@ -4,11 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from stimrig.api.models.together import JOINT_EFFECTS
@@ -20,8 +17,6 @@ from stimrig.api.sessions.joint_plan import (
     Curve,
     curve_of,
     layout,
-    targets,
-    torque_time,
     widths_of,
 )
 from stimrig.identify.effects import find_effect
@@ -48,51 +43,6 @@ def sigmoid(middle_us: float, steep_us: float, top_nm: float) -> dict[str, list[
     widths = [5.0 * k for k in range(61)]
     raw = [1 / (1 + math.exp(-(u - middle_us) / steep_us)) for u in widths]
     return {"pulse_width_us": widths, "torque_nm": [top_nm * (r - raw[0]) / (1 - raw[0]) for r in raw]}
-
-
-@given(middle=st.floats(40, 400), steep=st.floats(5, 80), top=st.floats(0.5, 40), width=st.floats(30, 150))
-@settings(max_examples=60, deadline=None)
-def test_the_three_tests_cost_at_most_what_the_papers_costs(middle: float, steep: float, top: float, width: float):
-    """Whatever the muscle and the range; recounted here from every pulse."""
-    curve = curve_of(sigmoid(middle, steep, top), 300.0, None)
-    found = layout((0.2, 0.2 + math.radians(width)), curve, 300.0, PAPER_US, RATE_HZ)
-    held = torque_time(widths_of(found.held), RATE_HZ, curve) * len(found.targets_rad)
-    whole = held + torque_time(widths_of(found.moving), RATE_HZ, curve)
-    assert whole <= 0.85 * torque_time(PAPER_US, RATE_HZ, curve) + 1e-6, "the rest is for a muscle stronger elsewhere"
-    assert found.doses["total"] == pytest.approx(whole)
-    assert max(widths_of(found.held + found.moving)) <= 300.0
-
-
-def test_a_usual_muscle_gets_steps_and_levels_that_are_long_enough() -> None:
-    found = layout((0.2, 1.9), curve_of(sigmoid(150, 25, 8.0), 300.0, None), 300.0, PAPER_US, RATE_HZ)
-    assert found.known and 0.7 < found.share <= 0.85
-    steps = [s for s in found.held if s["name"].startswith("hold")]
-    assert len(steps) == 3 and all(len(s["settings"]["pulse_width_us"]) >= 0.6 * RATE_HZ for s in steps)
-    under = sum(width > 0 for width in widths_of(found.moving)) / RATE_HZ
-    assert under > 12.0
-
-
-@pytest.mark.parametrize(("degrees", "count"), [(29, 0), (30, 3), (59, 3), (60, 4), (90, 5), (140, 5)])
-def test_three_to_five_angles_by_the_range(degrees: float, count: int) -> None:
-    assert len(targets((0.3, 0.3 + math.radians(degrees)))) == count
-
-
-@given(low=st.floats(-0.5, 1.5), width=st.floats(math.radians(30), 2.6))
-@settings(deadline=None)
-def test_angles_rise_and_keep_off_the_ends(low: float, width: float) -> None:
-    found = targets((low, low + width))
-    assert found == sorted(found) and 3 <= len(found) <= 5
-    assert all(b - a > joint_plan.TOLERANCE_RAD / 2 for a, b in pairwise(found))
-    margin = min(2 * joint_plan.TOLERANCE_RAD, width / 6)
-    assert found[0] >= low + margin - 1e-6 and found[-1] <= low + width - margin + 1e-6
-
-
-def test_usual_angles_are_whole_fives() -> None:
-    assert [round(math.degrees(x)) for x in targets((math.radians(20), math.radians(110)))] == [35, 50, 65, 80, 95]
-
-
-def test_a_range_that_is_no_number_has_no_angles() -> None:
-    assert targets((math.nan, 1.0)) == [] == targets((0.0, math.nan)) == targets((1.0, 0.2))
 
 
 def test_without_a_model_the_calibration_stands_in() -> None:
@@ -162,14 +112,11 @@ def test_columns_lie_within_the_range() -> None:
     assert [Coverage((0.0, width), 0.2).columns for width in (0.3, 0.9, 6.0)] == [3, 3, 8]
 
 
-def test_slow_alone_leaves_the_fast_ones_missing() -> None:
+def test_slow_alone_leaves_the_fast_ones_missing_and_both_are_enough() -> None:
     found = moved(0.4)
     assert not found.enough and 0.4 < found.share < ENOUGH
     assert {each["speed"] for each in found.missing()} == {"fast"}
     assert {each["direction"] for each in found.missing()} == {"flexion", "extension"}
-
-
-def test_slow_and_fast_is_enough() -> None:
     found = moved(0.4, 1.2)
     assert found.share == 1.0 and found.enough and found.missing() == []
 
