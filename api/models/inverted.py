@@ -1,4 +1,4 @@
-"""Pulse widths for a reference torque: what of it is out of reach in words, and all of it as a table."""
+"""Pulse widths for a reference torque: reasons why a part is out of reach, and all of it as a CSV table."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ REASONS: dict[str, str] = {
 COLUMNS = ("pulse_width_us", "reference_torque_nm", "predicted_torque_nm")
 
 
-def table(found: dict[str, Any]) -> str:
-    """Rows of a CSV file, one for each pulse."""
-    columns = zip(*(found[name] for name in COLUMNS), strict=True)
+def table(inversion: dict[str, Any]) -> str:
+    """Write a CSV table, a row for each pulse."""
+    columns = zip(*(inversion[name] for name in COLUMNS), strict=True)
     lines = [
-        f"{k / found['pulse_rate_hz']:.6g},{width:g},{wanted:g},{predicted:g}"
+        f"{k / inversion['pulse_rate_hz']:.6g},{width:g},{wanted:g},{predicted:g}"
         for k, (width, wanted, predicted) in enumerate(columns)
     ]
     return "\r\n".join([",".join(["time_s", *COLUMNS]), *lines, ""])

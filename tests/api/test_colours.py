@@ -41,10 +41,10 @@ def contrast(one: str, other: str) -> float:
 
 
 MODES = modes()
-SURFACES = ("card", "paper", "soft", "chosen", "chart")
+SURFACES = ("card", "paper", "soft", "chart")
 TEXT = [
     *((ink, surface) for surface in SURFACES for ink in ("ink", "dim", "accent", "accent-dark")),
-    *((ink, kind + "-bg") for kind in ("good", "warn", "bad") for ink in (kind, kind + "-ink", "ink", "dim")),
+    *((ink, kind + "-bg") for kind in ("good", "warn", "bad") for ink in (kind, "ink", "dim")),
     *((f"on-{name}", name) for name in ("stimulate", "stop", "tag", "running", "unknown", "emulated")),
     *((f"on-{name}", f"{name}-hover") for name in ("stimulate", "stop")),
     ("on-primary", "accent"), ("on-primary", "accent-dark"),

@@ -30,7 +30,7 @@ MAY: dict[str, str] = {
 
 
 @router.get("")
-async def show(request: Request, context: Ctx, _who: Administrator) -> Response:
+async def show(request: Request, context: Ctx, _principal: Administrator) -> Response:
     """Show people, tokens and the newest entries of the audit trail."""
 
     def gather() -> dict[str, Any]:
@@ -55,11 +55,11 @@ async def show(request: Request, context: Ctx, _who: Administrator) -> Response:
 
 def role_of(scopes: list[str]) -> str:
     """Return the role that holds exactly these scopes; else their names."""
-    return next((name for name, held in ROLES.items() if set(held) == set(scopes)), ", ".join(scopes))
+    return next((role for role, its_scopes in ROLES.items() if set(its_scopes) == set(scopes)), ", ".join(scopes))
 
 
 @router.get("/audit.jsonl")
-async def export(context: Ctx, _who: Administrator) -> Response:
+async def export(context: Ctx, _principal: Administrator) -> Response:
     """Export the audit trail, one JSON object a line, as `stimrig audit verify --file` takes it in."""
     entries = await asyncio.to_thread(lambda: context.store.all(AuditEntry, order=AuditEntry.seq))
     lines = "".join(json.dumps(entry.as_dict(), ensure_ascii=False) + "\n" for entry in entries)

@@ -18,7 +18,7 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/models/{model_id}/approve")
-async def ask(request: Request, context: Ctx, who: Approver, row: Version) -> Response:
+async def show_risks(request: Request, context: Ctx, principal: Approver, row: Version) -> Response:
     """Show the risks of a model that is not usable, and the field for the reason; else lead to the model's page."""
     document = stored_model.read(row)
     if stored_model.quality(document)["verdict"] not in registry.POOR:
@@ -28,7 +28,7 @@ async def ask(request: Request, context: Ctx, who: Approver, row: Version) -> Re
         "approve_poor.html",
         model=await asyncio.to_thread(context.versions.document, row),
         risks=advice.risks(document, advice.findings(document)),
-        ask_password=not await context.people.is_confirmed(who.session_hash),
+        ask_password=not await context.people.is_confirmed(principal.session_hash),
         threshold_us=stored_model.threshold_us(row),
         what_to_write=registry.WHAT_TO_WRITE,
     )

@@ -31,7 +31,7 @@ Width = Annotated[int, Query(ge=240, le=2400)]
 
 @router.get("/models/{model_id}/figures/{name}")
 async def of_model(
-    request: Request, context: Ctx, _who: ModelReader, row: Version, name: str, width: Width = 720
+    request: Request, context: Ctx, _principal: ModelReader, row: Version, name: str, width: Width = 720
 ) -> Response:
     """Return one of the charts of a model's page, its kind at the end of its name."""
     figures = await model_view.figures_of(context, row)
@@ -40,7 +40,7 @@ async def of_model(
 
 @router.get("/compare/figures/{name}")
 async def compared(
-    request: Request, context: Ctx, _who: ModelReader, name: str,
+    request: Request, context: Ctx, _principal: ModelReader, name: str,
     model: Annotated[list[str] | None, Query()] = None, width: Width = 720,
 ) -> Response:  # fmt: skip
     """Return one of the charts of models side by side."""

@@ -33,14 +33,14 @@ MOST_FINDINGS = 2
 
 
 @router.get("/models/{model_id}")
-async def model(request: Request, context: Ctx, who: ModelReader, row: Version, diagnose: int = -1) -> Response:
+async def model(request: Request, context: Ctx, principal: ModelReader, row: Version, diagnose: int = -1) -> Response:
     """Show a model. `diagnose`: 1 begins a diagnosis anew, 0 begins none."""
     document = stored_model.read(row)
     measured = await measurement(context, row)
     diagnosis, job = await diagnosis_of(context, row, diagnose)
-    shown = await asyncio.to_thread(gather, context, row, measured, diagnosis)
+    parts = await asyncio.to_thread(gather, context, row, measured, diagnosis)
     version = await asyncio.to_thread(context.versions.document, row)
-    why, findings, fit_words = shown["why"], advice.findings(document), advice.fit_sentence(document.get("fit") or {})
+    why, findings, fit_words = parts["why"], advice.findings(document), advice.fit_sentence(document.get("fit") or {})
     running = job is not None and diagnosis is None and job.state in ("running", "completed")
     in_fit_words = ("gap", "ceiling") if fit_words else ()
     others = [finding for finding in findings if finding.gate not in in_fit_words]
@@ -59,17 +59,17 @@ async def model(request: Request, context: Ctx, who: ModelReader, row: Version, 
         # One that has just ended is shown as running once more: the page asks after it, and then shows the diagnosis.
         job=job.document() if job and running else None,
         why_problem=job.problem if job and job.state == "failed" else None,
-        step=await next_step(context, row, version, who),
+        step=await next_step(context, row, version, principal),
         changes=await asyncio.to_thread(context.trend.changes_to, row),
-        ask_password=not await context.people.is_confirmed(who.session_hash),
+        ask_password=not await context.people.is_confirmed(principal.session_hash),
         threshold_us=stored_model.threshold_us(row),
         has_key=version["served"] and await asyncio.to_thread(controllers.has_key, context.auth, row.participant),
         problem=measured["problem"],
         hdf5=not (await asyncio.to_thread(context.analyses.path, row.recording_id)).endswith(".csv"),
-        may_test=who.may(Scope.RUN_TEST),
-        may_approve=who.may(Scope.APPROVE_MODEL),
+        may_test=principal.may(Scope.RUN_TEST),
+        may_approve=principal.may(Scope.APPROVE_MODEL),
         **await facts(context, row, document),
-        **shown,
+        **parts,
     )  # fmt: skip
 
 
@@ -87,12 +87,14 @@ async def facts(context: Context, row: Model, document: dict[str, Any]) -> dict[
     }
 
 
-async def next_step(context: Context, row: Model, version: dict[str, Any], who: Principal) -> next_view.Step | None:
+async def next_step(
+    context: Context, row: Model, version: dict[str, Any], principal: Principal
+) -> next_view.Step | None:
     """Say what comes after the decision on this model; None before it: then the verdict says what to do."""
-    if version["decision"] is None or not who.may(Scope.RUN_TEST):
+    if version["decision"] is None or not principal.may(Scope.RUN_TEST):
         return None
     participant = await asyncio.to_thread(participants.find, context, row.participant)
-    step = await asyncio.to_thread(next_view.step, context, participant, who)
+    step = await asyncio.to_thread(next_view.step, context, participant, principal)
     return None if step.href == f"/models/{row.id}" else step
 
 
@@ -151,7 +153,7 @@ def versions_of(context: Context, row: Model, lineage: Sequence[Model] = ()) -> 
 
 
 @router.post("/models/{model_id}/experiment")
-async def run_experiment(context: Ctx, who: Tester, row: Version) -> Response:
+async def run_experiment(context: Ctx, principal: Tester, row: Version) -> Response:
     """To the question before the diagnosis' next experiment; its recording is joined to this model's."""
     found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     experiment = (found or {}).get("experiment")
@@ -160,7 +162,7 @@ async def run_experiment(context: Ctx, who: Tester, row: Version) -> Response:
         raise ApiError(409, "no-experiment", "There is no next experiment", detail)
     asked = {key: experiment[key] for key in ("segments", "pulse_rate_hz") if key in experiment}
     body = TestIn.model_validate({"participant": row.participant, "kind": "next-experiment", "joins": row.id, **asked})
-    return RedirectResponse(await starting.ask(context, who, body, back=f"/models/{row.id}#experiment"), 303)
+    return RedirectResponse(await starting.ask(context, principal, body, back=f"/models/{row.id}#experiment"), 303)
 
 
 # ---- charts -------------------------------------------------------------------------------------------------
@@ -198,8 +200,8 @@ def draw_model(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, 
     figures["curve"] = replace(figures["recruitment"], height=CURVE_PX)
     if "overview" in figures:
         figures["overview"] = replace(figures["overview"], height=OVERVIEW_PX)
-    held = diagnosis_charts.free_effects(explanation.held_free(document))
-    return figures | held | joint_charts.joint_figures(document)
+    free = diagnosis_charts.free_effects(explanation.held_free(document))
+    return figures | free | joint_charts.joint_figures(document)
 
 
 # ---- long work ----------------------------------------------------------------------------------------------
@@ -209,7 +211,7 @@ TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improv
 
 
 @router.get("/jobs/{job_id}")
-async def job(request: Request, context: Ctx, _who: ModelReader, job_id: str) -> Response:
+async def job(request: Request, context: Ctx, _principal: ModelReader, job_id: str) -> Response:
     """Show how far a job is; lead on to its result once it is done."""
     job = context.jobs.get(job_id)
     if job.result_url is not None:

@@ -43,13 +43,13 @@ def comparison_html(
     comparison : dict, optional
         As `identify.compare` gives it, cleaned and thinned.
     """
-    held, effects = explanation.held_free(document), [effect["id"] for effect in document.get("effects") or []]
+    free, effects = explanation.held_free(document), [effect["id"] for effect in document.get("effects") or []]
     model = {**stored_model.figures(document), **stored_model.quality(document)}
     return _write(
         title=f"{name}: measurement against model",
         lead=f"with {', '.join(effects)}" if effects else "",
         model={**model, "id": document["model_id"], "method": document["method"]},
-        held=held,
+        held=free,
         recruitment=stored_model.recruitment(document),
         dynamics=stored_model.dynamics(document),
         repetition=stored_model.repetition(document),
@@ -57,7 +57,7 @@ def comparison_html(
         figures=Figures(
             model_charts.model_figures(document, curves, comparison)
             | joint_charts.joint_figures(document)
-            | diagnosis_charts.free_effects(held)
+            | diagnosis_charts.free_effects(free)
             | diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, [])
         ),
         plain=(comparison or {}).get("plain") or [],

@@ -31,7 +31,7 @@ MOST_NOTES = 12
 
 
 @router.get("/models/{model_id}/report")
-async def report(request: Request, context: Ctx, _who: ModelReader, row: Version) -> Response:
+async def report(request: Request, context: Ctx, _principal: ModelReader, row: Version) -> Response:
     """Show one sheet on a model."""
     document, measured = stored_model.read(row), await measurement(context, row)
     charts = draw_model(document, measured)
@@ -63,9 +63,9 @@ def session_of(context: Context, recording: Recording) -> dict[str, Any]:
     participant: Participant = context.store.get(Participant, recording.participant)
     test: Test | None = context.store.get(Test, recording.test_id) if recording.test_id else None
     notes = _notes(context, recording, test)
-    kept = site_of_recording(recording, test if test and "side" in test.plan else None)
+    site = site_of_recording(recording, test if test and "side" in test.plan else None)
     return {
-        "site": kept or site_of(participant),
+        "site": site or site_of(participant),
         "profile": (test.plan.get("profile") or {}) if test else {},
         "test": test,
         "ran_by": (test.ran_by or test.requested_by) if test else None,

@@ -23,19 +23,19 @@ router = APIRouter(include_in_schema=False, prefix="/models/{model_id}/story")
 
 
 @router.get("")
-async def show_story(request: Request, context: Ctx, _who: ModelReader, row: Version) -> Response:
+async def show_story(request: Request, context: Ctx, _principal: ModelReader, row: Version) -> Response:
     """Show how a model was improved."""
-    shown: dict[str, Any] = {"story": {"title": ""}, "problem": None}
+    parts: dict[str, Any] = {"story": {"title": ""}, "problem": None}
     try:
         known = await _known(context, row)
-        shown |= {"story": known["told"], "figures": story_figures(**known, at=f"/models/{row.id}/story/figures/{{}}")}
+        parts |= {"story": known["told"], "figures": story_figures(**known, at=f"/models/{row.id}/story/figures/{{}}")}
     except ApiError as error:
-        shown["problem"] = error
-    return page(request, "story_page.html", model=await asyncio.to_thread(context.versions.document, row), **shown)
+        parts["problem"] = error
+    return page(request, "story_page.html", model=await asyncio.to_thread(context.versions.document, row), **parts)
 
 
 @router.get(".html")
-async def story_file(context: Ctx, _who: ModelReader, row: Version) -> Response:
+async def story_file(context: Ctx, _principal: ModelReader, row: Version) -> Response:
     """Give the same as one file that needs no network."""
     text = story_html(**await _known(context, row), name=f"{row.participant}, {row.created_utc}")
     return Response(text, media_type="text/html; charset=utf-8", headers={"Content-Disposition": "attachment"})
@@ -43,7 +43,7 @@ async def story_file(context: Ctx, _who: ModelReader, row: Version) -> Response:
 
 @router.get("/figures/{name}")
 async def story_figure(
-    request: Request, context: Ctx, _who: ModelReader, row: Version, name: str, width: Width = 720
+    request: Request, context: Ctx, _principal: ModelReader, row: Version, name: str, width: Width = 720
 ) -> Response:
     """Give one figure, for the page, or as SVG or PDF for a paper."""
     figures = story_figures(**await _known(context, row))
@@ -56,18 +56,18 @@ async def _known(context: Context, row: Model) -> dict[str, Any]:
     before = await _measured(context, path[0])
     after = before if len(path) == 1 else await _measured(context, row)
 
-    def tell() -> dict[str, Any]:
+    def read_story() -> dict[str, Any]:
         documents = [context.versions.document(version) for version in path]
         documents[-1]["repetition"] = stored_model.repetition(stored_model.read(row))
         rows = explanation.versions(documents, row.id)
         first, last = (context.analyses.known_diagnosis(version) for version in (path[0], row))
         return story(rows, before["comparison"], after["comparison"], first, last)
 
-    return {"told": await asyncio.to_thread(tell), "before": before, "after": after}
+    return {"told": await asyncio.to_thread(read_story), "before": before, "after": after}
 
 
 async def _measured(context: Context, row: Model) -> dict[str, Any]:
-    found = await measurement(context, row)
-    if found["problem"] is not None:
-        raise found["problem"]
-    return found
+    measured = await measurement(context, row)
+    if measured["problem"] is not None:
+        raise measured["problem"]
+    return measured

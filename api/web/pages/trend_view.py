@@ -30,7 +30,7 @@ COLUMNS = (
 
 
 @router.get("/participants/{code}/trend")
-def trend(request: Request, context: Ctx, _who: ModelReader, code: str) -> Response:
+def trend(request: Request, context: Ctx, _principal: ModelReader, code: str) -> Response:
     """Show all sessions in one picture."""
     participants.find(context, code)
     sessions = context.trend.sessions(code)
@@ -64,7 +64,7 @@ def _session_cells(session: dict[str, Any]) -> list[dict[str, Any]]:
 async def compare(
     request: Request,
     context: Ctx,
-    _who: ModelReader,
+    _principal: ModelReader,
     model: Annotated[list[str] | None, Query()] = None,
     reference: str = "",
 ) -> Response:

@@ -15,7 +15,7 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/models/{model_id}/widths")
-async def show(request: Request, context: Ctx, _who: ModelReader, row: Version) -> Response:
+async def show(request: Request, context: Ctx, _principal: ModelReader, row: Version) -> Response:
     """Show the form."""
     version = await asyncio.to_thread(context.versions.document, row)
     return page(request, "widths.html", model=version, reasons=REASONS)
