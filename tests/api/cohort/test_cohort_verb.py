@@ -10,10 +10,11 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pyarrow.parquet as pq
 import pytest
 from distributed import LocalCluster
@@ -179,14 +180,23 @@ def processes(tmp_path: Path) -> Iterator[Processes]:
         yield started
 
 
+def group(number: int) -> list[psutil.Process]:
+    """List the processes of a group that run."""
+    found = []
+    for process in psutil.process_iter():
+        with suppress(psutil.NoSuchProcess, ProcessLookupError):
+            if os.getpgid(process.pid) == number and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process)
+    return found
+
+
 def test_ctrl_c_ends_a_run_and_all_its_processes_in_one_line(processes: Processes) -> None:
     run = processes.begin(pause_s=600.0)
     os.killpg(run.pid, signal.SIGINT)  # as a terminal does
     out, err = run.communicate(timeout=PATIENCE_S)
     assert (run.returncode, out) == (130, "") and err.count("\n") == 1 and "the same command goes on" in err, err
     assert processes.rows() >= 3 and not processes.output.exists()
-    with pytest.raises(ProcessLookupError):
-        os.killpg(run.pid, 0)
+    processes.until(lambda: not group(run.pid), "the end of its processes")
 
 
 @pytest.mark.campaign
