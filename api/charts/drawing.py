@@ -160,15 +160,15 @@ def _colour(value: str) -> Any:
     return red / 255, green / 255, blue / 255, opacity
 
 
-def decimate(x: Sequence[float], y: Sequence[float | None], most: int = MOST_POINTS) -> tuple[Any, Any]:
-    """Keep the lowest and the highest of each few neighbours, and the gaps: about `most` points, and no peak lost."""
+def decimate(x: Sequence[float], y: Sequence[float | None], limit: int = MOST_POINTS) -> tuple[Any, Any]:
+    """Keep the lowest and the highest of each few neighbours, and the gaps: about `limit` points, and no peak lost."""
     at, value = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    if at.size <= most:
+    if at.size <= limit:
         return at, value
     gaps = np.isnan(value)
     low, high = np.where(gaps, np.inf, value), np.where(gaps, -np.inf, value)
     chosen = set(np.flatnonzero(gaps))
-    for part in np.array_split(np.arange(at.size), most // 2):
+    for part in np.array_split(np.arange(at.size), limit // 2):
         chosen |= {part[np.argmin(low[part])], part[np.argmax(high[part])]}
     rows = sorted(chosen)
     return at[rows], value[rows]
@@ -230,10 +230,10 @@ def _add_parts(figure: Figure, panels: Sequence[Any], colours: Mapping[str, Any]
         style = {"facecolor": colours[band.colour], "linewidth": 0, "zorder": 1.5}
         few = slice(None, None, 1 + len(band.x) // MOST_BAND)
         panels[band.panel].fill_between(band.x[few], band.lower[few], band.upper[few], **style)
-    most = min(MOST_POINTS, int(1.5 * width))
+    limit = min(MOST_POINTS, int(1.5 * width))
     for number, curve in enumerate(figure.curves):
         style = {**_style(curve, colours), "markevery": curve.every, "zorder": 2 + 0.01 * number}
-        panels[curve.panel].plot(*decimate(curve.x, curve.y, most), **style)
+        panels[curve.panel].plot(*decimate(curve.x, curve.y, limit), **style)
     for rule in figure.rules:
         draw = [axes.axvline for axes in panels] if rule.vertical else [panels[0].axhline]
         for line in draw:

@@ -11,7 +11,7 @@
 
   const still = (box) => box.querySelector("svg.still");
   const drawnWidth = (box) => (still(box) ? still(box).viewBox.baseVal.width : 0);
-  const address = (box) => { const at = new URL(box.dataset.still, location.href); at.searchParams.set("width", Math.min(2400, Math.max(240, box.clientWidth))); return at; };
+  const address = (box) => { const at = new URL(box.dataset.still, location.href); at.searchParams.set("width", 40 * Math.round(Math.min(2400, Math.max(240, box.clientWidth)) / 40)); return at; }; // few widths: the service keeps what it drew
 
   // One that stands there already is good enough where it is about as wide as its box.
   const wanted = (box) => box.clientWidth && !plots.has(box) && Math.abs(drawnWidth(box) / box.clientWidth - 1) > 0.08;
