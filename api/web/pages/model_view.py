@@ -44,7 +44,8 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
     running = job is not None and diagnosis is None and job.state in ("running", "completed")
     in_fit_words = ("gap", "ceiling") if fit_words else ()
     others = [finding for finding in findings if finding.gate not in in_fit_words]
-    return page(
+    return await asyncio.to_thread(  # its charts are drawn there, and a stop must not wait for that
+        page,
         request,
         "model.html",
         model=version,

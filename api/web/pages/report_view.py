@@ -37,16 +37,19 @@ async def report(request: Request, context: Ctx, _principal: ModelReader, row: V
     charts = draw_model(document, measured)
     diagnosis = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
+    drawn = await asyncio.to_thread(
+        lambda: {
+            name: svg(charts[name], width, height, words, light=True)
+            for name, (width, height, words) in CHARTS.items()
+            if name in charts
+        }
+    )
     return page(
         request,
         "report_sheet.html",
         model=await asyncio.to_thread(context.versions.document, row),
         **await facts(context, row, document),
-        drawn={
-            name: svg(charts[name], width, height, words, light=True)
-            for name, (width, height, words) in CHARTS.items()
-            if name in charts
-        },
+        drawn=drawn,
         problem=measured["problem"],
         why=explanation.view(diagnosis, measured["comparison"]) if diagnosis else None,
         versions=await asyncio.to_thread(versions_of, context, row),

@@ -31,13 +31,15 @@ async def show_story(request: Request, context: Ctx, _principal: ModelReader, ro
         parts |= {"story": known["told"], "figures": story_figures(**known, at=f"/models/{row.id}/story/figures/{{}}")}
     except ApiError as error:
         parts["problem"] = error
-    return page(request, "story_page.html", model=await asyncio.to_thread(context.versions.document, row), **parts)
+    version = await asyncio.to_thread(context.versions.document, row)
+    return await asyncio.to_thread(page, request, "story_page.html", model=version, **parts)
 
 
 @router.get(".html")
 async def story_file(context: Ctx, _principal: ModelReader, row: Version) -> Response:
     """Give the same as one file that needs no network."""
-    text = story_html(**await _known(context, row), name=f"{row.participant}, {row.created_utc}")
+    name = f"{row.participant}, {row.created_utc}"
+    text = await asyncio.to_thread(lambda known: story_html(**known, name=name), await _known(context, row))
     return Response(text, media_type="text/html; charset=utf-8", headers={"Content-Disposition": "attachment"})
 
 

@@ -113,7 +113,8 @@ async def measured(context: Context, model_id: str) -> Markup | None:
     if found["curves"] is None:
         return None
     figure = draw_model(stored_model.read(row), found)["comparison"]
-    return svg(figure, 1160.0, 520.0, "Torque measured and predicted, what is left, and the pulse width, over time")
+    words = "Torque measured and predicted, what is left, and the pulse width, over time"
+    return await asyncio.to_thread(svg, figure, 1160.0, 520.0, words)
 
 
 async def what_was_recorded(context: Context, row: Test) -> Markup:
@@ -122,4 +123,5 @@ async def what_was_recorded(context: Context, row: Test) -> Markup:
     found = await context.pool.submit("recorded", urgent=True, data=path).result
     plan_us = [] if row.plan.get("adaptive") else (row.plan.get("preview") or {}).get("pulse_width_us") or []
     figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), row.state)
-    return svg(figure, 1160.0, 460.0, "Torque that was measured and pulses that were sent, over time")
+    words = "Torque that was measured and pulses that were sent, over time"
+    return await asyncio.to_thread(svg, figure, 1160.0, 460.0, words)
