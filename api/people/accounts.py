@@ -13,7 +13,6 @@ from typing import Any
 
 from argon2 import PasswordHasher
 from argon2.exceptions import Argon2Error, InvalidHashError
-from fastapi import Request
 from sqlalchemy import delete, select
 from sqlalchemy.orm import Session
 
@@ -141,21 +140,16 @@ class People:
         with self.store.write() as session:
             session.merge(Confirmation(session_hash=session_hash, at_unix_s=self.clock.unix_s()))
 
-    async def confirmed(self, request: Request, principal: Principal) -> None:
-        """Refuse an approval of a person who has not given the password again; a form may carry it in `password`.
+    async def refuse_unconfirmed(self, principal: Principal) -> None:
+        """Refuse an approval of a person who has not given the password again.
 
         Raises ApiError: 403 the password is asked for.
         """
         if principal.session_hash is None:
             return
-        if "form" in request.headers.get("content-type", ""):
-            password = (await request.form()).get("password")
-            if isinstance(password, str) and password:
-                await self.confirm(principal, password)
         if not await asyncio.to_thread(self._use_confirmation, principal.session_hash):
             detail = (
-                "To approve, enter your password again: as `password` in the form, or by POST /v1/sessions/confirm "
-                f"at most {CONFIRMED_S:.0f} s before."
+                f"To approve, enter your password again: POST /v1/sessions/confirm, at most {CONFIRMED_S:.0f} s before."
             )
             raise ApiError(403, "confirm-password", "Please confirm with your password", detail)
 

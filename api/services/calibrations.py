@@ -12,7 +12,7 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, Change, require_confirmation
 from stimrig.api.services import participants
 from stimrig.api.services.context import Context
 from stimrig.api.sessions import profiles
@@ -47,8 +47,11 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
     return asked
 
 
-async def begin(context: Context, code: str, body: CalibrationIn, by: str, tags: Tags | None = None) -> dict[str, Any]:
-    """Open a calibration: where it stands.
+async def begin(
+    context: Context, code: str, body: CalibrationIn, by: str, tags: Tags | None = None, confirm: str = "",
+    ask: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Open a calibration: where it stands. A person, with `ask`, is asked before a current far above the usual one.
 
     What is not asked for is the participant's own, so never wider. It is bound to the limits that it is begun with: the
     participant's version ends its id, and so is kept by the rig, which may outlive this service.
@@ -58,12 +61,26 @@ async def begin(context: Context, code: str, body: CalibrationIn, by: str, tags:
         refuse_archived(row)
         context.runner.refuse_second()
         asked = settings(body, row.profile)
+        if ask:
+            confirm_current(row, asked, confirm)
         identity = await asyncio.to_thread(_write_begin, context, by, code, asked, tags)
         last = messages.Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
             requests.CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **asked)
         )
         return await standing(context, code)
+
+
+def confirm_current(row: Participant, asked: dict[str, Any], confirm: str) -> None:
+    """Ask before a calibration with a current far above the participant's."""
+    if warnings := profiles.jumps(row.profile, {**row.profile, "current_ma": asked["current_ma"]}):
+        current = f"{asked['current_ma']:g} mA"
+        changes = [
+            Change("Current of every pulse", current, f"{row.profile['current_ma']:g} mA"),
+            Change("Fine step", f"{asked['step_us']:g} µs"),
+        ]
+        title, button = f"Calibrate {row.code} with {current}?", f"Yes, calibrate with {current}"
+        require_confirmation(confirm, title, button, changes, warnings)
 
 
 async def step(context: Context, code: str, body: StepIn, tags: Tags | None = None) -> dict[str, Any]:

@@ -26,7 +26,6 @@ from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock
 from stimrig.api.people.pace import Guesses
 from stimrig.api.sessions.notes import Notes
-from stimrig.api.sessions.questions import Questions
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.stops import StopLog, StopRights
@@ -82,7 +81,7 @@ class Context:
             self.limits_lock,
         )  # fmt: skip
         self.trend, self.jobs = Trend(store), Jobs(pool)
-        self.questions, self.notes, self.stops = Questions(clock), Notes(store, clock), StopLog()
+        self.notes, self.stops = Notes(store, clock), StopLog()
         stop_key = store.secret("stop-right")
         self.stop_rights = StopRights(stop_key, clock)
         self._tasks: list[asyncio.Task[None]] = []

@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import math
 from typing import Annotated, Any
 
-from pydantic import AfterValidator, Field, StrictBool, StringConstraints
+from pydantic import AfterValidator, Field, FiniteFloat, StrictBool, StringConstraints
 
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, invalid
 from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import together
 from stimrig.api.services.context import Context
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.kinds import no_sensor
-from stimrig.api.sessions.requests import AngleRad, Body
+from stimrig.api.sessions.requests import Body
 from stimrig.api.store import locking
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Participant
@@ -29,7 +30,7 @@ NOTHING_OPEN: dict[str, Any] = {
 class PoseIn(Body):
     """What a goniometer shows while the joint is held still."""
 
-    angle_rad: AngleRad = Field(description="elbow: 0 is straight, flexion is positive, rad")
+    angle_rad: FiniteFloat = Field(description="elbow: 0 is straight, flexion is positive, rad")
     first: StrictBool = Field(False, description="begin anew with this one: a first pose that waits is forgotten")
 
 
@@ -61,9 +62,14 @@ async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags | None =
 
     The intent is written before: of one whose answer is lost nobody knows whether it was taken.
 
-    Raises ApiError: 409 no sensor, or the rig refuses; 412 another pose was told meanwhile.
+    Raises ApiError: 409 no sensor, or the rig refuses; 412 another pose was told meanwhile;
+    422 it is no angle of this rig.
     """
-    sensor(context)
+    low_rad, high_rad = sensor(context).range_rad or (profiles.LEAST_RAD, profiles.MOST_RAD)
+    if not (low_rad <= body.angle_rad <= high_rad):
+        within = profiles.range_words((low_rad, high_rad))
+        words = f"{math.degrees(body.angle_rad):.0f}° is not within {within}, as this rig asks"
+        raise invalid(f"angle_rad: {words}", errors=[{"field": "angle_rad", "detail": words}])
     pose = {"angle_rad": round(body.angle_rad, 4)}
 
     def write_intent() -> int:

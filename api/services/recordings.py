@@ -72,7 +72,11 @@ def _whose(context: Context, code: str, who: Principal, says: str, data: bytes, 
         f"The file says that it is a recording of {own}, not of {code}. Nothing of it was kept. Who may approve models "
         f"can take it for {code} all the same: send it again with of={own}."
     )
-    raise ApiError(409, "other-participant", "This is another participant's recording", detail, of=own)
+    title, more = "This is another participant's recording", {}
+    if who.may(Scope.APPROVE_MODEL):
+        button = f"Take the recording of {own} for {code}"
+        more = {"confirm": {"title": title, "button": button, "rows": [], "warnings": [detail], "token": own}}
+    raise ApiError(409, "other-participant", title, detail, of=own, **more)
 
 
 async def _rename_columns(context: Context, path: Path, columns: Sequence[str], data: bytes) -> tuple[list[str], bytes]:

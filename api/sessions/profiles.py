@@ -157,7 +157,8 @@ def rising_range(range_rad: tuple[float, float]) -> tuple[float, float]:
     """A range as it was sent. Raises ValueError where it is no range, or too narrow to move in."""
     low, high = range_rad
     if not (high - low >= NARROWEST_RAD - 1e-9):
-        raise ValueError(f"the second angle must be at least {NARROWEST_RAD:.2f} rad above the first")
+        least = f"{math.degrees(NARROWEST_RAD):.0f}° ({NARROWEST_RAD:.2f} rad)"
+        raise ValueError(f"the second angle must be at least {least} above the first")
     return range_rad
 
 

@@ -175,6 +175,9 @@ class TestIn(Labels, Body):
     __test__ = False
 
     participant: Code
+    plan_hash: Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")] | None = Field(
+        default=None, description="starts the plan of `POST /v1/preview` with this hash; sent with participant alone"
+    )
     kind: Annotated[str, StringConstraints(pattern=r"^[a-z-]{1,40}$")] = "pre-session"
     profile: ProfileIn | None = Field(
         default=None, description="for this test alone, never wider than the participant's own"
@@ -237,6 +240,8 @@ class TestIn(Labels, Body):
     def _check_kind(self) -> TestIn:
         # Clients that generators make send every default, too.
         sent = set(self.model_dump(exclude_defaults=True, exclude_none=True))
+        if self.plan_hash is not None and (more := sent - {"participant", "plan_hash"}):
+            raise ValueError(f"plan_hash: all else is as it was previewed; leave out {', '.join(sorted(more))}")
         wrong = sent & (set().union(*OWN_FIELDS.values()) - OWN_FIELDS.get(self.kind, set()))
         planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING)
         if "reference_torque_nm" in wrong:

@@ -9,6 +9,7 @@ import secrets
 import time
 from collections.abc import Coroutine, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,7 @@ from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Lifecycle
 from stimrig.api.sessions.live import Hub
 from stimrig.api.sessions.playing import Current, Playing, may_play, other_than, refuse_archived, right_ended
+from stimrig.api.sessions.previews import Preview, Previews, refuse_changed
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
 from stimrig.api.sessions.stop_counter import StopCounter
@@ -68,6 +70,7 @@ class Runner(Playing):
     ) -> None:  # fmt: skip
         super().__init__(store, clock, rig)
         self.versions, self.pool, self.trials, self.limits_lock = versions, pool, trials, limits_lock
+        self.previews = Previews(clock)
         self.start_lock = asyncio.Lock()
         """Of several starts one is prepared at a time."""
         self.hub, self.counted = Hub(clock), StopCounter()
@@ -87,20 +90,15 @@ class Runner(Playing):
 
     # ---- start and stop -------------------------------------------------------------------------------------
 
-    async def start(
-        self, body: TestIn, by: str, confirmed: dict[str, Any] | None = None, holder: str = "",
-        tags: Tags | None = None, model: str = "",
-    ) -> Test:  # fmt: skip
+    async def start(self, body: TestIn, by: str, holder: str = "", tags: Tags | None = None, model: str = "") -> Test:
         """Begin a test.
 
         Parameters
         ----------
         body : TestIn
-            The test.
+            The test; with `plan_hash` the previewed one. Started from it twice, the first test is returned.
         by : str
             Who answers for it.
-        confirmed : dict, optional
-            The preview that a person has said yes to; None: a program's request, which nobody was shown.
         holder : str
             Hash of the token by whose right it is begun.
         tags : tuple of str
@@ -112,17 +110,30 @@ class Runner(Playing):
         ------
         ApiError
             404 no such participant; 412 it was changed; 409 another test runs, the holder named; 409 it would not be
-            what was seen, or a stop came since it was asked for; 503 that was too long ago; what the rig refuses.
+            what was seen, or a stop came since it was asked for; 410 no such preview; 503 that was too long ago; what
+            the rig refuses.
         """
+        if body.plan_hash is None:
+            return await self._begin(body, by, holder, tags, model)
+        shown = self.previews.find(body.participant, body.plan_hash)
+        async with shown.starting:
+            if shown.test_id is None:
+                return await self._begin(shown.body, by, holder, tags, model, shown)
+        return await asyncio.to_thread(self.store.get, Test, shown.test_id)
+
+    async def _begin(
+        self, body: TestIn, by: str, holder: str, tags: Tags | None, model: str, shown: Preview | None = None
+    ) -> Test:
         tokens = await asyncio.to_thread(self.tokens_of, holder)
         await self.let_end()
         self.refuse_second()
-        if body.kind == ADAPTIVE:  # what it can reach is computed now, and not while others wait, and then remembered
+        # what an adaptive test can reach is computed now, and not while others wait, and then remembered
+        if body.kind == ADAPTIVE and shown is None:
             await self._planned(body, await self._participant(body))
         async with self.start_lock:
             self.refuse_second()
             participant = await self._participant(body)
-            return await self._start(body, participant, by, confirmed, tokens, tags, model)
+            return await self._start(body, participant, by, shown, tokens, tags, model)
 
     def _check(self, code: str, tags: Tags | None) -> None:
         with self.store.read() as session:
@@ -138,11 +149,15 @@ class Runner(Playing):
         return participant
 
     async def _start(
-        self, body: TestIn, participant: Participant, by: str, confirmed: dict[str, Any] | None,
-        tokens: list[str], tags: Tags | None, model: str,
+        self, body: TestIn, participant: Participant, by: str, shown: Preview | None, tokens: list[str],
+        tags: Tags | None, model: str,
     ) -> Test:  # fmt: skip
         await asyncio.to_thread(self._check, body.participant, tags)  # then the preview may differ for no other reason
-        planned = await self._planned(body, participant)
+        if shown is None:
+            planned = await self._planned(body, participant)
+        else:
+            refuse_changed(shown, participant)
+            planned = replace(shown.planned, plan=shown.planned.plan.model_copy(update={"test_id": self._new_id()}))
         plan = planned.plan
         until_utc = await asyncio.to_thread(self.until_utc, tokens)
         current = self.current = Current(
@@ -152,12 +167,14 @@ class Runner(Playing):
         self.pool.cancel_background()
         try:
             preview = await self._previewed(plan)
-            if confirmed is not None and not same(confirmed, preview):
+            if shown is not None and not same(shown.answer, preview):
                 raise not_what_was_seen()
             row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant, tags, model)
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
+            if shown is not None:
+                shown.test_id = plan.test_id
             self._tasks.begin(self.look_again_and_again(current))
         except BaseException:
             self.current = None
@@ -284,9 +301,11 @@ class Runner(Playing):
         return row
 
     async def preview(self, body: TestIn) -> dict[str, Any]:
-        """A test's duration, dose and pulse widths; nothing is played."""
-        planned = await self._planned(body, await self._participant(body))
-        return {**await self._previewed(planned.plan), **planned.kept}
+        """A test's duration, dose and pulse widths; nothing is played. With its `plan_hash` it can be started."""
+        row = await self._participant(body)
+        planned = await self._planned(body, row)
+        answer = await self._previewed(planned.plan)
+        return {**answer, **planned.kept, "plan_hash": self.previews.keep(body, planned, answer, row)}
 
     async def _previewed(self, plan: messages.TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)

@@ -8,7 +8,6 @@ the version back as `If-Match` (RFC 9110, section 13.1.1). `check` runs in the d
 from __future__ import annotations
 
 import re
-from contextvars import ContextVar
 from typing import Any
 
 from sqlalchemy import ColumnElement, and_, or_, select, update
@@ -33,8 +32,6 @@ GROUPS = (LIMITS, SITE, ARCHIVE, MODELS, POSES)
 UNITS = {"_ma": "mA", "_us": "µs", "_nm": "N·m", "_rad": "rad"}
 MOST_CHANGES = 20
 """Changes that a refusal lists, the newest."""
-form_tags: ContextVar[Tags | None] = ContextVar("form_tags", default=None)
-"""Versions that a page's form has sent."""
 
 
 def number_of(entry: AuditEntry) -> int:
@@ -75,7 +72,6 @@ def check(session: Session, row: Versioned, tags: Tags | None) -> int:
 
 def check_number(session: Session, version: int, tags: Tags | None, entries: ColumnElement[bool]) -> int:
     """The same for a version that is no row's; `entries`: those of the trail that change it."""
-    tags = form_tags.get() if tags is None else tags
     if tags is not None and str(version) not in tags:
         if not tags:
             raise missing("the document")
@@ -100,8 +96,7 @@ def is_known(session: Session, version: int) -> bool:
 
 
 def tags_of(tags: Tags | None) -> Tags:
-    """Return the tags of a request, or of the page's form. Raises ApiError (428) where there is none."""
-    tags = form_tags.get() if tags is None else tags
+    """Return the tags of a request. Raises ApiError (428) where there is none."""
     if not tags:
         raise missing("the document")
     return tags

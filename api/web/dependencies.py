@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import Depends, Request, Security
+from fastapi import Depends, Query, Request, Security
 from starlette.requests import HTTPConnection
 
 from stimrig.api.people.auth import Principal, Scope
@@ -26,6 +26,8 @@ async def from_request(request: Request) -> Context:
     return context_of(request)
 
 
+Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
+Ask = Annotated[bool, Query(description="a person decides: ask before what deserves a second look (409, `confirm`)")]
 Ctx = Annotated[Context, Depends(from_request)]
 Anyone = Annotated[Principal, Depends(anyone_signed_in)]
 EvenLocked = Annotated[Principal, Depends(anyone_even_locked)]

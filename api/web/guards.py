@@ -53,10 +53,9 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
         if not principal.may(scope):
             who = principal.name
             raise forbidden(f"This needs the scope {scope}; {who} holds {', '.join(sorted(principal.scopes))}.")
-        await check_csrf(request, principal)
-        await note_form(request)
+        check_csrf(request, principal)
         if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
-            await request.app.state.context.people.confirmed(request, principal)
+            await request.app.state.context.people.refuse_unconfirmed(principal)
         return principal
 
     check.__name__ = f"require_{scope.name.lower()}"
@@ -94,26 +93,24 @@ def is_action(request: Request) -> bool:
 async def anyone_signed_in(request: Request, _token: Token, _session: Session) -> Principal:
     """A dependency: anyone with a valid token or session."""
     principal = await identified(request)
-    await check_csrf(request, principal)
+    check_csrf(request, principal)
     return principal
 
 
 async def anyone_even_locked(request: Request, _token: Token, _session: Session) -> Principal:
     """A dependency: anyone with a valid token or session, which may be locked: to unlock it, or to sign out."""
     principal = request.state.who = await request.app.state.context.auth.ask(request, forgive_lock=True)
-    await check_csrf(request, principal)
+    check_csrf(request, principal)
     return principal
 
 
-async def check_csrf(request: Request, principal: Principal) -> None:
-    """Refuse a session's write whose form or header does not carry the session's CSRF token."""
+def check_csrf(request: Request, principal: Principal) -> None:
+    """Refuse a session's write that does not carry the session's CSRF token."""
     if principal.csrf is None or request.method in SAFE_METHODS:
         return
-    sent: Any = request.headers.get("x-csrf-token")
-    if sent is None and "form" in request.headers.get("content-type", ""):
-        sent = (await request.form()).get("csrf")
-    if not isinstance(sent, str) or not hmac.compare_digest(sent.encode(), principal.csrf.encode()):
-        raise ApiError(403, "csrf", "The form is out of date", "Load the page again and repeat what you did.")
+    sent = request.headers.get("x-csrf-token", "")
+    if not hmac.compare_digest(sent.encode(), principal.csrf.encode()):
+        raise ApiError(403, "csrf", "The page is out of date", "Load the page again and repeat what you did.")
 
 
 OPEN = [
@@ -221,15 +218,6 @@ def if_match(document: str, needed: bool = True) -> Any:
         return readable
 
     return Depends(tags)
-
-
-async def note_form(request: Request) -> None:
-    """Note the version that a page's form carries."""
-    if request.method in SAFE_METHODS or request.url.path.startswith("/v1/"):
-        return
-    form = await request.form() if "form" in request.headers.get("content-type", "") else {}
-    sent = (form.get(name) for name in ("latch", "calibration", "seen"))
-    locking.form_tags.set(tuple(str(text) for text in sent if text)[:1] or None)
 
 
 FIELD, HEADER = "right", "x-stop-right"

@@ -83,7 +83,7 @@ def enter(page: Any, service: Service, name: str = NAME, password: str = PASSWOR
     with service.client() as http:
         http.post("/v1/users", json={"name": name, "password": password})
     with service.client(None) as http:
-        answer = http.post("/sign-in", data={"name": name, "password": password})
+        answer = http.post("/v1/sessions", data={"name": name, "password": password})
         assert answer.status_code == 303, answer.text
         cookies = [{"name": key, "value": value, "url": service.url} for key, value in http.cookies.items()]
     page.context.add_cookies(cookies)
@@ -118,7 +118,7 @@ def chart(page: Any, name: str) -> Any:
 
 def settled(page: Any) -> None:
     """Wait until the page follows no work at whose end it would load itself anew."""
-    follows = page.locator("[data-job], [data-next^=identifying]")
+    follows = page.locator("[data-job], [data-next-key^=identifying]")
     for _ in range(2):  # one that is half loaded has nothing yet
         page.wait_for_load_state()
         expected(follows).to_have_count(0)

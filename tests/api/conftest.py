@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import re
 import shutil
 import ssl
 import tempfile
@@ -33,6 +32,7 @@ from stimrig.api.web.app import create_app
 from stimrig.api.web.server import configuration
 from tests.api import thread_worker
 from tests.api.fake_rig import FakeRig, RigThread
+from tests.api.forms import read
 from tests.harness.looks_first import LooksFirst
 
 TOKEN = "administrator-token-of-the-tests"
@@ -397,7 +397,7 @@ def approved(client: httpx.Client, participant: str) -> str:
 @contextmanager
 def signed_in(service: Service, token: str = TOKEN) -> Iterator[httpx.Client]:
     with service.client(token=None, headers=HTML, follow_redirects=False) as browser:
-        answer = browser.post("/sign-in", data={"token": token, "next": "/"})
+        answer = browser.post("/v1/sessions", data={"token": token})
         assert answer.status_code == 303, answer.text
         cookie = answer.headers["set-cookie"]
         assert "HttpOnly" in cookie and "SameSite=strict" in cookie
@@ -405,7 +405,7 @@ def signed_in(service: Service, token: str = TOKEN) -> Iterator[httpx.Client]:
 
 
 def csrf(browser: httpx.Client) -> str:
-    return re.findall(r'name="csrf" value="([^"]+)"', browser.get("/").text)[0]
+    return read(browser.get("/").text).meta
 
 
 @pytest.fixture

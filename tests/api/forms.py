@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
 from typing import Any
@@ -11,6 +12,8 @@ from urllib.parse import quote
 
 import httpx
 
+Text = str | tuple[str, ...] | None
+"""What a person typed in a field, or in each field of one name; None: a box that is not ticked."""
 VOID = {"input", "br", "img", "link", "meta", "hr"}
 
 
@@ -134,8 +137,8 @@ def find(html: str, call: str) -> tuple[Form, dict[str, str], Control | None]:
     return found[0]
 
 
-def sent(form: Form, button: Control | None, texts: dict[str, str | None]) -> dict[str, Any]:
-    """The body, as `act.js` makes it; `texts` are what a person typed, None a box that is not ticked."""
+def sent(form: Form, button: Control | None, texts: Mapping[str, Text]) -> dict[str, Any]:
+    """The body, as `act.js` makes it."""
     body: dict[str, Any] = {}
     groups: dict[str, list[Control]] = {}
     for control in [*form.fields, *([button] if button and button.name else [])]:
@@ -149,7 +152,8 @@ def sent(form: Form, button: Control | None, texts: dict[str, str | None]) -> di
         groups.setdefault(control.name, []).append(control)
     for name, controls in groups.items():
         types = controls[0].attributes.get("data-type", "").split()
-        typed = [str(texts.get(name) if name in texts else control.value).strip() for control in controls]
+        given = [texts.get(name, control.value) for control in controls]
+        typed = [str(text[place] if isinstance(text, tuple) else text).strip() for place, text in enumerate(given)]
         if "data-query" in controls[0].attributes:
             continue
         changed = any(
@@ -191,7 +195,7 @@ def _put(body: dict[str, Any], name: str, value: Any) -> None:
 
 
 def press(
-    client: httpx.Client, page: str, call: str, *, html: str = "", confirm: str = "", **texts: str | None
+    client: httpx.Client, page: str, call: str, *, html: str = "", confirm: str = "", **texts: Text
 ) -> httpx.Response:
     """Send the form of a page that makes this call; `html`: the page as it was shown before."""
     html = html or client.get(page, headers={"Accept": "text/html"}).text

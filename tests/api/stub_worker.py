@@ -237,7 +237,10 @@ def diagnosis(progress: Progress, data: str, model_json: str | None = None) -> d
     progress(float(slow.read_text()) if slow.exists() else 0.5, "tried fatigue")
     if slow.exists():
         state.pause(60)
-    return {**found_missing(model_json), "improvement": improvement(model_json)}
+    found = found_missing(model_json)
+    if (Path(data).parent / "nothing-missing").exists():
+        found |= {"verdict": "nothing_missing", "missing": [], "where": [], "experiment": None, "signatures": {}}
+    return {**found, "improvement": improvement(model_json)}
 
 
 def adaptive_outlook(

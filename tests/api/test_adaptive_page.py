@@ -7,8 +7,7 @@ from typing import Any
 import pytest
 
 from tests.api.browser import participant
-from tests.api.conftest import Service, csrf, own_service, signed_in, wait_done
-from tests.api.test_forms import fields
+from tests.api.conftest import Service, own_service, wait_done
 
 service = own_service(speed=0.25)
 """Slow enough to look at a running test from all sides."""
@@ -17,7 +16,7 @@ service = own_service(speed=0.25)
 @pytest.mark.browser
 def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> None:
     participant(tab, service, "X1")
-    tab.locator("[name=plan][value=adaptive]").check()
+    tab.locator("[name=kind][value=adaptive]").check()
     tab.locator("[name=target]").fill("0,2")
     tab.locator("button.stimulate").first.click()
     tab.get_by_text("The target should be reached").wait_for()
@@ -39,12 +38,3 @@ def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> Non
     after.goto(f"{service.url}/tests/{test_id}")
     after.get_by_text("A person said that it is enough").wait_for()
     assert tab.errors == []
-
-
-def test_what_is_no_target_starts_nothing(service: Service) -> None:
-    with signed_in(service) as browser:
-        browser.post("/participants", data={"csrf": csrf(browser), "code": "X1"})
-        for typed in ("", "-1", "nan", "0,1", "51", "zwei", "1e1"):
-            form = {**fields(browser, "/participants/X1"), "plan": "adaptive", "target": typed}
-            told = browser.post("/participants/X1/tests", data=form).text
-            assert "Target:" in told and "Nothing was started" in told and service.rig.starts == 0, typed

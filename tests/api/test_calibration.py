@@ -5,14 +5,13 @@ from __future__ import annotations
 import asyncio
 import re
 import threading
-import zlib
-from collections.abc import Iterator
 from typing import Any
 
 import httpx
 import pytest
 
-from tests.api.conftest import Service, csrf, signed_in, soon, wait_done
+from tests.api.conftest import Service, csrf, soon, wait_done
+from tests.api.forms import find, forms, press
 from tests.api.test_problems import problem
 from tests.api.test_profiles import calibrate, mark_all
 
@@ -79,31 +78,22 @@ def test_sequence_is_played_and_nothing_is_identified(client: httpx.Client, serv
     assert client.get(document["recording_url"]).status_code == 200
 
 
-def sight(service: Service, token: dict[str, str]) -> dict[str, str]:
-    """What the page's forms send: the version of the calibration that it shows."""
-    found = service.rig.calibration
-    assert found is not None
-    marks = zlib.crc32(repr(found.marks_us).encode())
-    return {**token, "calibration": f"{found.calibration_id}.{len(found.trains)}.{marks:08x}"}
+PAGE = "/participants/P017/calibration"
 
 
-def test_whole_calibration_by_plain_forms(service: Service, pages: httpx.Client, participant: str) -> None:
-    page = "/participants/P017/calibration"
-    token = {"csrf": csrf(pages)}
-    assert "Begin the calibration" in pages.get(page).text
-    assert pages.post(page, data={**token, "current_ma": "x", "step_us": "10"}).status_code == 422
-    assert pages.post(page, data={**token, "current_ma": "20", "step_us": "10"}).status_code == 303
-    (wider,) = re.findall(r'<button[^>]*id="step-up"[^>]*>', pages.get(page).text)
-    assert "disabled" not in wider, "it works without scripts"
+def test_a_whole_calibration_by_the_forms_of_its_page(service: Service, pages: httpx.Client, participant: str) -> None:
+    assert "Begin the calibration" in pages.get(PAGE).text
+    assert press(pages, PAGE, "/calibration").status_code == 201
     for threshold in ("sensory", "motor", "comfort"):
-        pages.post(f"{page}/step/up", data=sight(service, token))
-        pages.post(f"{page}/mark/{threshold}", data=sight(service, token))
-    assert "Still to be marked" not in pages.get(page).text
-    assert pages.post(f"{page}/step/sideways", data=sight(service, token)).status_code == 422
-    for what in ("step/up", "mark/comfort", "finish", "discard"):
-        assert pages.post(f"{page}/{what}", data=token, auth=None).status_code == 428, "it shows no calibration"
-    led = pages.post(f"{page}/finish", data=sight(service, token))
-    assert led.headers["location"] == "/participants/P017"
+        assert press(pages, PAGE, "/step").status_code == 202
+        assert press(pages, PAGE, "/mark", threshold=threshold).status_code == 200
+    shown = pages.get(PAGE).text
+    assert "Still to be marked" not in shown
+    for call in ("/step", "/mark", "/finish", "/discard"):
+        path = find(shown, call)[1]["data-call"].removeprefix("POST ")
+        unseen = pages.post(path, json={}, headers={"X-CSRF-Token": csrf(pages), "Accept": "*/*"}, auth=None)
+        assert unseen.status_code == 428, "it shows no calibration"
+    assert press(pages, PAGE, "/finish").status_code == 200
     assert "felt at 10 µs, moves at 20 µs" in pages.get("/participants/P017").text
 
 
@@ -111,10 +101,9 @@ def test_last_times_marks_stand_beside_todays(
     service: Service, pages: httpx.Client, client: httpx.Client, participant: str
 ):
     calibrate(client)
-    token, page = {"csrf": csrf(pages)}, "/participants/P017/calibration"
-    assert "felt at 10 µs, moves at 20 µs, comfortable up to 30 µs" in pages.get(page).text
-    pages.post(page, data={**token, "current_ma": "20", "step_us": "10"})
-    marks = pages.get(page).text.partition('<table class="marks">')[2].partition("</table>")[0]
+    assert "felt at 10 µs, moves at 20 µs, comfortable up to 30 µs" in pages.get(PAGE).text
+    press(pages, PAGE, "/calibration")
+    marks = pages.get(PAGE).text.partition('<table class="marks">')[2].partition("</table>")[0]
     assert re.findall(r"(\d+)\s*µs", marks) == ["10", "20", "30"]
     assert service.rig.asked is not None and service.rig.asked.large_steps
     assert service.rig.asked.last.sensory_pulse_width_us == 10
@@ -214,22 +203,18 @@ def test_a_change_waits_for_the_step_on_its_way_and_the_next_one_sees_it(
     assert up(client).status_code == 409 and order == ["train", "200"]
 
 
-def test_the_page_says_that_it_goes_no_further(client: httpx.Client, service: Service, participant: str) -> None:
-    page = "/participants/P017/calibration"
-    with signed_in(service) as browser:
-        token = {"csrf": csrf(browser)}
-        browser.post(page, data={**token, "current_ma": "20", "step_us": "10"})
-        browser.post(f"{page}/step/up", data=sight(service, token))
-        assert "A calibration is open." in browser.get("/participants/P017").text
-        assert client.put(PROFILE, json=LOWER).status_code == 200
-        shown = browser.get(page).text
-        assert "P017 now has other limits (5 mA, 60 µs, 5 N·m)" in shown
-        buttons = [part.split("<")[0] for part in shown.split("<button")[1:] if "/calibration/" in part.split(">")[0]]
-        assert len(buttons) == 9 and [b for b in buttons if "disabled" not in b] == [
-            next(b for b in buttons if "/discard" in b)
-        ]
-        for what, answer in (("step/up", 409), ("finish", 409), ("discard", 303)):
-            assert browser.post(f"{page}/{what}", data=sight(service, token)).status_code == answer
+def test_the_page_says_that_it_goes_no_further(client: httpx.Client, pages: httpx.Client, participant: str) -> None:
+    press(pages, PAGE, "/calibration")
+    press(pages, PAGE, "/step")
+    assert "A calibration is open." in pages.get("/participants/P017").text
+    assert client.put(PROFILE, json=LOWER).status_code == 200
+    shown = pages.get(PAGE).text
+    assert "P017 now has other limits (5 mA, 60 µs, 5 N·m)" in shown
+    calls = [(call, button) for form in forms(shown) for call, _, button in form.calls() if "/calibration/" in call]
+    assert len(calls) == 9
+    assert [call for call, button in calls if button and not button.disabled] == [f"POST {WHERE}/discard"]
+    for call, answer in (("/step", 409), ("/finish", 409), ("/discard", 200)):
+        assert press(pages, PAGE, call).status_code == answer
 
 
 def test_lowered_during_a_test_says_that_it_holds_from_the_next_one(
@@ -245,17 +230,12 @@ def test_lowered_during_a_test_says_that_it_holds_from_the_next_one(
     assert client.put(PROFILE, json=LOWER).json()["meanwhile"] == ""
 
 
-CALIBRATION_PAGE = "/participants/P017/calibration"
-
-
 @pytest.fixture
-def tab(client: httpx.Client, service: Service, participant: str) -> Iterator[tuple[httpx.Client, dict[str, str]]]:
-    """A person's browser and what its page's buttons send, after one train."""
+def shown(client: httpx.Client, pages: httpx.Client, participant: str) -> str:
+    """The calibration's page after one train."""
     client.post(WHERE)
     up(client)
-    assert service.rig.calibration is not None
-    with signed_in(service) as browser:
-        yield browser, {"csrf": csrf(browser), "calibration": client.get(WHERE).json()["version"]}
+    return pages.get(PAGE).text
 
 
 def trains(service: Service) -> int:
@@ -263,13 +243,13 @@ def trains(service: Service) -> int:
     return len(service.rig.calibration.trains)
 
 
-def at_once(service: Service, press: Any, count: int = 2) -> list[httpx.Response]:
+def at_once(service: Service, pressed: Any, count: int = 2) -> list[httpx.Response]:
     """Press so often; all requests stand at the turn before the first of them gets it."""
     context = service.context
     turn, loop = context.limits_lock, context.rig._task.get_loop()
     service.run(turn.acquire())
     answers: list[httpx.Response] = []
-    pressing = [threading.Thread(target=lambda: answers.append(press())) for _ in range(count)]
+    pressing = [threading.Thread(target=lambda: answers.append(pressed())) for _ in range(count)]
     for thread in pressing:
         thread.start()
     soon(lambda: len(turn._waiters or ()) >= count, 20)
@@ -279,29 +259,28 @@ def at_once(service: Service, press: Any, count: int = 2) -> list[httpx.Response
     return answers
 
 
-def test_two_presses_at_once_send_exactly_one_train(service: Service, tab: Any) -> None:
-    browser, fields = tab
-    answers = at_once(service, lambda: browser.post(f"{CALIBRATION_PAGE}/step/repeat", data=fields))
-    assert sorted(answer.status_code for answer in answers) == [303, 412] and trains(service) == 2
+def test_two_presses_at_once_send_exactly_one_train(service: Service, pages: httpx.Client, shown: str) -> None:
+    answers = at_once(service, lambda: press(pages, "", "/step", html=shown))
+    assert sorted(answer.status_code for answer in answers) == [202, 412] and trains(service) == 2
     (late,) = [answer.text for answer in answers if answer.status_code == 412]
     assert "Another train was sent after this page was shown, or another mark was set. Nothing was done now." in late
 
 
-def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(service: Service, tab: Any) -> None:
-    browser, fields = tab
+def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(
+    service: Service, pages: httpx.Client, shown: str
+) -> None:
     service.rig_thread.become("running")
-    for path in ("step/repeat", "mark/sensory", "finish"):
-        answer = browser.post(f"{CALIBRATION_PAGE}/{path}", data=fields)
-        assert answer.status_code == 412 and "Another train was sent" in answer.text, path
+    for call in ("/step", "/mark", "/finish"):
+        answer = press(pages, "", call, html=shown)
+        assert answer.status_code == 412 and "Another train was sent" in answer.text, call
     assert trains(service) == 1 and not service.rig.calibration.marks_us  # pyright: ignore[reportOptionalMemberAccess]
 
 
-def test_a_page_that_shows_not_all_marks_finishes_nothing(client: httpx.Client, service: Service, tab: Any) -> None:
-    browser, fields = tab
+def test_a_page_that_shows_not_all_marks_finishes_nothing(
+    client: httpx.Client, service: Service, pages: httpx.Client, shown: str
+) -> None:
     for threshold in ("sensory", "motor", "comfort"):
         client.post(f"{WHERE}/mark", json={"threshold": threshold})
-    assert browser.post(f"{CALIBRATION_PAGE}/finish", data=fields).status_code == 412
+    assert press(pages, "", "/finish", html=shown).status_code == 412
     assert trains(service) == 1
-    assert service.rig.calibration is not None
-    now = {**fields, "calibration": client.get(WHERE).json()["version"]}
-    assert browser.post(f"{CALIBRATION_PAGE}/finish", data=now).headers["location"] == "/participants/P017"
+    assert press(pages, PAGE, "/finish").status_code == 200

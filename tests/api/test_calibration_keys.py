@@ -40,7 +40,7 @@ def widths(service: Service) -> list[float]:
 
 def settled(page: Any, trains: int) -> None:
     """Wait until the page knows of so many trains and takes the next press."""
-    expected(page.locator("[name=calibration]").first).to_have_value(re.compile(rf"\.{trains}\."))
+    expected(page.locator(".touch form").first).to_have_attribute("data-if-match", re.compile(rf"\.{trains}\."))
     expected(page.locator("#step-repeat" if trains else "#step-up")).to_be_enabled()
 
 
@@ -148,8 +148,8 @@ def test_another_calibration_that_comes_under_the_hand_is_read_first(page: Any, 
         http.post("/v1/participants/K1/calibration/discard")
         http.post("/v1/participants/K1/calibration")
     page.evaluate("""() => { window.pressable = []; new MutationObserver(() => {
-        const box = document.getElementById("discard"), part = document.getElementById("calibration");
-        const told = part.textContent.includes("has begun another calibration");  // the rig's bar changes at any time
+        const box = document.getElementById("discard"), part = document.getElementById("refused");
+        const told = part?.textContent.includes("has begun another calibration");  // the rig's bar changes at any time
         if (box && told) window.pressable.push([!box.disabled, performance.now()]);
     }).observe(document.body, { childList: true, subtree: true, attributes: true }); }""")
     page.locator("#discard").focus()

@@ -56,19 +56,6 @@ def test_switching_colours_recolours_what_is_drawn_and_keeps_the_page(tab: Any, 
     assert tab.locator(".bar").get_by_role("button", name="Dark").get_attribute("aria-pressed") == "true"
 
 
-def test_without_scripts_the_switch_is_a_form(service: Service) -> None:
-    with service.client(token=None) as http:
-        chosen = http.post("/colours", data={"colours": "dark", "back": "/sign-in"})
-        assert chosen.headers["location"] == "/sign-in"
-        assert 'data-colours="dark"' in http.get("/sign-in").text
-        assert http.post("/colours", data={"colours": "pink"}).status_code == 422
-        away = http.post("/colours", data={"colours": "dark", "back": "//elsewhere.example"})
-        assert away.headers["location"] == "/"
-        assert (
-            http.post("/colours", data={"colours": "dark"}, headers={"Origin": "http://x.example"}).status_code == 403
-        )
-
-
 AT_REST = """() => new Promise((done) => { let last = scrollY, frames = 0;
   const look = () => { frames = scrollY === last ? frames + 1 : 0; last = scrollY;
     frames < 30 ? requestAnimationFrame(look) : done(scrollY); };

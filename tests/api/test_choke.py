@@ -139,7 +139,7 @@ def test_who_leaves_in_the_middle_of_a_form_is_no_error_of_ours(
 ):
     client.post("/v1/users", json={"name": "Ada", "password": "correct horse battery"})
     with service.client(None) as page:
-        page.post("/sign-in", data={"name": "Ada", "password": "correct horse battery"})
+        page.post("/v1/sessions", data={"name": "Ada", "password": "correct horse battery"})
         cookie = "; ".join(f"{name}={value}" for name, value in page.cookies.items())
     kinds = {"host": "x", "content-type": "application/x-www-form-urlencoded", "content-length": "10", "cookie": cookie}
     scope = {"type": "http", "method": "POST", "path": "/participants/none/calibration", "query_string": b""}

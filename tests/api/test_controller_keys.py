@@ -97,7 +97,7 @@ def test_every_route_that_is_not_opened_is_closed(shared: Service, one_key: str,
         assert answer.status_code == 200
     elif (method, path) == ("POST", "/v1/tests"):
         assert answer.status_code == 428  # no body: which participant is meant is not known yet
-    elif (method, path) in (("POST", "/sign-in"), ("POST", "/v1/sessions")):
+    elif (method, path) == ("POST", "/v1/sessions"):
         assert answer.status_code == 401
     else:
         assert answer.status_code == 403, answer.text
@@ -361,7 +361,7 @@ def test_one_that_a_program_makes(shared: Service, admin: httpx.Client, done: di
 def test_it_signs_nobody_in_on_the_page(shared: Service, admin: httpx.Client) -> None:
     text = made(admin)
     with shared.client(token=None) as browser:
-        answer = browser.post("/sign-in", data={"token": text})
+        answer = browser.post("/v1/sessions", data={"token": text})
         assert answer.status_code == 403 and "set-cookie" not in answer.headers
         home = browser.get("/", headers={"Authorization": f"Bearer {text}"})
         assert "P2" not in without_values(home.text) and "sign-in" in home.text

@@ -104,6 +104,7 @@ test_and_approve.__test__ = False  # type: ignore[attr-defined]
 
 def test_from_signing_in_to_an_approved_model(hand: Hand, service: Service) -> None:
     """At most 12 presses with a new participant, 9 with a known one; the trains and answers of a calibration apart."""
+    (service.data / "recordings" / "nothing-missing").touch()
     sign_in(hand, service)
     hand.type("code", "D1")
     hand.enter()

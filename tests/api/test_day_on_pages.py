@@ -57,7 +57,7 @@ def test_a_note_while_the_test_runs_does_not_leave_its_page(tab: Any, service: S
     assert tab.evaluate("window.same") and tab.get_by_label("Note (may be left empty)").input_value() == ""
     assert re.search(r"\d+\.\d s", tab.locator("#notes-written").inner_text())
     tab.get_by_role("button", name="Other").click()
-    tab.locator("#notes-written [role=alert]").wait_for()
+    tab.locator("#refused", has_text="say in a few words what it is").wait_for()
     tab.get_by_role("button", name="Stop stimulation").click()
     tab.get_by_role("link", name="See what was recorded").click()
     tab.get_by_label("Time in the test (s)").fill("0,4")
@@ -112,8 +112,8 @@ def test_a_persons_hand_is_told_and_a_scripts_is_not(tab: Any, service: Service)
     tab.goto(service.url + "/")
     tab.evaluate("document.dispatchEvent(new KeyboardEvent('keydown', {bubbles: true}))")
     tab.clock.run_for(30_000)
-    assert not [url for url in tab.requests if url.endswith("/rig/acted")]
-    with tab.expect_request("**/rig/acted"):
+    assert not [url for url in tab.requests if url.endswith("/sessions/acted")]
+    with tab.expect_request("**/sessions/acted"):
         tab.keyboard.press("Shift")
         tab.clock.run_for(30_000)
 

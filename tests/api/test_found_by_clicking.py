@@ -55,6 +55,8 @@ def test_hidden_effect_is_found_added_and_approved_by_clicking(tab: Any, service
     there(tab, "Muscle model of H1")
     expected(tab.get_by_text("+ hysteresis of recruitment")).to_be_visible()
     tab.go_back()
+    if not tab.get_by_label("Your password, once more").first.is_visible():
+        tab.get_by_text("Approve or reject it").click()
     tab.get_by_label("Your password, once more").first.fill(PASSWORD)
     tab.get_by_role("button", name="Approve").click()
     tab.get_by_text("the controller gets this model").wait_for()

@@ -15,7 +15,8 @@ from stimrig.api.clock import Clock
 from stimrig.api.people.auth import IdleLock
 from stimrig.api.people.pace import Pace
 from tests.api.browser import PASSWORD, without_values
-from tests.api.conftest import HTML, STUB, TOKEN, Service, csrf, run_service, wait_done
+from tests.api.conftest import HTML, STUB, TOKEN, Service, run_service, wait_done
+from tests.api.forms import find, press
 
 SCRIPT = {"Sec-Fetch-Dest": "empty", "Sec-Fetch-Mode": "cors"}
 
@@ -84,7 +85,6 @@ def test_it_locks_after_ten_minutes_and_not_before(service: Service, clock: SetC
     ("path", "headers"),
     [
         ("/rig/now", {}),
-        ("/rig/notice", {}),
         ("/v1/jobs/none", {}),
         ("/", {**SCRIPT, **HTML}),
         ("/v1/rig", SCRIPT),
@@ -103,7 +103,7 @@ def test_what_scripts_read_by_themselves_keeps_no_session_open(
 def test_an_action_on_any_tab_keeps_all_of_them_open(service: Service, clock: SetClock) -> None:
     with signed_in(service) as http, service.client(token=None, cookies=http.cookies) as other:
         clock.ahead_s = 590.0
-        assert http.post("/rig/acted").status_code == 204
+        assert http.post("/v1/sessions/acted").status_code == 204
         clock.ahead_s = 1180.0
         assert not locked(other)
         assert other.get("/", headers=HTML).status_code == 200
@@ -117,11 +117,9 @@ def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(se
     with signed_in(service) as http:
         clock.ahead_s = 900.0
         assert http.post("/v1/participants", json={"code": "L9"}).status_code == 401
-        csrf = http.headers.pop("X-CSRF-Token")
-        assert http.post("/unlock", data={"secret": PASSWORD}, headers=HTML).status_code == 403
-        assert http.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 403
-        wrong = http.post("/unlock", data={"secret": "no", "csrf": csrf}, headers=HTML)
-        assert wrong.status_code == 401 and "Ada" in wrong.text and locked(http)
+        shown = http.get("/locked", headers=HTML).text
+        assert "Ada" in shown
+        assert press(http, "", "/unlock", html=shown, password="no").status_code == 401 and locked(http)
         for target in (
             "https://evil.example/",
             "//evil.example",
@@ -129,9 +127,12 @@ def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(se
             "/\t/evil.example",
             "javascript:x",
         ):
-            http.get("/locked", params={"next": target}, headers=HTML)
-            back = http.post("/unlock", data={"secret": PASSWORD, "csrf": csrf, "next": target}, headers=HTML)
-            assert back.status_code == 303 and back.headers["location"] == "/", target
+            page = http.get("/locked", params={"next": target}, headers=HTML).text
+            assert find(page, "/unlock")[1]["data-next"] == "/", target
+        csrf = http.headers.pop("X-CSRF-Token")
+        assert http.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 403
+        http.headers["X-CSRF-Token"] = csrf
+        assert press(http, "", "/unlock", html=shown, password=PASSWORD).status_code == 204 and not locked(http)
     with service.client() as admin:
         assert admin.get("/v1/participants/L9").status_code == 404
 
@@ -175,21 +176,19 @@ def test_the_red_button_works_on_a_locked_page(service: Service, clock: SetClock
 
 def test_a_session_by_token_asks_for_the_token(service: Service, clock: SetClock) -> None:
     with service.client(token=None) as http:
-        http.post("/sign-in", data={"token": TOKEN})
-        page = http.post("/lock", data={"csrf": csrf(http)}, headers=HTML)
-        assert page.status_code == 303 and locked(http)
+        http.post("/v1/sessions", data={"token": TOKEN})
+        assert press(http, "/", "/lock").status_code == 204 and locked(http)
         form = http.get("/locked", headers=HTML).text
         assert "Access token" in form
-        token = form.split('name="csrf" value="')[1].split('"')[0]
-        assert http.post("/unlock", data={"secret": PASSWORD, "csrf": token}, headers=HTML).status_code == 401
-        assert http.post("/unlock", data={"secret": TOKEN, "csrf": token}, headers=HTML).status_code == 303
+        assert press(http, "", "/unlock", html=form, password=PASSWORD).status_code == 401
+        assert press(http, "", "/unlock", html=form, password=TOKEN).status_code == 204
         assert not locked(http)
 
 
 def test_somebody_else_may_leave_for_the_one_who_is_gone(service: Service, clock: SetClock) -> None:
     with signed_in(service) as http:
         http.post("/v1/sessions/lock")
-        assert http.post("/sign-out", data={"csrf": http.headers["X-CSRF-Token"]}, headers=HTML).status_code == 303
+        assert press(http, "/locked", "DELETE /v1/sessions/current").status_code == 204
         assert http.get("/v1/rig").json()["type"] == "/problems/unauthorized"
 
 

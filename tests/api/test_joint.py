@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-import html
 import json
 import math
-import re
 from typing import Any
 
 import httpx
 import pytest
 
-from tests.api.conftest import Service, csrf, own_service, run_test, soon, wait_done
+from tests.api.conftest import Service, own_service, run_test, soon, wait_done
 from tests.api.fake_arm import back_and_forth, still
+from tests.api.forms import press
 from tests.api.test_controller_keys import made
-from tests.api.test_forms import fields
+from tests.api.test_problems import problem
 
 RANGE = [math.radians(20), math.radians(110)]
 
@@ -110,38 +109,35 @@ def test_a_range_voids_no_calibration(service: Service, client: httpx.Client, re
 
 def test_two_poses_on_the_page_and_the_first_once_more(service: Service, pages: httpx.Client, ready: str) -> None:
     service.rig.arm.way = still(math.radians(15))
-    at, token = "/rig/angle", {"csrf": csrf(pages)}
+    at = "/rig/angle"
     assert "Not calibrated." in pages.get(at).text
 
-    def pose(text: str, **more: str) -> str:
-        shown = dict(re.findall(r'name="(seen|first)" value="([^"]*)"', pages.get(at, params=more).text))
-        return pages.post(f"{at}/pose", data={**token, **shown, "angle_deg": text}, follow_redirects=True).text
+    def pose(text: str, query: str = "") -> httpx.Response:
+        return press(pages, at + query, "/pose", angle_rad=text)
 
-    for slip, words in (("zwei", "is not a plain number"), ("200", "200° is not within −6° … 138°, as this rig asks")):
-        refused = pose(slip)
-        assert words in html.unescape(refused) and f'value="{slip}"' in refused
-    assert "Second pose" in pose("51"), "a slip"
-    assert "The first pose is taken: 15°" in pose("15", again="1")
-    assert "less than 0.5 rad apart" in pose("20")
-    assert "at 15° and 100°" in pose("100,4")
+    (error,) = problem(pose("200"), 422)["errors"]
+    assert error == {"field": "angle_rad", "detail": "200° is not within −6° … 138°, as this rig asks"}
+    assert pose("51").status_code == 200 and "Second pose" in pages.get(at).text, "a slip"
+    assert pose("15", "?again=1").status_code == 200 and "The first pose is taken: 15°" in pages.get(at).text
+    assert "less than 0.5 rad apart" in pose("20").text
+    assert pose("100,4").status_code == 200 and "at 15° and 100°" in pages.get(at).text
     found = service.rig.arm.calibration
     assert [round(math.degrees(one.angle_rad), 1) for one in found.poses] == [15.0, 100.4]
 
 
-def test_a_range_is_typed_in_degrees(client: httpx.Client, pages: httpx.Client, ready: str) -> None:
+def test_a_range_is_typed_in_degrees(service: Service, client: httpx.Client, pages: httpx.Client, ready: str) -> None:
     page = f"/participants/{ready}"
 
-    def typed(low: str, high: str) -> str:
-        form = {**fields(pages), "csrf": csrf(pages), "angle_from_deg": low, "angle_to_deg": high}
-        return html.unescape(pages.post(f"{page}/profile", data=form, follow_redirects=True).text)
+    def typed(low: str, high: str) -> httpx.Response:
+        return press(pages, page, "/profile", angle_range_rad=(low, high))
 
-    for low, high, words in (("110", "20", "must be at least 10° above"), ("x", "110", "not a plain number"),
-                             ("20", "170", "as this rig asks")):  # fmt: skip
-        assert words in typed(low, high)
-    typed("−5", "90")
+    for low, high, words in (("110", "20", "must be at least 10°"), ("20", "170", "as this rig asks")):
+        (error,) = problem(typed(low, high), 422)["errors"]
+        assert error["field"] == "angle_range_rad" and words in error["detail"]
+    assert typed("−5", "90").status_code == 200
     found = client.get(f"/v1{page}").json()["profile"]["angle_range_rad"]
     assert [round(math.degrees(value), 6) for value in found] == [-5, 90]
-    typed("", "")
+    assert typed("", "").status_code == 200
     assert "Set the range first." in pages.get(f"{page}/joint").text
 
 

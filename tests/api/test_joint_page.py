@@ -28,8 +28,8 @@ def sensor(service: Service) -> Service:
 
 def with_range(tab: Any, service: Service, code: str = "X1") -> None:
     participant(tab, service, code)
-    tab.locator("#angle_from_deg").fill("20")
-    tab.locator("#angle_to_deg").fill("110")
+    tab.locator("#angle-0").fill("20")
+    tab.locator("#angle-1").fill("110")
     tab.get_by_role("button", name="Set the limits").click()
     tab.wait_for_load_state()
 

@@ -53,7 +53,7 @@ def test_a_name_means_one_person_however_it_is_typed(service: Service, http: htt
     with service.client(token=None) as browser:
         signed = browser.post("/v1/sessions", json={"name": name, "password": PASSWORD})
         assert signed.status_code == 201 and signed.json()["name"] == JOERG
-        page = browser.post("/sign-in", data={"name": name, "password": PASSWORD})
+        page = browser.post("/v1/sessions", data={"name": name, "password": PASSWORD})
         assert page.status_code == 303
         assert JOERG in browser.get("/", headers={"Accept": "text/html"}).text
     last = http.get("/v1/audit").json()["entries"][-1]

@@ -86,9 +86,9 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     # nothing starts
     ({"rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({"rig": "uncertain"}, "rearm", "needs a re-arm", ""),
-    ({"archived_since": "today"}, "archived", "In the archive since today", "/participants/P1/unarchive"),
-    ({"archived_since": "today", "rig": "latched"}, "archived", "no test starts", "/participants/P1/unarchive"),
-    ({"archived_since": "today", "model": READY}, "archived", "no test starts", "/participants/P1/unarchive"),
+    ({"archived_since": "today"}, "archived", "In the archive since today", "form"),
+    ({"archived_since": "today", "rig": "latched"}, "archived", "no test starts", "form"),
+    ({"archived_since": "today", "model": READY}, "archived", "no test starts", "form"),
     ({"archived_since": "today", **RUNS}, "running", "is running", "/tests/T1"),
     ({"rig": "disconnected"}, "wait", "not connected", ""),
     ({"rig": "unreachable"}, "wait", "does not answer", ""),
@@ -127,13 +127,13 @@ def shown(service: Service, path: str = "/participants/P017") -> tuple[str, str]
     """The line's kind with what it is about, and its words."""
     with signed_in(service) as browser:
         text = browser.get(path).text
-        found = re.search(r'data-next="([^"]*)".*?data-words>(.*?)</b>', text, re.DOTALL)
+        found = re.search(r'data-next-key="([^"]*)".*?data-words>(.*?)</b>', text, re.DOTALL)
         assert found, "the page has the line"
-        assert text.count("data-next=") == 1
+        assert text.count("data-next-key=") == 1
         section = text[found.start() : text.index("</section>", found.end())]
         assert len(re.findall(r"<button|<a ", section)) <= 1
         code = re.search(r'data-from="/participants/([^/"]*)/next"', text)
-        assert code and browser.get(f"/participants/{code[1]}/next").json() == {"key": found[1]}
+        assert code and browser.get(f"/participants/{code[1]}/next").json()["key"] == found[1]
     leads = re.search(r'href="/(?:tests|models)/([^"]*)"', section)
     return f"{found[1].split()[0]} {leads[1] if leads else ''}".strip(), html.unescape(found[2])
 

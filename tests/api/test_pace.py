@@ -152,12 +152,10 @@ def test_guesses_of_tokens_are_slowed_down_and_keep_no_controller_out(
     assert [asked(f"guess {number}", OWN) for number in range(5)][-1] == 429
     assert asked(TOKEN, OWN) == 200, "where it opened before, it goes on opening"
     with service.client(token=None, headers={"X-Forwarded-For": "10.0.0.7"}) as page:
-        answers = [page.post("/sign-in", data={"token": f"guess {number}"}).status_code for number in range(6)]
-        assert answers == [401] * 5 + [429], "signing in on the page is held to the same pace"
-        refused = page.post("/sign-in", data={"token": "guess"}, headers={"Accept": "text/html"})
-        assert (
-            refused.status_code == 429 and int(refused.headers["retry-after"]) >= 1 and "Try again in" in refused.text
-        )
+        answers = [page.post("/v1/sessions", data={"token": f"guess {number}"}).status_code for number in range(6)]
+        assert answers == [401] * 5 + [429], "the page's door is held to the same pace"
+        told = page.post("/v1/sessions", data={"token": "guess"}, headers={"Accept": "text/html"})
+        assert told.status_code == 429 and int(told.headers["retry-after"]) >= 1 and "Try again in" in told.text
         assert page.get(path, headers={"Authorization": "Bearer guess"}).status_code == 429
         assert page.post("/v1/stop", headers={"Authorization": f"Bearer {drawn}"}).status_code == 200
 

@@ -14,6 +14,7 @@ import pytest
 
 from stimrig.api.web import pages
 from tests.api.browser import (
+    NAME,
     NARROW,
     PASSWORD,
     PHONE,
@@ -96,11 +97,19 @@ def test_stop_works_while_the_live_channel_is_cut(tab: Any, service: Service) ->
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
 
-def test_everything_needed_works_without_scripts(browser: Any, service: Service) -> None:
-    for page in open_tab(browser, service, java_script_enabled=False):
-        participant(page, service, f"N{time.time_ns() % 10**9}")
-        start(page)
-        assert "Scripts are off" in page.content() and 'http-equiv="refresh"' in page.content()
+def test_without_scripts_signing_in_and_stop_work_and_the_page_says_so(
+    browser: Any, service: Service, client: httpx.Client
+) -> None:
+    client.post("/v1/users", json={"name": NAME, "password": PASSWORD})
+    client.post("/v1/participants", json={"code": "N1"})
+    for page in open_tab(browser, service, signed_in=False, java_script_enabled=False):
+        page.goto(f"{service.url}/sign-in?next=/participants/N1")
+        page.get_by_label("Name", exact=True).fill(NAME)
+        page.get_by_label("Password").fill(PASSWORD)
+        page.get_by_role("button", name="Sign in", exact=True).click()
+        page.wait_for_url("**/participants/N1")
+        assert "This page needs scripts." in page.content()
+        client.post("/v1/tests", json={"participant": "N1"})
         page.get_by_role("button", name="Stop stimulation").click()
         page.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
@@ -139,7 +148,7 @@ def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> 
         '<script type="application/json" id="rig-words">{"left": "{seconds} s", "show": "Show it", "news": "News."}'
         "</script>"
         '<input id="mine"><div data-job="J"><b data-words></b><span data-left></span><progress></progress></div>'
-        f"<script>{script}</script>"
+        f"<script>const act = {{ busy: () => false }};{script}</script>"
     )
     job = {"progress": 0.5, "text": "at work", "time_left_s": 2.0, "done": False}
     answers = iter([500, 503])  # of a service that starts again
@@ -201,7 +210,7 @@ def test_a_reader_sees_no_deeds_and_may_stop(service: Service, client: httpx.Cli
     body = {"name": "Rosa", "password": PASSWORD, "scopes": ["read-live", "read-model"]}
     assert client.post("/v1/users", json=body).status_code in (201, 409)
     with service.client(token=None, headers=HTML, follow_redirects=True) as page:
-        home = page.post("/sign-in", data={"name": "Rosa", "password": PASSWORD}).text
+        home = page.post("/v1/sessions", data={"name": "Rosa", "password": PASSWORD}).text
         assert "You may not see this list" in home and "C4" not in without_values(home)
         shown = page.get(f"/models/{model}").text
         assert "A clinician approves or rejects it." in shown

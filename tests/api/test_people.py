@@ -28,12 +28,12 @@ from tests.api.conftest import (
     TOKEN,
     Service,
     SetClock,
-    csrf,
     run_service,
     run_test,
     signed_in,
     wait_done,
 )
+from tests.api.forms import press
 
 PASSWORD = "correct horse battery"
 
@@ -90,14 +90,14 @@ def test_approval_needs_the_password_once_more(
 
 def test_a_form_signs_in_and_leads_on_and_another_site_does_not(service: Service, clinician: httpx.Client) -> None:
     with service.client(token=None, follow_redirects=False) as browser:
-        form = {"name": "Ada", "password": PASSWORD, "next": "/participants/P1"}
+        form, on = {"name": "Ada", "password": PASSWORD}, {"next": "/participants/P1"}
         foreign = browser.post("/v1/sessions", data=form, headers={"Origin": "https://elsewhere.example"})
         assert foreign.status_code == 403
-        answer = browser.post("/v1/sessions", data=form)
+        answer = browser.post("/v1/sessions", data=form, params=on)
         assert answer.status_code == 303 and answer.headers["location"] == "/participants/P1"
-        elsewhere = browser.post("/sign-in", data=form, headers={"Origin": "https://elsewhere.example"})
+        elsewhere = browser.post("/v1/sessions", data=form, headers={"Origin": "https://elsewhere.example"})
         assert elsewhere.status_code == 403
-        away = browser.post("/v1/sessions", data=form | {"next": "//elsewhere.example"})
+        away = browser.post("/v1/sessions", data=form, params={"next": "//elsewhere.example"})
         assert away.headers["location"] == "/"
 
 
@@ -111,7 +111,7 @@ def tries(asgi: Any, peer: str, forwarded: list[str]) -> list[int]:
             for number, address in enumerate(forwarded):
                 form = {"name": f"n{peer}-{number}", "password": "wrong"}
                 headers = {"X-Forwarded-For": address} if address else {}
-                codes.append((await http.post("/sign-in", data=form, headers=headers)).status_code)
+                codes.append((await http.post("/v1/sessions", data=form, headers=headers)).status_code)
             return codes
 
     return asyncio.run(run())
@@ -265,16 +265,16 @@ def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
 
 def test_signing_out_ends_the_session(service: Service, pages: httpx.Client) -> None:
     cookie = dict(pages.cookies)
-    pages.post("/sign-out", data={"csrf": csrf(pages)})
+    press(pages, "/", "DELETE /v1/sessions/current")
     assert service.client(None, cookies=cookie).get("/v1/rig").status_code == 401
 
 
 def test_sign_in_leads_nowhere_else(service: Service) -> None:
     with service.client(None, headers=HTML) as browser:
         for target in ("//evil.example", "https://evil.example", "/\\evil.example"):
-            answer = browser.post("/sign-in", data={"token": TOKEN, "next": target})
+            answer = browser.post("/v1/sessions", params={"next": target}, data={"token": TOKEN})
             assert answer.headers["location"] == "/"
-        wrong = browser.post("/sign-in", data={"token": "wrong"})
+        wrong = browser.post("/v1/sessions", data={"token": "wrong"})
         assert wrong.status_code == 401 and "unknown" in wrong.text
     with service.client(None, headers=HTML) as stranger:
         led = stranger.get("/participants/P1")

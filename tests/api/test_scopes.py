@@ -27,18 +27,11 @@ GET    /                                                   anybody        200
 GET    /rig/now                                            anybody        200
 GET    /stopped/x                                          anybody        404
 GET    /sign-in                                            anybody        200
-POST   /sign-in                                            anybody        401
-POST   /colours                                            anybody        4xx
 POST   /v1/sessions                                        anybody        401
 POST   /v1/stop                                            anyone         200
-GET    /rig/notice                                         anyone         200
-POST   /sign-out                                           anyone         303
 POST   /v1/sessions/confirm                                anyone         422
 DELETE /v1/sessions/current                                anyone         404
-POST   /rig/acted                                          anyone         204
 GET    /locked                                             anyone         303
-POST   /unlock                                             anyone         303
-POST   /lock                                               anyone         303
 POST   /v1/sessions/acted                                  anyone         204
 POST   /v1/sessions/lock                                   anyone         409
 POST   /v1/sessions/unlock                                 anyone         422
@@ -47,12 +40,9 @@ GET    /v1/rig                                             read-live      200
 GET    /v1/rig/angle                                       read-live      200
 POST   /v1/rig/angle/pose                                  run-test       428
 GET    /rig/angle                                          run-test       409
-POST   /rig/angle/pose                                     run-test       4xx
 GET    /v1/participants/x/joint                            run-test       404
 POST   /v1/participants/x/models                           run-test       422
 GET    /participants/x/joint                               run-test       404
-POST   /participants/x/joint/tests                         run-test       4xx
-POST   /participants/x/joint/model                         run-test       404
 GET    /v1/tests                                           read-live      200
 GET    /v1/tests/x                                         read-live      404
 GET    /tests/x                                            read-live      404
@@ -97,29 +87,14 @@ POST   /v1/participants/x/calibration/discard              run-test       428
 DELETE /v1/participants/x/keys/x                           run-test       404
 POST   /v1/tests                                           run-test       428
 POST   /v1/tests/x/keep-plain                              run-test       404
-POST   /tests/x/keep-plain                                 run-test       404
 POST   /v1/tests/x/enough                                  run-test       404
-POST   /tests/x/enough                                     run-test       404
 POST   /v1/preview                                         run-test       422
 POST   /v1/models/x/effects                                run-test       422
-POST   /models/x/experiment                                run-test       4xx
 POST   /v1/models/x/improve                                run-test       404
 DELETE /v1/jobs/x                                          run-test       404
 GET    /participants/x                                     run-test       404
 GET    /participants/x/next                                run-test       404
-GET    /participants/x/trials                              run-test       404
-POST   /participants                                       run-test       4xx
-POST   /participants/x/profile                             run-test       4xx
-POST   /participants/x/tests                               run-test       4xx
-POST   /participants/x/recordings                          run-test       4xx
 GET    /participants/x/calibration                         run-test       404
-POST   /participants/x/calibration                         run-test       4xx
-POST   /participants/x/calibration/step/up                 run-test       4xx
-POST   /participants/x/calibration/mark/motor              run-test       4xx
-POST   /participants/x/calibration/finish                  run-test       4xx
-POST   /participants/x/calibration/discard                 run-test       4xx
-GET    /participants/x/confirm/x                            run-test       410
-POST   /participants/x/confirm/x                           run-test       410
 PUT    /v1/participants/x/muscle                           run-test       428
 POST   /v1/participants/x/archive                          run-test       428
 POST   /v1/participants/x/unarchive                        run-test       428
@@ -127,17 +102,8 @@ GET    /v1/participants/x/notes                            run-test       404
 POST   /v1/participants/x/notes                            run-test       422
 POST   /v1/participants/x/notes/x/strike                   run-test       404
 PUT    /v1/tests/x/ran-by                                  run-test       428
-POST   /participants/x/notes                               run-test       4xx
-POST   /participants/x/notes/x/strike                      run-test       4xx
-POST   /participants/x/archive                             run-test       4xx
-POST   /participants/x/unarchive                           run-test       4xx
-POST   /participants/x/muscle                              run-test       4xx
-POST   /tests/x/ran-by                                     run-test       4xx
-POST   /participants/x/keys/x/revoke                       run-test       404
 POST   /v1/participants/x/keys                             approve-model  428
-POST   /participants/x/keys                                approve-model  4xx
 POST   /v1/rearm                                           rearm          428
-POST   /rearm                                              rearm          4xx
 POST   /v1/models/x/approve                                approve-model  428
 POST   /v1/models/x/reject                                 approve-model  404
 POST   /v1/models/x/undo                                   approve-model  428
@@ -152,6 +118,7 @@ PUT    /v1/users/x/password                                administer     428
 DELETE /v1/users/x                                         administer     404
 GET    /administration                                     administer     200
 GET    /administration/audit.jsonl                         administer     200
+GET    /participants/x/start                               run-test       404
 """
 """Method, path, who may, and what they are answered, where nothing of the name x is there and no body is sent.
 
@@ -203,7 +170,7 @@ def test_each_scope_gets_what_the_table_says(
     for number, holder in enumerate(expected):
         head = {"Authorization": holders[holder]} if holder in holders else {}
         head["X-Forwarded-For"] = f"10.0.0.{number}"  # nobody is held back for another's tries
-        form = {"data": {"name": holder}} if path == "/sign-in" else {}
+        form = {"data": {"name": holder}} if path == "/v1/sessions" else {}
         code = http.request(method, path, headers=head, **form).status_code
         found[holder] = "4xx" if expected[holder] == "4xx" and code in {*range(400, 500)} - {401, 403} else str(code)
     assert found == expected
@@ -212,7 +179,7 @@ def test_each_scope_gets_what_the_table_says(
 def test_forms_of_another_page_change_nothing(shared: Service) -> None:
     """A session without its CSRF token may look and may stop: every route that writes is tried."""
     with shared.client(token=None) as page:
-        assert page.post("/sign-in", data={"token": TOKEN}).status_code == 303
+        assert page.post("/v1/sessions", data={"token": TOKEN}).status_code == 303
         tried = 0
         for method, path, who, _ in ROWS:
             if method == "GET" or who == "anybody" or path == "/v1/stop":
@@ -220,7 +187,7 @@ def test_forms_of_another_page_change_nothing(shared: Service) -> None:
             answer = page.request(method, path, auth=None)
             assert (answer.status_code, answer.json()["type"]) == (403, "/problems/csrf"), (method, path)
             tried += 1
-        assert tried > 40 and page.post("/v1/stop").status_code == 200
+        assert tried > 30 and page.post("/v1/stop").status_code == 200
 
 
 def test_a_key_that_only_reads_cancels_nothing(service: Service, client: httpx.Client, participant: str) -> None:

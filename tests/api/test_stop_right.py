@@ -18,6 +18,7 @@ from sqlalchemy.exc import OperationalError
 from stimrig.api.clock import Clock
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.stops import RIGHT_S, StopRights
+from tests.api import forms
 from tests.api.conftest import HTML, TOKEN, Service, SetClock, soon
 from tests.api.conftest import csrf as csrf_of
 from tests.api.test_people import standing_still
@@ -31,8 +32,13 @@ def person(service: Service, name: str = "Ada") -> httpx.Client:
     with service.client() as client:
         client.post("/v1/users", json={"name": name, "password": PASSWORD})
     browser = service.client(token=None, headers=HTML)
-    assert browser.post("/sign-in", data={"name": name, "password": PASSWORD}).status_code == 303
+    assert browser.post("/v1/sessions", data={"name": name, "password": PASSWORD}).status_code == 303
     return browser
+
+
+def rest(browser: httpx.Client, method: str, path: str) -> httpx.Response:
+    """As the script of a page calls it."""
+    return browser.request(method, path, headers={"X-CSRF-Token": csrf_of(browser), "Accept": "application/json"})
 
 
 def cookie_name(service: Service) -> str:
@@ -62,8 +68,7 @@ def stops_noted(client: httpx.Client) -> list[dict[str, Any]]:
 
 
 def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) -> None:
-    csrf = csrf_of(browser)
-    assert browser.post("/sign-out", data={"csrf": csrf}).status_code == 303
+    assert rest(browser, "DELETE", "/v1/sessions/current").status_code == 204
 
 
 def run_out(_browser: httpx.Client, _client: httpx.Client, service: Service) -> None:
@@ -83,8 +88,8 @@ def locked_out(browser: httpx.Client, client: httpx.Client, service: Service) ->
     sign_out(browser, client, service)
     for number in range(8):
         service.client(f"guess {number}").get("/v1/rig")
-        browser.post("/sign-in", data={"name": "Ada", "password": "wrong"})
-    assert browser.post("/sign-in", data={"name": "Ada", "password": PASSWORD}).status_code == 429
+        browser.post("/v1/sessions", data={"name": "Ada", "password": "wrong"})
+    assert browser.post("/v1/sessions", data={"name": "Ada", "password": PASSWORD}).status_code == 429
 
 
 async def too_late(*_: object, **__: object) -> None:
@@ -269,10 +274,8 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
     with service.client(token) as program, service.client(token=None, headers=HTML) as page:
         refused = program.post("/v1/rearm")
         assert refused.status_code == 403 and "rearm" in refused.json()["detail"]
-        assert program.post("/rearm").status_code == 403
-        page.post("/sign-in", data={"token": token})
-        csrf = csrf_of(page)
-        assert page.post("/rearm", data={"csrf": csrf}).status_code == 403, "a token that signs in is no person"
+        page.post("/v1/sessions", data={"token": token})
+        assert rest(page, "POST", "/v1/rearm").status_code == 403, "a token that signs in is no person"
         assert "I have checked" not in page.get("/").text
         assert program.post("/v1/tests", json=start).status_code == 409
         assert program.post(calibration).status_code == 409
@@ -281,13 +284,11 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         assert program.post(f"{calibration}/step", json={}, headers=seen).status_code == 404
         assert program.get("/v1/rig").json()["state"] == "latched" and service.rig.starts == 0
         assert "I have checked" in browser.get("/").text
-        csrf = csrf_of(browser)
-        assert browser.post("/v1/rearm", headers={"X-CSRF-Token": csrf}).status_code == 200
+        assert forms.press(browser, "/", "/rearm").status_code == 200
         assert program.post("/v1/tests", json=start).status_code == 202
 
 
 def test_a_person_who_runs_no_tests_does_not_rearm(service: Service, client: httpx.Client) -> None:
     client.post("/v1/users", json={"name": "Eve", "password": PASSWORD, "scopes": ["read-live", "read-model"]})
     browser = person(service, "Eve")
-    csrf = csrf_of(browser)
-    assert browser.post("/rearm", data={"csrf": csrf}).status_code == 403
+    assert rest(browser, "POST", "/v1/rearm").status_code == 403

@@ -70,13 +70,11 @@ def test_the_card_tells_the_trials_without_scripts(service: Service, client: htt
     page = client.get(PAGE).text
     card = page[page.index('<section class="card trials"') :]
     assert "In trial 3 the plateau is 5.9 % lower than at " in card and "as of trial 3, " in card
-    assert "(just now)" in card
     assert card.count("<figure") == 3, "nobody sent a reference, so there is no error against it"
     for unit in ("94.1 ± 1.0\u00a0%", "0.5 ± 0.0\u00a0µs", "100.0 ± 1.0\u00a0%"):
         assert unit in card, unit
     assert card.count("Number of the trial") == 3
     assert "not followed" in card and "the record is too short" in card and "Start the adaptive test" not in card
-    assert client.get(f"{PAGE}/trials").text.strip() in page
 
 
 def test_what_is_asked_leads_to_the_shortest_test_in_one_click(
@@ -88,10 +86,8 @@ def test_what_is_asked_leads_to_the_shortest_test_in_one_click(
     assert "The trials say that a new test is needed." in page
     notice = re.search(r'<div class="notice bad" role="alert">.*?</div>', page, re.S)
     assert notice and "After trial 1 the gain is expected to be 70.0 %" in notice[0]
-    fields = dict(re.findall(r'name="(\w+)" value="([^"]*)"', notice[0]))
-    asked = pages.post(f"{PAGE}/tests", data=fields)
-    assert asked.status_code == 303 and "/confirm/" in asked.headers["location"]
-    assert "Stops once known within" in pages.get(asked.headers["location"]).text
+    query = dict(re.findall(r'name="(\w+)" value="([^"]*)"', notice[0]))
+    assert "Stops once known within" in pages.get(f"{PAGE}/start", params=query).text
 
 
 def test_a_person_sets_the_limits_with_the_approval(pages: httpx.Client, client: httpx.Client, approved: str) -> None:
@@ -114,7 +110,7 @@ def test_a_person_sets_the_limits_with_the_approval(pages: httpx.Client, client:
 @pytest.mark.browser
 def test_the_card_is_renewed_while_trials_are_played(service: Service, client: httpx.Client, approved: str, tab: Any):
     # while a trial runs something else is next, and the page would be loaded anew
-    tab.route(f"**{PAGE}/next", lambda route: route.fulfill(status=204))
+    tab.add_init_script("addEventListener('DOMContentLoaded', () => { window.answering = () => true; })")
     tab.goto(service.url + PAGE)
     tab.evaluate("window.same = true")
     for number in (1, 2):

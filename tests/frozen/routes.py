@@ -34,7 +34,7 @@ VOLATILE = (
     (re.compile(r"\d{4}-\d\d-\d\dT[\d:.]+Z?"), "<time>"),
     (re.compile(r"\b\d{1,2}:\d\d(?::\d\d)?(?:\.\d+)?\b"), "<hh:mm>"),
     (re.compile(r"(name=\W?(?:csrf|seen|right)\W+value=)[^ >]+"), r"\1<secret>"),
-    (re.compile(r"(stimrig_session_|stimrig_|/confirm/)[\w-]{4,}"), r"\1<secret>"),
+    (re.compile(r"(stimrig_session_|stimrig_)[\w-]{4,}"), r"\1<secret>"),
     (re.compile(r"http://127\.0\.0\.1:\d+"), "<service>"),
 )
 
@@ -304,16 +304,16 @@ def pages(day: Day) -> None:
     """What a person sees and sends."""
     seen = (
         "/", "/?q=p2", "/?archived=1", "/participants/P1", "/participants/P2", "/participants/P1/next",
-        "/participants/P1/calibration", "/participants/P1/trend", "/participants/P1/trials", "/participants/P1/joint",
+        "/participants/P1/calibration", "/participants/P1/trend", "/participants/P1/joint",
         "/models/{model_first}", "/models/{model_added}", "/models/{model_second}", "/models/{model_first}/approve",
         "/models/{model_first}/report", "/models/{model_first}/widths", "/tests/{test_first}", "/tests/{test_stopped}",
         "/tests/{test_held}", "/tests/{test_trial}", "/compare?model={model_first}&model={model_second}", "/rig/angle",
-        "/rig/now", "/rig/notice", "/administration", "/sign-in", "/locked", "/models/none", "/nowhere", "/docs",
+        "/rig/now", "/administration", "/sign-in", "/locked", "/models/none", "/nowhere", "/docs",
     )  # fmt: skip
     with day.service.client(None, headers=HTML, follow_redirects=False) as http:
         day.ask("GET", "/", note="page nobody", http=http)
         day.ask("GET", "/sign-in", note="page nobody", http=http)
-        http.post("/sign-in", data={"name": "Ada", "password": "wrong"})
-        day.found["page signed in"] = day.kept(http.post("/sign-in", data={"token": TOKEN, "next": "/"}))
+        http.post("/v1/sessions", data={"name": "Ada", "password": "wrong"})
+        day.found["page signed in"] = day.kept(http.post("/v1/sessions", data={"token": TOKEN, "next": "/"}))
         for path in seen:
             day.ask("GET", path, note="page", http=http)

@@ -9,6 +9,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 
 from stimrig.api import clinical_words, effect_words, local_time
 from stimrig.api.models.changes import dose_words
+from stimrig.api.models.places import Site, site_of
 from stimrig.api.models.stored_model import followed
 from stimrig.rig.messages import LABEL_TITLES
 
@@ -39,6 +40,11 @@ def figures(value: float | None) -> str:
     return text.replace("-", "−")
 
 
+def site_words(site: Site) -> str:
+    """Write a site as a person says it: left, biceps brachii, A. Muscles keep their Latin names."""
+    return ", ".join(part for part in site if part) or "not said"
+
+
 environment.filters.update({
     "number": number, "followed": followed, "figures": figures, "when": local_time.when, "clock": local_time.clock,
     "day": local_time.day, "until": local_time.until,
@@ -47,4 +53,9 @@ environment.filters.update({
     "label_rows": clinical_words.label_rows, "dose": dose_words,
 })  # fmt: skip
 environment.policies["json.dumps_kwargs"] = {"sort_keys": True}
-environment.globals |= {"known_words": clinical_words.WORDS, "label_titles": LABEL_TITLES}
+environment.globals |= {
+    "site_words": site_words,
+    "site_of": site_of,
+    "known_words": clinical_words.WORDS,
+    "label_titles": LABEL_TITLES,
+}

@@ -18,10 +18,9 @@ from stimrig.api.models import advice, carried_structure, explanation, stored_mo
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.services import jobs, participants
 from stimrig.api.sessions import controllers
-from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store.tables import Model
-from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Tester, Version
-from stimrig.api.web.pages import next_view, starting
+from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
+from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.render import page
 from stimrig.api.web.pages.report_file import missing_parts
 
@@ -151,19 +150,6 @@ def versions_of(context: Context, row: Model, lineage: Sequence[Model] = ()) -> 
     """List the versions of the model's recording; `lineage`: where it is known."""
     known = lineage or context.versions.lineage(row)
     return explanation.versions([context.versions.document(version) for version in known], row.id)
-
-
-@router.post("/models/{model_id}/experiment")
-async def run_experiment(context: Ctx, principal: Tester, row: Version) -> Response:
-    """To the question before the diagnosis' next experiment; its recording is joined to this model's."""
-    found = await asyncio.to_thread(context.analyses.known_diagnosis, row)
-    experiment = (found or {}).get("experiment")
-    if not experiment:
-        detail = "The diagnosis of this recording names none: no effects need to be told apart."
-        raise ApiError(409, "no-experiment", "There is no next experiment", detail)
-    asked = {key: experiment[key] for key in ("segments", "pulse_rate_hz") if key in experiment}
-    body = TestIn.model_validate({"participant": row.participant, "kind": "next-experiment", "joins": row.id, **asked})
-    return RedirectResponse(await starting.ask(context, principal, body, back=f"/models/{row.id}#experiment"), 303)
 
 
 # ---- charts -------------------------------------------------------------------------------------------------

@@ -93,10 +93,7 @@ class Situation:
 
 @dataclass(frozen=True)
 class Step:
-    """The line. `href` empty: the button is a form's own (`test`, `calibrate`), or there is none (no `button`).
-
-    To the `href` of the kind `archived` a form is sent: it changes something.
-    """
+    """The line. `href` empty: the button calls REST (`test`, `calibrate`, `archived`), or there is none."""
 
     kind: Kind
     words: str
@@ -146,7 +143,7 @@ def _archived(now: Situation) -> Step | None:
     if not now.archived_since:
         return None
     words = f"In the archive since {now.archived_since}: no test starts."
-    return Step("archived", words, "Take out of the archive", f"/participants/{now.code}/unarchive")
+    return Step("archived", words, "Take out of the archive")
 
 
 def _model_waits(now: Situation) -> Step | None:
@@ -232,9 +229,19 @@ def _ended(now: Situation) -> str:
 
 @router.get("/participants/{code}/next")
 async def key(context: Ctx, who: Tester, code: str) -> dict[str, str]:
-    """Whether the line is still the one that the page shows."""
-    row = await asyncio.to_thread(participants.find, context, code)
-    return {"key": (await asyncio.to_thread(step, context, row, who)).key}
+    """Return what changes when the line, or the card of the trials, is another one."""
+
+    def read() -> dict[str, str]:
+        row = participants.find(context, code)
+        return {"key": step(context, row, who).key, "trials": trials_key(context, code)}
+
+    return await asyncio.to_thread(read)
+
+
+def trials_key(context: Context, code: str) -> str:
+    """Return what changes with each trial that is followed; empty where none may be."""
+    approval = context.tracked.allowing(code)
+    return f"{approval.id} {len(context.tracked.rows(approval.id))}" if approval else ""
 
 
 def step(context: Context, row: Participant, who: Principal) -> Step:

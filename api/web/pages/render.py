@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Awaitable, Callable
 from typing import Any
 from urllib.parse import quote
 
 from fastapi import Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
-from markupsafe import Markup
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api import local_time
@@ -23,18 +21,9 @@ from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment
 
 COLOURS = "stimrig_colours"
-"""The choice; it says nothing about who chose. `colours.js` writes it, too: then no page has to be loaded again."""
+"""The choice, written by `colours.js`; it says nothing about who chose."""
 CHOICES = ("light", "dark", "system")
 LOOK_S = 1.0
-
-
-async def done_or_said(done: Awaitable[Any], said: Callable[[ApiError], Awaitable[Response]], leads: str) -> Response:
-    """Do it and go on to a page; what the rig or the service refuses is said on the page that `said` makes."""
-    try:
-        await done
-    except ApiError as error:
-        return await said(error)
-    return RedirectResponse(leads, 303)
 
 
 NEWEST = 30
@@ -56,21 +45,12 @@ def page(request: Request, template: str, status: int = 200, **values: Any) -> H
     context: Context = request.app.state.context
     bar = {**bar_of(context, principal), "right": stop_right(request, looking), "version": request.app.version}
     shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
-    version = getattr(request.state, "version", 0)
-    shown["signed"] = signed(principal, version)
-    shown["version_of"] = lambda _document: version
+    shown["shown_version"] = getattr(request.state, "version", 0)
     shown["csrf"] = (looking.csrf if looking else None) or ""
     kept = request.cookies.get(COLOURS, "")
     shown["colours"] = kept if kept in CHOICES else "system"
     html = environment.get_template(template).render(request=request, **shown, **values)
     return HTMLResponse(html, status_code=status)
-
-
-def signed(principal: Principal | None, version: int = 0) -> Markup:
-    """What every form carries: that it is of this session, and the version of what the page shows."""
-    fields = {"csrf": (principal.csrf if principal else None) or "", "seen": version or ""}
-    field = Markup('<input type="hidden" name="{}" value="{}">')
-    return Markup("").join(field.format(name, value) for name, value in fields.items())
 
 
 def zone(context: Context) -> str:
@@ -110,13 +90,6 @@ def _right_of(context: Context, name: str) -> str:
     return context.stop_rights.give(name, current.test_id if current else None)
 
 
-def fragment(context: Context, template: str, principal: Principal, place: str) -> str:
-    """A part of a page by itself, for a script that renews it; `place`: the page it is on."""
-    bar = bar_of(context, principal)
-    values = {"principal": principal, "here": place, "signed": signed(principal)}
-    return environment.get_template(template).render(bar=bar, **values)
-
-
 def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
     """What every page has at its top."""
     return {
@@ -129,11 +102,10 @@ def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
 
 
 def here(request: Request) -> str:
-    """The address of the page that is shown; of the one with the form where a form was refused."""
-    if request.method == "GET":
-        return request.url.path + (f"?{request.url.query}" if request.url.query else "")
-    back = back_from(request.url.path)
-    return back[0] if back else "/"
+    """Return the address of the page that is shown; the first page where a form was posted."""
+    if request.method != "GET":
+        return "/"
+    return request.url.path + (f"?{request.url.query}" if request.url.query else "")
 
 
 def problem_page(request: Request, problem: ApiError) -> Response:
@@ -142,7 +114,7 @@ def problem_page(request: Request, problem: ApiError) -> Response:
         return RedirectResponse(f"/locked?next={quote(here(request), safe='')}", 303)
     if problem.status == 401 and request.method == "GET":
         return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
-    values: dict[str, Any] = {"problem": problem, "back": back_from(request.url.path), "again_at": request.url.path}
+    values: dict[str, Any] = {"problem": problem, "back": back_from(request.url.path)}
     response = page(request, "problem.html", problem.status, **values)
     response.headers.update(problem.headers)
     return response

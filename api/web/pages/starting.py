@@ -1,4 +1,4 @@
-"""The question before stimulation: a person sees who, how strong, how long, and confirms."""
+"""The page before a test: a person sees who, how strong and how long; its button starts exactly that plan."""
 
 from __future__ import annotations
 
@@ -8,23 +8,33 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
+from fastapi import APIRouter, Request
+from fastapi.responses import Response
+from pydantic import ValidationError
+
 from stimrig.api.clinical_words import degrees, label_rows, words
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, invalid
 from stimrig.api.local_time import until, when
 from stimrig.api.models.changes import dose_words
-from stimrig.api.models.places import Site, site_of
+from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Principal
 from stimrig.api.services import participants
 from stimrig.api.sessions import profiles
-from stimrig.api.sessions.joint_plan import HELD, PASSIVE
-from stimrig.api.sessions.playing import other_than, refuse_archived
-from stimrig.api.sessions.questions import Question, Row
+from stimrig.api.sessions.joint_plan import HELD, KINDS, PASSIVE
+from stimrig.api.sessions.playing import refuse_archived
+from stimrig.api.sessions.previews import VALID_S
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store.tables import AuditEntry, Participant
-from stimrig.api.web.dependencies import Context
-from stimrig.api.web.pages.environment import environment, number
+from stimrig.api.web.dependencies import Context, Ctx, Tester
+from stimrig.api.web.pages.environment import number, site_words
+from stimrig.api.web.pages.render import page
+from stimrig.rig.messages import LABEL_TITLES
 
+router = APIRouter(include_in_schema=False)
 NOBODY = "today nobody has tested which pulse widths are felt, move the limb and are comfortable"
+PRE_SESSION, ADAPTIVE, NEXT_EXPERIMENT = "pre-session", "adaptive", "next-experiment"
+Row = tuple[str, str]
+"""A line of what is about to happen: what, and its value."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +47,7 @@ class Calibrated:
 
 
 def calibrated(context: Context, row: Participant) -> Calibrated:
-    """Whether a person has found this participant's limits today, who, and whether a test may start without."""
+    """Say whether this participant's limits were found today, by whom, and whether a test may start without."""
     profile = row.profile
     state = profiles.calibration(profile, context.clock.utc())
     if state == "none":
@@ -45,106 +55,145 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
         return Calibrated(state, "not calibrated", not required)
     own = AuditEntry.subject == row.code, AuditEntry.action == "finish calibration"
     entry = context.store.first(AuditEntry, *own, order=AuditEntry.seq.desc())
-    said = {"time": when(profile.get("set_at_utc")), "end": until(profile.get("expires_at_utc"))}
-    said["name"] = entry.who if entry else "–"
-    if state == "expired":
-        words = "found on {time} by {name}, expired {end}".format(**said)
-    else:
-        words = "found on {time} by {name}, valid until {end}".format(**said)
-    return Calibrated(state, words, state == "valid")
+    time, end = when(profile.get("set_at_utc")), until(profile.get("expires_at_utc"))
+    ends = f"expired {end}" if state == "expired" else f"valid until {end}"
+    return Calibrated(state, f"found on {time} by {entry.who if entry else '–'}, {ends}", state == "valid")
 
 
-async def ask(context: Context, who: Principal, body: TestIn, back: str = "") -> str:
-    """Ask a person whether this test is to be started; the address of the question.
+@router.get("/participants/{code}/start")
+async def start(
+    request: Request, context: Ctx, who: Tester, code: str, kind: str = PRE_SESSION, target: float | None = None,
+    target_rad: float | None = None, model: str = "",
+) -> Response:  # fmt: skip
+    """Preview the test that the address names, and offer to start it.
 
-    Raises ApiError: 409 a test runs, or a calibration is wanted first; what the rig refuses.
+    Parameters
+    ----------
+    kind : str
+        Of the test.
+    target : float, optional
+        Of an adaptive test: within how many percent both curves are to be known.
+    target_rad : float, optional
+        Of a held test: the angle; default: the next that is open.
+    model : str
+        Of a next experiment: the model whose diagnosis names it.
+
+    Raises
+    ------
+    ApiError
+        409 a test runs, or a calibration is needed first; 422 no such test; what the rig refuses.
     """
-    row = await asyncio.to_thread(participants.find, context, body.participant)
+    row = await asyncio.to_thread(participants.find, context, code)
     refuse_archived(row)
     context.runner.refuse_second()
     standing = await asyncio.to_thread(calibrated, context, row)
     if not standing.may_start:
-        detail = f"{row.code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
+        detail = f"{code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
+    labels = {name: request.query_params.get(name, "").strip() or None for name in LABEL_TITLES}
+    own = await asyncio.to_thread(fields_of_kind, context, code, kind, target, target_rad, model)
+    body = checked_test(participant=code, kind=kind, **labels, **own)
     preview = await context.runner.preview(body)
-
-    async def action() -> str:
-        test = await context.runner.start(body, who.name, preview, who.token_hash)
-        return f"/tests/{test.id}"
-
-    strength = f"{current_words(row)}, {number(widest_us(preview), 0, 'µs')}"
-    stimulates = widest_us(preview) > 0.0
-    joint = preview.get("joint")
-    question = Question(
-        participant=row.code,
-        title=f"Start the {words(body.kind, 'kind')} of {row.code}?",
-        button=f"Start now: {strength}" if stimulates else "Start now: no stimulation",
-        action=action,
-        rows=rows(row, preview, standing, other_than(who.name, body.ran_by) or who.name, rig_words(context))
-        + [Row(*said) for said in label_rows(vars(body))],
+    widest_us, joint = max(preview["pulse_width_us"], default=0.0), preview.get("joint")
+    stimulates = widest_us > 0.0
+    strength = f"{current_words(row)}, {number(widest_us, 0, 'µs')}"
+    return page(
+        request,
+        "start.html",
+        participant=row,
+        title=f"Start the {words(body.kind, 'kind')} of {code}?",
+        button=f"Start now: {strength if stimulates else 'no stimulation'}",
+        rows=[*rows(context, row, preview, standing, who), *label_rows(vars(body))],
         warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
         stimulates=stimulates,
-        back=back,
         at_deg=allowed_deg(joint) if joint else None,
+        plan_hash=preview["plan_hash"],
+        minutes=VALID_S / 60,
+        back=f"/models/{model}" if model else f"/participants/{code}{'/joint' if joint else ''}",
     )
-    return context.questions.ask(question, who)
+
+
+def fields_of_kind(
+    context: Context, code: str, kind: str, target: float | None, target_rad: float | None, model_id: str
+) -> dict[str, Any]:
+    """Return what a test of this kind is asked with. Raises ApiError: 404, 409 or 422 there is no such test."""
+    if kind == ADAPTIVE and target is not None:  # shown whether or not its target is in reach
+        return {"target": {"curve_percent": target, "step_percent": target}, "anyway": True}
+    if kind == HELD and target_rad is not None:
+        return {"angle": {"target_rad": target_rad}}
+    if kind == NEXT_EXPERIMENT:
+        model = context.versions.get(model_id)
+        experiment = (context.analyses.known_diagnosis(model) or {}).get("experiment")
+        if not experiment or model.participant != code:
+            detail = "The diagnosis of this recording names none: no effects need to be told apart."
+            raise ApiError(409, "no-experiment", "There is no next experiment", detail)
+        chosen = {key: experiment[key] for key in ("segments", "pulse_rate_hz") if key in experiment}
+        return {"joins": model.id, **chosen}
+    if kind not in (PRE_SESSION, ADAPTIVE, *KINDS):
+        raise invalid(f"kind: {kind[:40]!r} is no test that a page starts. Nothing was started.")
+    return {}
+
+
+def checked_test(**fields: Any) -> TestIn:
+    """Return the request of a test. Raises ApiError (422): in one sentence, what does not hold."""
+    try:
+        return TestIn.model_validate(fields)
+    except ValidationError as error:
+        first = error.errors()[0]
+        raise invalid(f"{' '.join(map(str, first['loc']))}: {first['msg']}. Nothing was started.") from None
 
 
 def warnings(row: Participant, standing: Calibrated) -> list[str]:
-    """What deserves a second look."""
-    if standing.state == "valid":
-        return []
-    return [f"{row.code} is not calibrated: {NOBODY}."]
+    """Say what deserves a second look."""
+    return [] if standing.state == "valid" else [f"{row.code} is not calibrated: {NOBODY}."]
 
 
 def out_of_reach(preview: dict[str, Any]) -> list[str]:
-    """That a test which stops itself will probably not reach its target, with what it can."""
+    """Say that a test which stops itself will probably not reach its target, with what it can."""
     reach = preview.get("reach")
     return [] if reach is None or reach["reachable"] else [reach["words"]]
 
 
-def rows(row: Participant, preview: dict[str, Any], standing: Calibrated, ran_by: str, rig: str) -> list[Row]:
-    """What a person has to know before saying yes."""
-    pulses = sum(width > 0 for width in preview["pulse_width_us"])
-    torque_time = preview.get("torque_time_nms")
-    charge = dose_words(preview["charge_uc"])
-    dose = f"{pulses} pulses, {charge} (charge of one phase, all pulses together)"
-    if pulses == 1:
-        dose = f"1 pulse, {charge} (charge of one phase)"
+def rows(
+    context: Context, row: Participant, preview: dict[str, Any], standing: Calibrated, who: Principal
+) -> list[Row]:
+    """List what a person has to know before pressing the button."""
+    widths_us, torque_time = preview["pulse_width_us"], preview.get("torque_time_nms")
+    pulses, widest_us = sum(width > 0 for width in widths_us), max(widths_us, default=0.0)
+    phase = "charge of one phase" if pulses == 1 else "charge of one phase, all pulses together"
+    dose = f"{pulses} pulse{'' if pulses == 1 else 's'}, {dose_words(preview['charge_uc'])} ({phase})"
     if torque_time is not None:
         dose += f", about {number(torque_time, 0, 'N·m·s')} of torque"
-    long = number(preview["duration_s"], 0, "s")
-    more = []
+    long, more = number(preview["duration_s"], 0, "s"), []
     if joint := preview.get("joint"):
         long, dose, more = joint_rows(joint, row.profile, long, dose)
     elif bounds := preview.get("bounds"):
-        reach, most = preview["reach"], number(bounds["max_torque_time_nms"], 0, "N·m·s")
+        reach = preview["reach"]
         long = f"at most {number(bounds['max_duration_s'], 0, 's')}"
-        dose = f"at most {most} of torque"
-        more = [Row("Stops once known within", number(preview["target"]["curve_percent"], 1, "%"))]
-        more += [Row("Expected", reach["words"])] if reach["reachable"] else []
-    widest, most = number(widest_us(preview), 0, "µs"), number(row.profile["max_pulse_width_us"], 0, "µs")
+        dose = f"at most {number(bounds['max_torque_time_nms'], 0, 'N·m·s')} of torque"
+        more = [("Stops once known within", number(preview["target"]["curve_percent"], 1, "%"))]
+        more += [("Expected", reach["words"])] if reach["reachable"] else []
+    most = number(row.profile["max_pulse_width_us"], 0, "µs")
     current = [
-        Row("Side and muscle", site_words(site_of(row))),
-        Row("Current of every pulse", current_words(row)),
-        Row("Widest pulse", f"{widest}, comfort maximum {most}"),
+        ("Side and muscle", site_words(site_of(row))),
+        ("Current of every pulse", current_words(row)),
+        ("Widest pulse", f"{number(widest_us, 0, 'µs')}, comfort maximum {most}"),
     ]
-    stimulates = widest_us(preview) > 0.0
     return [
-        Row("Who", row.code),
-        *(current if stimulates else []),
+        ("Who", row.code),
+        *(current if widest_us > 0.0 else []),
         *more,
-        Row("How long", long),
-        Row("Dose", dose),
-        Row("Stops at", number(row.profile["max_torque_nm"], 1, "N·m")),
-        *([Row("Calibration", standing.words)] if stimulates else []),
-        Row("Run by", ran_by),
-        Row("Rig", rig),
+        ("How long", long),
+        ("Dose", dose),
+        ("Stops at", number(row.profile["max_torque_nm"], 1, "N·m")),
+        *([("Calibration", standing.words)] if widest_us > 0.0 else []),
+        ("Run by", who.name),
+        ("Rig", rig_words(context)),
     ]
 
 
 def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Between which angles a held test starts, °; None of another one."""
+    """Angles between which a held test starts, °; None of another one."""
     if joint["target_rad"] is None:
         return None
     middle, half = math.degrees(joint["target_rad"]), math.degrees(joint.get("tolerance_rad", profiles.TOLERANCE_RAD))
@@ -154,16 +203,11 @@ def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
 def joint_rows(
     joint: Mapping[str, Any], profile: Mapping[str, Any], long: str, dose: str
 ) -> tuple[str, str, list[Row]]:
-    """How long a guided test of a joint takes, at what dose, and the rows about the angle."""
-    range_rad = profiles.range_of(profile)
-    more = [
-        Row(
-            "Joint angles",
-            f"{profiles.range_words(range_rad or (0, 0))}; beyond them the test stops",
-        )
-    ]
+    """Say how long a guided test of a joint takes, at what dose, and list the rows about the angle."""
+    range_words = profiles.range_words(profiles.range_of(profile) or (0, 0))
+    more = [("Joint angles", f"{range_words}; beyond them the test stops")]
     if joint["kind"] == HELD:
-        more.insert(0, Row("Hold at", degrees(joint["target_rad"])))
+        more.insert(0, ("Hold at", degrees(joint["target_rad"])))
         expected = joint["doses"]["held_each"]
     else:
         long = f"at most {number(joint['longest_s'], 0, 's')}; ends by itself once enough was seen"
@@ -178,31 +222,17 @@ def joint_rows(
     return long, dose, more
 
 
-def site_words(site: Site) -> str:
-    """A site as a person says it: left, biceps brachii, A. Muscles keep their Latin names."""
-    sides = {"left": "left", "right": "right"}
-    return ", ".join(part for part in (sides.get(site[0] or ""), *site[1:]) if part) or "not said"
-
-
-environment.globals |= {"site_words": site_words, "site_of": site_of}
-
-
 def current_words(row: Participant) -> str:
-    """The current of every pulse."""
+    """Write the current of every pulse."""
     return f"{row.profile['current_ma']:g} mA"
 
 
-def widest_us(preview: dict[str, Any]) -> float:
-    """Width of the widest pulse of a plan, µs."""
-    return max(preview["pulse_width_us"], default=0.0)
-
-
 def rig_words(context: Context) -> str:
-    """What the current comes from."""
+    """Say what the current comes from."""
     status = context.rig.status
     if status is None or not context.rig.connected:
         return "cannot be reached"
     stimulator = status.stimulator
     parts = [str(stimulator.get("device") or "stimulator unknown").upper(), str(stimulator.get("firmware") or "")]
-    words = f"{' '.join(part for part in parts if part)}, {status.state}"
-    return f"{words}, emulated: no person is connected" if context.settings.emulated else words
+    described = f"{' '.join(part for part in parts if part)}, {status.state}"
+    return f"{described}, emulated: no person is connected" if context.settings.emulated else described

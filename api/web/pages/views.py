@@ -6,7 +6,7 @@ import asyncio
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import RedirectResponse, Response
+from fastapi.responses import Response
 from markupsafe import Markup
 
 from stimrig.api.charts import model_charts
@@ -15,13 +15,10 @@ from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
 from stimrig.api.services import tests
-from stimrig.api.sessions.requests import RanByIn
 from stimrig.api.store.tables import Test
-from stimrig.api.web.dependencies import Context, Ctx, LiveReader, Tester
-from stimrig.api.web.pages import typed
+from stimrig.api.web.dependencies import Context, Ctx, LiveReader
 from stimrig.api.web.pages.model_view import draw_model, measurement
 from stimrig.api.web.pages.render import page
-from stimrig.api.web.pages.typed import Text
 from stimrig.rig.messages import Status
 
 router = APIRouter(include_in_schema=False)
@@ -36,8 +33,6 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     grows = document["adaptive"] or (joint and joint["coverage"])
     fixed = [] if grows else (row.plan.get("preview") or {}).get("pulse_width_us") or []
     bounds = limits_of(row, status)
-    if told := document["adaptive"]:
-        document = {**document, "adaptive": {**told, **{name: told[name] for name in ("words", "problem")}}}
     data = {
         "test": document, "planned_us": fixed, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
         "sensor": joint is not None or (status is not None and status.angle.present),
@@ -48,37 +43,6 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
     notes = await asyncio.to_thread(context.notes.test_notes, test_id)
     missing = missing_words(((joint or {}).get("coverage") or {}).get("missing"))
     return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, missing=missing, **shown)
-
-
-@router.post("/tests/{test_id}/keep-plain")
-async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> Response:
-    """Wait no longer for last session's structure: on to the plain model, which is there already.
-
-    Where the fit ended just before the press there is nothing to end, and the test's page shows what came of it.
-    """
-    row = await asyncio.to_thread(tests.find, context, test_id)
-    plain = row.model_id if context.runner.lifecycle.keep_plain(test_id) else None
-    return RedirectResponse(f"/models/{plain}" if plain else f"/tests/{test_id}", 303)
-
-
-@router.post("/tests/{test_id}/enough")
-async def enough(context: Ctx, who: Tester, test_id: str) -> Response:
-    """End a test that stops itself well; where it has ended just before the press, its page shows what came of it."""
-    row = await asyncio.to_thread(tests.find, context, test_id)
-    try:
-        await context.runner.enough(row, who.name)
-    except ApiError as error:
-        if error.code != "rig-late":
-            raise
-    return RedirectResponse(f"/tests/{test_id}", 303)
-
-
-@router.post("/tests/{test_id}/ran-by")
-async def set_ran_by(context: Ctx, who: Tester, test_id: str, ran_by: Text = "") -> Response:
-    """Say who ran a test at the rig."""
-    body = typed.checked(RanByIn, ran_by=ran_by.strip() or None)
-    await asyncio.to_thread(tests.change_ran_by, context, test_id, body.ran_by, who.name)
-    return RedirectResponse(f"/tests/{test_id}#notes", 303)
 
 
 def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:

@@ -98,6 +98,7 @@ class PreviewOut(PlannedOut):
 
     pulse_width_us: list[float] = Field(description="one for each pulse, µs; of an adaptive test its fixed plan")
     reach: ReachOut | None = Field(None, description="of an adaptive test: what it will probably reach")
+    plan_hash: str = Field(description="starts just this plan: `POST /v1/tests`, within five minutes")
 
 
 class TestSummary(Document):

@@ -8,7 +8,7 @@ from fastapi import APIRouter, Response
 
 from stimrig.api.services import calibrations
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
-from stimrig.api.web.dependencies import PROBLEM, CalibrationVersion, Ctx, ParticipantVersion, Tester
+from stimrig.api.web.dependencies import PROBLEM, Ask, CalibrationVersion, Confirm, Ctx, ParticipantVersion, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
 
@@ -18,10 +18,12 @@ router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibrat
 @router.post("", status_code=201, **describe_answer(CalibrationOut, 201, "open; nothing was sent yet"))
 async def begin_calibration(
     context: Ctx, who: Tester, code: str, tags: ParticipantVersion, response: Response,
-    body: CalibrationIn | None = None,
+    body: CalibrationIn | None = None, confirm: Confirm = "", ask: Ask = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Open a guided calibration: nothing is sent until a step is asked for."""
-    found = await calibrations.begin(context, code, body or CalibrationIn.model_validate({}), who.name, tags)
+    found = await calibrations.begin(
+        context, code, body or CalibrationIn.model_validate({}), who.name, tags, confirm, ask
+    )
     return tagged(response, found)
 
 

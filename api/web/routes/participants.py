@@ -13,14 +13,12 @@ from fastapi import APIRouter, Query, Response
 from stimrig.api.services import notes, participants
 from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
 from stimrig.api.store.tables import Participant
-from stimrig.api.web.dependencies import PROBLEM, Ctx, ParticipantVersion, Tester
+from stimrig.api.web.dependencies import PROBLEM, Ask, Confirm, Ctx, ParticipantVersion, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
 MayVoid = Annotated[bool, Query(description="the change may void the calibration of the day")]
-Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
-Ask = Annotated[bool, Query(description="a person decides: ask before what deserves a second look (409, `confirm`)")]
 
 
 @router.post("", status_code=201, **describe_answer(ParticipantOut, 201, "made; see `Location`"))

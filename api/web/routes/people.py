@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
 
@@ -61,10 +61,11 @@ class UserIn(_Body):
 
 
 class SignIn(_Body):
-    """Name and password."""
+    """Name and password, or a token."""
 
-    name: Annotated[str, StringConstraints(min_length=1, max_length=320)]
-    password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
+    name: Annotated[str, StringConstraints(max_length=320)] = ""
+    password: Annotated[str, StringConstraints(max_length=200)] = ""
+    token: Annotated[str, StringConstraints(max_length=400)] = ""
 
 
 class PasswordIn(_Body):
@@ -121,17 +122,22 @@ def remove_user(context: Ctx, who: Administrator, name: str) -> None:
     responses={429: TOO_MANY, 201: {"model": SessionOut, "description": "signed in; the session is in `Set-Cookie`"}},
     openapi_extra={"requestBody": {"content": {"application/json": {"schema": SignIn.model_json_schema()}}}},
 )
-async def sign_in(context: Ctx, request: Request) -> Response:
-    """Sign in with name and password (JSON or a form); the session is a cookie. 429 after too many wrong tries."""
+async def sign_in(
+    context: Ctx, request: Request, next: Annotated[str, Query(description="of a form: where to go on")] = "/"
+) -> Response:
+    """Sign in with name and password, or a token (JSON or a form); the session is a cookie. 429 after wrong tries."""
     same_origin(request)
     form = "form" in request.headers.get("content-type", "")
     given = await _given(request, form)
     address = request.client.host if request.client else ""
-    cookie = await context.people.sign_in(given.name, given.password, address)
+    if given.token.strip():
+        cookie = await asyncio.to_thread(context.auth.sign_in, given.token.strip(), address)
+    else:
+        cookie = await context.people.sign_in(given.name.strip(), given.password, address)
     principal = await asyncio.to_thread(context.auth.cookie, cookie)
     answer: Response
     if form:
-        answer = RedirectResponse(local(str((await request.form()).get("next") or "/")), 303)
+        answer = RedirectResponse(local(next), 303)
     else:
         scopes = sorted(principal.scopes)
         answer = JSONResponse({"name": principal.name, "scopes": scopes, "csrf": principal.csrf}, 201)
@@ -143,10 +149,10 @@ async def _given(request: Request, form: bool) -> SignIn:
     try:
         if not form:
             return SignIn.model_validate_json(await request.body())
-        fields = await request.form()
-        return SignIn(name=str(fields.get("name") or ""), password=str(fields.get("password") or ""))
+        sent = await request.form()
+        return SignIn(**{name: str(sent.get(name) or "") for name in SignIn.model_fields})
     except (ValidationError, ValueError):
-        raise unauthorized("Send `name` and `password`.") from None
+        raise unauthorized("Send `name` and `password`, or `token`.") from None
 
 
 @router.post("/sessions/confirm", status_code=204)

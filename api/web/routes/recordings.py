@@ -12,7 +12,7 @@ from starlette.background import BackgroundTask
 
 from stimrig.api.errors import ApiError
 from stimrig.api.services import participants, recordings
-from stimrig.api.web.dependencies import PROBLEM, Ctx, ModelReader, ParticipantVersion, Tester
+from stimrig.api.web.dependencies import PROBLEM, Confirm, Ctx, ModelReader, ParticipantVersion, Tester
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import UploadOut
@@ -73,6 +73,7 @@ async def upload(
     response: Response,
     columns: Annotated[list[str], Query(alias="map", max_length=MOST_COLUMNS)] = [],  # noqa: B006
     of: Annotated[str, Query(description="whose recording it is, where the participant's it is not")] = "",
+    confirm: Confirm = "",
 ) -> dict[str, Any]:
     """Upload a recording of another tool (CSV, MAT, Parquet or HDF5 as the body) and identify a model from it.
 
@@ -84,7 +85,7 @@ async def upload(
     data = await request.body()  # `stimrig.api.web.middleware` bounds it
     if not data:
         raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
-    row, model, warnings = await recordings.take_in(context, code, data, who, columns, of, tags)
+    row, model, warnings = await recordings.take_in(context, code, data, who, columns, of or confirm, tags)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
     return {"recording_id": row.id, "model": version, "warnings": warnings}

@@ -50,7 +50,7 @@ async def start_test(
     """
     row = await controllers.start(context.runner, context.keys_lock, context.store, who, body, tags)
     response.headers["Location"] = f"/v1/tests/{row.id}"
-    return context.runner.document(row)
+    return await asyncio.to_thread(context.runner.document, row)
 
 
 @router.get("", **describe_answer(list[TestOut]))

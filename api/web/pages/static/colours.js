@@ -16,7 +16,7 @@ function colourOf(name) { // the custom property itself keeps its light-dark() a
 
   document.addEventListener("click", (event) => {
     const button = event.target.closest?.("[name=colours]");
-    if (button) { event.preventDefault(); choose(button.value); }
+    if (button) choose(button.value);
   });
 
   let kept = page.dataset.colours;

@@ -9,11 +9,10 @@
 
   function tell() {
     due = 0; told = performance.now();
-    const csrf = lock.querySelector("[name=csrf]").value;
-    fetch("/rig/acted", { method: "POST", headers: { "X-CSRF-Token": csrf } }).catch(() => {}); // the next action tells again
+    act.request("POST /v1/sessions/acted").catch(() => {}); // the next action tells again
   }
 
-  function act(event) {
+  function acted(event) {
     if (!event.isTrusted || due) return;
     due = setTimeout(tell, Math.max(0, EVERY_MS - (performance.now() - told)));
   }
@@ -38,16 +37,16 @@
   if (lock) {
     putBack();
     told = performance.now(); // loading the page was an action
-    for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"]) addEventListener(name, act, { passive: true, capture: true });
+    for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"]) addEventListener(name, acted, { passive: true, capture: true });
     lock.addEventListener("submit", keep);
     addEventListener("rig-now", (event) => {
       if (!event.detail.locked) return;
       keep();
-      location.replace(lock.dataset.locked + encodeURIComponent(location.pathname + location.search));
+      location.replace("/locked?next=" + encodeURIComponent(location.pathname + location.search));
     });
   }
   if (waits) { // unlocked in another tab
-    addEventListener("rig-now", (event) => { if (event.detail.signed_in) location.replace(waits.dataset.next); });
+    addEventListener("rig-now", (event) => { if (event.detail.signed_in) location.replace(waits.dataset.back); });
     addEventListener("submit", (event) => { if (event.target.id === "leave") sessionStorage.clear(); });
   }
 }

@@ -6,14 +6,13 @@
   const EVERY_MS = 500, PATIENCE_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000;
   const clock = () => [performance.now(), Date.now()]; // the first stands still while a machine sleeps, the second may be set
   const since = (then) => Math.max(performance.now() - then[0], Date.now() - then[1]);
-  const pill = document.getElementById("rig-state"), notice = document.getElementById("rig-notice");
+  const pill = document.getElementById("rig-state");
   const live = document.getElementById("live"), said = document.getElementById("page-old"), person = document.querySelector(".who");
   const boxes = (name) => document.querySelectorAll(`[data-now="${name}"]`);
   const begun = clock();
   let heard = said.dataset.at, lost = "", stopped = "", late = 0; // when the page last heard of the service; why what it shows is old
-  let known = null, asked = null, last = null, busy = false, fetching = "";
-  const unread = document.querySelector(".read-first");
-  let shown = { latch: document.querySelector("[name=latch]")?.value, since: unread ? performance.now() : -READ_MS };
+  let known = null, asked = null, last = null, busy = false, fetching = "", notice = document.getElementById("rig-notice");
+  let shown = { latch: document.getElementById("rearm")?.dataset.ifMatch, since: -READ_MS };
 
   const say = (name, text) => { for (const box of boxes(name)) if (box.textContent !== text) box.textContent = text; };
   const figure = (value, digits) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false }).replace("-", "−");
@@ -113,22 +112,21 @@
     if (!notice || notice.dataset.key === key || fetching === key) return;
     fetching = key;
     try {
-      const answer = await get("/rig/notice?back=" + encodeURIComponent(notice.dataset.back));
-      const fresh = await answer.text(), focused = notice.contains(document.activeElement);
-      if (answer.ok) { notice.innerHTML = fresh; notice.dataset.key = key; hold(focused); }
+      const focused = notice.contains(document.activeElement);
+      await act.renew(["rig-notice"]);
+      notice = document.getElementById("rig-notice");
+      hold(focused);
     } catch { /* the next answer asks again */ }
     fetching = "";
   }
 
   function hold(focused) { // another stop came under the hand that was about to re-arm: it is read first
-    const fields = [...document.querySelectorAll("form [name=latch]")];
-    if (fields.length && fields[0].value !== shown.latch) shown = { latch: fields[0].value, since: shown.latch ? performance.now() : shown.since };
+    const form = document.getElementById("rearm"), button = form?.querySelector("button");
+    if (form && form.dataset.ifMatch !== shown.latch) shown = { latch: form.dataset.ifMatch, since: shown.latch ? performance.now() : shown.since };
     const left_ms = READ_MS - (performance.now() - shown.since);
-    if (left_ms <= 0) return;
-    for (const button of fields.map((field) => field.form.querySelector("button"))) {
-      button.disabled = true;
-      setTimeout(() => { button.disabled = false; if (focused && document.activeElement === document.body && notice.contains(button)) button.focus(); }, left_ms);
-    }
+    if (!form || left_ms <= 0) return;
+    button.disabled = true;
+    setTimeout(() => { button.disabled = false; if (focused && document.activeElement === document.body) button.focus(); }, left_ms);
   }
 
   function look() {
@@ -148,7 +146,5 @@
   addEventListener("pageshow", (event) => { if (event.persisted) location.reload(); else now(); }); // kept by Back: all of it is old
   document.addEventListener("visibilitychange", now);
   addEventListener("online", now);
-  hold(false); // another stop than the one that was to be re-armed: page.css has hidden the buttons so far
-  unread?.classList.remove("read-first");
   now();
 }

@@ -2,18 +2,20 @@
 "use strict";
 const said = JSON.parse(document.getElementById("rig-words").textContent);
 for (const box of document.querySelectorAll("[data-job]")) follow(box);
-for (const box of document.querySelectorAll("[data-next][data-from]")) watch(box);
+for (const box of document.querySelectorAll("[data-next-key]")) watch(box);
 
-// The line that says what is next: asked for again when the rig does something else, and every few seconds.
+// The line that says what is next, and the card of a controller's trials: asked for again when the rig does something else, and every few seconds.
 function watch(box) {
-  const every_ms = box.dataset.next.startsWith("identifying") ? 1000 : 5000;
+  const quick = box.dataset.nextKey.startsWith("identifying");
   let seen = null, asking = false;
   async function ask() {
     if (asking) return;
     asking = true;
     try {
-      const answer = await fetch(box.dataset.from, { cache: "no-store" });
-      if (answer.ok && (await answer.json()).key !== box.dataset.next && !answering()) arrive(box.querySelector("[data-words]"), box.querySelector("[data-left]"));
+      const answer = await fetch(box.dataset.from, { cache: "no-store" }), trials = document.getElementById("trials");
+      const now = answer.ok ? await answer.json() : null;
+      if (now && now.key !== box.dataset.nextKey && !answering()) arrive(box.querySelector("[data-words]"), box.querySelector("[data-left]"));
+      else if (now && trials && now.trials !== trials.dataset.trials && !trials.contains(document.activeElement)) await renewTrials(trials);
     } catch { /* asked again */ }
     asking = false;
   }
@@ -22,7 +24,13 @@ function watch(box) {
     if (now !== seen) ask();
     seen = now;
   });
-  setInterval(() => { if (!document.hidden) ask(); }, every_ms);
+  setInterval(() => { if (!document.hidden) ask(); }, quick ? 1000 : document.getElementById("trials") ? 2000 : 5000);
+}
+
+async function renewTrials(old) { // a table that was opened stays open
+  const open = old.querySelector("details")?.open;
+  await act.renew(["trials"]);
+  if (open) document.querySelector("#trials details")?.setAttribute("open", "");
 }
 
 async function follow(box) {
@@ -52,7 +60,7 @@ addEventListener("beforeunload", () => { pressed = performance.now(); });
 addEventListener("pageshow", (event) => { if (event.persisted) pressed = -ANSWER_MS; });
 
 // Meanwhile the page is not loaded anew, by live.js neither. It is asked again later: only a service that answers can give another page.
-const answering = () => performance.now() - pressed < ANSWER_MS;
+const answering = () => act.busy() || performance.now() - pressed < ANSWER_MS;
 
 // What somebody has begun to write is not taken away: then they say when the page is read anew.
 function arrive(words, left) {
