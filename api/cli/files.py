@@ -186,14 +186,14 @@ def story_of(record: Any, explained: Any, structure: Sequence[str]) -> dict[str,
     improvement, left_open = explained.improvement.to_dict(), only_open(vars(explained.left)) or {}
     # of what is left open the last diagnosis speaks
     improvement["refused"] = [row for row in improvement["refused"] if row["effect"] != left_open.get("effect")]
-    told = story(step_versions(improvement), before["comparison"], after["comparison"], *diagnoses)
+    narrative = story(step_versions(improvement), before["comparison"], after["comparison"], *diagnoses)
     words = in_words(structure)
-    return {"story": told, "before": before, "after": after, "improvement": improvement, "structure": words}
+    return {"story": narrative, "before": before, "after": after, "improvement": improvement, "structure": words}
 
 
-def story_page(shown: dict[str, Any], name: str) -> str:
+def story_page(story: dict[str, Any], name: str) -> str:
     """Write the story as a file."""
     from stimrig.api.web.pages.report_file import story_html
 
-    refused = shown["improvement"]["refused"]
-    return story_html(shown["story"], shown["before"], shown["after"], name, refused, shown["structure"])
+    refused = story["improvement"]["refused"]
+    return story_html(story["story"], story["before"], story["after"], name, refused, story["structure"])

@@ -65,8 +65,8 @@ def _overview() -> typer.Typer:
             app.command(name, help=does[name])(lambda: None)
         else:
             calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-            made = next(call for call in calls if ast.unparse(call.func) == "typer.Typer")
-            groups[name] = next(ast.literal_eval(word.value) for word in made.keywords if word.arg == "help")
+            group = next(call for call in calls if ast.unparse(call.func) == "typer.Typer")
+            groups[name] = next(ast.literal_eval(word.value) for word in group.keywords if word.arg == "help")
     for name, words in groups.items():  # verbs with verbs of their own stand behind the others
         app.command(name, help=words)(lambda: None)
     return app
@@ -119,8 +119,8 @@ def run(arguments: list[str] | None = None) -> int:
     # Matrices of a fit are small: a second BLAS thread only waits for the first, and on a busy machine for long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     _keep_compiled()
-    given = arguments if arguments is not None else sys.argv[1:]
-    verb = next((word for word in given if word[:1] != "-"), "")
+    words = arguments if arguments is not None else sys.argv[1:]
+    verb = next((word for word in words if word[:1] != "-"), "")
     try:
         code = (build(verb) if verb in VERBS else _overview())(arguments, standalone_mode=False)
         sys.stdout.flush()
@@ -135,7 +135,7 @@ def run(arguments: list[str] | None = None) -> int:
             print("stimrig: interrupted", file=sys.stderr)
             return INTERRUPTED
         name = f"stimrig {verb}" if verb in VERBS else "stimrig"
-        line, code = _explain(name, given, error)
+        line, code = _explain(name, words, error)
         print(line, file=sys.stderr)
         return code
 
@@ -160,7 +160,7 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _explain(name: str, given: list[str], error: BaseException) -> tuple[str, int]:
+def _explain(name: str, words: list[str], error: BaseException) -> tuple[str, int]:
     """Return the error's line, and the exit code it stands for."""
     if isinstance(error, TyperException):
         message = error.format_message().strip()
@@ -169,7 +169,7 @@ def _explain(name: str, given: list[str], error: BaseException) -> tuple[str, in
         return f"{name}: {flat(message)} (see {name} --help)", 2
     if isinstance(error, CommandError | IdentifyError | ApiError | SettingsError):
         # the files of the command line, where it is of what they hold and names none of them
-        files = [word for word in given if word[:1] != "-" and Path(word).is_file()]
+        files = [word for word in words if word[:1] != "-" and Path(word).is_file()]
         about = f"{', '.join(files)}: " if isinstance(error, IdentifyError) and not error.place and files else ""
         return f"{name}: {flat(f'{about}{error}')}", error.exit_code if isinstance(error, CommandError) else 2
     if isinstance(error, ServiceError):

@@ -34,17 +34,17 @@ def compare(
         say("", f"report         {html}")
 
 
-def comparison_lines(found: dict[str, Any]) -> list[str]:
+def comparison_lines(comparison: dict[str, Any]) -> list[str]:
     """Write the comparison in words, the worst places, and where the error above the noise sits."""
-    places = [place["text"] for place in found["where"]]
-    lines = [line for line in found["plain"] if line not in {f"{text}." for text in places}]
-    if looks_like_noise(found):
+    places = [place["text"] for place in comparison["where"]]
+    lines = [line for line in comparison["plain"] if line not in {f"{text}." for text in places}]
+    if looks_like_noise(comparison):
         return [*lines, "No place stands out."]
     if places:
         lines += ["", "worst places", *[f"  {text}" for text in places]]
     split = []
     for kind in ("segment", "level", "direction", "frequency"):
-        rows = [row for row in (found.get("by") or {}).get(kind) or [] if row["share_of_excess"] > 0.005]
+        rows = [row for row in (comparison.get("by") or {}).get(kind) or [] if row["share_of_excess"] > 0.005]
         shares = ", ".join(f"{row['label']} {100 * row['share_of_excess']:.0f} %" for row in rows)
         split += [f"by {kind:12}{shares}"] if shares else []
     return [*lines, *split, *(["               in % of the error above the noise"] if split else [])]

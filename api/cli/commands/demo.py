@@ -37,16 +37,16 @@ def demo(
     token = secrets.token_urlsafe(32)
     tell("starting the emulated rig, the rig process and the service")
     with Services(Settings(data_dir=folder, port=0, rig_file=None), emulate.split(), token) as services:
-        found = play(services, token, tell)
-    found["files"] = write_files(folder, found)
-    found["seconds"] = round(time.monotonic() - began, 1)
+        result = play(services, token, tell)
+    result["files"] = write_files(folder, result)
+    result["seconds"] = round(time.monotonic() - began, 1)
     if as_json:
-        say_json(found)
+        say_json(result)
         return
-    shares = ", ".join(f"{name} {number(share, 1)} %" for name, share in found["cpu_percent"].items())
-    say("", *report_test(found["test"], found["model"]), f"processor      {shares} of a core during the test")
-    say("", *[f"{name:14} {path}" for name, path in found["files"].items()])
-    say(f"{'done in':14} {found['seconds']} s")
+    shares = ", ".join(f"{name} {number(share, 1)} %" for name, share in result["cpu_percent"].items())
+    say("", *report_test(result["test"], result["model"]), f"processor      {shares} of a core during the test")
+    say("", *[f"{name:14} {path}" for name, path in result["files"].items()])
+    say(f"{'done in':14} {result['seconds']} s")
 
 
 def play(services: Services, token: str, tell: Callable[..., None]) -> dict[str, Any]:
@@ -88,13 +88,13 @@ def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
     return first.document
 
 
-def write_files(folder: Path, found: dict[str, Any]) -> dict[str, str]:
+def write_files(folder: Path, result: dict[str, Any]) -> dict[str, str]:
     """Write the model, and a report with charts, beside the recording; return where each file is."""
     from stimrig.api.web.pages.report_file import comparison_html
 
-    model, report, test = folder / "MODEL.json", folder / "report.html", found["test"]
-    model.write_text(json.dumps(found["model"], indent=1, ensure_ascii=False))
-    report.write_text(comparison_html(found["model"], found.pop("curves"), test["id"], test))
+    model, report, test = folder / "MODEL.json", folder / "report.html", result["test"]
+    model.write_text(json.dumps(result["model"], indent=1, ensure_ascii=False))
+    report.write_text(comparison_html(result["model"], result.pop("curves"), test["id"], test))
     recording = next((folder / "recordings").glob(f"*{test['id']}*.h5"), folder / "recordings")
     files = {"recording": recording, "model": model, "report": report, "logs": folder / "logs"}
     return {name: str(path.absolute()) for name, path in files.items()}

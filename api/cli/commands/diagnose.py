@@ -25,67 +25,67 @@ def diagnose(
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         if html is None:
-            found = identify.diagnose(record, model, progress)
+            diagnosis = identify.diagnose(record, model, progress)
         else:
-            found, improved = identify.diagnose_and_improve(record, progress, model)
-            write(html, _report(record, found, improved, structure, short(data)))
-    shown = {"structure": structure, **found.to_dict()}
+            diagnosis, improved = identify.diagnose_and_improve(record, progress, model)
+            write(html, _report(record, diagnosis, improved, structure, short(data)))
+    document = {"structure": structure, **diagnosis.to_dict()}
     if as_json:
-        say_json(shown)
+        say_json(document)
         return
-    say(*diagnosis_lines(shown), *([] if html is None else ["", f"report         {html}"]))
+    say(*diagnosis_lines(document), *([] if html is None else ["", f"report         {html}"]))
 
 
-def _report(record: Any, found: Any, improved: Any, structure: Sequence[str], name: str) -> str:
+def _report(record: Any, diagnosis: Any, improved: Any, structure: Sequence[str], name: str) -> str:
     from stimrig.api.jobs.curves import rounded, segments_of
     from stimrig.api.jobs.verbs import finding_of
     from stimrig.api.web.pages.report_file import diagnosis_html
 
     comparison = rounded(identify.compare(improved.models[0], record).to_dict())
-    return diagnosis_html(finding_of(record, found, improved, structure), comparison, segments_of(record), name)
+    return diagnosis_html(finding_of(record, diagnosis, improved, structure), comparison, segments_of(record), name)
 
 
-def diagnosis_lines(found: dict[str, Any]) -> list[str]:
+def diagnosis_lines(diagnosis: dict[str, Any]) -> list[str]:
     """Write a diagnosis for people."""
     from stimrig.identify.conclusion import conclude
     from stimrig.identify.summary import certainty, held_out_label
 
-    base, verdict, said = found["base"], found["verdict"], conclude(found)
+    base, verdict, conclusion = diagnosis["base"], diagnosis["verdict"], conclude(diagnosis)
     lines = [
-        f"{said.title}{certainty(found)}.",
-        said.words,
+        f"{conclusion.title}{certainty(diagnosis)}.",
+        conclusion.words,
         "",
-        f"structure      {in_words(found['structure'])}",
-        f"noise          {number(found['noise_sd_nm'], 4)} N·m",
+        f"structure      {in_words(diagnosis['structure'])}",
+        f"noise          {number(diagnosis['noise_sd_nm'], 4)} N·m",
         *repetition_lines(base),
         f"the model      fit {percent(base.get('fit_percent'))}, error {number(base.get('rms_nm'), 4)} N·m; "
         f"{held_out_label(base)} fit {percent(base.get('held_out_fit_percent'))}, "
         f"error {number(base.get('held_out_rms_nm'), 4)} N·m",
     ]
-    if verdict == "unexplained_structure" and found.get("missing"):
+    if verdict == "unexplained_structure" and diagnosis.get("missing"):
         lines += ["", "Nearest in the library, but not near enough: adding it leaves the structure."]
-    for effect in found.get("missing") or []:
+    for effect in diagnosis.get("missing") or []:
         lines += ["", *effect_lines(effect)]
-    for row in found.get("free") or []:
+    for row in diagnosis.get("free") or []:
         lines += ["", f"{row['effect']}: a free effect; it describes, and names no cause", f"  {row['words']}"]
         lines += [f"  {row['left_out']}"]
     # Where nothing is missing the worst of the noise is no place to look at.
-    places = [] if said.kind == "nothing" else found.get("where") or []
+    places = [] if conclusion.kind == "nothing" else diagnosis.get("where") or []
     if places:
         lines += ["", "worst places"]
         lines += [f"  {place['start_s']:.1f}-{place['end_s']:.1f} s, {place['text']}" for place in places]
-    lines += ["", *found["notes"]] if found.get("notes") else []
-    return [*lines, "", f"next           {said.advice} {_command(found, said.kind)}".rstrip()]
+    lines += ["", *diagnosis["notes"]] if diagnosis.get("notes") else []
+    return [*lines, "", f"next           {conclusion.advice} {_command(diagnosis, conclusion.kind)}".rstrip()]
 
 
-def _command(found: dict[str, Any], kind: str) -> str:
+def _command(diagnosis: dict[str, Any], kind: str) -> str:
     """Name the commands that do what is advised."""
     if kind == "nothing":
         return "The model is that of `stimrig fit DATA -o MODEL.json`."
-    plays = "`stimrig test --decide DATA` plays the next experiment." if found.get("deciding_experiment") else ""
-    adds = "`stimrig explain DATA -o MODEL.json` adds, and shows how the error falls." if found.get("add") else ""
-    own = "An effect of your own: docs/add-an-effect.md." if kind == "unexplained" and not adds else ""
-    return " ".join(filter(None, (adds, plays, own)))
+    play = "`stimrig test --decide DATA` plays the next experiment." if diagnosis.get("deciding_experiment") else ""
+    add = "`stimrig explain DATA -o MODEL.json` adds, and shows how the error falls." if diagnosis.get("add") else ""
+    extension = "An effect of your own: docs/add-an-effect.md." if kind == "unexplained" and not add else ""
+    return " ".join(filter(None, (add, play, extension)))
 
 
 def effect_lines(effect: dict[str, Any]) -> list[str]:

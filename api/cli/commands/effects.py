@@ -59,9 +59,11 @@ def _own_text(path: Path, wanted: str | None, name: str) -> str:
     if known is None or known[0].shape is None:
         names = ", ".join(str(entry["id"]) for entry in free) or "none"
         raise InputError(f"{path}: no free effect{f' {wanted!r}' if wanted else ''} in it. It has {names}.")
-    given = found[-1]["parameters"]
+    estimates = found[-1]["parameters"]
     try:
-        values = {p.name: (float(given[p.name]["value"]), float(given[p.name]["sd"])) for p in known[1].parameters}
+        values = {
+            p.name: (float(estimates[p.name]["value"]), float(estimates[p.name]["sd"])) for p in known[1].parameters
+        }
         return own_file.text_of(*known, values, name)
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: {known[0].id} lacks a value or an sd: {error}. Fit the record again.") from error
@@ -93,6 +95,6 @@ def effect_lines(entry: dict[str, Any]) -> list[str]:
         elif key == "forms":
             lines += [f"  {'form':14} {form['name']}: {form['equation']}" for form in value]
         else:
-            shown = ", ".join(str(item) for item in value) if isinstance(value, list | tuple) else str(value)
-            lines.append(f"  {key.replace('_', ' '):14} {shown}")
+            text = ", ".join(str(item) for item in value) if isinstance(value, list | tuple) else str(value)
+            lines.append(f"  {key.replace('_', ' '):14} {text}")
     return lines

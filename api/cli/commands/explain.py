@@ -30,60 +30,60 @@ def explain(
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         explained = identify.explain(record, progress, model)
-    shown = story_of(record, explained, structure)
+    document = story_of(record, explained, structure)
     if output is not None:
         write_model(output, explained.improvement.models[-1])
     if html is not None:
-        write(html, story_page(shown, short(data)))
+        write(html, story_page(document, short(data)))
     if figures is not None:
-        _write_figures(figures, shown)
+        _write_figures(figures, document)
     if as_json:
         say_json({"structure": structure, **explained.to_dict()})
         return
-    say(*story_lines(shown))
+    say(*story_lines(document))
     say(*[f"written to     {path}" for path in (output, html, figures) if path is not None])
 
 
-def _write_figures(folder: Path, shown: dict[str, Any]) -> None:
+def _write_figures(folder: Path, document: dict[str, Any]) -> None:
     from stimrig.api.charts.story_charts import story_figures
 
     folder.mkdir(parents=True, exist_ok=True)
-    figures = story_figures(shown["story"], shown["before"], shown["after"])
+    figures = story_figures(document["story"], document["before"], document["after"])
     for name in figures:
         for kind in ("svg", "pdf", "png"):
             write(folder / f"{name}.{kind}", figures.file(name, kind))
 
 
-def story_lines(shown: dict[str, Any]) -> list[str]:
+def story_lines(document: dict[str, Any]) -> list[str]:
     """Write the story for people at a terminal."""
-    made, changed = shown["story"], len(shown["story"]["rows"]) > 1
-    first, last = made["rows"][0], made["rows"][-1]
+    story, changed = document["story"], len(document["story"]["rows"]) > 1
+    first, last = story["rows"][0], story["rows"][-1]
     lines = [
-        f"{made['title']}; the noise is {number(made['noise_sd_nm'], 4)} N·m.",
+        f"{story['title']}; the noise is {number(story['noise_sd_nm'], 4)} N·m.",
         "",
         f"1 compare      fit {number(first['fit_percent'])} %, error {number(first['rms_nm'], 4)} N·m; held out fit "
         f"{number(first['held_out_fit_percent'])} %, error {number(first['held_out_rms_nm'], 4)} N·m",
     ]
-    lines += labelled("2 fails in", [place["text"] for place in made["places"]] or ["no place stands out"])
-    why = made["why"]
-    lines += labelled("3 missing", [f"{why['title']}.", *[_named(one) for one in why["missing"]],
-                                     *[f"{one['id']}: {one['words']}" for one in why["free"]]])  # fmt: skip
+    lines += labelled("2 fails in", [place["text"] for place in story["places"]] or ["no place stands out"])
+    why = story["why"]
+    lines += labelled("3 missing", [f"{why['title']}.", *[_named(item) for item in why["missing"]],
+                                     *[f"{item['id']}: {item['words']}" for item in why["free"]]])  # fmt: skip
     if changed:
-        error = "held-out error" if made["error"] == "held_out_rms_nm" else "error"
-        errors = [(number(one["before_nm"], 4), number(one["after_nm"], 4)) for one in made["steps"]]
-        added = zip(made["steps"], errors, strict=True)
-        lines += labelled("4 added", [f"{one['label']}: {error} {a} -> {b} N·m" for one, (a, b) in added])
-        healed = [f"{place['text'].partition(':')[0]}: {place['became']}" for place in made["places"]]
+        error = "held-out error" if story["error"] == "held_out_rms_nm" else "error"
+        errors = [(number(item["before_nm"], 4), number(item["after_nm"], 4)) for item in story["steps"]]
+        added = zip(story["steps"], errors, strict=True)
+        lines += labelled("4 added", [f"{item['label']}: {error} {a} -> {b} N·m" for item, (a, b) in added])
+        healed = [f"{place['text'].partition(':')[0]}: {place['became']}" for place in story["places"]]
         lines += labelled("  there", healed)
         lines.append(f"  now          fit {number(last['fit_percent'])} %, error {number(last['rms_nm'], 4)} N·m")
-    lines += labelled(f"{4 + changed} ended", [made["ended"]])
-    experiment = made["then"]["experiment"]
+    lines += labelled(f"{4 + changed} ended", [story["ended"]])
+    experiment = story["then"]["experiment"]
     if experiment:
         lines += labelled("  next", [experiment["text"], "`stimrig test --decide DATA` plays it, judges both."])
     return lines
 
 
-def _named(one: dict[str, Any]) -> str:
+def _named(item: dict[str, Any]) -> str:
     """Write which effect is missing, how sure that is, and what it is."""
-    sure = f" ({one['sure_words']})" if one["sure_words"] else ""
-    return f"{one['id']}{sure}: {one['plain']}"
+    sure = f" ({item['sure_words']})" if item["sure_words"] else ""
+    return f"{item['id']}{sure}: {item['plain']}"

@@ -55,7 +55,7 @@ def fit(
         raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
     earlier = None if carry is None else load_model(carry)
     record = load_record(data, columns, names(effects))
-    found: dict[str, Any] | None = None
+    finding: dict[str, Any] | None = None
     with progress_bar() as progress:
         if earlier is None:
             model = identify.fit(
@@ -63,11 +63,11 @@ def fit(
             )
         else:
             carried = identify.carry(record, earlier, progress)
-            found = carried.finding()
-            model = carried.model.with_(extra=carried.model.extra | {"carried": found})
+            finding = carried.finding()
+            model = carried.model.with_(extra=carried.model.extra | {"carried": finding})
     if output is not None:
         write_model(output, model)
     if as_json:
         say_json(model.to_dict())
         return
-    say(*model_report(model.to_dict()), *carried_lines(found), *([f"written to     {output}"] if output else []))
+    say(*model_report(model.to_dict()), *carried_lines(finding), *([f"written to     {output}"] if output else []))

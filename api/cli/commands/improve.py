@@ -36,17 +36,17 @@ def improve(
             explained = identify.explain(record, progress, model)
             improved = explained.improvement
             write(html, story_page(story_of(record, explained, structure), short(data)))
-    found = {"structure": structure, **improved.to_dict()}
-    del found["models"]
+    document = {"structure": structure, **improved.to_dict()}
+    del document["models"]
     if output is not None:
         write_model(output, improved.models[-1])
     if as_json:
-        say_json(found)
+        say_json(document)
     else:
-        say(*improvement_lines(found), *[f"written to     {path}" for path in (output, html) if path is not None])
+        say(*improvement_lines(document), *[f"written to     {path}" for path in (output, html) if path is not None])
 
 
-def improvement_lines(found: dict[str, Any]) -> list[str]:
+def improvement_lines(document: dict[str, Any]) -> list[str]:
     """Write the steps for people."""
     from stimrig.identify.effects import any_free
 
@@ -58,15 +58,15 @@ def improvement_lines(found: dict[str, Any]) -> list[str]:
             number(step.get("held_out_fit_percent")),
             number(step.get("held_out_rms_nm"), 4),
         )
-        for step in found["steps"]
+        for step in document["steps"]
     ]
     header = ("added", "fit %", "error N·m", "held-out fit %", "held-out error N·m")
-    lines = [f"structure      {in_words(found['structure'])}", "", *table(header, rows), ""]
-    lines.append(f"noise          {number(found['noise_sd_nm'], 4)} N·m: of a sample, which no model can explain")
-    lines += repetition_lines(found["steps"][-1])
-    added = [step for step in found["steps"] if step["added"]]
+    lines = [f"structure      {in_words(document['structure'])}", "", *table(header, rows), ""]
+    lines.append(f"noise          {number(document['noise_sd_nm'], 4)} N·m: of a sample, which no model can explain")
+    lines += repetition_lines(document["steps"][-1])
+    added = [step for step in document["steps"] if step["added"]]
     lines += [f"{step['added']:15}{step['reason']}" for step in added if any_free([step["added"]])]
-    refused = [f"{row['effect']}: {row['reason']}" for row in found.get("refused") or []]
+    refused = [f"{row['effect']}: {row['reason']}" for row in document.get("refused") or []]
     if len(refused) > FEW:
         refused[FEW:] = [f"and {len(refused) - FEW} effects more (--json says which)"]
     return [*lines, *labelled("not added", refused)]

@@ -41,18 +41,18 @@ def invert(
         raise InputError(f"{reference}: {error.strerror}. Give a CSV file with time_s,torque_nm.") from error
     try:
         wanted = read_reference(content, str(reference), model.pulse_rate_hz)
-        found = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us, shortest_us=shortest_us).to_dict()
+        inversion = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us, shortest_us=shortest_us).to_dict()
     except IdentifyError as error:
         raise InputError(str(error)) from error
-    write(output, inverted.table(found))
+    write(output, inverted.table(inversion))
     if as_json:
-        say_json({"output": str(output), **found})
+        say_json({"output": str(output), **inversion})
         return
-    fit = percent(found["fit_percent"])
-    say(f"{output}: {len(found['pulse_width_us'])} pulses, fit {fit} where it can be reached")
-    if found["unreachable"]:
+    fit = percent(inversion["fit_percent"])
+    say(f"{output}: {len(inversion['pulse_width_us'])} pulses, fit {fit} where it can be reached")
+    if inversion["unreachable"]:
         rows = [
-            [f"{one['begin_s']:.2f}", f"{one['end_s']:.2f}", number(one["shortfall_nm"], 3), one["reason"]]
-            for one in found["unreachable"]
+            [f"{row['begin_s']:.2f}", f"{row['end_s']:.2f}", number(row["shortfall_nm"], 3), row["reason"]]
+            for row in inversion["unreachable"]
         ]
         say(*table(["begin (s)", "end (s)", "lacks (N·m)", "reason"], rows))

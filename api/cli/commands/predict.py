@@ -29,12 +29,12 @@ def predict(
     model = load_model(model_json, "predict MODEL.json DATA -o FILE")
     record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))
-    found = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
+    rows = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
     with writing(output) as place:
         if output.suffix.lower() == ".mat":
-            plain_mat.write(place, found)
+            plain_mat.write(place, rows)
         else:
-            np.savetxt(place, np.column_stack(list(found.values())), "%.9g", ",", header=",".join(found), comments="")
+            np.savetxt(place, np.column_stack(list(rows.values())), "%.9g", ",", header=",".join(rows), comments="")
     reached = best_fit_percent(record.torque_nm, predicted)
     rms_nm = float(np.sqrt(np.mean((record.torque_nm - predicted) ** 2)))
     if as_json:

@@ -51,16 +51,16 @@ def check(
         signal.signal(signal.SIGINT, before)
     if not ended.stdout:  # it has said why
         raise typer.Exit(max(ended.returncode, 1))
-    found = json.loads(ended.stdout)
-    say_json(found) if as_json else say(*summary(found))
+    report = json.loads(ended.stdout)
+    say_json(report) if as_json else say(*summary(report))
     raise typer.Exit(ended.returncode)
 
 
-def summary(found: dict[str, Any]) -> list[str]:
+def summary(report: dict[str, Any]) -> list[str]:
     """Write the report for people: the verdict, and each fault with its remedy."""
-    lines = [found["verdict"]]
-    for step in found["steps"]:
+    lines = [report["verdict"]]
+    for step in report["steps"]:
         if step["outcome"] == "failed":
             lines += [f"{step['name']}: {step['figure']}: {step['cause']}", f"  -> {step['remedy']}"]
-    undone = [step["name"] for step in found["steps"] if step["outcome"] == "not done"]
+    undone = [step["name"] for step in report["steps"] if step["outcome"] == "not done"]
     return [*lines, *([f"not done: {', '.join(undone)}"] if undone else [])]

@@ -32,8 +32,8 @@ def serve(
     """The service and the page, until Ctrl-C or SIGTERM."""
     settings = Settings(**given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
     attached = rig_status(settings, emulate) if settings.rig_socket else None
-    made = Services(settings, emulate.split(), attach=settings.rig_socket)
-    with contextlib.suppress(KeyboardInterrupt), made as services:
+    services = Services(settings, emulate.split(), attach=settings.rig_socket)
+    with contextlib.suppress(KeyboardInterrupt), services:
         say(*welcome(services, attached))
         try:
             with StopKey(at_rig(services.socket), say) as key:

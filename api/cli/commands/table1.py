@@ -19,14 +19,14 @@ def table1(
     from stimrig.identify import paper
 
     with progress_bar() as progress:
-        found = paper.table1(trials, progress)
-    say_json(found) if as_json else say(*lines(found))
+        result = paper.table1(trials, progress)
+    say_json(result) if as_json else say(*lines(result))
 
 
-def lines(found: dict[str, Any]) -> list[str]:
+def lines(result: dict[str, Any]) -> list[str]:
     """The table for people."""
-    rows = found["rows"]
+    rows = result["rows"]
     header = list(rows[0])
     body = [[str(row[key]) if isinstance(row[key], str) else number(row[key]) for key in header] for row in rows]
-    rest = [f"{key}: {value}" for key, value in found.items() if key != "rows"]
+    rest = [f"{key}: {value}" for key, value in result.items() if key != "rows"]
     return [*table(header, body), "", *rest]

@@ -92,33 +92,33 @@ def test(
         over = Event()
         with StopKey(at_service(url, token, over.is_set), say_aside) as key:
             announce(key)
-            found = through(url, token, code, over=over.set, request=request)
+            result = through(url, token, code, over=over.set, request=request)
     else:
-        found = on_own_services(rig, data, emulate, code, request)
-    recording = found.pop("recording")
+        result = on_own_services(rig, data, emulate, code, request)
+    recording = result.pop("recording")
     if output is not None:  # first: what was measured is not lost, whatever comes after
         with writing(output) as place:
             place.write_bytes(recording)
     if decide:
-        found["diagnosis"] = deciding.diagnose_together(decide, recording)
+        result["diagnosis"] = deciding.diagnose_together(decide, recording)
     if as_json:
-        say_json(found)
+        say_json(result)
         return
-    say(*report_test(found["test"], None if decide else found["model"]))
+    say(*report_test(result["test"], None if decide else result["model"]))
     if decide:
-        say("", "both together", "", *diagnosis_lines(found["diagnosis"]), "")
-        if found["diagnosis"]["left"]["structure"]:
-            say("with what was added", "", *diagnosis_lines(found["diagnosis"]["left"]), "")
-    say(f"recording      {output or found['test']['recording_url']}")
+        say("", "both together", "", *diagnosis_lines(result["diagnosis"]), "")
+        if result["diagnosis"]["left"]["structure"]:
+            say("with what was added", "", *diagnosis_lines(result["diagnosis"]["left"]), "")
+    say(f"recording      {output or result['test']['recording_url']}")
 
 
 def take_labels(verb: Any) -> None:
     """Make an option of each label that a person types, in the place of the verb's keywords."""
     *parameters, _labels = inspect.signature(verb, eval_str=True).parameters.values()
     for name in LABEL_TITLES:
-        says = Annotated[str | None, typer.Option(help=Labels.model_fields[name].description, show_default=False)]
-        parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=says))
-        verb.__annotations__[name] = says
+        option = Annotated[str | None, typer.Option(help=Labels.model_fields[name].description, show_default=False)]
+        parameters.append(inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=option))
+        verb.__annotations__[name] = option
     verb.__signature__ = inspect.Signature(parameters)
 
 
