@@ -129,16 +129,13 @@ def test_next_experiment_of_a_diagnosis_is_its_first_undecided_effect(record: st
         stimrig.next_experiment(diagnosis, ["fatigue"])
 
 
-@pytest.mark.parametrize(("progress", "told"), [(True, True), (False, False)])
-def test_long_work_shows_a_bar_unless_it_is_turned_off(
-    record: stimrig.Record, monkeypatch: pytest.MonkeyPatch, progress: bool, told: bool
-) -> None:
+def test_long_work_shows_no_bar_where_it_is_turned_off(record: stimrig.Record, monkeypatch: pytest.MonkeyPatch) -> None:
     shown = io.StringIO()
     shown.isatty = lambda: True
     monkeypatch.setattr("sys.stderr", shown)
     monkeypatch.setattr("stimrig.api.progress_bar.PATIENCE_S", 0.0)
-    stimrig.fit(record, effects=["recruitment_hysteresis"], progress=progress)
-    assert ("fitting hysteresis of recruitment" in shown.getvalue()) == told
+    stimrig.fit(record, progress=False)
+    assert shown.getvalue() == ""
 
 
 def test_progress_may_be_a_function_of_ones_own(record: stimrig.Record) -> None:
@@ -183,27 +180,18 @@ def test_a_session_from_participant_to_controller(client: Client, service: Servi
     assert [row["id"] for row in client.versions("P017")] == [client.version(test["model_id"])["id"]]
 
 
-def test_adding_an_effect_as_a_job_and_at_once(client: Client) -> None:
-    model_id = client.run_test("P017")["model_id"]
-    told: list[tuple[float, str]] = []
+def test_long_work_is_a_job_that_is_followed_and_cancelled_by_what_progress_raises(client: Client) -> None:
+    """Each asks for a job and follows it: an answer that waits for the work would come after `timeout_s`."""
+    model_id, asked, told = client.run_test("P017")["model_id"], list[str](), list[tuple[float, str]]()
+    client.http.event_hooks = {"request": [lambda request: asked.append(str(request.url))]}
+    with pytest.raises(KeyboardInterrupt):
+        client.improve(model_id, Mock(side_effect=KeyboardInterrupt))
+    assert client.job(asked[-1].rpartition("/")[2])["done"], "nothing goes on behind the person's back"
     child = client.add_effects(model_id, ["fatigue"], progress=lambda *now: told.append(now))
-    assert child["parent_id"] == model_id and child["effects"] == ["fatigue"]
-    assert told[-1] == (1.0, "done")
+    assert child["parent_id"] == model_id and child["effects"] == ["fatigue"] and told[-1] == (1.0, "done")
     with pytest.raises(errors.Conflict, match=r"in the model"):
         client.add_effects(child["id"], ["fatigue"])
-    with pytest.raises(errors.Conflict, match=r"in the model"):
-        client.add_effects(child["id"], ["fatigue"], progress=lambda *_: None)
-    assert client.improve(model_id)["parent_id"]
-
-
-def test_long_work_may_last_longer_than_an_answer(client: Client) -> None:
-    """Each asks for a job and follows it: an answer that waits for the work would come after `timeout_s`."""
-    model_id = client.run_test("P017")["model_id"]
-    asked: list[str] = []
-    client.http.event_hooks = {"request": [lambda request: asked.append(str(request.url))]}
-    client.improve(model_id)
-    client.diagnosis(model_id)
-    client.add_effects(model_id, ["fatigue"])
+    assert client.improve(model_id)["parent_id"] and client.diagnosis(model_id)["verdict"]
     for name in ("improve", "diagnosis", "effects"):
         assert any(url.endswith(f"/{name}?wait=false") for url in asked), asked
     assert any("/jobs/J" in url for url in asked), "and the job is asked after"
@@ -215,14 +203,6 @@ def test_an_upload_waits_as_long_as_the_service_works_on_it(client: Client) -> N
     with pytest.raises(errors.Invalid):
         client.upload("P017", b"")
     assert waits[-1]["read"] >= worker.WALL_FACTOR * (worker.PROCESSOR_S["fit"] + worker.PROCESSOR_S["carry"])
-
-
-def test_what_progress_raises_cancels_the_job(client: Client) -> None:
-    model_id = client.run_test("P017")["model_id"]
-    client.diagnosis(model_id)
-    with pytest.raises(KeyboardInterrupt):
-        client.improve(model_id, Mock(side_effect=KeyboardInterrupt))
-    assert client.job("J1")["done"], "nothing goes on behind the person's back"
 
 
 def test_live_signals_come_until_the_end(client: Client, service: Service) -> None:
