@@ -19,6 +19,7 @@ import pytest
 from stimrig.api.cli.supervisor import Child
 from tests.api.conftest import TOKEN, soon, wait_done
 from tests.harness.looks_first import LooksFirst
+from tests.harness.processes import below
 
 ROOT = Path(__file__).parents[2]
 SEED = 61
@@ -141,6 +142,9 @@ def test_killed_at_any_moment_nothing_acknowledged_is_lost(tmp_path: Path, short
         try:
             with httpx.Client(base_url=child.start()["url"], auth=LooksFirst(TOKEN), timeout=60) as http:
                 everything_is_there(http, kept)
+                assert child.process is not None
+                for pid in below(child.process.pid):  # no process that reads uploads is told the token
+                    assert TOKEN.encode() not in Path(f"/proc/{pid}/environ").read_bytes()
                 assert len(kept.participants) >= kills and kept.tests, "there was something to lose"
         finally:
             child.end()
