@@ -20,7 +20,7 @@ from stimrig.api.models import stored_model
 from stimrig.api.models.places import Place, differ, place_of, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive_follower import AdaptiveStatus, Follower
-from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Tell, Watched, begun
+from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Send, Watched, begun
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Participant, Test
@@ -50,8 +50,8 @@ class AdaptiveTests(Watched):
     names, part = (ADAPTIVE,), "adaptive"
     ends: ClassVar[Mapping[str, str]] = {"torque_time": "torque-time", "plan": "fixed-rest"}
 
-    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, adviser: Pool, tell: Tell) -> None:
-        super().__init__(clock, rig, versions, tell)
+    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, adviser: Pool, send: Send) -> None:
+        super().__init__(clock, rig, versions, send)
         self.adviser = adviser
         self._outlooks: OrderedDict[str, dict[str, Any]] = OrderedDict()
         self._outlook_lock = asyncio.Lock()
@@ -127,7 +127,7 @@ class AdaptiveTests(Watched):
         """As `Kind`."""
         assert planned.how is not None
         follower = Follower(
-            planned.plan, planned.how, planned.kept["reach"], self.rig, self.adviser, self.clock, self.tell_now
+            planned.plan, planned.how, planned.extra["reach"], self.rig, self.adviser, self.clock, self.publish
         )
         self.watch(follower)
         return follower.key

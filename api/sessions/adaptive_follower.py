@@ -102,9 +102,9 @@ class Follower(Watcher):
 
     def __init__(
         self, plan: TestPlan, how: dict[str, Any], reach: dict[str, Any], rig: RigClient, adviser: Pool,
-        clock: Clock, tell: Callable[[], None],
+        clock: Clock, publish: Callable[[], None],
     ) -> None:  # fmt: skip
-        super().__init__(plan, AdaptiveStatus(how["target"], reach), rig, clock, tell)
+        super().__init__(plan, AdaptiveStatus(how["target"], reach), rig, clock, publish)
         self.how, self.adviser = how, adviser
         self.key = secrets.token_urlsafe(24)
         self._fixed = [segment.settings["pulse_width_us"] for segment in plan.segments or []]
@@ -213,7 +213,7 @@ class Follower(Watcher):
                 status.knowledge, status.least_known = known, document["least_known"]
             row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
         status.decisions.append(row)
-        self.tell()
+        self.publish()
         return Advice(document, received_s, len(status.decisions) - 1)
 
     def _write(self, advice: Advice, **more: Any) -> None:
@@ -250,7 +250,7 @@ class Follower(Watcher):
             log.info("not laid: %s", error.detail, extra={"test_id": test_id})
             return
         self._write(advice, sample_to_plan_ms=round(1e3 * (self.clock.monotonic_s() - advice.received_s), 1))
-        self.tell()
+        self.publish()
 
     def _spent(self) -> str:
         """Which bound leaves no room for another piece."""

@@ -111,7 +111,7 @@ class JointTests(Watched):
         if plan.adaptive is None or plan.angle is None:
             return ""
         coverage = Coverage(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
-        self.watch(JointWatcher(plan, JointStatus(coverage), self.rig, self.clock, self.tell_now))
+        self.watch(JointWatcher(plan, JointStatus(coverage), self.rig, self.clock, self.publish))
         return secrets.token_urlsafe(24)
 
     def end_of(self, row: Test, event: messages.FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
@@ -238,7 +238,7 @@ class JointWatcher(Watcher):
         now_s = self.clock.monotonic_s()
         if now_s - self._shown_s >= TELL_S or status.state == "ending":
             self._shown_s = now_s
-            self.tell()
+            self.publish()
 
     def _counts(self, time_s: float) -> bool:
         """Without stimulation everything counts in a passive test, and nothing in another one."""

@@ -23,7 +23,7 @@ SERVICE = "stimrig"
 """Who says enough where the service does."""
 AT_STOPPING_TORQUE_S = 12.0
 """The largest torque-time, where nobody says: so many seconds at the torque that stops the test."""
-Tell = Callable[[dict[str, Any]], None]
+Send = Callable[[dict[str, Any]], None]
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Planned:
     """A plan, and what else is known of it before it is played."""
 
     plan: TestPlan
-    kept: dict[str, Any] = field(default_factory=dict)  # what is kept beside the plan; nothing of a plain test
+    extra: dict[str, Any] = field(default_factory=dict)  # what is kept beside the plan; nothing of a plain test
     how: dict[str, Any] | None = None  # of an adaptive test: what the adviser is asked with
 
 
@@ -70,7 +70,7 @@ class Kind:
             raise ApiError(422, "no-angle-range", "The participant has no range of angles", detail)
         return range_rad
 
-    def kept(self, body: TestIn, pulses: int) -> dict[str, Any]:  # noqa: ARG002
+    def stored_fields(self, body: TestIn, pulses: int) -> dict[str, Any]:  # noqa: ARG002
         """What more is kept of a test with so many pulses. Raises ApiError (422) where both do not go together."""
         return {}
 
@@ -81,7 +81,7 @@ class Kind:
     def said_enough(self, test_id: str) -> None:
         """A person has ended it well."""
 
-    def leave(self) -> None:
+    def unwatch(self) -> None:
         """Watch no test any more."""
 
     async def close(self) -> None:
@@ -121,15 +121,15 @@ class Watcher:
     """A test from its first sample to its end. Whatever goes wrong in watching leaves it to its plan, status.
 
     `plan`: as the rig plays it. `status`: what is known of the test, for pages and its document; has `state`, `problem`
-    and `ended`. `tell`: called whenever there is something new for pages.
+    and `ended`. `publish`: called whenever there is something new for pages.
     """
 
     watches, left = "watching", "alone"
     """States: while all goes well, and after it did not."""
     log = logging.getLogger("stimrig.sessions")
 
-    def __init__(self, plan: TestPlan, status: Any, rig: RigClient, clock: Clock, tell: Callable[[], None]) -> None:
-        self.plan, self.status, self.rig, self.clock, self.tell = plan, status, rig, clock, tell
+    def __init__(self, plan: TestPlan, status: Any, rig: RigClient, clock: Clock, publish: Callable[[], None]) -> None:
+        self.plan, self.status, self.rig, self.clock, self.publish = plan, status, rig, clock, publish
         self._tasks = Tasks(self.log)
 
     async def run(self, path: Path | None) -> None:
@@ -166,7 +166,7 @@ class Watcher:
         if self.status.state == self.watches:
             self.status.state, self.status.problem = self.left, self.problem(why)
             self.log.warning("%s", self.status.problem, extra={"test_id": self.plan.test_id})
-            self.tell()
+            self.publish()
 
     def problem(self, why: str) -> str:
         """What is told where it is watched no more."""
@@ -180,21 +180,21 @@ class Watcher:
 class Watched(Kind):
     """A kind whose running test this service watches, sample by sample; at most one runs.
 
-    `tell`: called with a message for the live channel.
+    `send`: called with a message for the live channel.
     """
 
     ends: ClassVar[Mapping[str, str]] = {}
     """Why a test ended, by the rig's reason, where it is told by another name."""
 
-    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, tell: Tell) -> None:
+    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, send: Send) -> None:
         super().__init__(rig)
-        self.clock, self.versions, self.tell = clock, versions, tell
+        self.clock, self.versions, self.send = clock, versions, send
         self.watcher: Watcher | None = None
         self._task: asyncio.Task[None] | None = None
 
     def watch(self, watcher: Watcher) -> None:
         """Watch this test from now on."""
-        self.leave()
+        self.unwatch()
         self.watcher, self._task = watcher, asyncio.create_task(watcher.run(self.rig.path))
 
     @property
@@ -202,10 +202,10 @@ class Watched(Kind):
         """Whether a test is being watched."""
         return self._task is not None and not self._task.done()
 
-    def tell_now(self) -> None:
-        """Tell pages how it stands."""
+    def publish(self) -> None:
+        """Send its state to the pages."""
         if self.watcher is not None:
-            self.tell({"type": self.part, "test_id": self.watcher.plan.test_id, **self.watcher.document()})
+            self.send({"type": self.part, "test_id": self.watcher.plan.test_id, **self.watcher.document()})
 
     def _watcher_of(self, test_id: str) -> Watcher | None:
         return self.watcher if self.watcher is not None and self.watcher.plan.test_id == test_id else None
@@ -214,9 +214,9 @@ class Watched(Kind):
         """As `Kind`."""
         if (watcher := self._watcher_of(test_id)) is not None:
             watcher.status.state, watcher.status.ended = "ending", watcher.status.ended or "enough"
-            self.tell_now()
+            self.publish()
 
-    def leave(self) -> None:
+    def unwatch(self) -> None:
         """As `Kind`."""
         if self._task is not None:
             self._task.cancel()
@@ -225,7 +225,7 @@ class Watched(Kind):
     async def close(self) -> None:
         """As `Kind`."""
         task = self._task
-        self.leave()
+        self.unwatch()
         if task is not None:
             await asyncio.gather(task, return_exceptions=True)
 

@@ -279,8 +279,8 @@ class Runner(Playing):
             "joins": body.joins,
             **dict(zip(("side", "muscle", "placement"), site_of(participant), strict=True)),
             "tokens": current.tokens,
-            **planned.kept,
-            **self.kinds[body.kind].kept(body, _pulses(preview)),
+            **planned.extra,
+            **self.kinds[body.kind].stored_fields(body, _pulses(preview)),
         }
         row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
         row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
@@ -305,7 +305,7 @@ class Runner(Playing):
         row = await self._participant(body)
         planned = await self._planned(body, row)
         answer = await self._previewed(planned.plan)
-        return {**answer, **planned.kept, "plan_hash": self.previews.keep(body, planned, answer, row)}
+        return {**answer, **planned.extra, "plan_hash": self.previews.keep(body, planned, answer, row)}
 
     async def _previewed(self, plan: messages.TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)
@@ -443,7 +443,7 @@ class Runner(Playing):
 
     def _leave(self) -> None:
         for kind in self.kinds.all:
-            kind.leave()
+            kind.unwatch()
 
     # ---- after a restart ------------------------------------------------------------------------------------
 

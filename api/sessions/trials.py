@@ -50,7 +50,7 @@ class Trials(Kind):
 
     # ---- before a trial ----------------------------------------------------------------------------------------
 
-    def kept(self, body: TestIn, pulses: int) -> dict[str, Any]:
+    def stored_fields(self, body: TestIn, pulses: int) -> dict[str, Any]:
         """Its approval, and what the controller wants: a value for each pulse, else ApiError (422)."""
         reference = body.reference_torque_nm
         if reference is not None and len(reference) != pulses:

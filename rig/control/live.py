@@ -18,7 +18,7 @@ from stimrig.rig.messages import LaidSegment, LiveEvent, PulseOutcomes
 IDLE = {"test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "dropped_pulses": 0}
 
 
-def take(
+def live_event(
     receiver: Receiver, run: TestRun | None, zero_s: float, now_s: float, angle: AngleReceiver | None
 ) -> LiveEvent | None:
     """Return what is new, or None if there is no new torque. Numbers are only copied: no pulse waits for it.

@@ -14,7 +14,7 @@ from stimrig.rig.config import RigConfig
 from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibrating import Calibrations
 from stimrig.rig.control.calibration import check_profile, check_range
-from stimrig.rig.control.live import finite, take
+from stimrig.rig.control.live import finite, live_event
 from stimrig.rig.control.memory import LatchFile, Rest, Result
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
@@ -127,8 +127,8 @@ class Rig:
         if receiver is None:
             return None
         if run is None or run.t0_s is None:  # until a test's clock runs nothing has a time on it
-            return take(receiver, None, self._born_s, now_s, self.pair.angle)
-        return take(receiver, run, run.t0_s, now_s, self.pair.angle)
+            return live_event(receiver, None, self._born_s, now_s, self.pair.angle)
+        return live_event(receiver, run, run.t0_s, now_s, self.pair.angle)
 
     async def open(self) -> None:
         """Seal what a crash left, then connect; a missing device is reported in the status, not raised.
