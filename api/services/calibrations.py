@@ -24,7 +24,7 @@ from stimrig.api.store.tables import AuditEntry, Participant
 from stimrig.rig import messages, requests
 
 
-def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any], tags: Tags | None) -> str:
+def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any], tags: Tags) -> str:
     """The intent; the calibration's id."""
     with context.store.write() as session:
         version, now = locking.check(session, participants.within(session, code), tags), context.clock.utc()
@@ -48,7 +48,7 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
 
 
 async def begin(
-    context: Context, code: str, body: CalibrationIn, by: str, tags: Tags | None = None, confirm: str = "",
+    context: Context, code: str, body: CalibrationIn, by: str, tags: Tags, confirm: str = "",
     ask: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Open a calibration: where it stands. A person, with `ask`, is asked before a current far above the usual one.
@@ -83,7 +83,7 @@ def confirm_current(row: Participant, asked: dict[str, Any], confirm: str) -> No
         require_confirmation(confirm, title, button, changes, warnings)
 
 
-async def step(context: Context, code: str, body: StepIn, tags: Tags | None = None) -> dict[str, Any]:
+async def step(context: Context, code: str, body: StepIn, tags: Tags) -> dict[str, Any]:
     """Play one train: where the calibration stands."""
     async with context.limits_lock:  # of two presses on the same sight one plays
         check_train(await sound(context, code), tags)
@@ -91,7 +91,7 @@ async def step(context: Context, code: str, body: StepIn, tags: Tags | None = No
     return await standing(context, code)
 
 
-async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags | None = None) -> dict[str, Any]:
+async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags) -> dict[str, Any]:
     """Mark the last train's width as a threshold: where the calibration stands."""
     async with context.limits_lock:  # no train comes between looking and marking
         found = await sound(context, code)
@@ -102,19 +102,19 @@ async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags | 
     return await standing(context, code)
 
 
-def check_train(found: dict[str, Any], tags: Tags | None, any_train: bool = False) -> None:
+def check_train(found: dict[str, Any], tags: Tags, any_train: bool = False) -> None:
     """Refuse what was decided on another calibration, or, but with `any_train`, without knowing of the last train.
 
     Raises ApiError: 412 it is another one, or another train was sent or is on its way.
     """
     check_calibration(found["calibration_id"], found["by"], tags)
-    if not any_train and (found["version"] not in locking.tags_of(tags) or found["playing"]):
+    if not any_train and (found["version"] not in tags or found["playing"]):
         raise another_train()
 
 
-def check_calibration(calibration_id: str, by: str, tags: Tags | None) -> None:
+def check_calibration(calibration_id: str, by: str, tags: Tags) -> None:
     """Raise ApiError (412): the one that was decided on has ended, and somebody has begun another one."""
-    if calibration_id not in {tag.partition(".")[0] for tag in locking.tags_of(tags)}:
+    if calibration_id not in {tag.partition(".")[0] for tag in tags}:
         detail = (
             f"{by} has begun another calibration since this page was shown. Nothing was done. Look at that one first."
         )
@@ -223,7 +223,7 @@ def _stored(session: Session, code: str, identity: str) -> bool:
     return session.scalar(own) is not None
 
 
-async def close(context: Context, code: str, by: str, tags: Tags | None, discard: bool = False) -> dict[str, Any]:
+async def close(context: Context, code: str, by: str, tags: Tags, discard: bool = False) -> dict[str, Any]:
     """Close a calibration. The rig keeps the result until it is stored here: where that fails, finish it again."""
     async with context.limits_lock:
         waits = await _waiting(context, code)

@@ -57,7 +57,7 @@ def pose_version(context: Context) -> int:
         return locking.pose_version(session)
 
 
-async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags | None = None) -> tuple[Status, int]:
+async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags) -> tuple[Status, int]:
     """Tell the rig a pose of the sensor: the rig's state, and the version that the sensor's calibration has now.
 
     The intent is written before: of one whose answer is lost nobody knows whether it was taken.

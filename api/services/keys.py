@@ -18,7 +18,7 @@ from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Token
 
 
-def make(context: Context, who: Principal, code: str, body: KeyFor, tags: Tags | None = None) -> tuple[str, Token, int]:
+def make(context: Context, who: Principal, code: str, body: KeyFor, tags: Tags) -> tuple[str, Token, int]:
     """Make a key: its text, its row, and the participant's new version.
 
     Raises ApiError: 403 who makes it lacks a scope; 409 archived; 412 changed since it was seen; 422 as `plan_within`.

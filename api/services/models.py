@@ -13,9 +13,7 @@ from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model, Participant
 
 
-async def approve(
-    context: Context, row: Model, by: str, reason: str, tracking: Limits, tags: Tags | None = None
-) -> int:
+async def approve(context: Context, row: Model, by: str, reason: str, tracking: Limits, tags: Tags) -> int:
     """Approve a version; the worker that follows its trials is warm by the first one."""
     version = await asyncio.to_thread(context.versions.decide, row.id, True, by, reason, tracking, tags=tags)
     context.runner.trials.warm(row.participant)

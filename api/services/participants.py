@@ -55,13 +55,12 @@ def within(session: Session, code: str) -> Participant:
 
 @under_limits_lock
 def change_profile(
-    context: Context, code: str, asked: dict[str, Any], by: str, may_void: bool = False, confirm: str = "",
-    ask: bool = False, tags: Tags | None = None,
-) -> Participant:  # fmt: skip
+    context: Context, code: str, asked: dict[str, Any], by: str, tags: Tags, confirm: str = "", ask: bool = False
+) -> Participant:
     """Change limits of a participant: those that are asked for; the rest stays.
 
     Raises ApiError: 404 no such participant; 412 changed meanwhile; 422 beyond what the rig takes, or the first ones
-    are not whole; 409 the calibration would be lost, and that was not allowed.
+    are not whole; 409 the calibration would be lost, or with `ask` a limit jumps, and that was not confirmed.
     """
     with context.store.write() as session:
         row = within(session, code)
@@ -69,7 +68,7 @@ def change_profile(
         before = row.profile
         check_asked(context, before, asked)
         profile, voids = profiles.changed(before, add_calibration_time(context, asked))
-        confirm_profile(context, code, before, profile, "" if may_void else voids, confirm, ask)
+        confirm_profile(context, code, before, profile, voids, confirm, ask)
         if profile != before:
             row.profile = profile
             now = context.clock.utc()
@@ -160,13 +159,12 @@ def site_in(body: MuscleIn) -> Site:
 
 @under_limits_lock
 def change_site(
-    context: Context, code: str, body: MuscleIn, by: str, voids: bool = False, confirm: str = "", ask: bool = False,
-    tags: Tags | None = None,
-) -> Participant:  # fmt: skip
+    context: Context, code: str, body: MuscleIn, by: str, tags: Tags, confirm: str = "", ask: bool = False
+) -> Participant:
     """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
-    Raises ApiError: 404 no such participant; 409 a test or calibration of it is under way, or the calibration would be
-    lost and that was not allowed.
+    Raises ApiError: 404 no such participant; 412 changed meanwhile; 409 a test or calibration of it is under way, or
+    the calibration would be lost, or with `ask` the approved model, and that was not confirmed.
     """
     refuse_busy(context, code)
     now, has_model = context.clock.utc(), ask and context.versions.approved(code) is not None
@@ -176,7 +174,7 @@ def change_site(
         lost, here = loses_calibration(row, body), site_of(row)
         before, after = in_words(here), in_words(site_in(body))
         warnings = []
-        if lost and not voids:
+        if lost:
             warnings.append(f"The calibration is lost with it: its thresholds were found at {before}.")
         if ask and here != site_in(body) and has_model:
             warnings.append(f"The approved model and its keys are of {before}. Here there is none.")
@@ -205,7 +203,7 @@ def refuse_busy(context: Context, code: str) -> None:
 
 
 @under_limits_lock
-def put_archived(context: Context, code: str, archived: bool, by: str, tags: Tags | None = None) -> Participant:
+def put_archived(context: Context, code: str, archived: bool, by: str, tags: Tags) -> Participant:
     """Put a participant into the archive, or take it out; doing it again changes nothing. Raises as `change_site`."""
     if archived:
         refuse_busy(context, code)

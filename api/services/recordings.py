@@ -34,9 +34,8 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
 
 
 async def take_in(
-    context: Context, code: str, data: bytes, who: Principal, columns: Sequence[str] = (), of: str = "",
-    tags: Tags | None = None,
-) -> tuple[Recording, Model, list[str]]:  # fmt: skip
+    context: Context, code: str, data: bytes, who: Principal, tags: Tags, columns: Sequence[str] = (), of: str = ""
+) -> tuple[Recording, Model, list[str]]:
     """Keep a recording of another tool and identify a model from it; what was assumed, and left out of its structure.
 
     Where `columns` are mapped, what is kept is the record as a CSV file of ours, with the SHA-256 of what was sent.
@@ -126,7 +125,7 @@ def _write(context: Context, data: bytes, suffix: str) -> Path:
 
 
 def _store(
-    context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str], of: str, tags: Tags | None
+    context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str], of: str, tags: Tags
 ) -> Recording:
     now = context.clock.utc()
     row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)

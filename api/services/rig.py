@@ -30,9 +30,9 @@ def rig_state(context: Context) -> dict[str, Any]:
     }
 
 
-async def rearm(context: Context, by: str, tags: Tags | None = None) -> Status:
+async def rearm(context: Context, by: str, tags: Tags) -> Status:
     """Re-arm the rig after the stop that was shown. Raises ApiError: 412 it was stopped again since."""
-    (latch, *_), latches = locking.tags_of(tags), context.rig.latches
+    latch, latches = tags[0], context.rig.latches
     _, shown = latches.get(latch, ("", ""))
     note = partial(context.store.note, context.clock, by)
     await asyncio.to_thread(note, "re-arm", "rig", reason=shown)

@@ -18,7 +18,7 @@ def find(context: Context, test_id: str) -> Test:
     return require_found(context.store.get(Test, test_id), "test", test_id, LISTED)
 
 
-def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tags: Tags | None = None) -> Test:
+def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tags: Tags) -> Test:
     """Note who ran a test at the rig. Raises ApiError: 404 no such test; 412 it was said meanwhile."""
     with context.store.write() as session:
         row = require_found(session.get(Test, test_id), "test", test_id, LISTED)

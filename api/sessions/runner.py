@@ -459,7 +459,7 @@ class Runner(Playing):
             ):
                 tokens = row.plan.get("tokens") or []
                 current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
-                current.version = row.plan.get("participant_version")
+                current.version = row.plan.get("participant_version", 0)
                 current.until_utc = await asyncio.to_thread(self.until_utc, tokens)
                 self.current = current
                 self.hub.begin(row.id)

@@ -15,20 +15,17 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError
 from stimrig.api.store import audit
-from stimrig.api.store.tables import AuditEntry, Model, Participant, Test, User
+from stimrig.api.store.tables import AuditEntry, Participant, Test, User
 
 Tags = tuple[str, ...]
 """Entity tags of a request's `If-Match`, without their quotes."""
 Versioned = Participant | User | Test
 HASH_DIGITS = 6
-LIMITS = ("create participant", "set profile", "finish calibration")
-SITE, ARCHIVE = ("create participant", "set muscle"), ("create participant", "archive", "unarchive")
+LIMITS, SITE = ("create participant", "set profile", "finish calibration"), ("create participant", "set muscle")
+ARCHIVE, MODELS = ("create participant", "archive", "unarchive"), ("approve", "reject")
 SETTINGS = (*LIMITS, "set muscle", "archive", "unarchive")
-MODELS = ("approve", "reject")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
 RAN_BY = "set who ran it"
-GROUPS = (LIMITS, SITE, ARCHIVE, MODELS, POSES)
-"""Actions that set the same thing."""
 UNITS = {"_ma": "mA", "_us": "µs", "_nm": "N·m", "_rad": "rad"}
 MOST_CHANGES = 20
 """Changes that a refusal lists, the newest."""
@@ -57,24 +54,21 @@ def pose_version(session: Session) -> int:
     return 0 if entry is None else number_of(entry)
 
 
-def check_poses(session: Session, tags: Tags | None) -> None:
-    """The same as `check` for the angle sensor."""
-    check_number(session, pose_version(session), tags, _poses())
-
-
 def check(session: Session, row: Versioned, tags: Tags | None) -> int:
     """Return the row's version; without tags nothing is checked.
 
     Raises ChangedError: it is not among the tags; with each change since: who, when, what it was and what it is.
     """
-    return check_number(session, row.version, tags, about(row))
+    return _check(session, row.version, tags, about(row))
 
 
-def check_number(session: Session, version: int, tags: Tags | None, entries: ColumnElement[bool]) -> int:
-    """The same for a version that is no row's; `entries`: those of the trail that change it."""
+def check_poses(session: Session, tags: Tags | None) -> None:
+    """The same as `check` for the angle sensor."""
+    _check(session, pose_version(session), tags, _poses())
+
+
+def _check(session: Session, version: int, tags: Tags | None, entries: ColumnElement[bool]) -> int:
     if tags is not None and str(version) not in tags:
-        if not tags:
-            raise missing("the document")
         numbers = [int(tag) for tag in tags if re.fullmatch(r"\d{1,18}", tag, re.ASCII)]
         raise ChangedError(version, since(session, max(numbers, default=-1), entries))
     return version
@@ -93,13 +87,6 @@ def is_known(session: Session, version: int) -> bool:
     """Return whether this trail has the version; one that was shown by another database is not known."""
     entry = session.get(AuditEntry, version >> 4 * HASH_DIGITS)
     return entry is not None and number_of(entry) == version
-
-
-def tags_of(tags: Tags | None) -> Tags:
-    """Return the tags of a request. Raises ApiError (428) where there is none."""
-    if not tags:
-        raise missing("the document")
-    return tags
 
 
 def settings_of(code: str) -> ColumnElement[bool]:
@@ -123,15 +110,12 @@ def _poses() -> ColumnElement[bool]:
 
 
 def _change(session: Session, place: int, entry: AuditEntry) -> dict[str, Any]:
-    alike = next((group for group in GROUPS if entry.action in group), (entry.action,))
-    earlier = select(AuditEntry).where(
-        AuditEntry.seq <= place, AuditEntry.subject == entry.subject, AuditEntry.action.in_(alike)
-    )
-    before = session.scalars(earlier.order_by(AuditEntry.seq.desc()).limit(1)).first()
+    alike = next((group for group in (LIMITS, SITE, ARCHIVE, MODELS) if entry.action in group), (entry.action,))
+    same = AuditEntry.subject == entry.subject, AuditEntry.action.in_(alike), AuditEntry.seq <= place
+    before = session.scalars(select(AuditEntry).where(*same).order_by(AuditEntry.seq.desc()).limit(1)).first()
     old, new = _values(before, alike), _values(entry, alike)
-    changed = [name for name in new | old if new.get(name) != old.get(name)]
     told = {name: getattr(entry, name) for name in ("who", "at_utc", "action", "subject")}
-    return {**told, "old": _words(old, changed), "new": _words(new, changed)}
+    return {**told, "old": _words(old, new), "new": _words(new, old)}
 
 
 def _values(entry: AuditEntry | None, alike: tuple[str, ...]) -> dict[str, Any]:
@@ -146,14 +130,13 @@ def _values(entry: AuditEntry | None, alike: tuple[str, ...]) -> dict[str, Any]:
     return {"": entry.detail.get("ran_by") or entry.action}
 
 
-def _words(values: dict[str, Any], names: list[str]) -> str:
-    """Say values with their units: "current 5 mA, max pulse width 200 µs"."""
+def _words(values: dict[str, Any], other: dict[str, Any]) -> str:
+    """Say the values that differ, with their units: "current 5 mA, max pulse width 200 µs"."""
     words = []
-    for name in names:
-        unit = next((unit for ending, unit in UNITS.items() if name.endswith(ending)), "")
-        label = name.removesuffix(next((ending for ending in UNITS if name.endswith(ending)), "")).replace("_", " ")
-        if (value := values.get(name)) is not None:
-            words.append(f"{label} {value} {unit}".strip())
+    for name, value in values.items():
+        ending = next((ending for ending in UNITS if name.endswith(ending)), "")
+        if value is not None and value != other.get(name):
+            words.append(f"{name.removesuffix(ending).replace('_', ' ')} {value} {UNITS.get(ending, '')}".strip())
     return ", ".join(words)
 
 
@@ -161,26 +144,9 @@ class ChangedError(ApiError):
     """412: what was decided on has another version now; the answer's `ETag` has it."""
 
     def __init__(self, version: int | str, changes: list[dict[str, Any]], detail: str = "") -> None:
-        changes = changes[-MOST_CHANGES:]
         last = changes[-1] if changes else None
         what = f"{last['who']}: {last['action']} {last['subject']}, {last['at_utc']}. " if last else ""
         detail = detail or f"{what}Nothing was done. Look at what is there now; what you decide then is a new decision."
-        super().__init__(412, "changed-meanwhile", "This was changed since you saw it", detail, changes=changes)
+        title, changes = "This was changed since you saw it", changes[-MOST_CHANGES:]
+        super().__init__(412, "changed-meanwhile", title, detail, changes=changes)
         self.headers["ETag"] = f'"{version}"'
-
-
-def missing(document: str) -> ApiError:
-    """428: the request does not say which version it was decided on (RFC 6585, section 3)."""
-    detail = f"Send the ETag of GET {document} as If-Match, as you last saw it. Nothing was done."
-    return ApiError(428, "version-missing", "Say what this was decided on", detail)
-
-
-def shown(session: Session, path: str, names: dict[str, Any]) -> int:
-    """Return the version of what the page at a path shows; 0 where there is none."""
-    if path == "/rig/angle":
-        return pose_version(session)
-    code = names.get("code")
-    if (model_id := names.get("model_id")) is not None:
-        code = session.scalar(select(Model.participant).where(Model.id == model_id))
-    row = session.get(Test, names["test_id"]) if "test_id" in names else session.get(Participant, code or "")
-    return row.version if row else 0

@@ -19,6 +19,7 @@ from fastapi.responses import Response
 from fastapi.security import APIKeyCookie, APIKeyHeader, HTTPBearer
 from pydantic import ValidationError
 from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.orm import defer
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, HTTPConnection
 
@@ -78,8 +79,17 @@ async def identified(request: Request) -> Principal:
 
 
 def _shown(store: Store, request: Request) -> int:
+    """Return the version of what a page shows, by the names in its address; 0 where it has none."""
+    names = request.path_params
     with store.read() as session:
-        return locking.shown(session, request.url.path, request.path_params)
+        if request.url.path == "/rig/angle":
+            return locking.pose_version(session)
+        if "test_id" in names:
+            row = session.get(Test, names["test_id"])
+        else:
+            model = session.get(Model, names.get("model_id", ""), options=[defer(Model.document)])
+            row = session.get(Participant, model.participant if model else names.get("code", ""))
+        return row.version if row else 0
 
 
 def is_action(request: Request) -> bool:
@@ -214,10 +224,16 @@ def if_match(document: str, needed: bool = True) -> Any:
         if not readable:
             own = request.state.who.participant  # a controller's key reads no participant
             of_key = None if own is None else f"/v1/participants/{own}/model"
-            raise locking.missing(of_key or document.format(**{"code": "{code}", **request.path_params}))
+            raise version_missing(of_key or document.format(**{"code": "{code}", **request.path_params}))
         return readable
 
     return Depends(tags)
+
+
+def version_missing(document: str) -> ApiError:
+    """428: the request does not say which version it was decided on (RFC 6585, section 3)."""
+    detail = f"Send the ETag of GET {document} as If-Match, as you last saw it. Nothing was done."
+    return ApiError(428, "version-missing", "Say what this was decided on", detail)
 
 
 FIELD, HEADER = "right", "x-stop-right"

@@ -112,7 +112,7 @@ def test_a_model_of_another_arm_or_current_says_nothing_of_this_one(
     assert client.post(f"{document['model_url']}/approve", json={"reason": "good fit"}).status_code == 200
     assert known()
     assert not known(profile={"current_ma": 10.0})
-    client.put("/v1/participants/P017/muscle?void_calibration=true", json={"side": "right", "muscle": "biceps"})
+    client.put("/v1/participants/P017/muscle", json={"side": "right", "muscle": "biceps"})
     assert not known()
 
 

@@ -95,7 +95,8 @@ def test_thresholds_of_one_arm_do_not_hold_for_the_other(service: Service, http:
     refused = http.put("/v1/participants/M2/muscle", json={"side": "right"})
     assert refused.status_code == 409 and "left" in refused.json()["detail"]
     assert http.get("/v1/participants/M2").json()["side"] == "left"
-    done = http.put("/v1/participants/M2/muscle?void_calibration=true", json={"side": "right"}).json()
+    token = {"confirm": refused.json()["confirm"]["token"]}
+    done = http.put("/v1/participants/M2/muscle", params=token, json={"side": "right"}).json()
     assert done["side"] == "right" and done["profile"]["motor_pulse_width_us"] is None
 
 

@@ -162,9 +162,11 @@ def test_a_tighter_limit_keeps_the_calibration(asked: dict[str, float], words: s
 
 def test_a_calibration_is_lost_knowingly_alone(client: httpx.Client, tight: dict[str, float]) -> None:
     found, asked = calibrate(client), {"current_ma": 12.5}
-    assert "above the 12 mA" in problem(client.put(f"{P}/profile", json=asked), 409)["detail"]
-    assert client.get(P).json()["profile"] == found
-    assert client.put(f"{P}/profile", params={"void_calibration": True}, json=asked).status_code == 200
+    refused = problem(client.put(f"{P}/profile", json=asked), 409)
+    assert "above the 12 mA" in refused["detail"] and client.get(P).json()["profile"] == found
+    token = {"confirm": refused["confirm"]["token"]}
+    assert client.put(f"{P}/profile", params=token, json={"current_ma": 13.0}).status_code == 409, "just that change"
+    assert client.put(f"{P}/profile", params=token, json=asked).status_code == 200
     profile = client.get(P).json()["profile"]
     assert [profile[name] for name in profiles.FOUND] == [None] * 4 and profile | asked == profile
 

@@ -18,7 +18,6 @@ from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
-MayVoid = Annotated[bool, Query(description="the change may void the calibration of the day")]
 
 
 @router.post("", status_code=201, **describe_answer(ParticipantOut, 201, "made; see `Location`"))
@@ -60,16 +59,15 @@ async def set_profile(
     tags: ParticipantVersion,
     body: ProfileIn,
     response: Response,
-    void_calibration: MayVoid = False,
     confirm: Confirm = "",
     ask: Ask = False,
 ) -> dict[str, Any]:
     """Change limits: those that are sent; the others keep their values, and so does what a calibration found.
 
-    A limit wider than at the calibration voids it: 409, unless `void_calibration` or `confirm`. `meanwhile` says what
-    it means for a test that runs, or a calibration that is open.
+    A limit wider than at the calibration voids it: 409, until it is confirmed. `meanwhile` says what it means for a
+    test that runs, or a calibration that is open.
     """
-    row = await participants.change_profile(context, code, body.sent(), who.name, void_calibration, confirm, ask, tags)
+    row = await participants.change_profile(context, code, body.sent(), who.name, tags, confirm, ask)
     return {**tagged(response, row), "meanwhile": participants.meanwhile(context, code)}
 
 
@@ -81,16 +79,15 @@ async def set_muscle(
     tags: ParticipantVersion,
     body: MuscleIn,
     response: Response,
-    void_calibration: MayVoid = False,
     confirm: Confirm = "",
     ask: Ask = False,
 ) -> dict[str, Any]:
-    """Say the site. Another one than before voids the calibration: 409, unless allowed.
+    """Say the site. Another one than before voids the calibration: 409, until it is confirmed.
 
     A model belongs to the site at which it was measured: at another one there is no approved model, and no key of a
     controller, until it has its own. Tests keep the site that they were begun with.
     """
-    row = await participants.change_site(context, code, body, who.name, void_calibration, confirm, ask, tags)
+    row = await participants.change_site(context, code, body, who.name, tags, confirm, ask)
     return tagged(response, row)
 
 

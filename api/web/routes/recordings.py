@@ -85,7 +85,7 @@ async def upload(
     data = await request.body()  # `stimrig.api.web.middleware` bounds it
     if not data:
         raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
-    row, model, warnings = await recordings.take_in(context, code, data, who, columns, of or confirm, tags)
+    row, model, warnings = await recordings.take_in(context, code, data, who, tags, columns, of or confirm)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
     return {"recording_id": row.id, "model": version, "warnings": warnings}
