@@ -1,18 +1,5 @@
 // Forms that call REST: `<form data-call="PUT /v1/...">`. Fields become JSON; the answer leads on, or is shown where it belongs.
-// Attributes of a form, or of the pressed button, which goes before:
-//   data-call      method and address
-//   data-if-match  version that the page shows
-//   data-next      address to go to; {name} is a field's value, {answer.id} a value of the answer. Without it the page loads again.
-//   data-renew     ids of elements to take from the page anew, instead of loading it
-//   data-show      id of a hidden element that shows the answer: its [data-answer=key] get the text of that key
-//   data-changed   send only the fields that a person has changed
-//   data-again     words of the button that sends again what was overtaken; "reload": shows the page anew instead; "none": no button
-// Attributes of a field:
-//   data-type      number, int, degrees (sent in radians), flag, list; "degrees list": all fields of this name as one list
-//   data-empty     "null": an empty field is sent as null. Otherwise it is left out.
-//   data-query     goes into the query of data-next instead of the body
-//   data-confirm   a password, sent to POST /v1/sessions/confirm first
-// Dots in a name nest. The file of a file field is the body; the other fields then go into the query.
+// The attributes that it reads are listed in docs/decisions/0021-one-script.md.
 "use strict";
 const act = (() => {
   const PATIENCE_MS = 30000, FILE_PATIENCE_MS = 600000, READ_MS = 2000;
@@ -179,8 +166,6 @@ const act = (() => {
     for (const field of form.querySelectorAll("[aria-invalid]")) field.removeAttribute("aria-invalid");
   }
 
-  const told = (value) => (value && typeof value === "object" ? Object.entries(value).map(([name, each]) => `${name} ${told(each)}`).join(", ") : String(value ?? "–"));
-
   function overtaken({ title, detail, changes = [] }, { again }) {
     const rows = changes.map((each) => ({ what: each.action, before: each.old, now: each.new, who: `${each.who}, ${new Date(each.at_utc).toLocaleTimeString()}` }));
     const button = again === "reload" ? words.show_anew : again || words.all_the_same;
@@ -189,7 +174,7 @@ const act = (() => {
 
   // Not modal: that would put the stop button out of reach. `late`: it is read before it can be pressed.
   function ask({ title, warnings = [], rows = [], button = words.yes }, yes, late = false) {
-    const cell = (tag, value) => make(tag, { textContent: told(value) }), heads = ["", words.before, words.now, ...(rows.some((row) => row.who) ? [words.who] : [])];
+    const cell = (tag, value) => make(tag, { textContent: value || "–", scope: "row" }), heads = ["", words.before, words.now, ...(rows.some((row) => row.who) ? [words.who] : [])];
     const lines = rows.map((row) => make("tr", {}, cell("th", row.what), cell("td", row.before), make("td", {}, cell("b", row.now)), ...(row.who ? [cell("td", row.who)] : [])));
     const box = make("dialog", { id: "asked", className: "card question" }, make("h2", { id: "asked-title", textContent: title }));
     const go = make("button", { type: "button", className: "big primary", textContent: button, disabled: late, onclick: () => { box.remove(); yes(); } });
