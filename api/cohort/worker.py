@@ -21,7 +21,6 @@ from importlib import import_module
 from pathlib import Path, PurePath
 from typing import Any
 
-import psutil
 from distributed import get_worker
 
 from stimrig.api.cohort.errors import CohortError
@@ -94,9 +93,10 @@ def _compute(content: bytes, entry: Entry, task: Task, bounds: Bounds) -> Row:
     ) as file:
         file.write(content)
         file.flush()
+        future = _submit(bounds, file.name, entry, task)
         began_s = time.monotonic()
         try:
-            return _submit(bounds, file.name, entry, task).result()
+            return future.result()
         except BrokenProcessPool:
             took_s = time.monotonic() - began_s
     if took_s >= bounds.limit_s:
@@ -138,8 +138,9 @@ def _prepare_process(memory_bytes: int) -> None:
     for name in LIBRARIES:
         import_module(name)
     side_by_side.WORKERS = 1
-    most_bytes = psutil.Process().memory_info().vms + memory_bytes
-    resource.setrlimit(resource.RLIMIT_AS, (most_bytes, most_bytes))
+    pages = int(Path("/proc/self/statm").read_text("ascii").split()[0])  # of addresses, as RLIMIT_AS counts them
+    limit_bytes = pages * resource.getpagesize() + memory_bytes
+    resource.setrlimit(resource.RLIMIT_AS, (limit_bytes, limit_bytes))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 

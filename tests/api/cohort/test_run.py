@@ -7,6 +7,7 @@ import os
 import signal
 from collections import Counter
 from collections.abc import Callable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -232,6 +233,14 @@ def test_record_that_crashes_its_process_is_a_row(
         row = compute(good)
     assert row["error_kind"] == "killed" and "\n" not in row["error"] and row["sha256"]
     assert compute(good)["status"] == "ok"
+
+
+def test_process_that_does_not_start_is_no_fault_of_the_record(
+    compute: Callable[..., dict[str, Any]], good: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "_prepare_process", crash)
+    with pytest.raises(BrokenProcessPool):
+        compute(good, limit_s=298.0)
 
 
 def test_record_beyond_the_memory_is_a_row(compute: Callable[..., dict[str, Any]], tmp_path: Path) -> None:
