@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any, Self
 
 import httpx
+from pydantic_core import to_jsonable_python
 from websockets.exceptions import WebSocketException
 from websockets.sync.client import connect
 
@@ -50,6 +51,8 @@ class Connection:
         headers, document = httpx.Headers(more.pop("headers", None)), document_of(method, path, more.get("json"))
         if document and "if-match" not in headers and (etag := self._etag(document, path)):
             headers["if-match"] = etag
+        if "json" in more:  # parts of an answer may be sent back, as the segments of `widths`
+            more["json"] = to_jsonable_python(more["json"])
         answer = self._send(method, path, headers=headers, **more)
         if answer.is_success and (document or path == "/v1/stop"):
             self._take_etag(document, headers.get("if-match"), answer)

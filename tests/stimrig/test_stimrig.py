@@ -19,6 +19,7 @@ import stimrig
 from stimrig import Client, errors
 from stimrig.api.jobs import worker
 from stimrig.api.progress_bar import in_notebook
+from stimrig.api.web.responses.base import SegmentOut
 from stimrig.api.web.responses.models import JobOut
 from stimrig.errors import BadRequest
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
@@ -178,6 +179,11 @@ def test_a_session_from_participant_to_controller(client: Client, service: Servi
     assert client.recording(test["recording_id"]).startswith(b"\x89HDF")
     assert client.reject(test["model_id"])["decision"] == "rejected"
     assert [row["id"] for row in client.versions("P017")] == [client.version(test["model_id"])["id"]]
+
+
+def test_a_part_of_an_answer_may_be_sent_back(client: Client) -> None:
+    rest = SegmentOut(name="rest", sequence="rest", settings={"duration_s": 2})
+    assert client.preview("P017", segments=[rest]).segments[0].name == "rest"
 
 
 def test_long_work_is_a_job_that_is_followed_and_cancelled_by_what_progress_raises(client: Client) -> None:
