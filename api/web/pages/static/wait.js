@@ -15,7 +15,7 @@ function watch(box) {
       const answer = await fetch(box.dataset.from, { cache: "no-store" }), trials = document.getElementById("trials");
       const now = answer.ok ? await answer.json() : null;
       if (now && now.key !== box.dataset.nextKey && !answering()) arrive(box.querySelector("[data-words]"), box.querySelector("[data-left]"));
-      else if (now && trials && now.trials !== trials.dataset.trials && !trials.contains(document.activeElement)) await renewTrials(trials);
+      else if (now && trials && now.trials !== trials.dataset.trials && !(trials.contains(document.activeElement) && document.activeElement.tagName !== "SUMMARY")) await renewTrials(trials);
     } catch { /* asked again */ }
     asking = false;
   }
@@ -27,10 +27,12 @@ function watch(box) {
   setInterval(() => { if (!document.hidden) ask(); }, quick ? 1000 : document.getElementById("trials") ? 2000 : 5000);
 }
 
-async function renewTrials(old) { // a table that was opened stays open
-  const open = old.querySelector("details")?.open;
+async function renewTrials(old) { // a table that was opened stays open, and a question that was read aloud is not read again
+  const open = old.querySelector("details")?.open, question = old.querySelector(".notice")?.textContent;
   await act.renew(["trials"]);
   if (open) document.querySelector("#trials details")?.setAttribute("open", "");
+  const notice = document.querySelector("#trials .notice");
+  if (notice && notice.textContent === question) notice.removeAttribute("role");
 }
 
 async function follow(box) {
