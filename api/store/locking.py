@@ -27,8 +27,7 @@ SETTINGS = (*LIMITS, "set muscle", "archive", "unarchive")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
 RAN_BY = "set who ran it"
 UNITS = {"_ma": "mA", "_us": "µs", "_nm": "N·m", "_rad": "rad"}
-MOST_CHANGES = 20
-"""Changes that a refusal lists, the newest."""
+MOST_CHANGES = 20  # that a refusal lists, the newest
 
 
 def number_of(entry: AuditEntry) -> int:
@@ -144,8 +143,7 @@ class ChangedError(ApiError):
     """412: what was decided on has another version now; the answer's `ETag` has it."""
 
     def __init__(self, version: int | str, changes: list[dict[str, Any]], detail: str = "") -> None:
-        last = changes[-1] if changes else None
-        what = f"{last['who']}: {last['action']} {last['subject']}, {last['at_utc']}. " if last else ""
+        what = "{who}: {action} {subject}, {at_utc}. ".format(**changes[-1]) if changes else ""
         detail = detail or f"{what}Nothing was done. Look at what is there now; what you decide then is a new decision."
         title, changes = "This was changed since you saw it", changes[-MOST_CHANGES:]
         super().__init__(412, "changed-meanwhile", title, detail, changes=changes)
