@@ -30,8 +30,8 @@ def with_range(tab: Any, service: Service, code: str = "X1") -> None:
     participant(tab, service, code)
     tab.locator("#angle-0").fill("20")
     tab.locator("#angle-1").fill("110")
-    tab.get_by_role("button", name="Set the limits").click()
-    tab.wait_for_load_state()
+    with tab.expect_navigation():  # the page is loaded again once they are set
+        tab.get_by_role("button", name="Set the limits").click()
 
 
 def at(tab: Any, service: Service, angle_deg: float) -> None:
