@@ -197,9 +197,8 @@ class Runner(Playing):
                     raise right_ended()
                 if current.changes or version != current.version:
                     raise locking.ChangedError(version or 0, current.changes or changes)
-                self._refuse_overtaken(
-                    request_received_s.get(self.clock.monotonic_s())
-                )  # from here to the command nothing waits
+                # from here to the command nothing waits
+                self._refuse_overtaken(request_received_s.get(self.clock.monotonic_s()))
                 key = self.kinds[plan.kind].begin(planned)
                 await self.rig.ask(requests.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
@@ -274,16 +273,15 @@ class Runner(Playing):
         tags: Tags | None, model: str,
     ) -> Test:  # fmt: skip
         now, plan, by = self.clock.utc(), planned.plan, current.by
-        row = Test(id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested")
         kept: dict[str, Any] = {
+            **plan.model_dump(),
+            "preview": preview,
             "joins": body.joins,
             **dict(zip(("side", "muscle", "placement"), site_of(participant), strict=True)),
             "tokens": current.tokens,
             **planned.extra,
-            **self.kinds[body.kind].stored_fields(body, _pulses(preview)),
+            **self.kinds[body.kind].stored_fields(body, len(preview["pulse_width_us"])),
         }
-        row.plan, row.summary, row.reason = {**plan.model_dump(), "preview": preview, **kept}, {}, ""
-        row.requested_by, row.requested_utc, row.ran_by = by, now, other_than(by, body.ran_by)
         dose = {name: preview.get(name) for name in ("duration_s", "charge_uc", "torque_time_nms")}
         with self.store.write() as session:
             person = session.get(Participant, plan.participant)
@@ -291,7 +289,11 @@ class Runner(Playing):
             version = locking.check(session, person, tags)
             if any(not may_play(session.get(Token, each)) for each in current.tokens):
                 raise right_ended()
-            row.plan = {**row.plan, "participant_version": version}
+            row = Test(
+                id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested",
+                plan={**kept, "participant_version": version}, summary={}, reason="", requested_by=by,
+                requested_utc=now, ran_by=other_than(by, body.ran_by),
+            )  # fmt: skip
             told = {"participant": plan.participant, "kind": plan.kind, "shown": dose, "version": version}
             told |= {"model": model} if model else {}
             locking.write(session, row, now, by, "start test", plan.test_id, **told)
@@ -379,44 +381,45 @@ class Runner(Playing):
 
     def _on_link(self, connected: bool) -> None:
         self.hub.send({"type": "link", "connected": connected})
-        current, status = self.current, self.rig.status
-        if not connected or status is None or current is None or not current.started:
-            return  # a start under way learns by itself what became of it
-        if not current.ending and status.test_id != current.test_id:
-            current.ending = True
-            self._follow(current.test_id, self._recover(current.test_id, "the rig's process ended during the test"))
+        if connected and self.rig.status is not None:
+            self._look_for_end(self.rig.status, 1, "the rig's process ended during the test")
 
     def _on_poll(self, status: messages.Status) -> None:
         """A test whose end was lost on the way must not hold the rig for ever."""
+        self._look_for_end(status, MISSED_POLLS, f"the rig is {status.state} and no longer plays this test")
+
+    def _look_for_end(self, status: messages.Status, most: int, why: str) -> None:
+        """Take the current test's end as missed where so many states running did not name it.
+
+        A start under way learns by itself what became of it.
+        """
         current = self.current
         if current is None or not current.started or current.ending:
             return
         current.missed = 0 if status.test_id == current.test_id else current.missed + 1
-        if current.missed >= MISSED_POLLS:
+        if current.missed >= most:
             current.ending = True
-            self._follow(
-                current.test_id,
-                self._recover(current.test_id, f"the rig is {status.state} and no longer plays this test"),
-            )
+            self._follow(current.test_id, self._recover(current.test_id, why))
 
     def _follow(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
-        """Do what leads a test to its last state, in the background and under the one guard."""
-        self._tasks.begin(self._guarded(test_id, work))
+        """Lead a test to its last state in the background.
 
-    async def _guarded(self, test_id: str, work: Coroutine[Any, Any, None]) -> None:
-        """Follow a test to its last state: an unexpected error is told as its reason, and the rig is let go.
-
-        Where the state cannot be written either, the next start of the service takes the test up.
+        An unexpected error is told as its reason, and the rig is let go. Where the state cannot be written either, the
+        next start of the service takes the test up.
         """
-        current_test.set(test_id)
-        try:
-            await work
-        except Exception as error:
-            log.exception("the test could not be taken over", extra={"test_id": test_id})
-            await asyncio.to_thread(self.lifecycle.fail, test_id, error)
-        finally:
-            self._release(test_id)
-            self.announce(test_id)
+
+        async def guarded() -> None:
+            current_test.set(test_id)
+            try:
+                await work
+            except Exception as error:
+                log.exception("the test could not be taken over", extra={"test_id": test_id})
+                await asyncio.to_thread(self.lifecycle.fail, test_id, error)
+            finally:
+                self._release(test_id)
+                self.announce(test_id)
+
+        self._tasks.begin(guarded())
 
     async def _finish(self, event: messages.FinishedEvent) -> None:
         """Take over a finished test: store the recording, identify, store the model."""
@@ -452,11 +455,8 @@ class Runner(Playing):
         self.trials.resume()
         for row in await asyncio.to_thread(self.store.all, Test, Test.state.in_(OPEN_STATES)):
             status = self.rig.status
-            if (
-                status is not None
-                and status.test_id == row.id
-                and status.state not in ("ready", "latched", "uncertain")
-            ):
+            over = ("ready", "latched", "uncertain")
+            if status is not None and status.test_id == row.id and status.state not in over:
                 tokens = row.plan.get("tokens") or []
                 current = Current(row.id, row.participant, row.requested_by, row.kind, True, tokens=tokens)
                 current.version = row.plan.get("participant_version", 0)
@@ -513,11 +513,6 @@ class Runner(Playing):
             await kind.close()
         await asyncio.to_thread(self._notes.shutdown)
         await asyncio.to_thread(self._telling.shutdown)
-
-
-def _pulses(preview: Mapping[str, Any]) -> int:
-    """How many pulses a test has, those of width 0 included."""
-    return len(preview["pulse_width_us"])
 
 
 def not_what_was_seen() -> ApiError:
