@@ -110,6 +110,8 @@ class Playing:
             if not lost:  # by time it is known here, also where the store cannot be read
                 version, changes, lost = await asyncio.to_thread(self.find_changes, current)
             ended = lost and not current.over
+            if version is None:  # its intent was not written yet; if it is by now, it rests on what is there now
+                version = current.version
             if version == current.version and not ended:
                 return
             current.changes = changes or current.changes
@@ -122,7 +124,7 @@ class Playing:
                 log.error("%s could not be withdrawn: %s", current.test_id, error)
                 await self.stop_quietly(f"{current.test_id} could not be withdrawn: {reason}")
             else:
-                current.version, current.over = version, current.over or ended
+                current.version, current.over = version or current.version, current.over or ended
 
     async def look_again_and_again(self, current: Current) -> None:
         """Check at intervals whether it may still be played: a right ends by time, too, and no request says so."""

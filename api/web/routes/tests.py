@@ -28,6 +28,7 @@ from stimrig.api.web.dependencies import (
     context_of,
 )
 from stimrig.api.web.guards import refuse_outside, same_origin
+from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import TestOut
 from stimrig.rig.messages import Extended
@@ -38,9 +39,11 @@ LOOK_S = 1.0
 GOODBYE_S = 2.0
 """So long it waits for a client that reads nothing to hear why it is closed."""
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
+BEGUN = describe_answer(TestOut, 202, "begun; see `Location`")
+BEGUN["responses"][410] = problem("the previewed plan is not known, or too old")
 
 
-@router.post("", status_code=202, **describe_answer(TestOut, 202, "begun; see `Location`"))
+@router.post("", status_code=202, **BEGUN)
 async def start_test(
     context: Ctx, who: Tester, tags: ParticipantVersion, body: TestIn, response: Response
 ) -> dict[str, Any]:
