@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -60,16 +61,6 @@ def test_a_field_that_does_not_hold_says_so_beside_it(tab: Any, service: Service
     expected(tab.get_by_text("biceps").first).to_be_visible()
 
 
-def test_what_is_refused_as_a_whole_is_said_at_the_top(tab: Any, service: Service) -> None:
-    form = opened(tab, service, "A4")
-    with service.client() as client:
-        client.post("/v1/participants/A4/calibration")
-        save(form)
-        expected(tab.locator("#refused")).to_contain_text("A calibration of A4 is open.")
-        expected(tab.locator("#refused")).to_have_attribute("role", "alert")
-        client.post("/v1/participants/A4/calibration/finish", json={"discard": True})
-
-
 def test_what_deserves_a_second_look_is_asked_with_stop_in_reach(tab: Any, service: Service) -> None:
     form = opened(tab, service, "P017")
     form.get_by_label("Side").select_option("right")
@@ -117,3 +108,13 @@ def test_without_an_answer_it_says_that_nothing_was_written_and_keeps_what_was_t
     save(form)
     tab.get_by_text("triceps").first.wait_for()
     assert site(service, "A6") == (None, "triceps")
+
+
+def test_a_file_is_sent_and_its_model_is_shown(tab: Any, service: Service, tmp_path: Path) -> None:
+    opened(tab, service, "A7")
+    (tmp_path / "record.csv").write_text("time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n")
+    tab.get_by_text("Upload a recording of another tool").click()
+    tab.get_by_label("or HDF5").set_input_files(tmp_path / "record.csv")
+    tab.get_by_role("button", name="Upload and identify").click()
+    tab.wait_for_url("**/models/M-*")
+    assert tab.errors == []

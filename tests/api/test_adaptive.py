@@ -6,13 +6,14 @@ import asyncio
 from collections.abc import AsyncGenerator
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import httpx
 import pytest
 
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import Job
-from stimrig.api.sessions import adaptive_follower, kinds, runner
+from stimrig.api.sessions import adaptive_follower, kinds
 from stimrig.api.sessions.adaptive import AdaptiveTests
 from stimrig.api.sessions.adaptive_follower import Follower
 from stimrig.api.sessions.requests import TargetIn
@@ -88,18 +89,6 @@ def test_only_new_samples_are_sent_and_none_is_lost(client: httpx.Client, servic
     assert advised[-1]["laid_us"][-40:] == [100.0, 200.0] * 20
 
 
-def test_a_start_that_took_long_is_not_played_and_is_quick_when_asked_again(
-    client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Who asked may have given up long ago: nobody waits for a pulse then."""
-    monkeypatch.setattr(runner, "START_S", 1.5)
-    target = {"curve_percent": 2.0, "step_percent": 49.0}  # two seconds until it is known what can be reached
-    late = start(client, target=target)
-    assert (late.status_code, late.json()["type"], service.rig.starts) == (503, "/problems/too-late", 0)
-    assert start(client, target=target).status_code == 202
-    client.post("/v1/stop")
-
-
 def test_a_model_of_another_arm_or_current_says_nothing_of_this_one(
     client: httpx.Client, service: Service, participant: str
 ) -> None:
@@ -128,24 +117,10 @@ def test_enough_ends_it_well_at_any_time(client: httpx.Client, service: Service,
     assert late.status_code == 409 and late.json()["type"] == "/problems/rig-late"
 
 
-def test_a_fixed_test_knows_no_enough(client: httpx.Client, service: Service, participant: str) -> None:
+def test_a_fixed_test_knows_no_enough(client: httpx.Client, participant: str) -> None:
     test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
     assert client.post(f"/v1/tests/{test_id}/enough").status_code == 422
-    assert client.get(f"/v1/tests/{test_id}").json()["adaptive"] is None
     client.post("/v1/stop")
-    assert client.post("/v1/tests/none/enough").status_code == 404
-
-
-def test_after_its_workers_death_the_fixed_plan_plays_on_and_it_is_told(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    """What else an adviser may answer: below."""
-    service.rig.speed = 1.5
-    document = played(client, target={"curve_percent": 45.0}, max_duration_s=11)
-    told = document["adaptive"]
-    assert document["state"] == "completed" and told["ended"] == "fixed-rest"
-    assert told["problem"].startswith("The fixed plan plays on") and "The worker process died" in told["problem"]
-    assert document["summary"]["duration_s"] > 8
 
 
 def test_out_of_reach_is_said_before_the_first_pulse(client: httpx.Client, service: Service, participant: str) -> None:
@@ -188,25 +163,9 @@ def test_the_bounds_of_a_target_are_those_of_identify() -> None:
                 TargetIn.model_validate({name: outside})
 
 
-class Nobody:
-    """Participants without models, and a store without tests."""
-
-    def all_approved_ones(self, _participant: str) -> list[Any]:
-        return []
-
-    @property
-    def store(self) -> Nobody:
-        return self
-
-    def all(self, *_: Any) -> list[Any]:
-        return []
-
-
 @pytest.fixture
 def adaptive() -> AdaptiveTests:
-    nothing: Any = None
-    models: Any = Nobody()
-    return AdaptiveTests(nothing, nothing, models, nothing, lambda _message: None)
+    return AdaptiveTests(*([MagicMock()] * 5))
 
 
 def row(max_duration_s: float = 45.0, planned: tuple[str, ...] = ("opening", "prbs", "validate")) -> Test:
@@ -280,6 +239,8 @@ class World:
         self.asked.append(arguments)
         if (answer := self.answers.pop(0) if self.answers else None) is None:
             await asyncio.Event().wait()
+        if isinstance(answer, ApiError):
+            raise answer
         while answer.get("late") and not self.requests:
             await asyncio.sleep(0)
         return answer
@@ -363,28 +324,22 @@ def test_no_question_is_asked_before_the_record_is_long_enough(monkeypatch: pyte
         assert world.asked[0]["measured_s"] == pytest.approx(least_s, abs=0.03)
 
 
-def test_a_chooser_that_gives_up_has_the_fixed_plan_play_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World([{**SAID, "kind": "misfit", "segments": []}])
-    followed(world, 40.0, monkeypatch)
-    [(_, request)] = world.requests
-    assert (request.after, request.segments) == (30, [])
-
-
 @pytest.mark.parametrize(
     ("answer", "why"),
     [
         ({**SAID, "segments": [{**NEXT, "settings": {}}]}, "KeyError"),
         ({**SAID, "kind": "misfit", "segments": []}, "Known a little."),
         ({}, "KeyError"),
+        (ApiError(503, "worker-died", "Worker died", "The worker process died."), "The worker process died"),
     ],
 )
-def test_an_answer_that_cannot_be_used_is_told(
-    monkeypatch: pytest.MonkeyPatch, answer: dict[str, Any], why: str
+def test_an_answer_that_cannot_be_used_is_told_and_the_fixed_plan_plays_at_once(
+    monkeypatch: pytest.MonkeyPatch, answer: Any, why: str
 ) -> None:
     world = World([answer])
     told = followed(world, 40.0, monkeypatch).status
     assert told.state == "fixed" and told.problem.startswith("The fixed plan plays on: ") and why in told.problem
-    assert [request for _, request in world.requests if request.segments] == []
+    assert [(request.after, request.segments) for _, request in world.requests] == [(30, [])]
 
 
 def test_what_the_rig_refuses_is_noted_and_the_fixed_plans_next_piece_plays(monkeypatch: pytest.MonkeyPatch) -> None:

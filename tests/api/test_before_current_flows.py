@@ -144,14 +144,3 @@ def test_the_next_experiment_is_shown_the_same_way(tab: httpx.Client, client: ht
 def test_an_address_of_no_test_is_refused_in_words(tab: httpx.Client, query: str, words: str) -> None:
     answer = tab.get(f"{WHERE}?{query}")
     assert answer.status_code in (404, 422) and words in answer.text
-
-
-def test_a_busy_rig_starts_nothing_more(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
-    service.rig.speed = 0.2  # runs until it is stopped below
-    shown = tab.get(WHERE).text
-    test_id = client.post("/v1/tests", json={"participant": "P017"}).json()["id"]
-    for answer in (tab.get(WHERE), start(tab, shown)):
-        assert answer.status_code == 409 and test_id in answer.text
-    assert service.rig.starts == 1
-    assert client.post("/v1/stop").status_code == 200
-    assert wait_done(client, test_id)["state"] == "stopped"

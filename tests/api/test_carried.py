@@ -183,23 +183,6 @@ def test_upload_takes_the_structure_over_too(client: httpx.Client, participant: 
     assert child["id"] == taken["model"]["id"] and child["parent_id"] == plain["id"]
 
 
-def test_model_page_says_what_carries_over(
-    client: httpx.Client, pages: httpx.Client, participant: str, approved: dict[str, Any]
-) -> None:
-    test = run_test(client, participant)
-    plain, child = versions(client, participant, test)
-    client.get(f"/v1/models/{child['id']}/diagnosis")
-    page = pages.get(f"/models/{child['id']}").text
-    section = page[page.index('id="carried"') :].partition("</details>")[0]
-    assert "has the structure of the last approved model" in section
-    assert "<b>Fatigue</b>" in section and ">kept<" in section
-    assert "<b>Threshold_drift</b>" in section and "asked for again" in section  # by the stub's diagnosis
-    assert f"/models/{plain['id']}" in section
-    other = pages.get(f"/models/{plain['id']}").text
-    assert "explains this recording better" in other and f"/models/{child['id']}" in other
-    assert 'id="carried"' not in pages.get(f"/models/{approved['id']}").text
-
-
 # ---- The structure that a site's new participants start with: taken by the fit after a test, kept, shown, refused
 
 

@@ -5,11 +5,9 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -25,40 +23,8 @@ from stimrig.api.charts.interactive import plotly_figure
 from stimrig.api.jobs.curves import curves
 from stimrig.api.sessions import joint_plan
 from tests.api import made_up_joint
-from tests.api.conftest import REAL, Service, play_test, run_test, serving, shared_service
+from tests.api.conftest import Service, play_test, shared_service
 from tests.api.fake_rig import default_widths, muscle
-
-Done = tuple[httpx.Client, dict[str, Any], Path]
-
-
-@pytest.fixture(scope="module")
-def done(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Done]:
-    """A test's recording and model, by what a real worker does."""
-    folder = tmp_path_factory.mktemp("export")
-    with serving(folder, short_dir, REAL) as (_, client):
-        client.timeout = 120
-        client.post("/v1/participants", json={"code": "P1"})
-        yield client, run_test(client, "P1", 120.0), folder
-
-
-def test_csv_of_a_recording_is_the_recording(done: Done, tmp_path: Path) -> None:
-    client, document, folder = done
-    answer = client.get(f"{document['recording_url']}/csv")
-    assert answer.headers["content-type"].startswith("text/csv")
-    assert f"{document['recording_id']}.csv" in answer.headers["content-disposition"]
-    path = tmp_path / "out.csv"
-    path.write_bytes(answer.content)
-    ours, theirs = identify.read(path), identify.read(folder / "recordings" / f"{document['recording_id']}.h5")
-    np.testing.assert_allclose(ours.time_s, theirs.time_s, atol=1e-6)
-    np.testing.assert_allclose(ours.pulse_width_us, theirs.pulse_width_us, rtol=1e-6)
-    np.testing.assert_allclose(ours.torque_nm, theirs.torque_nm, rtol=1e-6, atol=1e-9)
-    assert ours.segment_names == theirs.segment_names
-    assert client.get("/v1/recordings/none/csv").status_code == 404
-    again = client.post("/v1/participants/P1/recordings", content=answer.content).json()
-    fits = again["model"]["fit_percent"], document["fit"]["fit_percent"]
-    assert abs(fits[0] - fits[1]) < 0.2, "it can be taken in again and says the same"
-    back = client.get(f"/v1/recordings/{again['recording_id']}/csv")
-    assert back.content == answer.content
 
 
 @cache

@@ -12,7 +12,7 @@ import pytest
 from stimrig.api.errors import ApiError
 from stimrig.api.store.tables import Model
 from tests.api.clinic import Clinic
-from tests.api.conftest import QUICK_SPEED, Service, run_test, wait_done
+from tests.api.conftest import Service, run_test
 from tests.api.test_problems import problem
 
 ASKED = {"participant": "P017"}
@@ -60,23 +60,13 @@ def test_each_damage_is_found_and_told_once(tmp_path: Path, how: str, caplog: py
     clinic.store.close()
 
 
-def test_a_test_is_previewed_and_started_without_the_estimate(
-    client: httpx.Client, service: Service, approved: str
-) -> None:
-    service.rig.speed = QUICK_SPEED
-    damage(service, approved, "one digit")
-    assert client.post("/v1/preview", json=ASKED).json()["torque_time_nms"] is None
-    started = client.post("/v1/tests", json=ASKED)
-    assert started.status_code == 202 and started.json()["planned"]["torque_time_nms"] is None
-    assert wait_done(client, started.json()["id"])["state"] == "completed"
-
-
 @pytest.mark.parametrize("how", ["no JSON", "uneven"])
 def test_everything_that_is_not_read_off_it_is_there(
     client: httpx.Client, service: Service, pages: httpx.Client, approved: str, how: str
 ) -> None:
     test_id = client.get("/v1/tests").json()[0]["id"]
     damage(service, approved, how)
+    assert client.post("/v1/preview", json=ASKED).json()["torque_time_nms"] is None, "the estimate alone is missing"
     for path in ("tests", "participants/P017", "participants/P017/models", "participants/P017/trend"):
         assert client.get(f"/v1/{path}").status_code == 200, path
     assert client.get(f"/v1/tests/{test_id}").json()["fit"]["verdict"] == "usable", "kept beside it"

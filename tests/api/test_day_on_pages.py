@@ -9,7 +9,7 @@ import httpx
 import pytest
 
 from tests.api.browser import PASSWORD, expected, participant, start
-from tests.api.conftest import Service, run_test, shared_service
+from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 
@@ -116,20 +116,3 @@ def test_a_persons_hand_is_told_and_a_scripts_is_not(tab: Any, service: Service)
     with tab.expect_request("**/sessions/acted"):
         tab.keyboard.press("Shift")
         tab.clock.run_for(30_000)
-
-
-def test_the_report_names_the_session_and_has_a_place_to_sign(tab: Any, service: Service, client: httpx.Client) -> None:
-    make(service, "U1", side="left", muscle="biceps brachii")
-    done = run_test(client, "U1")
-    for number in range(14):
-        note = {"kind": "spasm", "text": f"note {number}", "test_id": done["id"], "at_s": number}
-        struck = client.post("/v1/participants/U1/notes", json=note).json()
-    client.post(f"/v1/participants/U1/notes/{struck['id']}/strike")
-    client.post(f"/v1/models/{done['model_id']}/approve", json={"reason": "follows the ramp"})
-    tab.goto(f"{service.url}/models/{done['model_id']}/report")
-    text = tab.locator("main").inner_text()
-    for words in ("left, biceps brachii", "20.0 mA", "30.0 N·m", "administrator", "follows the ramp", "not calibrated"):
-        assert words in text, words
-    assert "note 11" in text and "note 12" not in text and "note 13" not in text and "1 more note" in text
-    assert [box.inner_text() for box in tab.locator(".sign div").all()] == ["Name", "Date", "Signature"]
-    assert len(re.findall(rb"/Type\s*/Page\b", tab.pdf(prefer_css_page_size=True))) <= 2

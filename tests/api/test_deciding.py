@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -13,14 +12,13 @@ import pytest
 
 from stimrig.api.cli import deciding
 from stimrig.api.cli.commands import test as verb
-from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.cli.errors import InputError
 from stimrig.api.client.errors import NotFound, ServiceError
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.verbs import experiment
 from stimrig.api.models import explanation
 from stimrig.api.sessions.runner import Runner
-from stimrig.api.web.pages import model_view
+from stimrig.api.web.pages import starting
 from stimrig.api.web.responses.models import ExperimentOut
 from stimrig.identify.records.record import Source
 
@@ -43,29 +41,16 @@ def test_it_goes_before_the_test_between_rivals_and_is_shown() -> None:
     assert found is not None and found["effect"] == "" and found["text"] == DECIDING["text"]
     ExperimentOut.model_validate(found)
     assert explanation.tidy_experiment(found, {})["shown"] == ["Levels held at random", "Rest 2 s"]
-    left = {"verdict": "unexplained_structure", "deciding_experiment": DECIDING, "base": {}, "probability": 1.0,
-            "structure": [], "noise_sd_nm": 0.05}  # fmt: skip
-    said = diagnosis_lines(left)[-1]
-    assert "stimrig test --decide" in said and "stimrig explain" not in said and "next experiment" in said
-    gate = {"effect": "free_gate", "name": "A gate", "words": "", "left_out": ""}
-    said = diagnosis_lines({**left, "free": [gate], "add": ["free_gate"]})[-1]
-    assert "Add “A gate”" in said and "`stimrig explain DATA -o MODEL.json` adds" in said
 
 
-def test_the_page_asks_for_it_at_the_rate_of_the_recording(monkeypatch: pytest.MonkeyPatch) -> None:
-    bodies: list[Any] = []
-
-    async def ask(_context: object, _who: object, body: Any, back: str) -> str:
-        bodies.append(body)
-        return back
-
-    known = {"segments": DECIDING["segments"], "pulse_rate_hz": 25.0}
-    context: Any = SimpleNamespace(analyses=SimpleNamespace(known_diagnosis=lambda _: {"experiment": known}))
-    row: Any = SimpleNamespace(id="M1", method="", participant="P1")
-    monkeypatch.setattr(model_view.starting, "ask", ask)
-    asyncio.run(model_view.run_experiment(context, SimpleNamespace(name="B"), row))  # pyright: ignore[reportArgumentType]
-    assert bodies[-1].pulse_rate_hz == 25.0 and bodies[-1].joins == "M1"
-    assert [one.model_dump(exclude_unset=True) for one in bodies[-1].segments] == DECIDING["segments"]
+def test_the_page_asks_for_it_at_the_rate_of_the_recording() -> None:
+    known, row = {"segments": DECIDING["segments"], "pulse_rate_hz": 25.0}, SimpleNamespace(id="M1", participant=OWNER)
+    analyses, versions = (
+        SimpleNamespace(known_diagnosis=lambda _: {"experiment": known}),
+        SimpleNamespace(get=lambda _: row),
+    )
+    context: Any = SimpleNamespace(analyses=analyses, versions=versions)
+    assert starting.fields_of_kind(context, OWNER, "next-experiment", None, None, "M1") == {"joins": "M1", **known}
 
 
 class Recordings:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from unittest.mock import Mock
 
@@ -72,23 +71,18 @@ def test_wrong_key_of_the_rig_file_is_named(tmp_path: Path) -> None:
     assert found.verdict == "fails" and "stimulator.port" in found.says
 
 
-def test_a_file_is_no_serial_port(tmp_path: Path) -> None:
-    assert doctor.examine_port("stimulator", Path(__file__)).verdict == "fails"
-
-
-def test_little_room_and_a_slow_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    usage: Callable[[object], object] = lambda _: type("Usage", (), {"free": 0.1e9})  # noqa: E731
-    monkeypatch.setattr(doctor.shutil, "disk_usage", usage)
+def test_each_check_of_the_machine_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Little room, a slow disk, a folder open to all, a door open to the network, a check that breaks, no port."""
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: Mock(free=0.1e9))
     monkeypatch.setattr(doctor, "synced_ms", lambda _: 900.0)
-    assert finding("disk", data_dir=tmp_path).verdict == "fails"
-    assert finding("disk speed", data_dir=tmp_path).verdict == "care"
-
-
-def test_folder_open_to_all_is_said(tmp_path: Path) -> None:
-    tmp_path.chmod(0o755)
-    assert finding("data folder", data_dir=tmp_path).fix.startswith("chmod")
-    tmp_path.chmod(0o750)
-    assert finding("data folder", data_dir=tmp_path).verdict == "ok"
+    monkeypatch.setattr(doctor, "check_wake_up", Mock(side_effect=RuntimeError("no such thing")))
+    for mode, fix in ((0o755, "chmod o-rwx"), (0o750, "")):
+        tmp_path.chmod(mode)
+        found = {one.check: one for one in examine(Settings(data_dir=tmp_path, host="0.0.0.0"))}  # pyright: ignore
+        assert found["data folder"].fix.partition(" /")[0] == fix
+    assert (found["disk"].verdict, found["disk speed"].verdict, found["address"].verdict) == ("fails", "care", "fails")
+    assert "no such thing" in found["wake_up"].says
+    assert doctor.examine_port("stimulator", Path(__file__)).verdict == "fails"
 
 
 def test_rig_that_is_not_there_or_stands_still(service: Service, client: httpx.Client, tmp_path: Path) -> None:
@@ -103,12 +97,3 @@ def test_tampered_trail_is_found(service: Service) -> None:
     assert finding("database", data_dir=service.data).verdict == "ok"
     service.sql("UPDATE audit SET who = 'nobody' WHERE seq = 1")
     assert finding("database", data_dir=service.data).verdict == "fails"
-
-
-def test_open_door_fails(tmp_path: Path) -> None:
-    assert finding("address", data_dir=tmp_path, host="0.0.0.0").verdict == "fails"
-
-
-def test_check_that_breaks_is_a_finding(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "check_wake_up", Mock(side_effect=RuntimeError("no such thing")))
-    assert "no such thing" in finding("wake_up", data_dir=tmp_path).says

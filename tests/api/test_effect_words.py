@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stimrig.api.effect_words import library, parameter_words
-from stimrig.api.models import explanation, stored_model
+from stimrig.api.models import stored_model
 from stimrig.identify import effects
 
 PLAIN = {
@@ -24,13 +24,3 @@ def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -
             (figure,) = [name for name in stored_model.muscle_figures(PLAIN | {"effects": [held]}) if "." in name]
             assert figure.partition(".")[2] in known.main, figure
     assert set(library()) == set(effects.registry())
-
-
-def test_what_was_added_and_rivals_are_told_by_their_titles() -> None:
-    row = {"id": "M-1", "added_effect": "fatigue,threshold_drift"}
-    rival = {"effect": "fatigue", "confused_with": ["threshold_drift"]}
-    library = {entry["id"]: entry for entry in effects.library()}
-    title = "drift of the recruitment threshold"
-    assert explanation.label(row) == f"+ fatigue, {title}"
-    for known in ({}, library):
-        assert explanation.card(rival, known, {})["rivals"] == [title]

@@ -152,13 +152,6 @@ def test_one_that_cannot_be_read_is_a_line_and_the_others_are_done(
     assert all("record." not in row["reason"].split(":")[0] for row in rows), "messages name the file as it is called"
 
 
-def test_only_what_is_selected(data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    words = ["export", str(data), "-o", str(tmp_path / "out"), "--select", 'participant == "P-1"', "--json"]
-    assert main.run(words) == 0
-    told = json.loads(capsys.readouterr().out)
-    assert (told["records"], told["left_out"]) == (2, 2)
-
-
 def test_tables_of_other_tools_take_a_map(tmp_path: Path) -> None:
     (tmp_path / "t.csv").write_text(CSV.replace("torque_nm", "Kraft"))
     assert (

@@ -13,10 +13,8 @@ from stimrig.api.charts import diagnosis_charts
 from stimrig.api.charts.drawing import Figures
 from stimrig.api.charts.interactive import plotly_figure
 from stimrig.api.charts.plot import plot
-from stimrig.api.errors import ApiError
 from stimrig.api.models import explanation
 from stimrig.api.web.pages.environment import environment
-from stimrig.api.web.pages.report_file import diagnosis_html
 from stimrig.identify.errors import BadRequest
 from tests.api.test_own_effect_export import with_gate
 
@@ -50,12 +48,6 @@ def test_a_picture_has_each_curve_with_its_band_and_axes_that_are_no_links() -> 
     assert layout["xaxis"]["title"]["text"] == "time (s)" and "<" not in layout["yaxis"]["title"]["text"]
 
 
-def test_the_report_says_the_sentence_and_what_left_out_parts_say() -> None:
-    html = diagnosis_html(diagnosis(), {}, [], "record")
-    for words in ("Pulses open a gate.", "It falls by 78 %.", "names no cause", 'data-figure="free-free_gate"'):
-        assert words in html
-
-
 def test_a_model_that_holds_it_shows_it_and_the_diagnosis_does_not_offer_it_again(tmp_path: Path) -> None:
     document = json.loads(with_gate(tmp_path / "MODEL.json", shape=SHAPE).read_text("utf-8"))
     (card,) = explanation.held_free(document)
@@ -66,12 +58,6 @@ def test_a_model_that_holds_it_shows_it_and_the_diagnosis_does_not_offer_it_agai
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
     assert explanation.remaining(diagnosis(), ["free_gate"], {})["free"] == []
     assert explanation.held_free({"effects": [{"id": "fatigue"}]}) == []
-
-
-def test_what_was_found_freely_can_be_added_and_nothing_else() -> None:
-    explanation.require_evidence(diagnosis(), ["free_gate"])
-    with pytest.raises(ApiError, match="free_ways"):
-        explanation.require_evidence(diagnosis(), ["free_ways"])
 
 
 def test_a_notebook_draws_what_a_diagnosis_found_freely() -> None:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from bench.muscles import hidden_records
 from tests.harness.processes import READY_TIMEOUT_S
 
 BUSY = """
@@ -44,13 +43,6 @@ sys.argv = ["stimrig", "diagnose", sys.argv[1]]
 from stimrig.__main__ import main
 main()
 """
-
-
-@pytest.fixture(scope="module")
-def record(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("record") / "record.csv"
-    hidden_records.write_csv(hidden_records.generate("fatigue", "strong", seed=41, rate_hz=100, design="short"), path)
-    return path
 
 
 def interrupted(log: Path, said: str, *words: object) -> tuple[int, str]:

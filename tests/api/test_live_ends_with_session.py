@@ -104,6 +104,11 @@ def lock(http: httpx.Client, _service: Service) -> None:
     assert http.post("/v1/sessions/lock").status_code == 204
 
 
+def new_password(_http: httpx.Client, service: Service) -> None:
+    with service.client() as admin:
+        assert admin.put("/v1/users/Grace/password", json={"password": PASSWORD}).status_code == 204
+
+
 def removed(_http: httpx.Client, service: Service) -> None:
     with service.client() as admin:
         assert admin.delete("/v1/users/Grace").status_code == 204
@@ -115,7 +120,13 @@ def run_out(http: httpx.Client, service: Service) -> None:
 
 @pytest.mark.parametrize(
     ("how", "problem"),
-    [(sign_out, "unauthorized"), (lock, "locked"), (run_out, "unauthorized"), (removed, "unauthorized")],
+    [
+        (sign_out, "unauthorized"),
+        (lock, "locked"),
+        (run_out, "unauthorized"),
+        (new_password, "unauthorized"),
+        (removed, "unauthorized"),
+    ],
 )
 def test_it_closes_with_its_session_and_with_no_other(
     service: Service, test_id: str, how: Callable[[httpx.Client, Service], None], problem: str
@@ -150,15 +161,6 @@ def test_it_closes_with_its_token_and_with_no_other(service: Service, test_id: s
         status = 403 if how == "scope" else 401
         assert last(socket, 4000 + status)["problem"]["status"] == status
         goes_on(others)
-
-
-def test_a_new_password_ends_the_old_cookies_channel_and_the_new_one_watches(service: Service, test_id: str) -> None:
-    with signed_in(service, "Ada") as http, watching(service, test_id, cookie(http)) as socket:
-        with service.client() as admin:
-            assert admin.put("/v1/users/Ada/password", json={"password": PASSWORD}).status_code == 204
-        assert last(socket)["problem"]["status"] == 401
-    with signed_in(service, "Ada") as http, watching(service, test_id, cookie(http)) as socket:
-        goes_on(socket)
 
 
 @pytest.mark.parametrize("turns", range(4))
