@@ -44,9 +44,9 @@ class People:
 
     def _add(self, name: str, hashed: str, scopes: list[Scope], by: str) -> User:
         with self.store.write() as session:
-            taken = user_named(session, name)
-            if taken is not None:
-                raise ApiError(409, "exists", "The name is taken", f"User {taken.name!r} exists. Take another name.")
+            existing = user_named(session, name)
+            if existing is not None:
+                raise ApiError(409, "exists", "The name is taken", f"User {existing.name!r} exists. Take another name.")
             token = self.auth.token_of_person(session, name, scopes)
             row = User(name=name, folded_name=folded_name(name), password_hash=hashed, token_hash=token.hash)
             row.created_utc = row.changed_utc = now = self.clock.utc()
@@ -99,14 +99,14 @@ class People:
 
         Raises ApiError: 401 wrong password; 409 signed in with a token; 429 too many tries.
         """
-        held = principal.session_hash
-        if held is None:
+        session_hash = principal.session_hash
+        if session_hash is None:
             raise ApiError(409, "no-password", "There is no password to confirm", "Signed in with a token.")
-        if not await self._right(held, principal.name, password):
+        if not await self._right(session_hash, principal.name, password):
             await asyncio.to_thread(self.store.note, self.clock, principal.name, "confirmation refused", "page")
             detail = "Nothing was decided. Go back and enter it again."
             raise unauthorized(detail, "wrong-password", "The password does not match")
-        await asyncio.to_thread(self._confirm, held)
+        await asyncio.to_thread(self._confirm, session_hash)
 
     async def _right(self, session_hash: str, name: str, secret: str, token_hash: str | None = None) -> bool:
         """Whether a person's password, or the token of this hash, is right that is given once more in a session."""
@@ -126,15 +126,17 @@ class People:
 
         Raises ApiError: 401 it is not the right one; 429 too many tries.
         """
-        held = principal.page_session
-        if held is None or not principal.locked:
+        page_session = principal.page_session
+        if page_session is None or not principal.locked:
             return
         by_token = principal.session_hash is None
-        if not await self._right(held.hash, principal.name, secret, held.token_hash if by_token else None):
+        if not await self._right(
+            page_session.hash, principal.name, secret, page_session.token_hash if by_token else None
+        ):
             await asyncio.to_thread(self.store.note, self.clock, principal.name, "unlock refused", "page")
             title = "The token does not match" if by_token else "The password does not match"
             raise unauthorized("The page stays locked. Enter it again.", "wrong-password", title)
-        await asyncio.to_thread(self.auth.idle.unlock, held.hash, principal.name)
+        await asyncio.to_thread(self.auth.idle.unlock, page_session.hash, principal.name)
 
     def _confirm(self, session_hash: str) -> None:
         with self.store.write() as session:
@@ -158,9 +160,9 @@ class People:
         if session_hash is None:
             return True
         row: Confirmation | None = await asyncio.to_thread(self.store.get, Confirmation, session_hash)
-        return row is not None and self._holds(row)
+        return row is not None and self._is_valid(row)
 
-    def _holds(self, row: Confirmation) -> bool:
+    def _is_valid(self, row: Confirmation) -> bool:
         return 0 <= self.clock.unix_s() - row.at_unix_s <= CONFIRMED_S
 
     def _use_confirmation(self, session_hash: str) -> bool:
@@ -169,23 +171,25 @@ class People:
             if row is None:
                 return False
             session.delete(row)
-            return self._holds(row)
+            return self._is_valid(row)
 
-    async def change_password(self, name: str, password: str, who: Principal, tags: Tags | None) -> str | None:
+    async def change_password(self, name: str, password: str, principal: Principal, tags: Tags | None) -> str | None:
         """A new password. The person's sessions end; the one that made the change goes on under a new cookie, if any.
 
         Raises ApiError: 404 nobody of that name; 412 the account was changed since it was shown.
         """
-        return await asyncio.to_thread(self._change_password, name, await self.passwords.hash(password), who, tags)
+        return await asyncio.to_thread(
+            self._change_password, name, await self.passwords.hash(password), principal, tags
+        )
 
-    def _change_password(self, name: str, hashed: str, who: Principal, tags: Tags | None) -> str | None:
+    def _change_password(self, name: str, hashed: str, principal: Principal, tags: Tags | None) -> str | None:
         with self.store.write() as session:
             row = known_user(session, name)
             locking.check(session, row, tags)
             row.password_hash, row.changed_utc = hashed, self.clock.utc()
             session.execute(delete(KnownPlace).where(KnownPlace.name == row.name))
-            cookie = self.auth.end_sessions(session, row.token_hash, but=who.session_hash)
-            locking.write(session, row, self.clock.utc(), who.name, "change password", row.name)
+            cookie = self.auth.end_sessions(session, row.token_hash, but=principal.session_hash)
+            locking.write(session, row, self.clock.utc(), principal.name, "change password", row.name)
         return cookie
 
     def remove(self, name: str, by: str) -> None:
@@ -199,12 +203,12 @@ class People:
 
     def documents(self) -> list[dict[str, Any]]:
         """All users, without their hashes."""
-        found = []
+        documents = []
         for row in self.store.all(User, order=User.name):
             token = self.store.get(Token, row.token_hash)
-            told = {"name": row.name, "created_utc": row.created_utc, "version": row.version}
-            found.append({**told, "scopes": token.scopes, "removed": token.revoked})
-        return found
+            account = {"name": row.name, "created_utc": row.created_utc, "version": row.version}
+            documents.append({**account, "scopes": token.scopes, "removed": token.revoked})
+        return documents
 
     def close(self) -> None:
         """Let the threads go."""
@@ -235,8 +239,8 @@ MOST_STRANGERS, MOST_KNOWN = 8, 64
 class Lane:
     """One check at a time, and so many that wait."""
 
-    def __init__(self, name: str, most: int) -> None:
-        self.threads, self.most, self.inside = ThreadPoolExecutor(1, name), most, 0
+    def __init__(self, name: str, capacity: int) -> None:
+        self.threads, self.capacity, self.inside = ThreadPoolExecutor(1, name), capacity, 0
 
 
 class Passwords:
@@ -255,7 +259,7 @@ class Passwords:
     def room(self, known: bool) -> Iterator[Lane]:
         """A place in the lane. Raises ApiError: 429 too many wait already."""
         lane = self._known if known else self._strangers
-        if lane.inside >= lane.most:
+        if lane.inside >= lane.capacity:
             problem = ApiError(429, "too-many-tries", "Too many people sign in at once", "Try again in 2 s.")
             problem.headers["Retry-After"] = "2"
             raise problem
@@ -312,9 +316,11 @@ def written_name(text: str) -> str:
         raise ValueError(f"the character {_called_sign(odd)} cannot stand in a name")
     if not any(unicodedata.category(sign)[0] in "LN" for sign in name):
         raise ValueError("a name has at least one letter or digit")
-    found = {unicodedata.name(sign, "").split(" ")[0] for sign in name} & ALPHABETS
-    if len(found) > 1:
-        raise ValueError(f"letters of two alphabets ({', '.join(sorted(found)).lower()}) look alike; take one of them")
+    alphabets = {unicodedata.name(sign, "").split(" ")[0] for sign in name} & ALPHABETS
+    if len(alphabets) > 1:
+        raise ValueError(
+            f"letters of two alphabets ({', '.join(sorted(alphabets)).lower()}) look alike; take one of them"
+        )
     return name
 
 

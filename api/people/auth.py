@@ -77,7 +77,7 @@ class Auth:
         self.idle = idle
         self.cookie_name = f"stimrig_session_{store.secret('session-cookie').hex()[:8]}"
         """Browsers tell hosts apart, not ports: another service on this host has another name."""
-        self._seen: OrderedDict[str, str] = OrderedDict()
+        self._last_names: OrderedDict[str, str] = OrderedDict()
         self._remembering = threading.Lock()
         self._threads = ThreadPoolExecutor(8, "who-asks")
 
@@ -103,11 +103,11 @@ class Auth:
 
     def revoke_within(self, session: Session, token_id: str, by: str) -> bool:
         """The same in a transaction that does more."""
-        found = [row for row in session.scalars(select(Token)) if row.hash[:16] == token_id]
-        for row in found:
+        rows = [row for row in session.scalars(select(Token)) if row.hash[:16] == token_id]
+        for row in rows:
             row.revoked = True
             audit.write(session, self.clock.utc(), by, "revoke token", row.name, token=row.hash[:16])
-        return bool(found)
+        return bool(rows)
 
     def close(self) -> None:
         """Let the threads go."""
@@ -119,7 +119,7 @@ class Auth:
         A token set from outside (``STIMRIG_ADMIN_TOKEN``) replaces the one set before it.
         """
         if configured:
-            self._revoke_set_tokens(keep=digest(configured))
+            self._revoke_set_tokens(current_hash=digest(configured))
             self.issue("administrator", [Scope.ADMINISTER], "settings", text=configured, origin="settings")
             return None
         tokens = self.store.all(Token, Token.revoked.is_(False))
@@ -127,9 +127,9 @@ class Auth:
             return None
         return self.issue("administrator", [Scope.ADMINISTER], "first start")
 
-    def _revoke_set_tokens(self, keep: str) -> None:
+    def _revoke_set_tokens(self, current_hash: str) -> None:
         with self.store.write() as session:
-            old = select(Token).where(Token.origin == "settings", Token.hash != keep, Token.revoked.is_(False))
+            old = select(Token).where(Token.origin == "settings", Token.hash != current_hash, Token.revoked.is_(False))
             for token in session.scalars(old).all():
                 self.revoke_within(session, token.hash[:16], "settings")
 
@@ -178,10 +178,10 @@ class Auth:
 
     def sign_in(self, token_text: str, address: str) -> str:
         """Open a page session for a token's holder; its cookie. Raises as `bearer` does; 403 for a controller's key."""
-        who = self.bearer(token_text, address)
-        if who.participant is not None:
-            raise outside(who.participant)
-        return self.open_session(digest(token_text), who.name)
+        principal = self.bearer(token_text, address)
+        if principal.participant is not None:
+            raise outside(principal.participant)
+        return self.open_session(digest(token_text), principal.name)
 
     def open_session(self, token_hash: str, name: str) -> str:
         """Open a page session for the holder of a token; its cookie."""
@@ -249,18 +249,18 @@ class Auth:
         more = {Scope.REARM} if principal.may(Scope.RUN_TEST) else set()
         return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
 
-    async def ask(self, connection: HTTPConnection, **how: bool) -> Principal:
+    async def authenticate(self, connection: HTTPConnection, **how: bool) -> Principal:
         """`identify`, in threads of its own: whatever else waits for the database, it does not keep this from it."""
         return await asyncio.get_running_loop().run_in_executor(
             self._threads, partial(self.identify, connection, **how)
         )
 
-    async def ask_within(self, connection: HTTPConnection, patience_s: float, **how: bool) -> Principal:
+    async def authenticate_within(self, connection: HTTPConnection, patience_s: float, **how: bool) -> Principal:
         """`ask`, given up after a while; what the database says later is no matter. Raises TimeoutError, too."""
-        asked = asyncio.ensure_future(self.ask(connection, **how))
-        asked.add_done_callback(lambda done: done.cancelled() or done.exception())
+        task = asyncio.ensure_future(self.authenticate(connection, **how))
+        task.add_done_callback(lambda done: done.cancelled() or done.exception())
         async with asyncio.timeout(patience_s):
-            return await asyncio.shield(asked)
+            return await asyncio.shield(task)
 
     def identify(
         self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False, bound: bool = False
@@ -271,34 +271,34 @@ class Auth:
         (`bound`): `stimrig.api.web.guards`, and stop.
         """
         try:
-            who = self._identify(connection, forgive_age, forgive_lock)
+            principal = self._identify(connection, forgive_age, forgive_lock)
         except ApiError as error:
             if forgive_age and error.status == 401:  # it would not even stop
                 self._forget(connection)
             raise
-        self._remember(connection, who.name)
-        if who.participant is not None and not bound:
-            raise outside(who.participant)
-        return who
+        self._remember(connection, principal.name)
+        if principal.participant is not None and not bound:
+            raise outside(principal.participant)
+        return principal
 
     def _remember(self, connection: HTTPConnection, name: str) -> None:
         with self._remembering:  # many threads ask
-            self._seen[self._credential(connection)] = name
-            self._seen.move_to_end(self._credential(connection))
-            while len(self._seen) > MOST_SEEN:
-                self._seen.popitem(last=False)
+            self._last_names[self._credential(connection)] = name
+            self._last_names.move_to_end(self._credential(connection))
+            while len(self._last_names) > MOST_SEEN:
+                self._last_names.popitem(last=False)
 
     def _forget(self, connection: HTTPConnection) -> None:
         with self._remembering:
-            self._seen.pop(self._credential(connection), None)
+            self._last_names.pop(self._credential(connection), None)
 
-    def seen(self, connection: HTTPConnection) -> str | None:
+    def last_known_name(self, connection: HTTPConnection) -> str | None:
         """Who was behind this token or session when the database was last asked: good for a stop, and nothing else."""
-        return self._seen.get(self._credential(connection))
+        return self._last_names.get(self._credential(connection))
 
-    def seen_on_page(self, connection: HTTPConnection) -> str | None:
+    def last_known_name_on_page(self, connection: HTTPConnection) -> str | None:
         """`seen`, for a page's session only: a controller's key opens no page, so no page gives it a right."""
-        return None if connection.headers.get("authorization") else self.seen(connection)
+        return None if connection.headers.get("authorization") else self.last_known_name(connection)
 
     def _identify(self, connection: HTTPConnection, forgive_age: bool, forgive_lock: bool) -> Principal:
         header = connection.headers.get("authorization", "")

@@ -47,25 +47,25 @@ class Pace:
 
     def wait_s(self, key: str) -> float:
         """How long the next try has to wait."""
-        found = self._counts.get(self._slot(key))
-        return 0.0 if found is None else max(0.0, found.until_s - self.clock.monotonic_s())
+        count = self._counts.get(self._slot(key))
+        return 0.0 if count is None else max(0.0, count.until_s - self.clock.monotonic_s())
 
     def count(self, key: str) -> None:
         """A try."""
         now = self.clock.monotonic_s()
-        found = self._counts.setdefault(self._slot(key), Count())
-        if now - found.last_s > FORGOTTEN_S:
-            found.tries = 0
-        found.tries, found.last_s = found.tries + 1, now
-        over = found.tries - self.free
+        count = self._counts.setdefault(self._slot(key), Count())
+        if now - count.last_s > FORGOTTEN_S:
+            count.tries = 0
+        count.tries, count.last_s = count.tries + 1, now
+        over = count.tries - self.free
         if over >= 0:
-            found.until_s = now + min(LONGEST_WAIT_S, 2.0 ** min(over, 20))
+            count.until_s = now + min(LONGEST_WAIT_S, 2.0 ** min(over, 20))
 
     def give_back(self, key: str) -> None:
         """The try proved right: it counts no more; the wrong ones before it still do."""
-        found = self._counts.get(self._slot(key))
-        if found is not None:
-            found.tries, found.until_s = max(0, found.tries - 1), 0.0
+        count = self._counts.get(self._slot(key))
+        if count is not None:
+            count.tries, count.until_s = max(0, count.tries - 1), 0.0
 
     def forget(self, key: str) -> None:
         """Nothing of this key counts any more."""
@@ -80,7 +80,7 @@ class Pace:
         now = self.clock.monotonic_s()
         if now - self._swept_s >= SWEEP_S:
             self._swept_s = now
-            self._counts = {name: kept for name, kept in self._counts.items() if now - kept.last_s <= FORGOTTEN_S}
+            self._counts = {name: count for name, count in self._counts.items() if now - count.last_s <= FORGOTTEN_S}
             if len(self._counts) < self.most_keys:
                 return key
         return OTHERS
@@ -95,7 +95,7 @@ class Guesses:
     """
 
     def __init__(self, clock: Clock) -> None:
-        self._own, self._sessions, self._tokens = Pace(clock), Pace(clock), Pace(clock)
+        self._known_pairs, self._sessions, self._tokens = Pace(clock), Pace(clock), Pace(clock)
         self._pairs, self._places = Pace(clock), Pace(clock)
         self._names = Pace(clock, FREE_FOR_A_NAME)
         self._proven: OrderedDict[tuple[str, str], None] = OrderedDict()
@@ -115,7 +115,9 @@ class Guesses:
 
     def _password_paces(self, name: str, place: str, known: bool) -> list[tuple[Pace, str]]:
         pair = f"{place} {name}"
-        return [(self._own, pair)] if known else [(self._pairs, pair), (self._names, name), (self._places, place)]
+        return (
+            [(self._known_pairs, pair)] if known else [(self._pairs, pair), (self._names, name), (self._places, place)]
+        )
 
     def confirmation(self, session: str) -> None:
         """Admit a password given once more in a live session: only who sits in it is held back."""
@@ -141,10 +143,10 @@ class Guesses:
             if len(self._proven) > MOST_PROVEN:
                 self._proven.popitem(last=False)
 
-    def _admit(self, *held: tuple[Pace, str]) -> None:
+    def _admit(self, *paces: tuple[Pace, str]) -> None:
         with self._lock:
-            refuse(max(pace.wait_s(key) for pace, key in held))
-            for pace, key in held:
+            refuse(max(pace.wait_s(key) for pace, key in paces))
+            for pace, key in paces:
                 pace.count(key)
 
 
@@ -159,9 +161,9 @@ def refuse(wait_s: float) -> None:
 def place_of(address: str) -> str:
     """Where a try comes from: an IPv4 address, or the part of an IPv6 address that one customer gets."""
     try:
-        found = ipaddress.ip_address(address)
+        parsed = ipaddress.ip_address(address)
     except ValueError:
         return address[:60]
-    if isinstance(found, ipaddress.IPv4Address):
-        return str(found)
-    return str(found.ipv4_mapped or ipaddress.ip_network((found, 64), strict=False).network_address)
+    if isinstance(parsed, ipaddress.IPv4Address):
+        return str(parsed)
+    return str(parsed.ipv4_mapped or ipaddress.ip_network((parsed, 64), strict=False).network_address)

@@ -28,7 +28,7 @@ OF_VERB = {
 
 
 def load(name: str) -> dict[str, Any]:
-    """A schema by its name, or by the verb that prints it. Raises KeyError where there is none.
+    """Return a schema by its name, or by the verb that prints it. Raises KeyError: there is none.
 
     Parameters
     ----------
@@ -39,27 +39,27 @@ def load(name: str) -> dict[str, Any]:
 
 
 def components(name: str) -> dict[str, Any]:
-    """A schema and what it refers to as components of the OpenAPI document, where generators of clients look for them.
+    """Return a schema and its definitions as components of the OpenAPI document, where client generators look for them.
 
-    Of values that differ by case or signs alone no names are made: the list of them becomes a plain text.
+    An enumeration whose values differ only in case becomes a plain string, as generators make one name of each value.
     """
-    own, whole = component_name(name), load(name)
+    prefix, whole = component_name(name), load(name)
     text = json.dumps({key: value for key, value in whole.items() if key not in ("$schema", "$id")})
-    made = json.loads(
-        re.sub(r'"#/\$defs/(\w+)"', lambda found: f'"#/components/schemas/{own}{_title(found[1])}"', text)
+    schema = json.loads(
+        re.sub(r'"#/\$defs/(\w+)"', lambda match: f'"#/components/schemas/{prefix}{_title(match[1])}"', text)
     )
-    parts = made.pop("$defs", {})
-    found = {own: made, **{own + _title(part): schema for part, schema in parts.items()}}
-    _leave_alike(found)
-    return found
+    parts = schema.pop("$defs", {})
+    documents = {prefix: schema} | {prefix + _title(name): part for name, part in parts.items()}
+    _drop_ambiguous_enums(documents)
+    return documents
 
 
-def _leave_alike(node: Any) -> None:
+def _drop_ambiguous_enums(node: Any) -> None:
     if isinstance(node, list):
         for value in node:
-            _leave_alike(value)
+            _drop_ambiguous_enums(value)
     elif isinstance(node, dict):
-        _leave_alike(list(node.values()))
+        _drop_ambiguous_enums(list(node.values()))
         listed = node.get("enum")
         if isinstance(listed, list) and len({str(value).lower() for value in listed}) < len(listed):
             del node["enum"]
@@ -71,5 +71,5 @@ def _title(name: str) -> str:
 
 
 def component_name(name: str) -> str:
-    """What the OpenAPI document calls it."""
+    """Return the name of the schema in the OpenAPI document."""
     return f"{name.title()}Json"

@@ -24,13 +24,13 @@ from stimrig.api.store.tables import AuditEntry, Participant
 from stimrig.rig import messages, requests
 
 
-def _write_begin(context: Context, by: str, code: str, asked: dict[str, Any], tags: Tags) -> str:
+def _write_begin(context: Context, by: str, code: str, values: dict[str, Any], tags: Tags) -> str:
     """The intent; the calibration's id."""
     with context.store.write() as session:
         version, now = locking.check(session, participants.within(session, code), tags), context.clock.utc()
         stamp = now[:19].replace("-", "").replace(":", "")
         identity = f"C{stamp}-{secrets.token_hex(3)}-{version}"
-        audit.write(session, now, by, "begin calibration", code, calibration=identity, **asked)
+        audit.write(session, now, by, "begin calibration", code, calibration=identity, **values)
     return identity
 
 
@@ -39,17 +39,17 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
 
     Raises ApiError: 422 neither the request nor the participant says one of them.
     """
-    asked = body.model_dump()
+    values = body.model_dump()
     for name in ("current_ma", "max_torque_nm"):
-        asked[name] = profile.get(name) if asked[name] is None else asked[name]
-        if asked[name] is None:
+        values[name] = profile.get(name) if values[name] is None else values[name]
+        if values[name] is None:
             raise ApiError(422, "no-limits", "The participant has no limits", f"Send {name}; {name} is not known yet.")
-    return asked
+    return values
 
 
 async def begin(
     context: Context, code: str, body: CalibrationIn, by: str, tags: Tags, confirm: str = "",
-    ask: bool = False,
+    interactive: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Open a calibration: where it stands. A person, with `ask`, is asked before a current far above the usual one.
 
@@ -60,24 +60,24 @@ async def begin(
         row = await asyncio.to_thread(participants.find, context, code)
         refuse_archived(row)
         context.runner.refuse_second()
-        asked = settings(body, row.profile)
-        if ask:
-            confirm_current(row, asked, confirm)
-        identity = await asyncio.to_thread(_write_begin, context, by, code, asked, tags)
+        values = settings(body, row.profile)
+        if interactive:
+            confirm_current(row, values, confirm)
+        identity = await asyncio.to_thread(_write_begin, context, by, code, values, tags)
         last = messages.Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
-            requests.CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **asked)
+            requests.CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **values)
         )
         return await standing(context, code)
 
 
-def confirm_current(row: Participant, asked: dict[str, Any], confirm: str) -> None:
+def confirm_current(row: Participant, values: dict[str, Any], confirm: str) -> None:
     """Ask before a calibration with a current far above the participant's."""
-    if warnings := profiles.jumps(row.profile, {**row.profile, "current_ma": asked["current_ma"]}):
-        current = f"{asked['current_ma']:g} mA"
+    if warnings := profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]}):
+        current = f"{values['current_ma']:g} mA"
         changes = [
             Change("Current of every pulse", current, f"{row.profile['current_ma']:g} mA"),
-            Change("Fine step", f"{asked['step_us']:g} µs"),
+            Change("Fine step", f"{values['step_us']:g} µs"),
         ]
         title, button = f"Calibrate {row.code} with {current}?", f"Yes, calibrate with {current}"
         require_confirmation(confirm, title, button, changes, warnings)
@@ -94,21 +94,21 @@ async def step(context: Context, code: str, body: StepIn, tags: Tags) -> dict[st
 async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags) -> dict[str, Any]:
     """Mark the last train's width as a threshold: where the calibration stands."""
     async with context.limits_lock:  # no train comes between looking and marking
-        found = await sound(context, code)
-        check_train(found, tags)
+        calibration = await sound(context, code)
+        check_train(calibration, tags)
         await context.rig.ask(requests.CalibrateMarkRequest(**body.model_dump()))
-    width = {"pulse_width_us": found["pulse_width_us"]}
+    width = {"pulse_width_us": calibration["pulse_width_us"]}
     await asyncio.to_thread(context.store.note, context.clock, by, f"mark {body.threshold}", code, **width)
     return await standing(context, code)
 
 
-def check_train(found: dict[str, Any], tags: Tags, any_train: bool = False) -> None:
+def check_train(calibration: dict[str, Any], tags: Tags, any_train: bool = False) -> None:
     """Refuse what was decided on another calibration, or, but with `any_train`, without knowing of the last train.
 
     Raises ApiError: 412 it is another one, or another train was sent or is on its way.
     """
-    check_calibration(found["calibration_id"], found["by"], tags)
-    if not any_train and (found["version"] not in tags or found["playing"]):
+    check_calibration(calibration["calibration_id"], calibration["by"], tags)
+    if not any_train and (calibration["version"] not in tags or calibration["playing"]):
         raise another_train()
 
 
@@ -140,8 +140,8 @@ async def _waiting(context: Context, code: str) -> messages.Calibrated | None:
 async def standing(context: Context, code: str) -> dict[str, Any]:
     """Where the participant's calibration stands. Raises ApiError: 404 none is open for this participant."""
     status: messages.Status = await context.rig.fresh_status()
-    found = status.calibration
-    if found is None or found.participant != code:
+    calibration = status.calibration
+    if calibration is None or calibration.participant != code:
         ended = f" The rig is {status.state}: {status.reason}." if status.state == "latched" else ""
         detail = f"No calibration of {code} is open.{ended} POST /v1/participants/{code}/calibration begins one."
         error = ApiError(404, "no-calibration", "No calibration is open", detail)
@@ -149,20 +149,21 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
             error.detail = "It was finished, and waits to be stored. Finish it again, or discard it, with this ETag."
             error.headers["ETag"] = f'"{waits.calibration_id}.0"'
         raise error
+    marks = zlib.crc32(repr(calibration.marks_us).encode())
     return {
-        **found.model_dump(),
+        **calibration.model_dump(),
         "rig_state": status.state,
         "playing": status.state != "calibrating",
-        "outdated": await asyncio.to_thread(outdated, context, code, found),
-        "version": f"{found.calibration_id}.{len(found.trains)}.{zlib.crc32(repr(found.marks_us).encode()):08x}",
+        "outdated": await asyncio.to_thread(outdated, context, code, calibration),
+        "version": f"{calibration.calibration_id}.{len(calibration.trains)}.{marks:08x}",
     }
 
 
-def outdated(context: Context, code: str, found: messages.CalibrationStatus) -> str:
+def outdated(context: Context, code: str, calibration: messages.CalibrationStatus) -> str:
     """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
     with context.store.read() as session:
         row = participants.within(session, code)
-        return _outdated_words(row) if _changed(session, row, found.calibration_id) else ""
+        return _outdated_words(row) if _changed(session, row, calibration.calibration_id) else ""
 
 
 def _outdated_words(row: Participant) -> str:
@@ -187,10 +188,10 @@ async def sound(context: Context, code: str) -> dict[str, Any]:
     Raises ApiError: 404 none is open for this participant; 409 the participant's limits were changed since it was
     begun.
     """
-    found = await standing(context, code)
-    if found["outdated"]:
-        raise outdated_error(found["outdated"])
-    return found
+    calibration = await standing(context, code)
+    if calibration["outdated"]:
+        raise outdated_error(calibration["outdated"])
+    return calibration
 
 
 def outdated_error(detail: str) -> ApiError:
@@ -203,24 +204,26 @@ def _store(
 ) -> dict[str, Any] | None:  # fmt: skip
     """What was found is the profile, if nothing of that was changed since; what a calibration does not look for (the
     rest between tests) stays. Storing it again changes nothing."""
-    found = result.profile.model_dump() if result.profile else None
-    told = {"calibration": identity, "recordings": result.recordings}
+    new_profile = result.profile.model_dump() if result.profile else None
+    detail = {"calibration": identity, "recordings": result.recordings}
     with context.store.write() as session:
         row, now = participants.within(session, code), context.clock.utc()
-        if found is None:
-            audit.write(session, now, by, "discard calibration", code, **told)
+        if new_profile is None:
+            audit.write(session, now, by, "discard calibration", code, **detail)
         elif not _stored(session, code, identity):
             if _changed(session, row, identity):
                 raise outdated_error(_outdated_words(row))
-            row.profile = found | {name: value for name, value in row.profile.items() if found.get(name) is None}
-            locking.write(session, row, now, by, "finish calibration", code, profile=row.profile, **told)
-        return None if found is None else dict(row.profile)
+            row.profile = new_profile | {
+                name: value for name, value in row.profile.items() if new_profile.get(name) is None
+            }
+            locking.write(session, row, now, by, "finish calibration", code, profile=row.profile, **detail)
+        return None if new_profile is None else dict(row.profile)
 
 
 def _stored(session: Session, code: str, identity: str) -> bool:
     same = AuditEntry.detail["calibration"].as_string() == identity
-    own = select(AuditEntry.seq).where(AuditEntry.subject == code, AuditEntry.action == "finish calibration", same)
-    return session.scalar(own) is not None
+    entry = select(AuditEntry.seq).where(AuditEntry.subject == code, AuditEntry.action == "finish calibration", same)
+    return session.scalar(entry) is not None
 
 
 async def close(context: Context, code: str, by: str, tags: Tags, discard: bool = False) -> dict[str, Any]:
@@ -228,9 +231,9 @@ async def close(context: Context, code: str, by: str, tags: Tags, discard: bool 
     async with context.limits_lock:
         waits = await _waiting(context, code)
         if waits is None:
-            found = await (standing if discard else sound)(context, code)
-            check_train(found, tags, any_train=discard)
-            identity = str(found["calibration_id"])
+            calibration = await (standing if discard else sound)(context, code)
+            check_train(calibration, tags, any_train=discard)
+            identity = str(calibration["calibration_id"])
         else:
             identity = waits.calibration_id
             check_calibration(identity, waits.by, tags)

@@ -96,7 +96,7 @@ class Context:
                 break
             await asyncio.sleep(0.05)
         await self.runner.resume()
-        regular = ((FLUSH_S, self.auth.idle.flush), (KEEP_S, self.lock.keep))
+        regular = ((FLUSH_S, self.auth.idle.flush), (KEEP_S, self.lock.renew))
         self._tasks = [asyncio.create_task(_repeat(every_s, work)) for every_s, work in regular]
 
     async def close(self) -> None:
@@ -151,8 +151,8 @@ def under_limits_lock(
     """Do a change in a thread, under the lock of the limits."""
 
     @functools.wraps(change)
-    async def changed(context: Context, /, *given: P.args, **more: P.kwargs) -> T:
+    async def changed(context: Context, /, *args: P.args, **kwargs: P.kwargs) -> T:
         async with context.limits_lock:
-            return await asyncio.to_thread(change, context, *given, **more)
+            return await asyncio.to_thread(change, context, *args, **kwargs)
 
     return changed

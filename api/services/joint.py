@@ -45,10 +45,10 @@ def sensor(context: Context) -> AngleStatus:
 async def overview_of(context: Context, row: Participant) -> dict[str, Any]:
     """What is open of today's guided tests, and the sensor; nothing of tests where there is no sensor or no range."""
     status = context.rig.status
-    told = (status.angle if status is not None else AngleStatus()).model_dump()
-    if not told["present"] or profiles.range_of(row.profile) is None:
-        return {"sensor": told, "range_rad": row.profile.get(profiles.RANGE), **NOTHING_OPEN}
-    return {"sensor": told, **await context.runner.joint_overview(row)}
+    sensor_state = (status.angle if status is not None else AngleStatus()).model_dump()
+    if not sensor_state["present"] or profiles.range_of(row.profile) is None:
+        return {"sensor": sensor_state, "range_rad": row.profile.get(profiles.RANGE), **NOTHING_OPEN}
+    return {"sensor": sensor_state, **await context.runner.joint_overview(row)}
 
 
 def pose_version(context: Context) -> int:

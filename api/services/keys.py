@@ -18,18 +18,18 @@ from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Token
 
 
-def make(context: Context, who: Principal, code: str, body: KeyFor, tags: Tags) -> tuple[str, Token, int]:
+def make(context: Context, principal: Principal, code: str, body: KeyFor, tags: Tags) -> tuple[str, Token, int]:
     """Make a key: its text, its row, and the participant's new version.
 
     Raises ApiError: 403 who makes it lacks a scope; 409 archived; 412 changed since it was seen; 422 as `plan_within`.
     """
     row = participants.find(context, code)
-    controllers.refuse_maker_without(who)
+    controllers.refuse_maker_without(principal)
     refuse_archived(row)
     with context.store.read() as session:  # first: then the plan is wider for no other reason
         locking.check(session, participants.within(session, code), tags)
     plan = controllers.plan_within(body, row)
-    return controllers.make_key(context.auth, body.name, code, plan, who.name, who.token_hash, tags)
+    return controllers.make_key(context.auth, body.name, code, plan, principal.name, principal.token_hash, tags)
 
 
 def revoke(context: Context, code: str, key_id: str, by: str) -> None:

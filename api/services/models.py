@@ -30,12 +30,12 @@ def none_approved(code: str) -> ApiError:
 
 
 async def invert(
-    context: Context, model_id: str, given: dict[str, Any], width_us: float | None = None, rise_us: float | None = None,
-    whole: bool = True,
+    context: Context, model_id: str, reference: dict[str, Any], width_us: float | None = None,
+    rise_us: float | None = None, whole: bool = True,
 ) -> dict[str, Any]:  # fmt: skip
     """What a worker makes of a reference, within the limits of participant and rig.
 
-    `given`: the reference, as the verb `invert` takes it; `width_us`, `rise_us`: further limits.
+    `reference`: the torque to follow, as the verb `invert` takes it; `width_us`, `rise_us`: further limits.
     """
     text = await asyncio.to_thread(context.tracked.text_of, model_id)
     version = await asyncio.to_thread(context.tracked.version_of, model_id)
@@ -46,11 +46,11 @@ async def invert(
     rise_us = tighter(rise_us, bound and bound.hi)
     call = context.pool.submit(
         "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=whole,
-        shortest_us=shortest_us or 0.0, **given,
+        shortest_us=shortest_us or 0.0, **reference,
     )  # fmt: skip
-    found = await call.result
+    inverted = await call.result
     limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us, "shortest_pulse_us": shortest_us}
-    return {"model_id": model_id, **found, **limits, "segments": segments(found["pulse_width_us"])}
+    return {"model_id": model_id, **inverted, **limits, "segments": segments(inverted["pulse_width_us"])}
 
 
 def segments(pulse_width_us: list[float]) -> list[dict[str, Any]]:

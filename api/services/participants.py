@@ -29,7 +29,7 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
     now = context.clock.utc()
     profile = body.profile.model_dump(exclude_none=True)
     if "profile" in body.model_fields_set:
-        check_asked(context, profile, profile)
+        check_limits(context, profile, profile)
         profile = add_calibration_time(context, profile)
     with context.store.write() as session:
         if session.get(Participant, body.code) is not None:
@@ -55,7 +55,13 @@ def within(session: Session, code: str) -> Participant:
 
 @under_limits_lock
 def change_profile(
-    context: Context, code: str, asked: dict[str, Any], by: str, tags: Tags, confirm: str = "", ask: bool = False
+    context: Context,
+    code: str,
+    limits: dict[str, Any],
+    by: str,
+    tags: Tags,
+    confirm: str = "",
+    interactive: bool = False,
 ) -> Participant:
     """Change limits of a participant: those that are asked for; the rest stays.
 
@@ -66,9 +72,9 @@ def change_profile(
         row = within(session, code)
         locking.check(session, row, tags)
         before = row.profile
-        check_asked(context, before, asked)
-        profile, voids = profiles.changed(before, add_calibration_time(context, asked))
-        confirm_profile(context, code, before, profile, voids, confirm, ask)
+        check_limits(context, before, limits)
+        profile, voids = profiles.changed(before, add_calibration_time(context, limits))
+        confirm_profile(context, code, before, profile, voids, confirm, interactive)
         if profile != before:
             row.profile = profile
             now = context.clock.utc()
@@ -77,10 +83,16 @@ def change_profile(
 
 
 def confirm_profile(
-    context: Context, code: str, before: dict[str, Any], profile: dict[str, Any], voids: str, confirm: str, ask: bool
+    context: Context,
+    code: str,
+    before: dict[str, Any],
+    profile: dict[str, Any],
+    voids: str,
+    confirm: str,
+    interactive: bool,
 ) -> None:
     """Ask before limits that void the calibration; a person, with `ask`, also before a jump."""
-    warnings = profiles.jumps(before, profile) if ask else []
+    warnings = profiles.jumps(before, profile) if interactive else []
     if voids:
         required = context.rig.status is None or context.rig.status.require_calibration is not False
         then = " Until the participant is calibrated anew, no test starts." if required else ""
@@ -104,23 +116,23 @@ def confirm_profile(
     require_confirmation(confirm, f"Set these limits for {code}?", button, changes, warnings, refusal)
 
 
-def check_asked(context: Context, profile: dict[str, Any], asked: dict[str, Any]) -> None:
+def check_limits(context: Context, profile: dict[str, Any], limits: dict[str, Any]) -> None:
     """Refuse first limits that are not whole, and what this rig would refuse."""
-    if lacking := [name for name in profiles.LIMITS if {**profile, **asked}.get(name) is None]:
+    if lacking := [name for name in profiles.LIMITS if {**profile, **limits}.get(name) is None]:
         raise ApiError(422, "invalid-input", "Some limits are missing", f"Send {', '.join(lacking)}, too.")
     status = context.rig.status
-    found = profiles.outside(asked, profile, status.limits if status else {})
-    if found := found | profiles.range_outside(asked, status.angle.range_rad if status else None):
-        errors = [{"field": name, "detail": words} for name, words in found.items()]
-        detail = "; ".join(f"{name}: {words}" for name, words in found.items()) + ". Nothing was changed."
+    problems = profiles.outside(limits, profile, status.limits if status else {})
+    if problems := problems | profiles.range_outside(limits, status.angle.range_rad if status else None):
+        errors = [{"field": name, "detail": words} for name, words in problems.items()]
+        detail = "; ".join(f"{name}: {words}" for name, words in problems.items()) + ". Nothing was changed."
         raise ApiError(422, "invalid-input", "These limits cannot be used", detail, errors=errors)
 
 
-def add_calibration_time(context: Context, asked: dict[str, Any]) -> dict[str, Any]:
+def add_calibration_time(context: Context, limits: dict[str, Any]) -> dict[str, Any]:
     """What is asked for; a range of joint angles holds as long as the angle sensor's calibration of now."""
-    if asked.get(profiles.RANGE) is None:
-        return asked
-    return {**asked, profiles.SET_AT: calibrated_utc(context.rig.status)}
+    if limits.get(profiles.RANGE) is None:
+        return limits
+    return {**limits, profiles.SET_AT: calibrated_utc(context.rig.status)}
 
 
 def calibrated_utc(status: Status | None) -> str | None:
@@ -129,7 +141,7 @@ def calibrated_utc(status: Status | None) -> str | None:
     return calibration.set_at_utc if calibration else None
 
 
-def meanwhile(context: Context, code: str) -> str:
+def effect_on_open_work(context: Context, code: str) -> str:
     """What a change of this participant's limits means for what goes on; empty where nothing does."""
     current, status = context.runner.current, context.rig.status
     if current is not None and current.participant == code:
@@ -147,9 +159,9 @@ def meanwhile(context: Context, code: str) -> str:
 
 def loses_calibration(row: Participant, body: MuscleIn) -> bool:
     """Whether a calibration is lost: it was found at another site than the new one."""
-    found = any(row.profile.get(name) is not None for name in profiles.FOUND)
+    is_calibrated = any(row.profile.get(name) is not None for name in profiles.FOUND)
     pairs = zip(site_of(row), site_in(body), strict=True)
-    return found and any(before is not None and before != after for before, after in pairs)
+    return is_calibrated and any(before is not None and before != after for before, after in pairs)
 
 
 def site_in(body: MuscleIn) -> Site:
@@ -159,7 +171,7 @@ def site_in(body: MuscleIn) -> Site:
 
 @under_limits_lock
 def change_site(
-    context: Context, code: str, body: MuscleIn, by: str, tags: Tags, confirm: str = "", ask: bool = False
+    context: Context, code: str, body: MuscleIn, by: str, tags: Tags, confirm: str = "", interactive: bool = False
 ) -> Participant:
     """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
 
@@ -167,7 +179,7 @@ def change_site(
     the calibration would be lost, or with `ask` the approved model, and that was not confirmed.
     """
     refuse_busy(context, code)
-    now, has_model = context.clock.utc(), ask and context.versions.approved(code) is not None
+    now, has_model = context.clock.utc(), interactive and context.versions.approved(code) is not None
     with context.store.write() as session:
         row = within(session, code)
         locking.check(session, row, tags)
@@ -176,7 +188,7 @@ def change_site(
         warnings = []
         if lost:
             warnings.append(f"The calibration is lost with it: its thresholds were found at {before}.")
-        if ask and here != site_in(body) and has_model:
+        if interactive and here != site_in(body) and has_model:
             warnings.append(f"The approved model and its keys are of {before}. Here there is none.")
         if warnings:
             title, refusal = f"Change side and muscle of {code}?", "voids-calibration" if lost else "confirm"

@@ -22,7 +22,7 @@ from stimrig.api.store.tables import Model, Recording
 from stimrig.identify.records import HDF5_MAGIC, PARQUET_MAGIC
 
 
-def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
+def find(context: Context, recording_id: str) -> tuple[Recording, Path]:
     """A recording and its file. Raises ApiError: 404 no such recording; 410 its file is gone."""
     row = context.store.get(Recording, recording_id)
     require_found(row, "recording", recording_id, "A test's document names its recording.")
@@ -34,7 +34,13 @@ def held(context: Context, recording_id: str) -> tuple[Recording, Path]:
 
 
 async def take_in(
-    context: Context, code: str, data: bytes, who: Principal, tags: Tags, columns: Sequence[str] = (), of: str = ""
+    context: Context,
+    code: str,
+    data: bytes,
+    principal: Principal,
+    tags: Tags,
+    columns: Sequence[str] = (),
+    of: str = "",
 ) -> tuple[Recording, Model, list[str]]:
     """Keep a recording of another tool and identify a model from it; what was assumed, and left out of its structure.
 
@@ -47,35 +53,39 @@ async def take_in(
     part = uploads.part_of(whole)
     try:
         assumed, data = await _rename_columns(context, part, columns, data)
-        found, warning = await _identified(context, code, part)
-        of = await asyncio.to_thread(_whose, context, code, who, found.get("of") or "", data, of)
+        fitted, warning = await _identified(context, code, part)
+        of = await asyncio.to_thread(_other_owner, context, code, principal, fitted.get("of") or "", data, of)
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
-    warnings = [note for note in (*assumed, *found["notes"], warning) if note]
-    row = await asyncio.shield(asyncio.to_thread(_store, context, code, whole, data, who.name, warnings, of, tags))
-    plain = await asyncio.to_thread(context.versions.add, found["json"], code, row.id, who.name)
+    warnings = [note for note in (*assumed, *fitted["notes"], warning) if note]
+    row = await asyncio.shield(
+        asyncio.to_thread(_store, context, code, whole, data, principal.name, warnings, of, tags)
+    )
+    plain = await asyncio.to_thread(context.versions.add, fitted["json"], code, row.id, principal.name)
     return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), warnings
 
 
-def _whose(context: Context, code: str, who: Principal, says: str, data: bytes, of: str) -> str:
+def _other_owner(context: Context, code: str, principal: Principal, stated_owner: str, data: bytes, of: str) -> str:
     """The other participant whose recording a person has decided to take in; empty: it is nobody else's.
 
     Refuses what the file, or this database, says is another participant's, where nobody has decided that.
     """
     same = Recording.file_sha256 == hashlib.sha256(data).hexdigest()
-    own = says or next(iter(context.store.all(Recording.participant, same, order=Recording.created_utc)), code)
-    if own == code or (own == of and who.may(Scope.APPROVE_MODEL)):
-        return "" if own == code else own
+    owner = stated_owner or next(
+        iter(context.store.all(Recording.participant, same, order=Recording.created_utc)), code
+    )
+    if owner == code or (owner == of and principal.may(Scope.APPROVE_MODEL)):
+        return "" if owner == code else owner
     detail = (
-        f"The file says that it is a recording of {own}, not of {code}. Nothing of it was kept. Who may approve models "
-        f"can take it for {code} all the same: send it again with of={own}."
+        f"The file says that it is a recording of {owner}, not of {code}. Nothing of it was kept. Who may approve "
+        f"models can take it for {code} all the same: send it again with of={owner}."
     )
     title, more = "This is another participant's recording", {}
-    if who.may(Scope.APPROVE_MODEL):
-        button = f"Take the recording of {own} for {code}"
-        more = {"confirm": {"title": title, "button": button, "rows": [], "warnings": [detail], "token": own}}
-    raise ApiError(409, "other-participant", title, detail, of=own, **more)
+    if principal.may(Scope.APPROVE_MODEL):
+        button = f"Take the recording of {owner} for {code}"
+        more = {"confirm": {"title": title, "button": button, "rows": [], "warnings": [detail], "token": owner}}
+    raise ApiError(409, "other-participant", title, detail, of=owner, **more)
 
 
 async def _rename_columns(context: Context, path: Path, columns: Sequence[str], data: bytes) -> tuple[list[str], bytes]:
@@ -85,11 +95,11 @@ async def _rename_columns(context: Context, path: Path, columns: Sequence[str], 
     out = path.with_suffix(uploads.PLAIN)
     try:
         with _about_the_upload(path):
-            found = await context.pool.submit("plain_csv", data=str(path), out=str(out), columns=list(columns)).result
+            table = await context.pool.submit("plain_csv", data=str(path), out=str(out), columns=list(columns)).result
         await asyncio.to_thread(out.replace, path)
     finally:
         out.unlink(missing_ok=True)
-    return found["notes"], await asyncio.to_thread(path.read_bytes)
+    return table["notes"], await asyncio.to_thread(path.read_bytes)
 
 
 async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
@@ -131,12 +141,12 @@ def _store(
     row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
     row.file_sha256 = hashlib.sha256(data).hexdigest()
     row.warnings = warnings
-    said = {"participant": code, "sha256": row.file_sha256, **({"of": of} if of else {})}
+    detail = {"participant": code, "sha256": row.file_sha256, **({"of": of} if of else {})}
     with uploads.taken_in(path), context.store.write() as session:
         participant = participants.within(session, code)
         locking.check(session, participant, tags)
         row.site = list(site_of(participant))
         session.add(row)
         session.flush()
-        audit.write(session, now, by, "upload recording", row.id, **said)
+        audit.write(session, now, by, "upload recording", row.id, **detail)
     return row

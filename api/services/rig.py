@@ -33,9 +33,9 @@ def rig_state(context: Context) -> dict[str, Any]:
 async def rearm(context: Context, by: str, tags: Tags) -> Status:
     """Re-arm the rig after the stop that was shown. Raises ApiError: 412 it was stopped again since."""
     latch, latches = tags[0], context.rig.latches
-    _, shown = latches.get(latch, ("", ""))
+    _, shown_reason = latches.get(latch, ("", ""))
     note = partial(context.store.note, context.clock, by)
-    await asyncio.to_thread(note, "re-arm", "rig", reason=shown)
+    await asyncio.to_thread(note, "re-arm", "rig", reason=shown_reason)
     try:
         await context.rig.ask(RearmRequest(by=by, latch=latch))
     except ApiError as error:
@@ -44,6 +44,13 @@ async def rearm(context: Context, by: str, tags: Tags) -> Status:
             raise
         status = await context.rig.fresh_status()
         at_utc, reason = latches[status.latch]
-        change = {"who": "", "at_utc": at_utc, "action": "latched", "subject": "rig", "old": shown, "new": reason}
+        change = {
+            "who": "",
+            "at_utc": at_utc,
+            "action": "latched",
+            "subject": "rig",
+            "old": shown_reason,
+            "new": reason,
+        }
         raise locking.ChangedError(status.latch, [change], error.detail) from error
     return await context.rig.fresh_status()

@@ -14,17 +14,17 @@ from stimrig.api.store.tables import AuditEntry
 
 def entry_hash(entry: dict[str, Any]) -> str:
     """SHA-256 of an entry's canonical JSON, its own hash left out."""
-    held = {key: value for key, value in entry.items() if key != "hash"}
-    return digest(json.dumps(held, sort_keys=True, separators=(",", ":")))
+    hashed = {key: value for key, value in entry.items() if key != "hash"}
+    return digest(json.dumps(hashed, sort_keys=True, separators=(",", ":")))
 
 
-def write(session: Session, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> AuditEntry:
+def write(session: Session, at_utc: str, actor: str, action: str, subject: str, **detail: Any) -> AuditEntry:
     """Append an entry in the caller's transaction, so that action and entry stand or fall together."""
     last = newest(session)
     fields = {
         "seq": last.seq + 1 if last else 1,
         "at_utc": at_utc,
-        "who": storable(who),
+        "who": storable(actor),
         "action": action,
         "subject": storable(subject),
         "detail": detail,
@@ -48,7 +48,7 @@ ON_ACCOUNTS = (*ACCOUNTS, "issue token", "revoke token")
 """Actions whose subject is the name of a user or a key."""
 
 
-def erase(session: Session, names: set[str], at_utc: str, who: str, **detail: Any) -> None:
+def erase(session: Session, names: set[str], at_utc: str, actor: str, **detail: Any) -> None:
     """Take away the content of entries that name one of these, and append the entry that vouches for what is left.
 
     Number, time, person, action and hash of an entry stay, so that the trail stays a chain. A participant's code may
@@ -64,7 +64,7 @@ def erase(session: Session, names: set[str], at_utc: str, who: str, **detail: An
                 entry.who = ERASED
             erased.append(entry)
     session.flush()
-    write(session, at_utc, who, ERASE, "a participant", **detail, entries=len(erased), kept=left_of(erased))
+    write(session, at_utc, actor, ERASE, "a participant", **detail, entries=len(erased), kept=left_of(erased))
 
 
 def _mentions(value: Any, names: set[str]) -> bool:
@@ -78,18 +78,22 @@ def _mentions(value: Any, names: set[str]) -> bool:
 
 def left_of(entries: list[AuditEntry]) -> str:
     """Digest of what stays of entries whose content is taken away."""
-    return digest(canonical([[one.seq, one.at_utc, one.who, one.action, one.hash] for one in entries]))
+    return digest(canonical([[entry.seq, entry.at_utc, entry.who, entry.action, entry.hash] for entry in entries]))
 
 
 def vouched(entries: list[AuditEntry]) -> set[int]:
     """Numbers of the entries that a later, sound one says it has left as they are now."""
-    found: set[int] = set()
+    numbers: set[int] = set()
     for entry in entries:
         if entry.action == ERASE and entry.hash == entry_hash(entry.as_dict()):
-            blanked = [one for one in entries if one.seq < entry.seq and blank(one) == entry.seq]
+            blanked = [
+                blank_entry
+                for blank_entry in entries
+                if blank_entry.seq < entry.seq and blank(blank_entry) == entry.seq
+            ]
             if len(blanked) == entry.detail.get("entries") and left_of(blanked) == entry.detail.get("kept"):
-                found |= {one.seq for one in blanked}
-    return found
+                numbers |= {blank_entry.seq for blank_entry in blanked}
+    return numbers
 
 
 def blank(entry: AuditEntry) -> int | None:

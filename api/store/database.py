@@ -33,16 +33,16 @@ class Store:
     """
 
     def __init__(self, url: str) -> None:
-        shown = url
+        safe_url = url
         try:
             parsed = make_url(url)
-            shown = parsed.render_as_string(hide_password=True)
+            safe_url = parsed.render_as_string(hide_password=True)
             self.engine = open_engine(parsed)
             migrations.migrate(self.engine)
         except migrations.SchemaError as error:
             raise ApiError(503, "database", "The database has another version", str(error)) from error
         except (ArgumentError, SQLAlchemyError, ImportError, OSError) as error:
-            raise ApiError(503, "database", "The database cannot be opened", why_not_opened(error, shown)) from error
+            raise ApiError(503, "database", "The database cannot be opened", why_not_opened(error, safe_url)) from error
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
         self._writing = sessionmaker(self.engine.execution_options(**WRITES), expire_on_commit=False)
         self._write_lock = threading.Lock()
@@ -79,10 +79,10 @@ class Store:
         """The first of these, or None."""
         return next(iter(self.all(table, *where, order=order, limit=1)), None)
 
-    def note(self, clock: Clock, who: str, action: str, subject: str, **detail: Any) -> None:
+    def note(self, clock: Clock, actor: str, action: str, subject: str, **detail: Any) -> None:
         """Append an entry to the audit trail in a transaction of its own."""
         with self.write() as session:
-            audit.write(session, clock.utc(), who, action, subject, **detail)
+            audit.write(session, clock.utc(), actor, action, subject, **detail)
 
     def compact(self) -> None:
         """Write a SQLite file anew, so that deleted rows are not left in it; PostgreSQL's autovacuum does that."""
@@ -105,11 +105,11 @@ class Store:
         self.engine.dispose()
 
 
-def why_not_opened(error: Exception, shown: str) -> str:
+def why_not_opened(error: Exception, safe_url: str) -> str:
     """Say in one line what is wrong with the database, and the fix."""
     first = str(error).splitlines()[0]
-    if shown.startswith("postgresql"):
-        return f"{shown}: {first}; see that it runs and that STIMRIG_DATABASE_URL names it (docs/install.md)"
+    if safe_url.startswith("postgresql"):
+        return f"{safe_url}: {first}; see that it runs and that STIMRIG_DATABASE_URL names it (docs/install.md)"
     fix = "set STIMRIG_DATABASE_URL or STIMRIG_DATA_DIR to a place this user may write"
     if isinstance(error, DatabaseError) and not isinstance(error, OperationalError):
         fix = "restore the database from a backup, or set STIMRIG_DATA_DIR to another folder"
@@ -194,5 +194,5 @@ def close_to_others(path: Path) -> None:
     """The database is for its owner only: SQLite gives what it makes beside it the same rights."""
     owner_only.folder(path.parent)
     owner_only.file(path)
-    for beside in ("-wal", "-shm", "-journal"):
-        owner_only.close(path.with_name(path.name + beside), 0o600)
+    for suffix in ("-wal", "-shm", "-journal"):
+        owner_only.close(path.with_name(path.name + suffix), 0o600)

@@ -35,14 +35,14 @@ def number_of(entry: AuditEntry) -> int:
     return entry.seq << 4 * HASH_DIGITS | int(entry.hash[:HASH_DIGITS], 16)
 
 
-def write(session: Session, row: Versioned, at_utc: str, who: str, action: str, subject: str, **detail: Any) -> None:
+def write(session: Session, row: Versioned, at_utc: str, actor: str, action: str, subject: str, **detail: Any) -> None:
     """Write a decision's audit entry and make it the version of the row that was decided on."""
-    row.version = number_of(audit.write(session, at_utc, who, action, subject, **detail))
+    row.version = number_of(audit.write(session, at_utc, actor, action, subject, **detail))
 
 
-def write_pose(session: Session, at_utc: str, who: str, action: str, **detail: Any) -> int:
+def write_pose(session: Session, at_utc: str, actor: str, action: str, **detail: Any) -> int:
     """Write an entry about the angle sensor: its version. Ranges of angles rest on it: all participants get it, too."""
-    version = number_of(audit.write(session, at_utc, who, action, "rig", **detail))
+    version = number_of(audit.write(session, at_utc, actor, action, "rig", **detail))
     session.execute(update(Participant).values(version=version))
     return version
 
@@ -109,22 +109,22 @@ def _poses() -> ColumnElement[bool]:
 
 
 def _change(session: Session, place: int, entry: AuditEntry) -> dict[str, Any]:
-    alike = next((group for group in (LIMITS, SITE, ARCHIVE, MODELS) if entry.action in group), (entry.action,))
-    same = AuditEntry.subject == entry.subject, AuditEntry.action.in_(alike), AuditEntry.seq <= place
+    actions = next((group for group in (LIMITS, SITE, ARCHIVE, MODELS) if entry.action in group), (entry.action,))
+    same = AuditEntry.subject == entry.subject, AuditEntry.action.in_(actions), AuditEntry.seq <= place
     before = session.scalars(select(AuditEntry).where(*same).order_by(AuditEntry.seq.desc()).limit(1)).first()
-    old, new = _values(before, alike), _values(entry, alike)
-    told = {name: getattr(entry, name) for name in ("who", "at_utc", "action", "subject")}
-    return {**told, "old": _words(old, new), "new": _words(new, old)}
+    old, new = _values(before, actions), _values(entry, actions)
+    fields = {name: getattr(entry, name) for name in ("who", "at_utc", "action", "subject")}
+    return {**fields, "old": _words(old, new), "new": _words(new, old)}
 
 
-def _values(entry: AuditEntry | None, alike: tuple[str, ...]) -> dict[str, Any]:
+def _values(entry: AuditEntry | None, actions: tuple[str, ...]) -> dict[str, Any]:
     if entry is None:
         return {}
-    if alike is LIMITS:
+    if actions is LIMITS:
         return entry.detail.get("profile") or {}
-    if alike is SITE:
+    if actions is SITE:
         return {name: entry.detail.get(name) for name in ("side", "muscle", "placement")}
-    if alike is ARCHIVE:
+    if actions is ARCHIVE:
         return {"": "in the archive" if entry.action == "archive" else "not in the archive"}
     return {"": entry.detail.get("ran_by") or entry.action}
 

@@ -57,16 +57,16 @@ class ServiceLock:
         self._since_utc = Clock().utc()
         try:
             self._folder = _lock_folder(owner_only.folder(settings.data_dir))
-            for place, shown, fix in _lock_places(settings):
-                self._files[place] = _take_file(place, shown, fix)
+            for place, locked, fix in _lock_places(settings):
+                self._files[place] = _take_file(place, locked, fix)
             if settings.database.startswith("postgresql"):
                 self._database = DatabaseLock(make_url(settings.database))
         except BaseException:
             self.release()
             raise
-        self.tell(self._address)
+        self.write_holder(self._address)
 
-    def tell(self, address: str) -> None:
+    def write_holder(self, address: str) -> None:
         """Write down who holds it, for whoever comes second."""
         self._address = address
         words = {"pid": os.getpid(), "host": socket.gethostname(), "since_utc": self._since_utc, "address": address}
@@ -76,7 +76,7 @@ class ServiceLock:
             file.write(json.dumps(words) + "\n")
             file.flush()
 
-    def keep(self) -> None:
+    def renew(self) -> None:
         """Take again what was lost: a lock file that was removed, or PostgreSQL's connection; call it every `KEEP_S`.
 
         Ends this process where another service has taken it meanwhile.
@@ -87,9 +87,9 @@ class ServiceLock:
                     log.warning("%s was removed while this service runs on it; it is locked anew", place)
                     self._files[place] = _take_file(place, place, "do not remove lock files")
                     file.close()
-                    self.tell(self._address)
+                    self.write_holder(self._address)
             if self._database is not None:
-                self._database.take()
+                self._database.acquire()
         except HeldError as error:
             log.critical("this service ends: %s", error)
             os.kill(os.getpid(), signal.SIGTERM)
@@ -117,15 +117,15 @@ class DatabaseLock:
     """The advisory lock of a PostgreSQL database. Raises HeldError: another service has it, or no connection."""
 
     def __init__(self, url: URL) -> None:
-        self._shown = url.render_as_string(hide_password=True)
+        self._safe_url = url.render_as_string(hide_password=True)
         self._connection: Connection | None = None
         try:
             self._engine = open_engine(url).execution_options(isolation_level="AUTOCOMMIT")
-            self.take()
+            self.acquire()
         except (SQLAlchemyError, ImportError) as error:
-            raise HeldError(why_not_opened(error, self._shown)) from error
+            raise HeldError(why_not_opened(error, self._safe_url)) from error
 
-    def take(self) -> None:
+    def acquire(self) -> None:
         """Take it unless this connection has it. Raises HeldError, SQLAlchemyError."""
         if self._connection is not None:
             try:
@@ -136,7 +136,7 @@ class DatabaseLock:
         self._connection = self._engine.connect()
         if not self._connection.exec_driver_sql(f"SELECT pg_try_advisory_lock({SERVICE_KEY})").scalar():
             self.release()
-            raise HeldError(f"{self._shown}: another service runs on it; {OTHER_DATABASE}")
+            raise HeldError(f"{self._safe_url}: another service runs on it; {OTHER_DATABASE}")
 
     def release(self) -> None:
         """End the connection, which releases the lock."""
@@ -156,11 +156,11 @@ def reserve(settings: Settings) -> int | None:
 
 def _lock_folder(folder: Path) -> int | None:
     """Lock a folder, or use the lock that the supervisor has passed on; its descriptor."""
-    given = os.environ.get(INHERITED, "")
+    inherited = os.environ.get(INHERITED, "")
     with contextlib.suppress(OSError):
-        if given and os.path.samestat(os.fstat(int(given)), folder.stat()):
-            os.set_inheritable(int(given), False)
-            return int(given)
+        if inherited and os.path.samestat(os.fstat(int(inherited)), folder.stat()):
+            os.set_inheritable(int(inherited), False)
+            return int(inherited)
     try:
         opened = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
@@ -194,7 +194,7 @@ def _lock_places(settings: Settings) -> Iterator[tuple[Path, Path, str]]:
     yield real.with_name(f"{real.name}.lock"), database, OTHER_DATABASE
 
 
-def _take_file(place: Path, shown: Path, fix: str) -> IO[str]:
+def _take_file(place: Path, locked: Path, fix: str) -> IO[str]:
     try:
         file = os.fdopen(os.open(place, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600), "r+", encoding="utf-8")
     except OSError as error:
@@ -204,7 +204,7 @@ def _take_file(place: Path, shown: Path, fix: str) -> IO[str]:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         with file:
-            raise HeldError(f"{shown}: another service runs on it: {_holder(place)}; {fix}") from None
+            raise HeldError(f"{locked}: another service runs on it: {_holder(place)}; {fix}") from None
     except OSError as error:
         file.close()
         raise HeldError(f"{place}: cannot be locked ({error.strerror}); take a folder on a local disk") from error

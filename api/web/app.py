@@ -100,6 +100,10 @@ def _lifespan(context: Any):
 
 def routers(*packages: ModuleType) -> list[APIRouter]:
     """The routers of all files in these packages: a new file is a new subject."""
-    names = [f"{one.__name__}.{info.name}" for one in packages for info in sorted(pkgutil.iter_modules(one.__path__))]
-    found = [value for name in names for value in vars(importlib.import_module(name)).values()]
-    return [value for value in found if isinstance(value, APIRouter)]
+    names = [
+        f"{package.__name__}.{info.name}"
+        for package in packages
+        for info in sorted(pkgutil.iter_modules(package.__path__))
+    ]
+    values = [value for name in names for value in vars(importlib.import_module(name)).values()]
+    return [value for value in values if isinstance(value, APIRouter)]

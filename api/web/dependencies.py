@@ -27,7 +27,9 @@ async def from_request(request: Request) -> Context:
 
 
 Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
-Ask = Annotated[bool, Query(description="a person decides: ask before what deserves a second look (409, `confirm`)")]
+Interactive = Annotated[
+    bool, Query(alias="ask", description="a person decides: ask before what deserves a second look (409, `confirm`)")
+]
 Ctx = Annotated[Context, Depends(from_request)]
 Anyone = Annotated[Principal, Depends(anyone_signed_in)]
 EvenLocked = Annotated[Principal, Depends(anyone_even_locked)]

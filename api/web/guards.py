@@ -52,8 +52,8 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
     async def check(request: Request, _token: Token, _session: Session) -> Principal:
         principal = await identified(request)
         if not principal.may(scope):
-            who = principal.name
-            raise forbidden(f"This needs the scope {scope}; {who} holds {', '.join(sorted(principal.scopes))}.")
+            name = principal.name
+            raise forbidden(f"This needs the scope {scope}; {name} holds {', '.join(sorted(principal.scopes))}.")
         check_csrf(request, principal)
         if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
             await request.app.state.context.people.refuse_unconfirmed(principal)
@@ -66,19 +66,19 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
 async def identified(request: Request) -> Principal:
     """Who asks; where it is a person's own doing, the session is not idle."""
     context = request.app.state.context
-    auth, principal = context.auth, await context.auth.ask(request, bound=True)
+    auth, principal = context.auth, await context.auth.authenticate(request, bound=True)
     if principal.participant is not None:
         await asyncio.to_thread(refuse_outside, context.versions, principal, request.method, request.url.path)
-    request.state.who = principal
+    request.state.principal = principal
     if principal.page_session is not None and is_action(request):
         auth.idle.acted(principal.page_session.hash)
     if wants_html(request) or not request.url.path.startswith("/v1/"):
         # before anything of the page is read: what it shows is not older
-        request.state.version = await asyncio.to_thread(_shown, context.store, request)
+        request.state.version = await asyncio.to_thread(_page_version, context.store, request)
     return principal
 
 
-def _shown(store: Store, request: Request) -> int:
+def _page_version(store: Store, request: Request) -> int:
     """Return the version of what a page shows, by the names in its address; 0 where it has none."""
     names = request.path_params
     with store.read() as session:
@@ -109,7 +109,7 @@ async def anyone_signed_in(request: Request, _token: Token, _session: Session) -
 
 async def anyone_even_locked(request: Request, _token: Token, _session: Session) -> Principal:
     """A dependency: anyone with a valid token or session, which may be locked: to unlock it, or to sign out."""
-    principal = request.state.who = await request.app.state.context.auth.ask(request, forgive_lock=True)
+    principal = request.state.principal = await request.app.state.context.auth.authenticate(request, forgive_lock=True)
     check_csrf(request, principal)
     return principal
 
@@ -143,34 +143,34 @@ nothing.
 Of the models it is the approved one, and what was tracked from it under the approval that holds."""
 
 
-def refuse_outside(registry: Versions, who: Principal, method: str, path: str) -> None:
+def refuse_outside(registry: Versions, principal: Principal, method: str, path: str) -> None:
     """Let pass who is bound to nobody, and a key on what it opens.
 
     Raises ApiError: 403 the key is of another site; or, the same for what is another participant's, for what is not
     there, and for routes that no key opens. 409 a model is asked, and none of the key's participant is approved.
     """
-    if who.participant is None:
+    if principal.participant is None:
         return
-    if not _opens(registry, who.participant, method, path):
-        raise outside(who.participant)
-    row: Participant = registry.store.get(Participant, who.participant)
-    if kept((who.plan or {}).get("site")) != site_of(row):
+    if not _opens(registry, principal.participant, method, path):
+        raise outside(principal.participant)
+    row: Participant = registry.store.get(Participant, principal.participant)
+    if kept((principal.plan or {}).get("site")) != site_of(row):
         detail = "The participant is stimulated at another site now. A person makes a key for it."
         raise ApiError(403, "other-site", "This key is of another site", detail)
 
 
 def _opens(registry: Versions, participant: str, method: str, path: str) -> bool:
     for own_method, pattern, table in OPEN:
-        found = pattern.fullmatch(path)
-        if method != own_method or found is None:
+        match = pattern.fullmatch(path)
+        if method != own_method or match is None:
             continue
         if table is None:
             return True
         if table is str:
-            return found[1] == participant
+            return match[1] == participant
         if table is Model:
-            return _approved(registry, participant, found[1])
-        row = registry.store.get(table, found[1])
+            return _approved(registry, participant, match[1])
+        row = registry.store.get(table, match[1])
         of_test = table is not Recording or (row is not None and row.test_id is not None)
         return row is not None and row.participant == participant and of_test
     return False
@@ -181,8 +181,8 @@ def _approved(registry: Versions, participant: str, model_id: str) -> bool:
     approval = registry.approved(participant)
     if approval is None:
         raise unapproved(participant)
-    own = re.escape(approval.model_id)
-    return re.fullmatch(rf"{own}(\.{approval.id}\.[0-9]+)?", model_id) is not None
+    base = re.escape(approval.model_id)
+    return re.fullmatch(rf"{base}(\.{approval.id}\.[0-9]+)?", model_id) is not None
 
 
 def same_origin(request: HTTPConnection) -> None:
@@ -222,8 +222,8 @@ def if_match(document: str, needed: bool = True) -> Any:
         sent = [tag.strip('"') for field in if_match or () for tag in entity_tags(field)][:MOST_TAGS]
         readable = tuple(tag for tag in sent if re.fullmatch(r"[\w.-]{1,120}", tag, re.ASCII))
         if not readable:
-            own = request.state.who.participant  # a controller's key reads no participant
-            of_key = None if own is None else f"/v1/participants/{own}/model"
+            participant = request.state.principal.participant  # a controller's key reads no participant
+            of_key = None if participant is None else f"/v1/participants/{participant}/model"
             raise version_missing(of_key or document.format(**{"code": "{code}", **request.path_params}))
         return readable
 
@@ -280,10 +280,10 @@ async def _signed_in(request: Request, reason: str) -> Press:
     """Who is signed in; where the database does not say so at once, who was when it last did. Raises ApiError."""
     auth = request.app.state.context.auth
     try:
-        who = await auth.ask_within(request, PATIENCE_S, forgive_age=True, bound=True)
-        return Press(who.name, reason, who.participant is not None)
+        principal = await auth.authenticate_within(request, PATIENCE_S, forgive_age=True, bound=True)
+        return Press(principal.name, reason, principal.participant is not None)
     except (TimeoutError, SQLAlchemyError):
-        if (name := auth.seen(request)) is not None:
+        if (name := auth.last_known_name(request)) is not None:
             return Press(name, reason, by_key=True)  # whether a key asks is not known: then nobody else is named
         raise not_answering() from None
 

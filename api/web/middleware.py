@@ -146,18 +146,18 @@ class BodyLimit(HttpMiddleware):
         if scope["path"].rstrip("/").endswith(UPLOAD):
             limit, patience_s = int(self.context.settings.max_upload_mb * 1e6), UPLOAD_S
         end_s = asyncio.get_running_loop().time() + patience_s
-        taken, whole = 0, False
+        received, whole = 0, False
 
         async def bounded() -> Message:
-            nonlocal taken, whole
+            nonlocal received, whole
             try:
                 async with asyncio.timeout_at(None if whole else end_s):
                     message = await receive()
             except TimeoutError:
                 raise HTTPException(408, "The request was not complete in time. Send it again.") from None
-            taken += len(message.get("body", b""))
+            received += len(message.get("body", b""))
             whole = not message.get("more_body", False)
-            if taken > limit:
+            if received > limit:
                 raise HTTPException(413, f"At most {limit / 1e6:g} MB are taken here.")
             return message
 

@@ -77,8 +77,12 @@ def _pulses(context: Context) -> Iterator[Metric]:
         ("stimrig_pulse_lateness_seconds", "Of the pulses of the newest test that ended", "lateness_ms"),
         ("stimrig_pulse_acknowledgement_seconds", "From a pulse to its acknowledgement, in it", "ack_delay_ms"),
     ):
-        found = summary.get(key) or {}
-        values = {QUANTILES[one]: 1e-3 * found[one] for one in QUANTILES if isinstance(found.get(one), float | int)}
+        quantiles = summary.get(key) or {}
+        values = {
+            QUANTILES[level]: 1e-3 * quantiles[level]
+            for level in QUANTILES
+            if isinstance(quantiles.get(level), float | int)
+        }
         yield by_label(name, words, "quantile", values)
     yield from gauges((
         ("stimrig_live_listeners", "Open live channels", context.runner.hub.listeners),

@@ -60,9 +60,9 @@ def describe(app: FastAPI) -> None:
     plain = app.openapi
 
     def openapi() -> dict[str, Any]:
-        made = app.openapi_schema is not None
+        is_complete = app.openapi_schema is not None
         document = plain()
-        if not made:
+        if not is_complete:
             _complete(document)
             schemes = document["components"]["securitySchemes"]
             schemes["session"]["name"] = app.state.context.auth.cookie_name
@@ -74,8 +74,8 @@ def describe(app: FastAPI) -> None:
 def _complete(document: dict[str, Any]) -> None:
     components = document["components"]["schemas"]
     for model in (Problem, LiveOut, TrackedOut):
-        own = model.model_json_schema(ref_template="#/components/schemas/{model}")
-        components.update(own.pop("$defs", {}) | {model.__name__: own})
+        schema = model.model_json_schema(ref_template="#/components/schemas/{model}")
+        components.update(schema.pop("$defs", {}) | {model.__name__: schema})
     components["JsonValue"] = {"description": "any JSON value: what it holds depends on its key"}
     for name in ("HTTPValidationError", "ValidationError"):  # FastAPI's own words; ours are a Problem
         components.pop(name, None)

@@ -17,7 +17,7 @@ from starlette.requests import ClientDisconnect
 
 from stimrig.api.errors import ApiError, invalid, not_answering
 from stimrig.api.web.middleware import wants_html
-from stimrig.api.web.pages.render import look, problem_page
+from stimrig.api.web.pages.render import identify_viewer, problem_page
 
 log = logging.getLogger("stimrig.api")
 
@@ -83,7 +83,7 @@ async def respond(request: Request, error: Exception) -> Response:
     elif isinstance(error, ClientDisconnect):
         log.info("%s %s: the client left before the whole request was here", request.method, path)
     if wants_html(request):
-        await look(request)
+        await identify_viewer(request)
         return problem_page(request, problem)
     body = problem.body(str(request.url.path))
     return JSONResponse(body, problem.status, problem.headers, "application/problem+json")

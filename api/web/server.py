@@ -37,8 +37,8 @@ def main() -> int:
     """Run the service until SIGTERM or Ctrl-C; return the exit code."""
     logs.configure()
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)  # each connection is a file
-    most = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
-    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, most), hard))
+    max_files = MOST_FILES if hard == resource.RLIM_INFINITY else min(hard, MOST_FILES)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, max_files), hard))
     os.umask(os.umask(0o077) | 0o077)  # what the service and its workers write is for their user only
     try:
         settings = Settings()
@@ -48,7 +48,7 @@ def main() -> int:
         listener = bind(settings.host, settings.port)
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-        lock.tell(url)
+        lock.write_holder(url)
         asyncio.run(carried_structure.refuse_unknown(settings))  # before a first token is drawn: it is told only once
         app = create_app(settings, lock=lock)
     except (ApiError, SettingsError, OSError) as error:

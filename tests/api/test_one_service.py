@@ -107,7 +107,7 @@ def test_a_removed_lock_file_lets_nobody_in_and_is_locked_anew(tmp_path: Path) -
     for refused in (held, lambda **given: reserve(Settings(**given))):
         with pytest.raises(HeldError, match=f"{tmp_path}: another service runs on it"):
             refused(data_dir=tmp_path)
-    first.keep()
+    first.renew()
     assert {lock.name for lock in tmp_path.glob("*.lock")} == {"service.lock", "stimrig.db.lock"}
     with pytest.raises(HeldError, match=f"process {os.getpid()} on"):
         held(data_dir=tmp_path / ".." / tmp_path.name)
@@ -123,9 +123,9 @@ def test_a_service_whose_database_another_has_locked_meanwhile_ends(
     first = held(data_dir=tmp_path / "one", **database)
     (tmp_path / "shared.db.lock").unlink()
     second = held(data_dir=tmp_path / "two", **database)
-    second.keep()
+    second.renew()
     assert signals == []
-    first.keep()
+    first.renew()
     assert signals == [signal.SIGTERM]
     first.release()
     second.release()
@@ -230,7 +230,7 @@ def test_new_folders_are_closed_and_shared_ones_stay_as_they_are(tmp_path: Path)
 
 def test_the_message_names_nobody_who_is_gone(tmp_path: Path) -> None:
     first = held(data_dir=tmp_path)
-    first.tell("http://127.0.0.1:1234")
+    first.write_holder("http://127.0.0.1:1234")
     first.release()
     second = held(data_dir=tmp_path)
     with pytest.raises(HeldError) as caught:

@@ -187,7 +187,7 @@ def test_a_second_service_is_refused_until_the_first_has_ended(cluster: Cluster,
         lock(cluster, tmp_path / "b")
     assert "\n" not in str(caught.value)
     cluster.restart()
-    first.keep()
+    first.renew()
     with pytest.raises(HeldError, match="another service runs on it"):
         lock(cluster, tmp_path / "b")
     first.release()
@@ -204,9 +204,9 @@ def test_a_service_whose_lock_another_one_took_ends(
     with store.engine.connect() as connection:  # as a network that is cut
         connection.exec_driver_sql("SELECT pg_terminate_backend(pid) FROM pg_locks WHERE locktype = 'advisory'")
     second = lock(cluster, tmp_path / "b")
-    first.keep()
+    first.renew()
     assert killed == [(os.getpid(), signal.SIGTERM)]
-    second.keep()
+    second.renew()
     assert len(killed) == 1
     for one in (first, second, store):
         one.close() if isinstance(one, Store) else one.release()

@@ -31,7 +31,7 @@ FINE_US = (1.0, 25.0)
 
 
 @router.get("/participants/{code}/calibration")
-async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
+async def show(request: Request, context: Ctx, _principal: Tester, code: str) -> Response:
     """Show where the calibration stands, or the form that begins one."""
     row = await asyncio.to_thread(participants.find, context, code)
     try:
@@ -41,17 +41,17 @@ async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Respo
             raise
         standing = None
     status = context.rig.status
-    kept = status.calibrated if status and standing is None else None
-    waits = kept if kept is not None and kept.participant == code else None
+    finished = status.calibrated if status and standing is None else None
+    waits = finished if finished is not None and finished.participant == code else None
     low_us, high_us = fine_range(status)
-    own = {"current_ma": number_text(row.profile["current_ma"]), "step_us": number_text(DEFAULTS.step_us)}
-    takes = {
+    texts = {"current_ma": number_text(row.profile["current_ma"]), "step_us": number_text(DEFAULTS.step_us)}
+    help_texts = {
         "current_ma": profiles.takes("current_ma", status.limits if status else {}),
         "step_us": f"{low_us:g} to {high_us:g} µs",
     }
     return page(
         request, "calibration.html", participant=row, found=standing, waits=waits, marks=MARKS,
-        last=last(row.profile), texts=own, help=takes,
+        last=last(row.profile), texts=texts, help=help_texts,
     )  # fmt: skip
 
 

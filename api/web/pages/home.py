@@ -14,10 +14,10 @@ from stimrig.api.people.auth import LOCKED, Scope
 from stimrig.api.services import participants
 from stimrig.api.web.dependencies import Context, Ctx, EvenLocked
 from stimrig.api.web.guards import identified, local
-from stimrig.api.web.pages.render import look, page, problem_page
+from stimrig.api.web.pages.render import identify_viewer, page, problem_page
 
 router = APIRouter(include_in_schema=False)
-SHOWN = 50
+FIRST_ROWS = 50
 """So many participants are on the first page; a search, or one click, finds the others."""
 
 
@@ -34,19 +34,19 @@ class Search:
 async def home(request: Request, context: Ctx, q: str = "", archived: str = "", all: str = "") -> Response:
     """Show participants and the rig; the sign-in form to who is not signed in."""
     try:
-        who = await identified(request)
+        principal = await identified(request)
     except ApiError as error:
         return await sign_in(request, context) if error.code != LOCKED[0] else problem_page(request, error)
-    asked = Search(q[:80].strip(), archived == "1", all == "1")
-    listed = await asyncio.to_thread(_list, context, asked) if who.may(Scope.RUN_TEST) else None
-    return page(request, "home.html", asked=asked, listed=listed)
+    search = Search(q[:80].strip(), archived == "1", all == "1")
+    listed = await asyncio.to_thread(_list, context, search) if principal.may(Scope.RUN_TEST) else None
+    return page(request, "home.html", search=search, listed=listed)
 
 
-def _list(context: Context, asked: Search) -> dict[str, Any]:
-    matching = participants.matching(context.store, asked.q, asked.archived)
-    shown = [row for row, _last_utc in (matching if asked.all else matching[:SHOWN])]
+def _list(context: Context, search: Search) -> dict[str, Any]:
+    matching = participants.matching(context.store, search.q, search.archived)
+    listed = [row for row, _last_utc in (matching if search.all else matching[:FIRST_ROWS])]
     count = participants.participant_counts(context.store)
-    rows = participants.list_rows(context.store, context.versions, shown)
+    rows = participants.list_rows(context.store, context.versions, listed)
     return {"rows": rows, "more": len(matching) - len(rows), "count": count}
 
 
@@ -54,13 +54,13 @@ def _list(context: Context, asked: Search) -> dict[str, Any]:
 async def sign_in(request: Request, context: Ctx, next: str = "/") -> Response:
     """Show the sign-in form."""
     people = await asyncio.to_thread(context.people.any)
-    await look(request)
+    await identify_viewer(request)
     return page(request, "sign_in.html", next=local(next), people=people)
 
 
 @router.get("/locked")
-async def locked(request: Request, who: EvenLocked, next: str = "/") -> Response:
+async def locked(request: Request, principal: EvenLocked, next: str = "/") -> Response:
     """Ask for the password of a locked session; straight on where nothing is locked."""
-    if not who.locked:
+    if not principal.locked:
         return RedirectResponse(local(next), 303)
-    return page(request, "locked.html", waiting=who, next=local(next))
+    return page(request, "locked.html", waiting=principal, next=local(next))

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Annotated, Any
 
-from fastapi import APIRouter, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
 from stimrig.api.errors import ApiError
@@ -25,7 +25,7 @@ ISOMETRIC = ("pre-session", "adaptive", "next-experiment")
 
 
 @router.get("/participants/{code}/joint")
-async def show(request: Request, context: Ctx, _who: Tester, code: str) -> Response:
+async def show(request: Request, context: Ctx, _principal: Tester, code: str) -> Response:
     """Show sensor, range, the three kinds of tests with what is open, and the recordings of today."""
     row = await asyncio.to_thread(participants.find, context, code)
     problem = None
@@ -45,12 +45,14 @@ def _gather(context: Context, row: Participant, overview: dict[str, Any]) -> dic
     )  # fmt: skip
     rows = context.store.all(Test, *conditions, order=Test.requested_utc)
     picked, next_rad = _newest_of_each(rows), overview["next_rad"]
-    held = [{**each, "deg": starting.allowed_deg({"target_rad": each["angle_rad"]})} for each in overview["targets"]]
+    held_targets = [
+        {**each, "deg": starting.allowed_deg({"target_rad": each["angle_rad"]})} for each in overview["targets"]
+    ]
     return {
         "range_rad": profiles.range_of(row.profile),
         "may_start": starting.calibrated(context, row).may_start,
         "archived": row.archived_utc is not None,
-        "held": held,
+        "held": held_targets,
         "allowed": None if next_rad is None else starting.allowed_deg({"target_rad": next_rad}),
         "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],
         "kinds_lacking": [kind for kind in (PASSIVE, HELD, MOVING) if not any(test.kind == kind for test in rows)],
@@ -67,9 +69,11 @@ def _newest_of_each(rows: list[Test]) -> set[str]:
 
 
 @router.get("/rig/angle")
-async def show_sensor(request: Request, context: Ctx, _who: Tester, again: str = "") -> Response:
-    """Show what the sensor reads, how it was calibrated, and the next pose; `again`: the first one once more."""
+async def show_sensor(
+    request: Request, context: Ctx, _principal: Tester, restart: Annotated[str, Query(alias="again")] = ""
+) -> Response:
+    """Show what the sensor reads, how it was calibrated, and the next pose; `restart`: from the first pose."""
     if context.rig.connected:
         await context.rig.fresh_status()
     sensor = joint.sensor(context)
-    return page(request, "angle.html", sensor=sensor, second=sensor.pose is not None and not again)
+    return page(request, "angle.html", sensor=sensor, second=sensor.pose is not None and not restart)

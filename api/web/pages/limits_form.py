@@ -28,7 +28,7 @@ def has_sensor(status: Status | None) -> bool:
 def fields(profile: Mapping[str, Any], status: Status | None) -> list[dict[str, str]]:
     """Return name, label, text and help of each field, with what this rig takes."""
     bounds = status.limits if status else {}
-    found = [
+    entries = [
         {
             "name": name, "id": name, "label": limit.label, "type": "number", "empty": "",
             "text": number_text(profile[name]) if name in profile else "", "help": profiles.takes(name, bounds),
@@ -36,12 +36,12 @@ def fields(profile: Mapping[str, Any], status: Status | None) -> list[dict[str, 
         for name, limit in profiles.LIMITS.items()
     ]  # fmt: skip
     if status is None or not status.angle.present:
-        return found
+        return entries
     range_rad = profiles.range_of(profile)
     outdated = profiles.range_outdated(profile, calibrated_utc(status))
     texts = ["", ""] if range_rad is None or outdated else [angle_text(angle) for angle in range_rad]
     within = "" if status.angle.range_rad is None else f"within {profiles.range_words(status.angle.range_rad)} (rig)"
-    return found + [
+    return entries + [
         {
             "name": profiles.RANGE, "id": f"angle-{number}", "label": label, "type": "degrees list", "empty": "null",
             "text": text, "help": words,

@@ -29,7 +29,7 @@ BUSY = ("arming", "running", "stopping", "sealing", "calibrating", render.PASSIV
 """States in which the rig plays something, or lets go of it."""
 REARM = "The rig has stopped and needs a re-arm. Look at the participant, then press the button above."
 SILENT = "The rig does not answer. A test is possible when it does."
-STANDS = {
+RIG_ADVICE = {
     "latched": REARM, "uncertain": REARM, "unreachable": SILENT, "silent": SILENT,
     "disconnected": "A device is not connected. See above what to check.",
 }  # fmt: skip
@@ -85,7 +85,7 @@ class Situation:
     lacks_key: Literal["", "mine", "another's"] = ""
     """No controller has a key for that model: whether who looks may make one."""
     archived_since: str = ""
-    asked: bool = False
+    needs_test: bool = False
     """The trials of the approved model ask for a new test."""
     unstored: bool = False
     """The rig keeps a finished calibration of theirs that the service could not store."""
@@ -103,14 +103,14 @@ class Step:
     @property
     def key(self) -> str:
         """Changes when the line does."""
-        shown = crc32(f"{self.words} {self.button} {self.href}".encode())
-        return f"{self.kind} {shown:08x}"
+        checksum = crc32(f"{self.words} {self.button} {self.href}".encode())
+        return f"{self.kind} {checksum:08x}"
 
 
 def next_step(now: Situation) -> Step:
     """The next step."""
-    looks = (_under_way, _archived, _model_waits, _rig_stands, _served, _rig_is_busy)
-    return next(filter(None, (look(now) for look in looks)), None) or _test_waits(now)
+    rules = (_under_way, _archived, _model_waits, _rig_stands, _served, _rig_is_busy)
+    return next(filter(None, (rule(now) for rule in rules)), None) or _test_waits(now)
 
 
 def _under_way(now: Situation) -> Step | None:
@@ -157,7 +157,7 @@ def _model_waits(now: Situation) -> Step | None:
 
 def _rig_stands(now: Situation) -> Step | None:
     """What keeps the rig from playing anything, a controller's trials, too."""
-    words = STANDS.get(now.rig)
+    words = RIG_ADVICE.get(now.rig)
     has = f"{_has_model(now)} " if now.served_until else ""
     kind: Kind = "rearm" if now.rig in ("latched", "uncertain") else "wait"
     return None if words is None else Step(kind, f"{has}{words}")
@@ -165,16 +165,16 @@ def _rig_stands(now: Situation) -> Step | None:
 
 def _served(now: Situation) -> Step | None:
     """Done where the controller has a model, unless its trials, or tests of the joint, ask for more."""
-    if now.served_until and now.asked:
+    if now.served_until and now.needs_test:
         words = "The trials say that a new test is needed."
         return Step("asked", words, "See why", f"/participants/{now.code}#trials")
     if now.of == "joint":
         return None
     if now.served_until:
-        said = f"{_ended(now) or ('' if now.lacks_key else 'Done.' + ' ')}{_has_model(now)}"
+        words = f"{_ended(now) or ('' if now.lacks_key else 'Done.' + ' ')}{_has_model(now)}"
         if now.lacks_key == "mine":
-            return Step("done", said, "Make a controller key", f"/participants/{now.code}#keys")
-        return Step("done", said, "Back to the participants", "/")
+            return Step("done", words, "Make a controller key", f"/participants/{now.code}#keys")
+        return Step("done", words, "Back to the participants", "/")
     return None
 
 
@@ -228,12 +228,12 @@ def _ended(now: Situation) -> str:
 
 
 @router.get("/participants/{code}/next")
-async def key(context: Ctx, who: Tester, code: str) -> dict[str, str]:
+async def key(context: Ctx, principal: Tester, code: str) -> dict[str, str]:
     """Return what changes when the line, or the card of the trials, is another one."""
 
     def read() -> dict[str, str]:
         row = participants.find(context, code)
-        return {"key": step(context, row, who).key, "trials": trials_key(context, code)}
+        return {"key": step(context, row, principal).key, "trials": trials_key(context, code)}
 
     return await asyncio.to_thread(read)
 
@@ -244,7 +244,7 @@ def trials_key(context: Context, code: str) -> str:
     return f"{approval.id} {len(context.tracked.rows(approval.id))}" if approval else ""
 
 
-def step(context: Context, row: Participant, who: Principal) -> Step:
+def step(context: Context, row: Participant, principal: Principal) -> Step:
     """The participant's next step now, for who looks."""
     state, current = render.state_of(context), context.runner.current
     opened = context.rig.status.calibration if context.rig.status else None
@@ -252,7 +252,7 @@ def step(context: Context, row: Participant, who: Principal) -> Step:
     test = _last_test(context, row.code)
     kept_by_rig = context.rig.status.calibrated if context.rig.status else None
     models = context.versions.of(row.code, since_utc=context.clock.start_of_day_utc())
-    kept = next(filter(_counts, models), None)
+    newest = next(filter(_counts, models), None)
     served = context.versions.approved(row.code)
     of = _kind_of(test, models)  # a trial of today was played by somebody's own token where there is no key
     keyless = served is not None and of != "trial" and not controllers.has_key(context.auth, row.code)
@@ -265,12 +265,12 @@ def step(context: Context, row: Participant, who: Principal) -> Step:
         test=test.id if test else "",
         of=of,
         state=context.runner.document(test)["state"] if test else "",
-        model=Today(kept["id"], kept["verdict"], kept["decision"] == "approved") if kept else None,
-        rejected=bool(models) and kept is None,
+        model=Today(newest["id"], newest["verdict"], newest["decision"] == "approved") if newest else None,
+        rejected=bool(models) and newest is None,
         served_until=local_time.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
-        lacks_key="" if not keyless else "mine" if who.may(Scope.APPROVE_MODEL) else "another's",
+        lacks_key="" if not keyless else "mine" if principal.may(Scope.APPROVE_MODEL) else "another's",
         archived_since=local_time.when(row.archived_utc) if row.archived_utc else "",
-        asked=served is not None and context.tracked.asks(served.id) is not None,
+        needs_test=served is not None and context.tracked.asks(served.id) is not None,
         unstored=kept_by_rig is not None and kept_by_rig.participant == row.code,
     )
     return next_step(now)

@@ -30,30 +30,30 @@ environment.globals["muscles"] = ("biceps brachii", "triceps brachii")
 
 
 @router.get("/participants/{code}")
-async def participant(request: Request, context: Ctx, who: Tester, code: str) -> Response:
+async def participant(request: Request, context: Ctx, principal: Tester, code: str) -> Response:
     """Show limits, the next step, and the history of tests and models."""
 
     def gather() -> dict[str, Any]:
         row, status = participants.find(context, code), context.rig.status
-        models, shown = context.versions.of(code), render.rows_shown(request)
-        tests = context.runner.documents(code, models, shown and shown + 1)
+        models, limit = context.versions.of(code), render.rows_shown(request)
+        tests = context.runner.documents(code, models, limit and limit + 1)
         return {
             "participant": row,
             "notes": context.notes.participant_notes(code),
             "calibrated": starting.calibrated(context, row),
-            "step": next_view.step(context, row, who),
-            "meanwhile": participants.meanwhile(context, code),
+            "step": next_view.step(context, row, principal),
+            "meanwhile": participants.effect_on_open_work(context, code),
             "fields": limits_form.fields(row.profile, status),
-            "tests": tests[:shown],
-            "models": models[:shown],
-            "more": shown is not None and max(len(models), len(tests)) > shown,
+            "tests": tests[:limit],
+            "models": models[:limit],
+            "more": limit is not None and max(len(models), len(tests)) > limit,
             "keys": controllers.keys_of(context.auth, code),
             "trials": trials_card(context, code),
             "trials_key": next_view.trials_key(context, code),
             "sensor": limits_form.has_sensor(status),
         }
 
-    ask_password = not await context.people.is_confirmed(who.session_hash)
+    ask_password = not await context.people.is_confirmed(principal.session_hash)
     return page(request, "participant.html", ask_password=ask_password, **await asyncio.to_thread(gather))
 
 

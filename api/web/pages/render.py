@@ -40,16 +40,16 @@ BACK = {"models": "Back to the model", "participants": "Back to the participant"
 
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """A page, with the bar that every page has."""
-    looking: Principal | None = getattr(request.state, "who", None)
-    principal = None if looking is None or looking.locked else looking
+    viewer: Principal | None = getattr(request.state, "principal", None)
+    principal = None if viewer is None or viewer.locked else viewer
     context: Context = request.app.state.context
-    bar = {**bar_of(context, principal), "right": stop_right(request, looking), "version": request.app.version}
-    shown = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
-    shown["shown_version"] = getattr(request.state, "version", 0)
-    shown["csrf"] = (looking.csrf if looking else None) or ""
-    kept = request.cookies.get(COLOURS, "")
-    shown["colours"] = kept if kept in CHOICES else "system"
-    html = environment.get_template(template).render(request=request, **shown, **values)
+    bar = {**bar_of(context, principal), "right": stop_right(request, viewer), "version": request.app.version}
+    common = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
+    common["shown_version"] = getattr(request.state, "version", 0)
+    common["csrf"] = (viewer.csrf if viewer else None) or ""
+    colours = request.cookies.get(COLOURS, "")
+    common["colours"] = colours if colours in CHOICES else "system"
+    html = environment.get_template(template).render(request=request, **common, **values)
     return HTMLResponse(html, status_code=status)
 
 
@@ -59,21 +59,21 @@ def zone(context: Context) -> str:
     return offset if name in ("", offset, "Etc/UTC") else f"{name} ({offset})"
 
 
-async def look(request: Request) -> None:
+async def identify_viewer(request: Request) -> None:
     """Find out who looks at a page that anybody may see, for its bar.
 
     Nobody, where the database does not answer at once: what a stop did is said all the same, and the stop button is
     there for who was signed in when the database last answered.
     """
-    if getattr(request.state, "who", None) is not None:
+    if getattr(request.state, "principal", None) is not None:
         return
     context = request.app.state.context
     try:
-        request.state.who = await context.auth.ask_within(request, LOOK_S, forgive_age=True)
+        request.state.principal = await context.auth.authenticate_within(request, LOOK_S, forgive_age=True)
     except ApiError:
         return
     except (SQLAlchemyError, TimeoutError):
-        name = context.auth.seen_on_page(request)
+        name = context.auth.last_known_name_on_page(request)
         if name is not None and getattr(request.state, "stop_right", None) is None:
             request.state.stop_right = _right_of(context, name)
 
@@ -181,7 +181,7 @@ def rig_now(context: Context, principal: Principal | None) -> dict[str, Any]:
         state = PASSIVE
     flow, more = WORDS[state]
     torque_nm, age_s = torque_now(context)
-    shown: dict[str, Any] = {
+    public: dict[str, Any] = {
         "state": state,
         "flow": str(flow),
         "more": str(more),
@@ -190,11 +190,11 @@ def rig_now(context: Context, principal: Principal | None) -> dict[str, Any]:
         "ready": state == "ready",
     }
     if principal is None:
-        return shown
+        return public
     current, status = context.runner.current, context.rig.status
     angle_rad = context.runner.hub.angle()
     return {
-        **shown,
+        **public,
         "torque_nm": torque_nm,
         "torque_age_s": age_s,
         "test": {"id": current.test_id, "participant": current.participant} if current else None,
@@ -206,8 +206,8 @@ def rig_now(context: Context, principal: Principal | None) -> dict[str, Any]:
 
 def notice_key(context: Context, state: str) -> str:
     """A key that changes when the notice changes."""
-    told = f"{status.latch} {status.reason}" if (status := context.rig.status) else ""
-    return hashlib.sha256(f"{state} {told}".encode()).hexdigest()[:12]
+    latched = f"{status.latch} {status.reason}" if (status := context.rig.status) else ""
+    return hashlib.sha256(f"{state} {latched}".encode()).hexdigest()[:12]
 
 
 def what_to_check(reason: str) -> str:

@@ -99,7 +99,7 @@ def missing_parts(view: dict[str, Any] | None, comparison: dict[str, Any] | None
 
 
 def story_html(
-    told: dict[str, Any], before: dict[str, Any], after: dict[str, Any], name: str,
+    story: dict[str, Any], before: dict[str, Any], after: dict[str, Any], name: str,
     refused: Sequence[dict[str, Any]] = (), structure: str = "",
 ) -> str:  # fmt: skip
     """Write the story of a model.
@@ -117,10 +117,10 @@ def story_html(
     structure : str
         The structure that the first model had.
     """
-    figures = story_charts.story_figures(told, before, after)
+    figures = story_charts.story_figures(story, before, after)
     begun = f" · begun with {structure}" if structure else ""
-    lead = f"{name} · noise {told['noise_sd_nm'] or 0.0:.4f} N·m{begun}"
-    return _write(title=told["title"], lead=lead, story=told, figures=figures, refused=refused)
+    lead = f"{name} · noise {story['noise_sd_nm'] or 0.0:.4f} N·m{begun}"
+    return _write(title=story["title"], lead=lead, story=story, figures=figures, refused=refused)
 
 
 def _write(**values: Any) -> str:

@@ -37,7 +37,7 @@ async def report(request: Request, context: Ctx, _principal: ModelReader, row: V
     charts = draw_model(document, measured)
     diagnosis = await asyncio.to_thread(context.analyses.known_diagnosis, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
-    drawn = await asyncio.to_thread(
+    charts_svg = await asyncio.to_thread(
         lambda: {
             name: svg(charts[name], width, height, words, light=True)
             for name, (width, height, words) in CHARTS.items()
@@ -49,7 +49,7 @@ async def report(request: Request, context: Ctx, _principal: ModelReader, row: V
         "report_sheet.html",
         model=await asyncio.to_thread(context.versions.document, row),
         **await facts(context, row, document),
-        drawn=drawn,
+        drawn=charts_svg,
         problem=measured["problem"],
         why=explanation.view(diagnosis, measured["comparison"]) if diagnosis else None,
         versions=await asyncio.to_thread(versions_of, context, row),

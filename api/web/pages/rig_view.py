@@ -10,7 +10,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import LOCKED
 from stimrig.api.web.dependencies import Ctx
 from stimrig.api.web.pages import render
-from stimrig.api.web.pages.render import look, page
+from stimrig.api.web.pages.render import identify_viewer, page
 
 router = APIRouter(include_in_schema=False)
 
@@ -20,7 +20,7 @@ async def rig_now(request: Request, context: Ctx) -> Response:
     """Return the state for the bar of every page, also of one whose session has ended."""
     principal, locked, known = None, False, True
     try:
-        principal = await context.auth.ask(request)
+        principal = await context.auth.authenticate(request)
     except ApiError as error:  # the state is told all the same
         locked = error.code == LOCKED[0]
     except SQLAlchemyError:
@@ -37,7 +37,7 @@ async def stopped(request: Request, context: Ctx, key: str) -> Response:
     """
     stop = context.stops.get(key)
     request.state.stop_right = stop.right
-    await look(request)
+    await identify_viewer(request)
     if isinstance(stop.answer, ApiError):
         return page(request, "problem.html", stop.answer.status, problem=stop.answer, back=None)
     return page(request, "stop.html", told=stop, evidence=stop.answer)

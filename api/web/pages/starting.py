@@ -53,8 +53,8 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
     if state == "none":
         required = bool(context.rig.status and context.rig.status.require_calibration)
         return Calibrated(state, "not calibrated", not required)
-    own = AuditEntry.subject == row.code, AuditEntry.action == "finish calibration"
-    entry = context.store.first(AuditEntry, *own, order=AuditEntry.seq.desc())
+    conditions = AuditEntry.subject == row.code, AuditEntry.action == "finish calibration"
+    entry = context.store.first(AuditEntry, *conditions, order=AuditEntry.seq.desc())
     time, end = when(profile.get("set_at_utc")), until(profile.get("expires_at_utc"))
     ends = f"expired {end}" if state == "expired" else f"valid until {end}"
     return Calibrated(state, f"found on {time} by {entry.who if entry else '–'}, {ends}", state == "valid")
@@ -62,7 +62,7 @@ def calibrated(context: Context, row: Participant) -> Calibrated:
 
 @router.get("/participants/{code}/start")
 async def start(
-    request: Request, context: Ctx, who: Tester, code: str, kind: str = PRE_SESSION, target: float | None = None,
+    request: Request, context: Ctx, principal: Tester, code: str, kind: str = PRE_SESSION, target: float | None = None,
     target_rad: float | None = None, model: str = "",
 ) -> Response:  # fmt: skip
     """Preview the test that the address names, and offer to start it.
@@ -91,8 +91,8 @@ async def start(
         detail = f"{code}'s calibration: {standing.words}. This rig needs a calibration of today before a test."
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
     labels = {name: request.query_params.get(name, "").strip() or None for name in LABEL_TITLES}
-    own = await asyncio.to_thread(fields_of_kind, context, code, kind, target, target_rad, model)
-    body = checked_test(participant=code, kind=kind, **labels, **own)
+    fields = await asyncio.to_thread(fields_of_kind, context, code, kind, target, target_rad, model)
+    body = checked_test(participant=code, kind=kind, **labels, **fields)
     preview = await context.runner.preview(body)
     widest_us, joint = max(preview["pulse_width_us"], default=0.0), preview.get("joint")
     stimulates = widest_us > 0.0
@@ -103,7 +103,7 @@ async def start(
         participant=row,
         title=f"Start the {words(body.kind, 'kind')} of {code}?",
         button=f"Start now: {strength if stimulates else 'no stimulation'}",
-        rows=[*rows(context, row, preview, standing, who), *label_rows(vars(body))],
+        rows=[*rows(context, row, preview, standing, principal), *label_rows(vars(body))],
         warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
         stimulates=stimulates,
         at_deg=allowed_deg(joint) if joint else None,
@@ -155,7 +155,7 @@ def out_of_reach(preview: dict[str, Any]) -> list[str]:
 
 
 def rows(
-    context: Context, row: Participant, preview: dict[str, Any], standing: Calibrated, who: Principal
+    context: Context, row: Participant, preview: dict[str, Any], standing: Calibrated, principal: Principal
 ) -> list[Row]:
     """List what a person has to know before pressing the button."""
     widths_us, torque_time = preview["pulse_width_us"], preview.get("torque_time_nms")
@@ -173,11 +173,11 @@ def rows(
         dose = f"at most {number(bounds['max_torque_time_nms'], 0, 'N·m·s')} of torque"
         more = [("Stops once known within", number(preview["target"]["curve_percent"], 1, "%"))]
         more += [("Expected", reach["words"])] if reach["reachable"] else []
-    most = number(row.profile["max_pulse_width_us"], 0, "µs")
+    widest = number(row.profile["max_pulse_width_us"], 0, "µs")
     current = [
         ("Side and muscle", site_words(site_of(row))),
         ("Current of every pulse", current_words(row)),
-        ("Widest pulse", f"{number(widest_us, 0, 'µs')}, comfort maximum {most}"),
+        ("Widest pulse", f"{number(widest_us, 0, 'µs')}, comfort maximum {widest}"),
     ]
     return [
         ("Who", row.code),
@@ -187,7 +187,7 @@ def rows(
         ("Dose", dose),
         ("Stops at", number(row.profile["max_torque_nm"], 1, "N·m")),
         *([("Calibration", standing.words)] if widest_us > 0.0 else []),
-        ("Run by", who.name),
+        ("Run by", principal.name),
         ("Rig", rig_words(context)),
     ]
 

@@ -74,7 +74,7 @@ async def compare(
     sessions = await asyncio.to_thread(context.trend.for_models, participant, [row.id for row in rows])
     number = next((number for number, row in enumerate(rows) if row.id == reference), 0)
     sides = await asyncio.gather(*(_side(context, rows, number) for number in range(len(rows))))
-    doubts = [(local_time.when(row.created_utc), changes.doubt_sentences(sessions[number].state(), session.state()))
+    doubt_rows = [(local_time.when(row.created_utc), changes.doubt_sentences(sessions[number].state(), session.state()))
               for row, session in zip(rows, sessions, strict=True) if session is not sessions[number]]  # fmt: skip
     return page(
         request,
@@ -83,14 +83,14 @@ async def compare(
         sides=sides,
         reference=number,
         table=comparison(sessions, number),
-        doubts=doubts,
+        doubts=doubt_rows,
         figures=_draw(rows, [side["curves"] for side in sides]),
     )
 
 
-async def chosen(context: Context, asked: list[str] | None) -> list[Model]:
+async def chosen(context: Context, model_ids: list[str] | None) -> list[Model]:
     """Return the models, the oldest first; 422 if they are too few, too many, or of different participants."""
-    ids = list(dict.fromkeys(asked or []))
+    ids = list(dict.fromkeys(model_ids or []))
     if not 2 <= len(ids) <= MOST:
         detail = f"{len(ids)} are chosen. Go back and choose 2 to {MOST} models of the participant."
         raise ApiError(422, "two-models", "Choose two models or more to compare", detail)

@@ -25,7 +25,7 @@ router = APIRouter(include_in_schema=False)
 
 
 @router.get("/tests/{test_id}")
-async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -> Response:
+async def test(request: Request, context: Ctx, _principal: LiveReader, test_id: str) -> Response:
     """A test: live while it runs, its outcome after."""
     row = await asyncio.to_thread(tests.find, context, test_id)
     document = await asyncio.to_thread(context.runner.document, row)
@@ -37,12 +37,12 @@ async def test(request: Request, context: Ctx, _who: LiveReader, test_id: str) -
         "test": document, "planned_us": fixed, "pulse_rate_hz": row.plan.get("pulse_rate_hz", 40.0), "limits": bounds,
         "sensor": joint is not None or (status is not None and status.angle.present),
     }  # fmt: skip
-    shown: dict[str, Any] = (
+    picture: dict[str, Any] = (
         await draw_ended(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
     )
     notes = await asyncio.to_thread(context.notes.test_notes, test_id)
     missing = missing_words(((joint or {}).get("coverage") or {}).get("missing"))
-    return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, missing=missing, **shown)
+    return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, missing=missing, **picture)
 
 
 def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
@@ -73,10 +73,10 @@ async def draw_ended(context: Context, row: Test) -> dict[str, Any]:
 async def measured(context: Context, model_id: str) -> Markup | None:
     """What was measured, with the model's free run; None where it cannot be had."""
     row = await asyncio.to_thread(context.versions.get, model_id)
-    found = await measurement(context, row)
-    if found["curves"] is None:
+    measurements = await measurement(context, row)
+    if measurements["curves"] is None:
         return None
-    figure = draw_model(stored_model.read(row), found)["comparison"]
+    figure = draw_model(stored_model.read(row), measurements)["comparison"]
     words = "Torque measured and predicted, what is left, and the pulse width, over time"
     return await asyncio.to_thread(svg, figure, 1160.0, 520.0, words)
 
@@ -84,8 +84,8 @@ async def measured(context: Context, model_id: str) -> Markup | None:
 async def what_was_recorded(context: Context, row: Test) -> Markup:
     """Torque and the pulses that were sent, up to the test's end; the rest of the plan faint."""
     path = await asyncio.to_thread(context.analyses.path, str(row.recording_id))
-    found = await context.pool.submit("recorded", urgent=True, data=path).result
+    recorded = await context.pool.submit("recorded", urgent=True, data=path).result
     plan_us = [] if row.plan.get("adaptive") else (row.plan.get("preview") or {}).get("pulse_width_us") or []
-    figure = model_charts.recorded(found, plan_us, row.plan.get("pulse_rate_hz", 40.0), row.state)
+    figure = model_charts.recorded(recorded, plan_us, row.plan.get("pulse_rate_hz", 40.0), row.state)
     words = "Torque that was measured and pulses that were sent, over time"
     return await asyncio.to_thread(svg, figure, 1160.0, 460.0, words)

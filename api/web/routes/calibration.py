@@ -8,7 +8,15 @@ from fastapi import APIRouter, Response
 
 from stimrig.api.services import calibrations
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
-from stimrig.api.web.dependencies import PROBLEM, Ask, CalibrationVersion, Confirm, Ctx, ParticipantVersion, Tester
+from stimrig.api.web.dependencies import (
+    PROBLEM,
+    CalibrationVersion,
+    Confirm,
+    Ctx,
+    Interactive,
+    ParticipantVersion,
+    Tester,
+)
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
 
@@ -17,31 +25,31 @@ router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibrat
 
 @router.post("", status_code=201, **describe_answer(CalibrationOut, 201, "open; nothing was sent yet"))
 async def begin_calibration(
-    context: Ctx, who: Tester, code: str, tags: ParticipantVersion, response: Response,
-    body: CalibrationIn | None = None, confirm: Confirm = "", ask: Ask = False,
+    context: Ctx, principal: Tester, code: str, tags: ParticipantVersion, response: Response,
+    body: CalibrationIn | None = None, confirm: Confirm = "", interactive: Interactive = False,
 ) -> dict[str, Any]:  # fmt: skip
     """Open a guided calibration: nothing is sent until a step is asked for."""
-    found = await calibrations.begin(
-        context, code, body or CalibrationIn.model_validate({}), who.name, tags, confirm, ask
+    calibration = await calibrations.begin(
+        context, code, body or CalibrationIn.model_validate({}), principal.name, tags, confirm, interactive
     )
-    return tagged(response, found)
+    return tagged(response, calibration)
 
 
 @router.get("", **describe_answer(CalibrationOut))
-async def calibration(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
+async def calibration(context: Ctx, _principal: Tester, code: str, response: Response) -> dict[str, Any]:
     """Where it stands: width, ceiling and whose it is, marks, what is missing, every train."""
     return tagged(response, await calibrations.standing(context, code))
 
 
-def tagged(response: Response, found: dict[str, Any]) -> dict[str, Any]:
+def tagged(response: Response, calibration: dict[str, Any]) -> dict[str, Any]:
     """Return where a calibration stands, with its version as `ETag`."""
-    response.headers["ETag"] = f'"{found["version"]}"'
-    return found
+    response.headers["ETag"] = f'"{calibration["version"]}"'
+    return calibration
 
 
 @router.post("/step", status_code=202, **describe_answer(CalibrationOut, 202, "the train is on its way"))
 async def play_step(
-    context: Ctx, _who: Tester, code: str, tags: CalibrationVersion, body: StepIn, response: Response
+    context: Ctx, _principal: Tester, code: str, tags: CalibrationVersion, body: StepIn, response: Response
 ) -> dict[str, Any]:
     """Play one train: wider (`up`, or `fine` by a fine step), narrower, or the same again.
 
@@ -52,19 +60,19 @@ async def play_step(
 
 @router.post("/mark", **describe_answer(CalibrationOut))
 async def set_mark(
-    context: Ctx, who: Tester, code: str, tags: CalibrationVersion, body: MarkIn, response: Response
+    context: Ctx, principal: Tester, code: str, tags: CalibrationVersion, body: MarkIn, response: Response
 ) -> dict[str, Any]:
     """Mark the last train's width as a threshold; marking again replaces."""
-    return tagged(response, await calibrations.mark(context, code, body, who.name, tags))
+    return tagged(response, await calibrations.mark(context, code, body, principal.name, tags))
 
 
 @router.post("/finish", **describe_answer(CalibratedOut))
-async def finish_calibration(context: Ctx, who: Tester, code: str, tags: CalibrationVersion) -> dict[str, Any]:
+async def finish_calibration(context: Ctx, principal: Tester, code: str, tags: CalibrationVersion) -> dict[str, Any]:
     """Close it: the profile holds until the end of the day. The participant has another version then."""
-    return await calibrations.close(context, code, who.name, tags)
+    return await calibrations.close(context, code, principal.name, tags)
 
 
 @router.post("/discard", **describe_answer(CalibratedOut))
-async def discard_calibration(context: Ctx, who: Tester, code: str, tags: CalibrationVersion) -> dict[str, Any]:
+async def discard_calibration(context: Ctx, principal: Tester, code: str, tags: CalibrationVersion) -> dict[str, Any]:
     """Close it and keep the profile of before; however many trains were sent."""
-    return await calibrations.close(context, code, who.name, tags, discard=True)
+    return await calibrations.close(context, code, principal.name, tags, discard=True)

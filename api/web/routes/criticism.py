@@ -23,7 +23,7 @@ Wait = Annotated[bool, Query(description="false: answer 202 at once, with the jo
 @router.get("/models/{model_id}/comparison", response_model=ComparisonOut)
 async def comparison(
     context: Ctx,
-    _who: ModelReader,
+    _principal: ModelReader,
     row: Version,
     recording: Annotated[str | None, Query(description="another recording than the model's own")] = None,
 ) -> dict[str, Any]:
@@ -32,13 +32,13 @@ async def comparison(
 
 
 @router.get("/models/{model_id}/curves", **describe_answer(CurvesOut))
-async def curves(context: Ctx, _who: ModelReader, row: Version) -> dict[str, Any]:
+async def curves(context: Ctx, _principal: ModelReader, row: Version) -> dict[str, Any]:
     """The measured, predicted and commanded curves and the step response, thinned to what a screen shows."""
     return await context.analyses.curves(row)
 
 
 @router.get("/models/{model_id}/diagnosis", response_model=DiagnosisOut, responses=LATER)
-async def diagnosis(context: Ctx, _who: ModelReader, row: Version, wait: Wait = True) -> Any:
+async def diagnosis(context: Ctx, _principal: ModelReader, row: Version, wait: Wait = True) -> Any:
     """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""
     if wait or await asyncio.to_thread(context.analyses.known_diagnosis, row) is not None:
         return await context.analyses.diagnosis(row)
@@ -47,7 +47,7 @@ async def diagnosis(context: Ctx, _who: ModelReader, row: Version, wait: Wait = 
 
 @router.post("/models/{model_id}/effects", status_code=201, response_model=VersionOut, responses=LATER)
 async def add_effects(
-    context: Ctx, who: Tester, model_id: str, body: EffectsIn, response: Response, wait: Wait = True
+    context: Ctx, principal: Tester, model_id: str, body: EffectsIn, response: Response, wait: Wait = True
 ) -> Any:
     """Add effects: a new version, fitted anew; the old one stays as it is.
 
@@ -56,37 +56,37 @@ async def add_effects(
     """
     row = await asyncio.to_thread(context.versions.get, model_id)
     if not wait:
-        return later(jobs.begin_adding(context, row, body, who.name))
-    new = await context.analyses.add_effects(row, body.effects, who.name, force=body.force, reason=body.reason)
+        return later(jobs.begin_adding(context, row, body, principal.name))
+    new = await context.analyses.add_effects(row, body.effects, principal.name, force=body.force, reason=body.reason)
     response.headers["Location"] = f"/v1/models/{new.id}"
     return await asyncio.to_thread(context.versions.document, new)
 
 
 @router.post("/models/{model_id}/improve", status_code=201, response_model=ImprovementOut, responses=LATER)
-async def improve(context: Ctx, who: Tester, row: Version, response: Response, wait: Wait = True) -> Any:
+async def improve(context: Ctx, principal: Tester, row: Version, response: Response, wait: Wait = True) -> Any:
     """Add effects one by one while the evidence lasts; each step is a version."""
     if not wait:
-        return later(jobs.begin_improving(context, row, who.name))
-    found, rows = await context.analyses.improve(row, who.name)
+        return later(jobs.begin_improving(context, row, principal.name))
+    job, rows = await context.analyses.improve(row, principal.name)
     response.headers["Location"] = f"/v1/models/{rows[-1].id}"
     versions = await asyncio.to_thread(lambda: [context.versions.document(new) for new in rows])
-    return {**found, "versions": versions}
+    return {**job, "versions": versions}
 
 
 @router.get("/effects", response_model=None, responses={200: published("effects", "the library")})
-async def effects(context: Ctx, _who: ModelReader) -> dict[str, Any]:
+async def effects(context: Ctx, _principal: ModelReader) -> dict[str, Any]:
     """The library of effects."""
     return await context.pool.submit("effects").result
 
 
 @router.get("/jobs/{job_id}", response_model=JobOut)
-def job(context: Ctx, _who: ModelReader, job_id: str) -> dict[str, Any]:
+def job(context: Ctx, _principal: ModelReader, job_id: str) -> dict[str, Any]:
     """Long work: how far, how long yet, and where its result lies."""
     return context.jobs.get(job_id).document()
 
 
 @router.delete("/jobs/{job_id}", response_model=JobOut)
-async def cancel(context: Ctx, _who: Tester, job_id: str) -> dict[str, Any]:
+async def cancel(context: Ctx, _principal: Tester, job_id: str) -> dict[str, Any]:
     """Cancel it. What is done already stays done."""
     job = context.jobs.get(job_id)
     context.jobs.cancel(job)

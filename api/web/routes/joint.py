@@ -21,22 +21,22 @@ router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
 
 
 @router.get("/rig/angle", **describe_answer(AngleStatus))
-async def angle(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
+async def angle(context: Ctx, _principal: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
     response.headers["ETag"] = f'"{await asyncio.to_thread(joint.pose_version, context)}"'
     return (await context.rig.fresh_status()).angle.model_dump()
 
 
 @router.post("/rig/angle/pose", **describe_answer(AngleStatus))
-async def pose(context: Ctx, who: Tester, tags: AngleVersion, body: PoseIn, response: Response) -> dict[str, Any]:
+async def pose(context: Ctx, principal: Tester, tags: AngleVersion, body: PoseIn, response: Response) -> dict[str, Any]:
     """Tell the angle that a goniometer shows, at two poses at least 0.5 rad apart; a third one begins anew."""
-    status, version = await joint.take_pose(context, who.name, body, tags)
+    status, version = await joint.take_pose(context, principal.name, body, tags)
     response.headers["ETag"] = f'"{version}"'
     return status.angle.model_dump()
 
 
 @router.get("/participants/{code}/joint", **describe_answer(JointOverviewOut))
-async def overview(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
+async def overview(context: Ctx, _principal: Tester, code: str) -> dict[str, Any]:
     """Today's guided tests: which angles are still to be held, what was done, and the torque-time of all of them."""
     row = await asyncio.to_thread(participants.find, context, code)
     return await joint.overview_of(context, row)
@@ -44,12 +44,12 @@ async def overview(context: Ctx, _who: Tester, code: str) -> dict[str, Any]:
 
 @router.post("/participants/{code}/models", status_code=201, response_model=VersionOut, responses=LATER)
 async def fit_together(
-    context: Ctx, who: Tester, code: str, body: TogetherIn, response: Response, wait: Wait = True
+    context: Ctx, principal: Tester, code: str, body: TogetherIn, response: Response, wait: Wait = True
 ) -> Any:
     """One model of several recordings, joined: isometric ones and those in which the joint was held or moved."""
     await asyncio.to_thread(participants.find, context, code)
     if not wait:
-        return later(joint.begin_fit(context, code, body, who.name))
-    model = await together.fit(context.analyses, code, body.recordings, body.effects, who.name)
+        return later(joint.begin_fit(context, code, body, principal.name))
+    model = await together.fit(context.analyses, code, body.recordings, body.effects, principal.name)
     response.headers["Location"] = f"/v1/models/{model.id}"
     return await asyncio.to_thread(context.versions.document, model)

@@ -48,7 +48,7 @@ WITH_MODEL: dict[str, Any] = {
 
 @router.get("/participants/{code}/model", response_class=Response, responses=APPROVED)
 async def approved_model(
-    context: Ctx, _who: ModelReader, code: str, if_none_match: Annotated[str | None, Header()] = None,
+    context: Ctx, _principal: ModelReader, code: str, if_none_match: Annotated[str | None, Header()] = None,
     tracked: Annotated[bool, Query(description="as tracked to the last trial, within the approved limits")] = False,
 ) -> Response:  # fmt: skip
     """The approved model, for the ILC controller: MODEL.json with its `ETag`; 304 where it is known already.
@@ -77,24 +77,24 @@ def matches(if_none_match: str, etag: str) -> bool:
 
 
 @router.get("/participants/{code}/tracking", **describe_answer(TrackingOut))
-def tracking(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
+def tracking(context: Ctx, _principal: ModelReader, code: str) -> dict[str, Any]:
     """The trials since the approval that holds, oldest first; 404 where no model is approved today."""
-    found = context.tracked.document(code)
-    if found is None:
+    document = context.tracked.document(code)
+    if document is None:
         participants.find(context, code)
         raise services.none_approved(code)
-    return found
+    return document
 
 
 @router.get("/participants/{code}/models", response_model=list[VersionOut])
-def versions(context: Ctx, _who: ModelReader, code: str) -> list[dict[str, Any]]:
+def versions(context: Ctx, _principal: ModelReader, code: str) -> list[dict[str, Any]]:
     """A participant's model versions, newest first, with their errors and what each added."""
     participants.find(context, code)
     return context.versions.of(code)
 
 
 @router.get("/models/{model_id}", response_model=None, responses={200: WITH_MODEL})
-def one_model(context: Ctx, _who: ModelReader, row: Version, response: Response) -> dict[str, Any]:
+def one_model(context: Ctx, _principal: ModelReader, row: Version, response: Response) -> dict[str, Any]:
     """A version: its errors, its verdict, its lineage, and the model."""
     participant: Participant = context.store.get(Participant, row.participant)  # read first: it is not newer
     response.headers["ETag"] = f'"{participant.version}"'  # what is decided on one model is decided on all
@@ -102,7 +102,7 @@ def one_model(context: Ctx, _who: ModelReader, row: Version, response: Response)
 
 
 @router.get("/models/{model_id}/file", response_class=Response, responses={200: MODEL_JSON})
-def model_file(_who: ModelReader, row: Version) -> Response:
+def model_file(_principal: ModelReader, row: Version) -> Response:
     """MODEL.json, as it was stored."""
     headers = {"Content-Disposition": f'attachment; filename="{row.id}.json"', "ETag": f'"{row.etag}"'}
     return Response(stored_model.whole(row), media_type="application/json", headers=headers)
@@ -110,24 +110,24 @@ def model_file(_who: ModelReader, row: Version) -> Response:
 
 @router.post("/models/{model_id}/approve", response_model=VersionOut)
 async def approve(
-    context: Ctx, who: Approver, model_id: str, tags: DecisionVersion, response: Response,
+    context: Ctx, principal: Approver, model_id: str, tags: DecisionVersion, response: Response,
     body: ApprovalIn | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Let the controller have this version, and what is tracked from it within limits, until the day ends."""
-    given = body or ApprovalIn()
+    approval = body or ApprovalIn()
     row = await asyncio.to_thread(context.versions.get, model_id)
-    version = await services.approve(context, row, who.name, given.reason, given.tracking, tags)
+    version = await services.approve(context, row, principal.name, approval.reason, approval.tracking, tags)
     response.headers["ETag"] = f'"{version}"'
     return await asyncio.to_thread(context.versions.document, row)
 
 
 @router.post("/models/{model_id}/reject", response_model=VersionOut)
 def reject(
-    context: Ctx, who: Approver, model_id: str, tags: RejectionVersion, response: Response,
+    context: Ctx, principal: Approver, model_id: str, tags: RejectionVersion, response: Response,
     body: DecisionIn | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Keep this version from the controller. Without `If-Match`: on what is decided now, and without an `ETag`."""
-    version = context.versions.decide(model_id, False, who.name, body.reason if body else "", tags=tags)
+    version = context.versions.decide(model_id, False, principal.name, body.reason if body else "", tags=tags)
     if tags is not None:  # else what others decided would pass for what was read
         response.headers["ETag"] = f'"{version}"'
     return context.versions.document(context.versions.get(model_id))
@@ -135,11 +135,11 @@ def reject(
 
 @router.post("/models/{model_id}/undo", response_model=VersionOut)
 def undo(
-    context: Ctx, who: Approver, model_id: str, tags: DecisionVersion, response: Response,
+    context: Ctx, principal: Approver, model_id: str, tags: DecisionVersion, response: Response,
     body: DecisionIn | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Go back to the version this one was made from; nothing is deleted."""
-    parent, version = context.versions.undo(model_id, who.name, body.reason if body else "", tags)
+    parent, version = context.versions.undo(model_id, principal.name, body.reason if body else "", tags)
     response.headers["ETag"] = f'"{version}"'
     return context.versions.document(parent)
 
@@ -175,7 +175,7 @@ class WidthsIn(Body):
 
 
 @router.post("/models/{model_id}/prediction", **describe_answer(PredictionOut))
-async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
+async def prediction(context: Ctx, _principal: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
     """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included.
 
     Of a version, or of one that was tracked from it (its `model_id`).
@@ -185,8 +185,8 @@ async def prediction(context: Ctx, _who: ModelReader, model_id: str, body: Width
         "forecast", urgent=True, model_json=text, pulse_width_us=body.pulse_width_us,
         pulse_rate_hz=body.pulse_rate_hz, angle_rad=body.angle_rad,
     )  # fmt: skip
-    found = await call.result
-    return {"model_id": model_id, **found}
+    forecast = await call.result
+    return {"model_id": model_id, **forecast}
 
 
 class ReferenceIn(Body):
@@ -213,10 +213,10 @@ class ReferenceIn(Body):
 
 
 @router.post("/models/{model_id}/widths", **describe_answer(InversionOut))
-async def widths(context: Ctx, _who: ModelReader, model_id: str, body: ReferenceIn) -> dict[str, Any]:
+async def widths(context: Ctx, _principal: ModelReader, model_id: str, body: ReferenceIn) -> dict[str, Any]:
     """The pulse widths whose predicted torque follows a reference best, and where and why it is out of reach.
 
     Of a version, or of one that was tracked from it (its `model_id`).
     """
-    given = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz", "table"})
-    return await services.invert(context, model_id, given, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
+    reference = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz", "table"})
+    return await services.invert(context, model_id, reference, body.max_pulse_width_us, body.max_rise_us, body.whole_us)

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Query, Response
 from stimrig.api.services import notes, participants
 from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
 from stimrig.api.store.tables import Participant
-from stimrig.api.web.dependencies import PROBLEM, Ask, Confirm, Ctx, ParticipantVersion, Tester
+from stimrig.api.web.dependencies import PROBLEM, Confirm, Ctx, Interactive, ParticipantVersion, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 
@@ -21,9 +21,9 @@ router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=P
 
 
 @router.post("", status_code=201, **describe_answer(ParticipantOut, 201, "made; see `Location`"))
-def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: Response) -> dict[str, Any]:
+def make_participant(context: Ctx, principal: Tester, body: ParticipantIn, response: Response) -> dict[str, Any]:
     """Make a participant: a code, never a name."""
-    row = participants.create(context, body, who.name)
+    row = participants.create(context, body, principal.name)
     response.headers["Location"] = f"/v1/participants/{row.code}"
     return row.as_dict()
 
@@ -31,7 +31,7 @@ def make_participant(context: Ctx, who: Tester, body: ParticipantIn, response: R
 @router.get("", **describe_answer(list[ParticipantOut]))
 def list_participants(
     context: Ctx,
-    _who: Tester,
+    _principal: Tester,
     q: Annotated[str, Query(max_length=80, description="a part of the code, in any case")] = "",
     archived: Annotated[bool | None, Query(description="only those that are archived, or that are not")] = None,
 ) -> list[dict[str, Any]]:
@@ -40,7 +40,7 @@ def list_participants(
 
 
 @router.get("/{code}", **describe_answer(ParticipantOut))
-def one_participant(context: Ctx, _who: Tester, code: str, response: Response) -> dict[str, Any]:
+def one_participant(context: Ctx, _principal: Tester, code: str, response: Response) -> dict[str, Any]:
     """One participant with its profile."""
     return tagged(response, participants.find(context, code))
 
@@ -54,74 +54,76 @@ def tagged(response: Response, row: Participant) -> dict[str, Any]:
 @router.put("/{code}/profile", **describe_answer(ChangedOut))
 async def set_profile(
     context: Ctx,
-    who: Tester,
+    principal: Tester,
     code: str,
     tags: ParticipantVersion,
     body: ProfileIn,
     response: Response,
     confirm: Confirm = "",
-    ask: Ask = False,
+    interactive: Interactive = False,
 ) -> dict[str, Any]:
     """Change limits: those that are sent; the others keep their values, and so does what a calibration found.
 
     A limit wider than at the calibration voids it: 409, until it is confirmed. `meanwhile` says what it means for a
     test that runs, or a calibration that is open.
     """
-    row = await participants.change_profile(context, code, body.sent(), who.name, tags, confirm, ask)
-    return {**tagged(response, row), "meanwhile": participants.meanwhile(context, code)}
+    row = await participants.change_profile(context, code, body.sent(), principal.name, tags, confirm, interactive)
+    return {**tagged(response, row), "meanwhile": participants.effect_on_open_work(context, code)}
 
 
 @router.put("/{code}/muscle", **describe_answer(ParticipantOut))
 async def set_muscle(
     context: Ctx,
-    who: Tester,
+    principal: Tester,
     code: str,
     tags: ParticipantVersion,
     body: MuscleIn,
     response: Response,
     confirm: Confirm = "",
-    ask: Ask = False,
+    interactive: Interactive = False,
 ) -> dict[str, Any]:
     """Say the site. Another one than before voids the calibration: 409, until it is confirmed.
 
     A model belongs to the site at which it was measured: at another one there is no approved model, and no key of a
     controller, until it has its own. Tests keep the site that they were begun with.
     """
-    row = await participants.change_site(context, code, body, who.name, tags, confirm, ask)
+    row = await participants.change_site(context, code, body, principal.name, tags, confirm, interactive)
     return tagged(response, row)
 
 
 @router.post("/{code}/archive", **describe_answer(ParticipantOut))
-async def archive(context: Ctx, who: Tester, code: str, tags: ParticipantVersion, response: Response) -> dict[str, Any]:
+async def archive(
+    context: Ctx, principal: Tester, code: str, tags: ParticipantVersion, response: Response
+) -> dict[str, Any]:
     """Put it into the archive: it is listed no more by default, and no test of it starts."""
-    return tagged(response, await participants.put_archived(context, code, True, who.name, tags))
+    return tagged(response, await participants.put_archived(context, code, True, principal.name, tags))
 
 
 @router.post("/{code}/unarchive", **describe_answer(ParticipantOut))
 async def unarchive(
-    context: Ctx, who: Tester, code: str, tags: ParticipantVersion, response: Response
+    context: Ctx, principal: Tester, code: str, tags: ParticipantVersion, response: Response
 ) -> dict[str, Any]:
     """Take it out of the archive."""
-    return tagged(response, await participants.put_archived(context, code, False, who.name, tags))
+    return tagged(response, await participants.put_archived(context, code, False, principal.name, tags))
 
 
 notes_router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)
 
 
 @notes_router.get("", **describe_answer(list[NoteOut]))
-def list_notes(context: Ctx, _who: Tester, code: str) -> list[dict[str, Any]]:
+def list_notes(context: Ctx, _principal: Tester, code: str) -> list[dict[str, Any]]:
     """A participant's notes, newest first, the struck ones among them."""
     participants.find(context, code)
     return [note.as_dict() for note in context.notes.participant_notes(code)]
 
 
 @notes_router.post("", status_code=201, **describe_answer(NoteOut, 201, "written"))
-async def write_note(context: Ctx, who: Tester, code: str, body: NoteIn) -> dict[str, Any]:
+async def write_note(context: Ctx, principal: Tester, code: str, body: NoteIn) -> dict[str, Any]:
     """Write a note on the participant's session, on a test (`test_id`), or at a time in it (`at_s`, or `now`)."""
-    return (await notes.add(context, code, body, who.name)).as_dict()
+    return (await notes.add(context, code, body, principal.name)).as_dict()
 
 
 @notes_router.post("/{note_id}/strike", **describe_answer(NoteOut))
-def strike_note(context: Ctx, who: Tester, code: str, note_id: str) -> dict[str, Any]:
+def strike_note(context: Ctx, principal: Tester, code: str, note_id: str) -> dict[str, Any]:
     """Mark a note as wrong: it stays readable, with who struck it."""
-    return context.notes.strike(code, note_id, who.name).as_dict()
+    return context.notes.strike(code, note_id, principal.name).as_dict()

@@ -81,38 +81,40 @@ class ConfirmIn(_Body):
 
 
 @router.post("/users", status_code=201, **describe_answer(UserOut, 201, "added"))
-async def add_user(context: Ctx, who: Administrator, body: UserIn) -> dict[str, Any]:
+async def add_user(context: Ctx, principal: Administrator, body: UserIn) -> dict[str, Any]:
     """Add a person; the default scopes are a clinician's."""
-    row = await context.people.add(body.name, body.password, body.scopes, who.name)
+    row = await context.people.add(body.name, body.password, body.scopes, principal.name)
     return {"name": row.name, "scopes": body.scopes, "created_utc": row.created_utc}
 
 
 @router.get("/users", **describe_answer(list[ListedUser]))
-def list_users(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
+def list_users(context: Ctx, _principal: Administrator) -> list[dict[str, Any]]:
     """All users; a new password sends the person's `version` as `If-Match`."""
     return context.people.documents()
 
 
 @router.put("/users/{name}/password", status_code=204)
-async def set_password(context: Ctx, who: Administrator, name: str, tags: UserVersion, body: PasswordIn) -> Response:
+async def set_password(
+    context: Ctx, principal: Administrator, name: str, tags: UserVersion, body: PasswordIn
+) -> Response:
     """A new password; the person's sessions end. One that changes its own goes on under the cookie of the answer."""
-    return await renew_password(context, who, name, body.password, Response(status_code=204), tags)
+    return await renew_password(context, principal, name, body.password, Response(status_code=204), tags)
 
 
 async def renew_password(
-    context: Context, who: Principal, name: str, password: str, answer: Response, tags: Tags | None = None
+    context: Context, principal: Principal, name: str, password: str, answer: Response, tags: Tags | None = None
 ) -> Response:
     """Change it; the answer carries the cookie of the session that made the change, where it is the person's own."""
-    cookie = await context.people.change_password(name, password, who, tags)
+    cookie = await context.people.change_password(name, password, principal, tags)
     if cookie is not None:
         set_cookie(context, answer, cookie)
     return answer
 
 
 @router.delete("/users/{name}", status_code=204)
-def remove_user(context: Ctx, who: Administrator, name: str) -> None:
+def remove_user(context: Ctx, principal: Administrator, name: str) -> None:
     """Nobody signs in under this name any more."""
-    context.people.remove(name, who.name)
+    context.people.remove(name, principal.name)
 
 
 @router.post(
@@ -128,12 +130,12 @@ async def sign_in(
     """Sign in with name and password, or a token (JSON or a form); the session is a cookie. 429 after wrong tries."""
     same_origin(request)
     form = "form" in request.headers.get("content-type", "")
-    given = await _given(request, form)
+    credentials = await _read_sign_in(request, form)
     address = request.client.host if request.client else ""
-    if given.token.strip():
-        cookie = await asyncio.to_thread(context.auth.sign_in, given.token.strip(), address)
+    if credentials.token.strip():
+        cookie = await asyncio.to_thread(context.auth.sign_in, credentials.token.strip(), address)
     else:
-        cookie = await context.people.sign_in(given.name.strip(), given.password, address)
+        cookie = await context.people.sign_in(credentials.name.strip(), credentials.password, address)
     principal = await asyncio.to_thread(context.auth.cookie, cookie)
     answer: Response
     if form:
@@ -145,7 +147,7 @@ async def sign_in(
     return answer
 
 
-async def _given(request: Request, form: bool) -> SignIn:
+async def _read_sign_in(request: Request, form: bool) -> SignIn:
     try:
         if not form:
             return SignIn.model_validate_json(await request.body())
@@ -156,32 +158,32 @@ async def _given(request: Request, form: bool) -> SignIn:
 
 
 @router.post("/sessions/confirm", status_code=204)
-async def confirm(context: Ctx, who: Anyone, body: ConfirmIn) -> None:
+async def confirm(context: Ctx, principal: Anyone, body: ConfirmIn) -> None:
     """The password once more, before a model is approved."""
-    await context.people.confirm(who, body.password)
+    await context.people.confirm(principal, body.password)
 
 
 @router.post("/sessions/lock", status_code=204)
-async def lock(context: Ctx, who: Anyone) -> None:
+async def lock(context: Ctx, principal: Anyone) -> None:
     """Lock this session: until it is unlocked every request with it is refused, but for stop."""
-    if who.page_session is None:
+    if principal.page_session is None:
         raise ApiError(409, "no-session", "There is nothing to lock", "A token has no session.")
-    await asyncio.to_thread(context.auth.idle.lock, who.page_session.hash, who.name)
+    await asyncio.to_thread(context.auth.idle.lock, principal.page_session.hash, principal.name)
 
 
 @router.post("/sessions/acted", status_code=204)
-async def acted(_who: Anyone) -> None:
+async def acted(_principal: Anyone) -> None:
     """Note that a person has typed or moved the pointer on a page: its session is not idle."""
 
 
 @router.post("/sessions/unlock", status_code=204)
-async def unlock(context: Ctx, who: EvenLocked, body: ConfirmIn) -> None:
+async def unlock(context: Ctx, principal: EvenLocked, body: ConfirmIn) -> None:
     """Unlock this session by its person's password, or by the token that it was opened with."""
-    await context.people.unlock(who, body.password)
+    await context.people.unlock(principal, body.password)
 
 
 @router.delete("/sessions/current", status_code=204)
-def sign_out(context: Ctx, request: Request, _who: EvenLocked) -> None:
+def sign_out(context: Ctx, request: Request, _principal: EvenLocked) -> None:
     """Sign out."""
     cookie = request.cookies.get(context.auth.cookie_name)
     if cookie is None:
@@ -191,49 +193,51 @@ def sign_out(context: Ctx, request: Request, _who: EvenLocked) -> None:
 
 @router.post("/participants/{code}/keys", status_code=201, **describe_answer(KeyOut, 201, "made"))
 def participant_key(
-    context: Ctx, who: Approver, code: str, tags: ParticipantVersion, body: KeyFor, response: Response
+    context: Ctx, principal: Approver, code: str, tags: ParticipantVersion, body: KeyFor, response: Response
 ) -> dict[str, Any]:
     """A key with which a controller plays trials of one participant until the end of the day, within a plan.
 
     Who makes it holds `run-test`, `read-live` and `read-model`, too, and answers for what it plays. Its text is shown
     this once. `DELETE /v1/participants/{code}/keys/{id}` revokes it.
     """
-    text, row, version = keys.make(context, who, code, body, tags)
+    text, row, version = keys.make(context, principal, code, body, tags)
     response.headers["ETag"] = f'"{version}"'
-    told = {name: getattr(row, name) for name in ("name", "prefix", "scopes", "expires_utc", "participant", "plan")}
-    return {"key": text, "id": row.hash[:16], **told}
+    key_fields = {
+        name: getattr(row, name) for name in ("name", "prefix", "scopes", "expires_utc", "participant", "plan")
+    }
+    return {"key": text, "id": row.hash[:16], **key_fields}
 
 
 @router.delete("/participants/{code}/keys/{key_id}", status_code=204)
-def revoke_participant_key(context: Ctx, who: Tester, code: str, key_id: str) -> None:
+def revoke_participant_key(context: Ctx, principal: Tester, code: str, key_id: str) -> None:
     """Revoke a key of a participant; its trial ends at once."""
-    keys.revoke(context, code, key_id, who.name)
+    keys.revoke(context, code, key_id, principal.name)
 
 
 token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)
 
 
 @token_router.post("/tokens", status_code=201, **describe_answer(TokenOut, 201, "issued"))
-def issue_token(context: Ctx, who: Administrator, body: TokenIn) -> dict[str, Any]:
+def issue_token(context: Ctx, principal: Administrator, body: TokenIn) -> dict[str, Any]:
     """Issue a token; its text is shown this once."""
-    return keys.issue_token(context, body, who.name)
+    return keys.issue_token(context, body, principal.name)
 
 
 @token_router.get("/tokens", **describe_answer(list[ListedToken]))
-def list_tokens(context: Ctx, _who: Administrator) -> list[dict[str, Any]]:
+def list_tokens(context: Ctx, _principal: Administrator) -> list[dict[str, Any]]:
     """All tokens, by their prefix; never their text."""
     return keys.all_tokens(context)
 
 
 @token_router.delete("/tokens/{token_id}", status_code=204)
-def revoke_token(context: Ctx, who: Administrator, token_id: str) -> None:
+def revoke_token(context: Ctx, principal: Administrator, token_id: str) -> None:
     """Revoke a token."""
-    if not context.auth.revoke(token_id, who.name):
+    if not context.auth.revoke(token_id, principal.name):
         raise NotFoundError("token", token_id, "GET /v1/tokens lists them.")
 
 
 @token_router.get("/audit", **describe_answer(AuditOut))
-def trail(context: Ctx, _who: Administrator) -> dict[str, Any]:
+def trail(context: Ctx, _principal: Administrator) -> dict[str, Any]:
     """The audit trail, and whether its chain holds."""
     entries = context.store.all(AuditEntry, order=AuditEntry.seq)
     broken = audit.first_broken(entries)

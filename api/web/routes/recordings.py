@@ -36,17 +36,17 @@ MOST_COLUMNS = 8
 
 
 @router.get("/recordings/{recording_id}", response_class=FileResponse, responses={200: RAW, 410: GONE})
-def recording(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
+def recording(context: Ctx, _principal: ModelReader, recording_id: str) -> FileResponse:
     """The raw recording."""
-    row, path = recordings.held(context, recording_id)
+    row, path = recordings.find(context, recording_id)
     kind = KINDS.get(path.suffix, "application/x-hdf5")
     return FileResponse(path, media_type=kind, filename=path.name, headers={"X-Content-SHA256": row.file_sha256})
 
 
 @router.get("/recordings/{recording_id}/csv", response_class=FileResponse, responses={200: CSV, 410: GONE})
-async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> FileResponse:
+async def recording_csv(context: Ctx, _principal: ModelReader, recording_id: str) -> FileResponse:
     """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
-    _row, source = await asyncio.to_thread(recordings.held, context, recording_id)
+    _row, source = await asyncio.to_thread(recordings.find, context, recording_id)
     name = f"{recording_id}.csv"
     out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
     gone = BackgroundTask(out.unlink, missing_ok=True)
@@ -66,7 +66,7 @@ async def recording_csv(context: Ctx, _who: ModelReader, recording_id: str) -> F
 )
 async def upload(
     context: Ctx,
-    who: Tester,
+    principal: Tester,
     code: str,
     tags: ParticipantVersion,
     request: Request,
@@ -85,7 +85,7 @@ async def upload(
     data = await request.body()  # `stimrig.api.web.middleware` bounds it
     if not data:
         raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
-    row, model, warnings = await recordings.take_in(context, code, data, who, tags, columns, of or confirm)
+    row, model, warnings = await recordings.take_in(context, code, data, principal, tags, columns, of or confirm)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
     return {"recording_id": row.id, "model": version, "warnings": warnings}

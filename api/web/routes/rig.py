@@ -35,14 +35,14 @@ STOP = {"requestBody": {"content": {"application/json": FORM, "application/x-www
 
 
 @router.get("/rig", **describe_answer(RigOut))
-def rig(context: Ctx, _who: LiveReader, response: Response) -> dict[str, Any]:
+def rig(context: Ctx, _principal: LiveReader, response: Response) -> dict[str, Any]:
     """State, devices, newest torque and its age. `ETag` names the last stop: a re-arm says which one it answers."""
     response.headers["ETag"] = f'"{context.rig.status.latch if context.rig.status else ""}"'
     return services.rig_state(context)
 
 
 @router.get("/sequences", **describe_answer(SequencesOut))
-async def sequences(context: Ctx, _who: Anyone) -> dict[str, Any]:
+async def sequences(context: Ctx, _principal: Anyone) -> dict[str, Any]:
     """What a test can be made of: this rig's sequences with their settings, units and ranges; and the default test."""
     return await context.rig.ask(SequencesRequest())
 
@@ -69,22 +69,22 @@ async def stop_on_page(request: Request, context: Context, press: Press) -> Resp
     except ApiError as error:
         answer = error
     right, test_id = getattr(request.state, "stop_right", None), current.test_id if current else None
-    told = StopResult(press.by, press.reason, context.clock.utc(), test_id, right, answer)
-    return RedirectResponse(f"/stopped/{context.stops.keep(told)}", 303)
+    result = StopResult(press.by, press.reason, context.clock.utc(), test_id, right, answer)
+    return RedirectResponse(f"/stopped/{context.stops.keep(result)}", 303)
 
 
 @router.post("/rearm", **describe_answer(RigOut))
-async def rearm(context: Ctx, who: Rearmer, tags: LatchVersion, response: Response) -> dict[str, Any]:
+async def rearm(context: Ctx, principal: Rearmer, tags: LatchVersion, response: Response) -> dict[str, Any]:
     """After a stop, a fault or a restart the rig stays still until a person re-arms it: who signed in with a password.
 
     A program needs the scope `rearm`, which `run-test` does not imply and no controller's key holds.
     """
-    status = await services.rearm(context, who.name, tags)
+    status = await services.rearm(context, principal.name, tags)
     response.headers["ETag"] = f'"{status.latch}"'
     return services.rig_state(context)
 
 
 @router.post("/preview", **describe_answer(PreviewOut))
-async def preview(context: Ctx, _who: Tester, body: TestIn) -> Response:
+async def preview(context: Ctx, _principal: Tester, body: TestIn) -> Response:
     """A test's duration, dose and pulse widths, without playing it. 503 where too many are asked for at once."""
     return JSONResponse(await context.runner.preview(body))

@@ -45,27 +45,30 @@ BEGUN["responses"][410] = problem("the previewed plan is not known, or too old")
 
 @router.post("", status_code=202, **BEGUN)
 async def start_test(
-    context: Ctx, who: Tester, tags: ParticipantVersion, body: TestIn, response: Response
+    context: Ctx, principal: Tester, tags: ParticipantVersion, body: TestIn, response: Response
 ) -> dict[str, Any]:
     """Start a test; `Location` is where its progress is read. One at a time: 409 names the holder.
 
     A controller's key, which reads no participant, sends the `ETag` of `GET /v1/participants/{code}/model`.
     """
-    row = await controllers.start(context.runner, context.keys_lock, context.store, who, body, tags)
+    row = await controllers.start(context.runner, context.keys_lock, context.store, principal, body, tags)
     response.headers["Location"] = f"/v1/tests/{row.id}"
     return await asyncio.to_thread(context.runner.document, row)
 
 
 @router.get("", **describe_answer(list[TestOut]))
 def list_tests(
-    context: Ctx, _who: LiveReader, limit: Annotated[int, Query(ge=1, le=500)] = 50, participant: str | None = None
+    context: Ctx,
+    _principal: LiveReader,
+    limit: Annotated[int, Query(ge=1, le=500)] = 50,
+    participant: str | None = None,
 ) -> list[dict[str, Any]]:
     """The newest tests, of all participants or of one."""
     return tests.newest(context, limit, participant)
 
 
 @router.get("/{test_id}", **describe_answer(TestOut))
-def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
+def one_test(context: Ctx, _principal: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
     row = tests.find(context, test_id)
     response.headers["ETag"] = f'"{row.version}"'
@@ -74,16 +77,16 @@ def one_test(context: Ctx, _who: LiveReader, test_id: str, response: Response) -
 
 @router.put("/{test_id}/ran-by", **describe_answer(TestOut))
 def set_ran_by(
-    context: Ctx, who: Tester, test_id: str, tags: TestVersion, body: RanByIn, response: Response
+    context: Ctx, principal: Tester, test_id: str, tags: TestVersion, body: RanByIn, response: Response
 ) -> dict[str, Any]:
     """Say who ran a test at the rig, where that was not who asked for it."""
-    row = tests.change_ran_by(context, test_id, body.ran_by, who.name, tags)
+    row = tests.change_ran_by(context, test_id, body.ran_by, principal.name, tags)
     response.headers["ETag"] = f'"{row.version}"'
     return context.runner.document(row)
 
 
 @router.post("/{test_id}/keep-plain", **describe_answer(TestOut))
-async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]:
+async def keep_plain(context: Ctx, _principal: Tester, test_id: str) -> dict[str, Any]:
     """End the fit of the last approved model's structure after a test: the plain model is offered."""
     row = await asyncio.to_thread(tests.find, context, test_id)
     if not context.runner.lifecycle.keep_plain(test_id):
@@ -93,10 +96,10 @@ async def keep_plain(context: Ctx, _who: Tester, test_id: str) -> dict[str, Any]
 
 
 @router.post("/{test_id}/enough", **describe_answer(Extended))
-async def enough(context: Ctx, who: Tester, test_id: str) -> dict[str, Any]:
+async def enough(context: Ctx, principal: Tester, test_id: str) -> dict[str, Any]:
     """End a running adaptive, passive or moving test well, at the next pulse: what was measured is used."""
     row = await asyncio.to_thread(tests.find, context, test_id)
-    return (await context.runner.enough(row, who.name)).model_dump()
+    return (await context.runner.enough(row, principal.name)).model_dump()
 
 
 @router.websocket("/{test_id}/live")
@@ -109,9 +112,9 @@ async def live(socket: WebSocket, test_id: str) -> None:
     context = context_of(socket)
     await socket.accept()
     try:
-        who = await asyncio.to_thread(_admit, socket, context)
+        principal = await asyncio.to_thread(_admit, socket, context)
         row = await asyncio.to_thread(tests.find, context, test_id)
-        await _watched(socket, context, row, by_key=who.participant is not None)
+        await _watched(socket, context, row, by_key=principal.participant is not None)
     except ApiError as error:
         with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
             async with asyncio.timeout(GOODBYE_S):

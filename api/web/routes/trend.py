@@ -26,7 +26,7 @@ COLUMNS = ("model_id", "recording_id", "approved", "approved_by", "approved_utc"
 
 
 @router.get("/trend", **describe_answer(TrendOut))
-def trend(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
+def trend(context: Ctx, _principal: ModelReader, code: str) -> dict[str, Any]:
     """Figures with their uncertainty over the sessions, and what changed since the last approved one."""
     participants.find(context, code)
     sessions = context.trend.sessions(code)
@@ -35,7 +35,7 @@ def trend(context: Ctx, _who: ModelReader, code: str) -> dict[str, Any]:
 
 
 @router.get("/trend.csv", response_class=Response, responses=CSV)
-def trend_csv(context: Ctx, _who: ModelReader, code: str) -> Response:
+def trend_csv(context: Ctx, _principal: ModelReader, code: str) -> Response:
     """The same as a table: one row for each session, times in UTC, notes as text."""
     participants.find(context, code)
     text = table([session.document() for session in context.trend.sessions(code)])
@@ -54,9 +54,9 @@ def table(sessions: list[dict[str, Any]]) -> str:
              for name, key in cells]  # fmt: skip
     rows: list[list[Any]] = [["session_utc", *COLUMNS, *heads, "notes"]]
     for session in sessions:
-        shown = {**session, "approved": "yes" if session["approved"] else "no",
+        cells_of = {**session, "approved": "yes" if session["approved"] else "no",
                  "effects": ", ".join(session["effects"])}  # fmt: skip
         values = [(session["figures"].get(name) or {}).get(key) for name, key in cells]
         notes = [f"{note['at_utc']} {note['by']}, {note['kind']}: {note['text']}" for note in session["notes"]]
-        rows.append([session["at_utc"], *(shown[name] for name in COLUMNS), *values, " | ".join(notes)])
+        rows.append([session["at_utc"], *(cells_of[name] for name in COLUMNS), *values, " | ".join(notes)])
     return "".join(lines(rows, end="\r\n"))
