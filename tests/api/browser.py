@@ -79,7 +79,7 @@ def bring_to_rest(service: Service) -> None:
 
 
 def enter(page: Any, service: Service, name: str = NAME, password: str = PASSWORD) -> None:
-    """With a session from outside, on the first page: how people sign in, `sign_in` does."""
+    """With a session from outside, on the first page: tests/api/test_day_by_keys.py signs in as people do."""
     with service.client() as http:
         http.post("/v1/users", json={"name": name, "password": password})
     with service.client(None) as http:
@@ -88,17 +88,6 @@ def enter(page: Any, service: Service, name: str = NAME, password: str = PASSWOR
         cookies = [{"name": key, "value": value, "url": service.url} for key, value in http.cookies.items()]
     page.context.add_cookies(cookies)
     page.goto(service.url + "/")
-
-
-def sign_in(page: Any, service: Service, name: str = NAME, password: str = PASSWORD) -> None:
-    """By name and password; the person is made if nobody has."""
-    with service.client() as http:
-        http.post("/v1/users", json={"name": name, "password": password})
-    page.goto(service.url + "/")
-    page.get_by_label("Name", exact=True).fill(name)
-    page.get_by_label("Password").fill(password)
-    page.get_by_role("button", name="Sign in", exact=True).click()
-    there(page, "Participants")
 
 
 def sign_in_with_token(page: Any, service: Service) -> None:

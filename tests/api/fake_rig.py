@@ -106,7 +106,6 @@ class FakeRig:
         self.more_summary: dict[str, Any] = {}
         self.warnings: list[str] = []
         self.pauses: list[m.Pause] = []
-        self.torque_age_s = 0.004
         self.cell_speaks = True
         self.device_back = True
         self._idle: asyncio.Task[None] | None = None
@@ -123,8 +122,6 @@ class FakeRig:
         self.key = ""
         self.arm = FakeArm()
         self.score: FakeScore | None = None
-        self.last_segments: list[dict[str, Any]] = []
-        self.refuses_extensions = False
         self._play: asyncio.Task[None] | None = None
         self._server: asyncio.Server | None = None
 
@@ -140,7 +137,7 @@ class FakeRig:
             elapsed_s=self.elapsed_s, duration_s=self.duration_s,
             stimulator={"device": "fake P24", "firmware": "1.0", "shortest_us": self.shortest_us},
             load_cell={"device": "fake cell", "rate_hz": 400.0},
-            torque_age_s=self.torque_age_s, torque_nm=0.01,
+            torque_age_s=0.004, torque_nm=0.01,
             calibration=self.calibration and told_next(self.calibration),
             limits=self.limits, require_calibration=self.require_calibration,
             finished=self.finished, angle=self.arm.status(self.elapsed_s),
@@ -158,7 +155,7 @@ class FakeRig:
             if self.cell_speaks and not self.mute and self.state != "running":
                 self._send(m.LiveEvent(
                     test_id=None, segment=None, elapsed_s=0.0, duration_s=0.0, zero_s=0.0,
-                    torque=packed([(0.0, 0.42, 0), (0.001, 0.44, 1)]), torque_age_s=self.torque_age_s,
+                    torque=packed([(0.0, 0.42, 0), (0.001, 0.44, 1)]), torque_age_s=0.004,
                     lost_samples=0, dropped_pulses=0, **self.arm.now(time.monotonic()),
                 ))  # fmt: skip
 
@@ -263,7 +260,7 @@ class FakeRig:
             raise m_refusal("bad-plan", "Wrong key", "extend.key: not the key")
         if not request.segments:
             return score.told(request.test_id)
-        if code := "refused" if self.refuses_extensions else score.extend(request.after, request.segments):
+        if code := score.extend(request.after, request.segments):
             raise m_refusal(code, "Not laid", f"extend: {code}")
         return score.told(request.test_id)
 
@@ -406,7 +403,6 @@ class FakeRig:
             until = min(score.end_s, now_s)
             self._frame(plan, score, torque, sent, until)
             sent = until
-        self.last_segments = score.segments
         widths = score.widths[: round(sent * PULSE_RATE_HZ)]
         await self._end(plan, widths, torque[: round(sent * self.rate_hz)], score)
 

@@ -222,8 +222,6 @@ def fit(progress: Progress, data: str, effects: tuple[str, ...] | list[str] = ()
     progress(0.5, "identifying")
     if "slow" in effects:
         state.pause(60)
-    if "die" in effects:
-        state.die(9)
     if "bad" in effects:
         raise BadRequest("no effect bad", place="effects", fix="Take one of fatigue, tremor.")
     while (Path(data).parent / "fitting-slowly").exists():
@@ -272,8 +270,6 @@ def forecast(
 
 
 def invert(progress: Progress, **arguments: Any) -> dict[str, Any]:
-    if arguments.get("table") == "":
-        raise BadRequest("empty", place="the upload", fix="Give a header.")
     wanted = arguments.get("reference_torque_nm") or [0.0, 1.0, 2.0]
     widths = [min(100.0 * torque, arguments["largest_us"] or 500.0) for torque in wanted]
     lacks = [{"begin_s": 0.025, "end_s": 0.05, "reason": "above-plateau", "shortfall_nm": 0.5}]
@@ -293,7 +289,7 @@ def join(progress: Progress, parts: list[str], out: str, needs: list[str], **_: 
 
 
 def effects(progress: Progress) -> dict[str, Any]:
-    names = ("fatigue", "tremor", "threshold_drift", "slow", "die", "bad", *JOINT)
+    names = ("fatigue", "tremor", "threshold_drift", "slow", "bad", *JOINT)
     words = dict.fromkeys(("name", "stage", "equation", "source", "signature", "separated_by", "plain"), "made up")
     lists = {name: [] for name in ("parameters", "forms", "confused_with", "needs")}
     flags = {"predictable": True, "free": False}

@@ -176,17 +176,6 @@ def test_of_two_versions_of_a_test_the_offered_one_is_next(client: httpx.Client,
         assert shown(service)[0] == f"look {expected}"
 
 
-def test_a_stopped_test_says_so_until_the_next_one(client: httpx.Client, service: Service, participant: str) -> None:
-    service.rig.speed = 0.5
-    test = client.post("/v1/tests", json={"participant": participant}).json()["id"]
-    assert shown(service)[0] == f"running {test}"
-    client.post("/v1/stop")
-    wait_done(client, test)
-    assert shown(service)[0] == "rearm"
-    client.post("/v1/rearm")
-    assert shown(service)[1].startswith("The last test was stopped.")
-
-
 def test_while_a_trial_plays_the_line_says_so_and_after_it_what_became_of_it(
     client: httpx.Client, service: Service, approved: str
 ) -> None:

@@ -24,7 +24,7 @@ from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.service_lock import INHERITED, HeldError, ServiceLock, reserve
 from stimrig.api.store.tables import Participant
-from tests.api.conftest import PATIENCE_S, TOKEN, Service, run_test
+from tests.api.conftest import PATIENCE_S, TOKEN
 from tests.harness.looks_first import LooksFirst
 
 ROOT = Path(__file__).parents[2]
@@ -63,6 +63,8 @@ def test_a_second_service_is_told_who_holds_the_data_and_a_kill_lets_go(tmp_path
         files = [path for path in data.rglob("*") if path.is_file()]
         assert sent.status_code in (201, 422) and files
         assert [path for path in files if mode(path) & 0o077] == [], "by the process's own mask, uploads and logs too"
+        assert {"stimrig.db", "stimrig.db-wal", "service.lock"} <= {path.name for path in files}
+        assert mode(data / "exports") == 0o700 and not mode(data / "recordings") & 0o007
         first.send_signal(signal.SIGKILL)
         first.wait(20)
     held(data_dir=data).release()
@@ -196,13 +198,6 @@ def test_a_service_that_does_not_come_up_lets_go(tmp_path: Path) -> None:
 
 def mode(path: Path) -> int:
     return path.stat().st_mode & 0o777
-
-
-def test_what_a_service_keeps_is_its_owners_alone(service: Service, client: httpx.Client, participant: str) -> None:
-    run_test(client, participant)
-    private = ["stimrig.db", "stimrig.db-wal", "stimrig.db-shm", "service.lock", "stimrig.db.lock"]
-    assert {name: mode(service.data / name) for name in private} == dict.fromkeys(private, 0o600)
-    assert mode(service.data / "exports") == 0o700 and not mode(service.data / "recordings") & 0o007
 
 
 def test_a_database_that_was_open_to_others_is_closed(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from sqlalchemy.exc import OperationalError
 
 from stimrig.api.services import calibrations
 from stimrig.api.sessions import runner
-from tests.api.conftest import Service, run_test, soon
+from tests.api.conftest import Service, run_test
 from tests.api.test_profiles import mark_all
 
 
@@ -171,22 +171,6 @@ def test_a_trial_that_was_planned_with_another_model_is_not_played(
     assert service.rig.starts == starts
     assert controller.post("/v1/tests", json=body).status_code == 202
     assert approved != another
-
-
-def test_a_trial_that_outlives_its_service_ends_with_the_right_that_was_revoked_meanwhile(
-    service: Service, client: httpx.Client, participant: str, approved: str
-) -> None:
-    """The service is killed in a trial, and its key is revoked before it is there again."""
-    key, controller = key_of(service, client, participant)
-    service.rig.speed = 0.1
-    test = controller.post("/v1/tests", json={"participant": participant, **TRIAL}).json()
-    context = service.context
-    soon(lambda: context.rig.status.test_id == test["id"])
-    context.runner.current = None
-    assert context.auth.revoke(key, "somebody elsewhere")
-    service.run(context.runner.resume())
-    told = soon(lambda: service.rig.withdrawn)
-    assert (told[0].test_id, told[0].begun) == (test["id"], True)
 
 
 def test_a_rearm_that_a_stop_overtakes_is_not_done(service: Service, client: httpx.Client) -> None:

@@ -69,19 +69,6 @@ def test_a_wall_clock_that_is_set_back_ends_no_wait() -> None:
     assert 6 < pace.wait_s("a") <= 8
 
 
-def test_strangers_hold_back_nobody_at_their_usual_place() -> None:
-    guesses = Guesses(SetClock())
-    for number in range(3 * FREE_FOR_A_NAME):
-        for place in (f"10.1.{number}.1", OWN):
-            held(guesses.password, "Ada", place, known=False)
-    for number in range(200):
-        held(guesses.password, f"n{number}", OWN, known=False)
-    assert held(guesses.password, "Ada", OWN, known=True) == held(guesses.confirmation, "her session") == 0
-    assert held(guesses.password, "Ada", "10.2.0.1", known=False) > 0, "many places, one name: slowed down"
-    assert held(guesses.password, "Bob", OWN, known=False) > 0, "many names, one place: slowed down"
-    assert held(guesses.password, "Bob", "10.2.0.1", known=False) == 0
-
-
 @pytest.mark.parametrize("name", ["Ada", "Nobody"])
 def test_a_name_that_is_nobodys_is_held_back_like_one_that_is(name: str) -> None:
     guesses = Guesses(SetClock())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -27,8 +26,6 @@ from tests.api.browser import (
     open_tab,
     painted_soon,
     participant,
-    sign_in,
-    sign_in_with_token,
     start,
     without_values,
 )
@@ -169,12 +166,6 @@ def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> 
 # ---- What a clinician, a reader and an administrator do on the page, by mouse and by keyboard alone
 
 
-@pytest.fixture
-def blank(browser: Any, service: Service) -> Iterator[Any]:
-    """A tab in which nobody has signed in."""
-    yield from open_tab(browser, service, signed_in=False)
-
-
 def test_every_export_of_a_model_and_a_test_is_there(service: Service, pages: httpx.Client) -> None:
     model = service.play_test("C3")["model_id"]
     exports = pages.get(f"/models/{model}").text.partition('aria-label="Export"')[2].partition("</div>")[0]
@@ -223,34 +214,3 @@ def test_a_reader_sees_no_deeds_and_may_stop(service: Service, client: httpx.Cli
         assert "The rig confirms that stimulation is off" in page.post("/v1/stop", data={}).text
     assert service.rig.stopped_by == "Rosa"
     bring_to_rest(service)
-
-
-def test_an_administrator_adds_a_clinician_and_a_key_by_clicking(blank: Any, service: Service) -> None:
-    sign_in_with_token(blank, service)
-    blank.get_by_role("link", name="Administration").click()
-    name = f"Ben{time.time_ns() % 10**6}"
-    blank.get_by_label("Name", exact=True).fill(name)
-    blank.get_by_label("First password").fill(PASSWORD)
-    blank.get_by_role("button", name="Add").click()
-    blank.get_by_role("cell", name=name, exact=True).first.wait_for()
-    blank.get_by_label("Name of the controller").fill("ilc in room 3")
-    blank.get_by_role("button", name="Make the key").click()
-    blank.get_by_text("shown this once").wait_for()
-    key = blank.locator("#key-made .mono").inner_text()
-    blank.reload()
-    with service.client(key) as controller:
-        assert controller.get("/v1/participants/none/model").status_code == 404
-        assert controller.get("/v1/rig").status_code == 403
-    expected(blank.get_by_text("The chain of hashes is complete")).to_be_visible()
-    with blank.expect_download() as caught:
-        blank.get_by_role("link", name="Export all").click()
-    from stimrig.api.cli import main
-
-    assert main.run(["audit", "verify", "--file", str(caught.value.path())]) == 0
-    blank.get_by_role("button", name=re.compile("Revoke the token of ilc")).first.click()
-    blank.get_by_text("revoked").first.wait_for()
-    with service.client(key) as controller:
-        assert controller.get("/v1/participants/none/model").status_code == 401
-    blank.get_by_role("button", name="Sign out").click()
-    sign_in(blank, service, name)
-    assert blank.get_by_role("link", name="Administration").count() == 0

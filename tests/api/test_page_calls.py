@@ -12,6 +12,7 @@ from tests.api.conftest import HTML, Service, play_test, shared_service
 from tests.api.fake_arm import still
 from tests.api.forms import Control, Form, forms
 from tests.api.test_profiles import calibrate
+from tests.api.test_verdict import make_poor
 
 service = shared_service()
 
@@ -31,12 +32,13 @@ def addresses(service: Service) -> list[str]:
         client.post("/v1/participants/P017/notes", json={"kind": "spasm", "text": "left"})
         play_test(client, "P018")
         client.post("/v1/participants", json={"code": "P019"})
+        client.post("/v1/participants/P019/archive")
         client.post("/v1/users", json={"name": "Ada", "password": "correct horse battery"})
         client.post("/v1/participants/P018/calibration")
     return [
         "/", "/participants/P017", "/participants/P018", "/participants/P017/calibration",
         "/participants/P018/calibration", "/participants/P017/joint", "/rig/angle", f"/tests/{test['id']}",
-        f"/models/{model}", "/administration",
+        f"/models/{model}", f"/models/{make_poor(service, model)}/approve", "/participants/P019", "/administration",
     ]  # fmt: skip
 
 

@@ -12,7 +12,6 @@ from sqlalchemy import event
 from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
 from tests.api.conftest import Service, run_test, shared_service, signed_in, soon, wait_done
-from tests.api.forms import press
 
 service = shared_service()
 
@@ -126,25 +125,6 @@ def test_the_first_page_asks_as_much_of_the_database_for_many_as_for_few(service
     assert len(http.get("/v1/participants", params={"q": "Z"}).json()) == 500
 
 
-def test_the_page_of_an_archived_participant_offers_the_way_out_and_no_test(pages: httpx.Client, http: httpx.Client):
-    make(http, "A3")
-    http.post("/v1/participants/A3/archive")
-    page = pages.get("/participants/A3").text
-    assert 'class="card next next-archived"' in page and "In the archive since" in page
-    assert "Start the pre-session test" not in page and "A3/calibration" not in page
-    assert page.count('data-call="POST /v1/participants/A3/unarchive"') == 2, "in the line of what is next, and below"
-    assert press(pages, "/participants/A3", "/unarchive").status_code == 200
-    assert "Start the pre-session test" in pages.get("/participants/A3").text
-
-
-def test_side_and_muscle_are_asked_for_on_the_page(pages: httpx.Client, http: httpx.Client) -> None:
-    assert '<option value="right"' in pages.get("/").text and 'name="muscle"' in pages.get("/").text
-    more = {"side": "right", "muscle": "triceps brachii"}
-    assert press(pages, "/", "POST /v1/participants", code="A4", **more).json()["code"] == "A4"
-    made = http.get("/v1/participants/A4").json()
-    assert (made["side"], made["muscle"]) == ("right", "triceps brachii")
-
-
 # ---- Notes: on a session, on a test, at a time in it; struck and never deleted; and what may not stand in one
 
 
@@ -158,8 +138,8 @@ def made(service: Service) -> Iterator[tuple[httpx.Client, dict[str, Any]]]:
 def test_a_note_is_kept_struck_and_never_deleted(made: tuple[httpx.Client, dict[str, Any]]) -> None:
     http, _test = made
     http.post("/v1/participants", json={"code": "N2"})
-    written = http.post("/v1/participants/N2/notes", json={"kind": "posture", "text": "  sat up straight "})
-    assert written.status_code == 201 and written.json()["text"] == "sat up straight"
+    written = http.post("/v1/participants/N2/notes", json={"kind": "posture", "text": "  Mu\u0308de <b> "})
+    assert written.status_code == 201 and written.json()["text"] == "Müde <b>"
     note = written.json()
     for _ in range(2):
         struck = http.post(f"/v1/participants/N2/notes/{note['id']}/strike")
@@ -204,6 +184,7 @@ def test_now_is_where_the_running_test_stands(service: Service, client: httpx.Cl
 @pytest.mark.parametrize(
     "fields",
     [
+        {"text": "electrode 2 moved"},
         {"kind": "other"},
         {"kind": "other", "text": " "},
         {"kind": "nonsense"},
@@ -226,22 +207,7 @@ def test_what_is_no_note_is_refused(made: tuple[httpx.Client, dict[str, Any]], f
     assert len(http.get("/v1/participants/N1/notes").json()) == before
 
 
-def test_letters_are_composed(made: tuple[httpx.Client, dict[str, Any]]) -> None:
-    http, _test = made
-    answer = http.post("/v1/participants/N1/notes", json={"kind": "other", "text": "Mu\u0308de <b>"})
-    assert answer.json()["text"] == "Müde <b>"
-
-
 # ---- A note's kind is chosen; which fit is shown
-
-
-def test_the_kind_of_a_note_is_chosen(pages: httpx.Client, http: httpx.Client) -> None:
-    make(http, "L1")
-    page = pages.get("/participants/L1").text
-    assert 'name="kind" required><option value="">Choose…</option>' in page
-    assert press(pages, "", "/notes", html=page, text="electrode 2 moved").status_code == 422
-    assert press(pages, "", "/notes", html=page, text="electrode 2 moved", kind="electrodes").status_code == 201
-    assert [note["kind"] for note in pages.get("/v1/participants/L1/notes").json()] == ["electrodes"]
 
 
 def test_new_pulses_come_first() -> None:

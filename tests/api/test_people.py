@@ -12,7 +12,6 @@ from typing import Any
 import argon2
 import httpx
 import pytest
-from sqlalchemy import inspect
 
 from stimrig.api.cli import main
 from stimrig.api.clock import utc_label
@@ -65,14 +64,6 @@ def test_a_password_costs_what_rfc_9106_asks_for(monkeypatch: pytest.MonkeyPatch
     assert argon2.extract_parameters(kept) == argon2.profiles.RFC_9106_LOW_MEMORY
 
 
-def test_password_is_kept_as_argon2id_only(service: Service, clinician: httpx.Client) -> None:
-    assert clinician.get("/v1/rig").status_code == 200
-    ((kept,),) = service.sql("SELECT password_hash FROM users")
-    assert kept.startswith("$argon2id$")
-    tables = inspect(service.context.store.engine).get_table_names()
-    assert not any(PASSWORD in str(service.sql(f"SELECT * FROM {table}")) for table in tables)
-
-
 def test_approval_needs_the_password_once_more(
     service: Service, client: httpx.Client, clinician: httpx.Client, participant: str
 ) -> None:
@@ -97,8 +88,12 @@ def test_a_form_signs_in_and_leads_on_and_another_site_does_not(service: Service
         assert answer.status_code == 303 and answer.headers["location"] == "/participants/P1"
         elsewhere = browser.post("/v1/sessions", data=form, headers={"Origin": "https://elsewhere.example"})
         assert elsewhere.status_code == 403
-        away = browser.post("/v1/sessions", data=form, params={"next": "//elsewhere.example"})
-        assert away.headers["location"] == "/"
+        for target in ("//evil.example", "https://evil.example", "/\\evil.example"):
+            away = browser.post("/v1/sessions", data=form, params={"next": target})
+            assert away.headers["location"] == "/"
+        browser.cookies.clear()
+        led = browser.get("/participants/P1", headers=HTML)
+        assert led.status_code == 303 and led.headers["location"] == "/sign-in?next=/participants/P1"
 
 
 def tries(asgi: Any, peer: str, forwarded: list[str]) -> list[int]:
@@ -169,7 +164,7 @@ def test_other_addresses_than_loopback_are_refused_without_tls(host: str) -> Non
 
 
 def test_audit_is_verified_and_exported_by_a_command(
-    service: Service, participant: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    service: Service, client: httpx.Client, participant: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     data, out = str(service.data), tmp_path / "trail.jsonl"
     for number in range(3):
@@ -179,6 +174,9 @@ def test_audit_is_verified_and_exported_by_a_command(
     assert found["whole"] and found["entries"] >= 2
     assert main.run(["audit", "export", "--data", data, "-o", str(out)]) == 0
     assert main.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 0
+    page = tmp_path / "page.jsonl"
+    page.write_bytes(client.get("/administration/audit.jsonl").content)
+    assert main.run(["audit", "verify", "--file", str(page), "--head", found["head"]]) == 0 and participant
     lines = out.read_text().splitlines()
     for tampered in (
         lines[:1] + lines[2:],
@@ -231,13 +229,15 @@ def test_the_end_of_a_token_is_a_time_and_is_kept_as_the_clock_writes_it(
     assert answer.json().get("expires_utc") == kept and answer.status_code == (201 if kept else 422)
 
 
-def test_database_holds_no_token(service: Service) -> None:
+def test_database_holds_no_token(service: Service, client: httpx.Client) -> None:
+    """Nor a password: its argon2id hash alone."""
+    client.post("/v1/users", json={"name": "Ada", "password": PASSWORD})
     token = service.token("someone", "read-live")
     with signed_in(service, token):
         pass
     with sqlite3.connect(service.data / "stimrig.db") as database:
         dump = "\n".join(database.iterdump())
-    assert token not in dump and TOKEN not in dump
+    assert token not in dump and TOKEN not in dump and PASSWORD not in dump and "'$argon2id$" in dump
 
 
 def test_first_start_draws_a_token_once(tmp_path) -> None:
@@ -269,18 +269,6 @@ def test_signing_out_ends_the_session(service: Service, pages: httpx.Client) -> 
     assert service.client(None, cookies=cookie).get("/v1/rig").status_code == 401
 
 
-def test_sign_in_leads_nowhere_else(service: Service) -> None:
-    with service.client(None, headers=HTML) as browser:
-        for target in ("//evil.example", "https://evil.example", "/\\evil.example"):
-            answer = browser.post("/v1/sessions", params={"next": target}, data={"token": TOKEN})
-            assert answer.headers["location"] == "/"
-        wrong = browser.post("/v1/sessions", data={"token": "wrong"})
-        assert wrong.status_code == 401 and "unknown" in wrong.text
-    with service.client(None, headers=HTML) as stranger:
-        led = stranger.get("/participants/P1")
-        assert led.status_code == 303 and led.headers["location"] == "/sign-in?next=/participants/P1"
-
-
 # ---- stop ---------------------------------------------------------------------------------------------------
 
 
@@ -292,11 +280,6 @@ def test_stop_by_json_and_without_a_body_says_the_rigs_evidence(
     answer = client.post("/v1/stop", json={"reason": "pain"}).json()
     assert answer["stopped"] and answer["evidence"]["device_state"] == "not initialised"
     assert client.post("/v1/stop").json()["stopped"]
-
-
-def test_stop_is_open_to_anyone_signed_in_and_to_nobody_else(service: Service) -> None:
-    assert service.client(service.token("reader", "read-model")).post("/v1/stop").status_code == 200
-    assert service.client(None).post("/v1/stop").status_code == 401
 
 
 def test_stop_says_so_when_the_rig_is_gone(client: httpx.Client, service: Service) -> None:

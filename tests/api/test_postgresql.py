@@ -226,18 +226,11 @@ def test_no_column_limits_the_length_of_a_text(cluster: Cluster) -> None:
     assert limited == []
 
 
-def test_a_database_that_is_not_there_or_newer_is_refused_in_one_line(cluster: Cluster) -> None:
+def test_a_database_that_is_not_there_is_refused_in_one_line() -> None:
     with pytest.raises(ApiError) as caught:
         Store("postgresql://ann:secret@127.0.0.1:1/stimrig")
     line = str(caught.value)
     assert "127.0.0.1" in line and "secret" not in line and "\n" not in line and "STIMRIG_DATABASE_URL" in line
-    newer = cluster.database("newer")
-    store = Store(newer)
-    with store.write() as session:
-        session.connection().exec_driver_sql("UPDATE alembic_version SET version_num = '0900'")
-    store.close()
-    with pytest.raises(ApiError, match="it is of version 0900"):
-        Store(newer)
     with pytest.raises(ApiError, match="neither sqlite nor postgresql"):
         Store("mysql://ann@127.0.0.1/stimrig")
 

@@ -2,33 +2,18 @@
 
 from __future__ import annotations
 
-from datetime import UTC, datetime
 from email.utils import parsedate_to_datetime
 from pathlib import Path
 
-import h5py
 import httpx
 import numpy as np
 import pytest
 
-from stimrig.api.models.tracking import Limits
 from stimrig.api.store.tables import Recording
 from tests.api.conftest import REAL, Service, run_test, serving, soon, wait_done
 from tests.api.test_tracked import play, say
 
 pytestmark = pytest.mark.slow
-
-RATE_HZ = 400
-WIDE = Limits(gain_percent=60.0, threshold_percent=60.0, time_scale_percent=60.0).bounds(80.0)
-WIDTHS = np.concatenate([
-    np.zeros(40), np.linspace(0.0, 200.0, 80), np.full(60, 200.0), np.linspace(200.0, 120.0, 60), np.full(80, 120.0),
-    np.linspace(120.0, 0.0, 120), np.zeros(40),
-]).round()  # fmt: skip
-
-
-def silent(_share: float, _text: str = "") -> None:
-    """Progress that nobody looks at."""
-
 
 # ---- What the muscle did between two trials: the service passes it on, the worker carries its effects through it
 
@@ -59,13 +44,6 @@ def test_the_worker_is_given_what_was_played_since(service: Service, client: htt
     play(client)
     expected = [[tested["recording_id"], first["recording_id"]], [missed["recording_id"]], []]
     soon(lambda: passed_on(service, 2) == expected)
-
-
-def at(path: str, unix_s: float) -> str:
-    """The recording, begun then."""
-    with h5py.File(path, "a") as file:
-        file.attrs["created_utc"] = datetime.fromtimestamp(unix_s, UTC).isoformat(timespec="milliseconds")
-    return path
 
 
 # ---- from a trial to the tracked model that is served; nothing is stubbed but the rig ----------------------------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from typing import Any, get_args
 
 import httpx
@@ -12,7 +11,7 @@ from stimrig.api import local_time
 from stimrig.api.models.tracking import OUTCOMES, sentences
 from stimrig.api.web.responses.models import TrialOut
 from tests.api.conftest import Service
-from tests.api.test_tracked import play, say, tracked
+from tests.api.test_tracked import play, say
 
 PAGE = "/participants/P017"
 
@@ -59,52 +58,6 @@ def test_every_outcome_of_the_service_has_words() -> None:
     told = get_args(TrialOut.model_fields["outcome"].annotation)
     assert set(told) == set(OUTCOMES)
     assert len(set(OUTCOMES.values())) == len(told)
-
-
-def test_the_card_tells_the_trials_without_scripts(service: Service, client: httpx.Client, approved: str):
-    assert "Number of the trial" not in client.get(PAGE).text, "only where there is something"
-    for _ in range(3):
-        play(client)
-    say(service, reason="the record is too short")
-    play(client)
-    page = client.get(PAGE).text
-    card = page[page.index('<section class="card trials"') :]
-    assert "In trial 3 the plateau is 5.9 % lower than at " in card and "as of trial 3, " in card
-    assert card.count("<figure") == 3, "nobody sent a reference, so there is no error against it"
-    for unit in ("94.1 ± 1.0\u00a0%", "0.5 ± 0.0\u00a0µs", "100.0 ± 1.0\u00a0%"):
-        assert unit in card, unit
-    assert card.count("Number of the trial") == 3
-    assert "not followed" in card and "the record is too short" in card and "Start the adaptive test" not in card
-
-
-def test_what_is_asked_leads_to_the_shortest_test_in_one_click(
-    service: Service, pages: httpx.Client, client: httpx.Client, approved: str
-) -> None:
-    say(service, values={"gain": 0.7})
-    play(client)
-    page = pages.get(PAGE).text
-    assert "The trials say that a new test is needed." in page
-    notice = re.search(r'<div class="notice bad" role="alert">.*?</div>', page, re.S)
-    assert notice and "After trial 1 the gain is expected to be 70.0 %" in notice[0]
-    query = dict(re.findall(r'name="(\w+)" value="([^"]*)"', notice[0]))
-    assert "Stops once known within" in pages.get(f"{PAGE}/start", params=query).text
-
-
-def test_a_person_sets_the_limits_with_the_approval(pages: httpx.Client, client: httpx.Client, approved: str) -> None:
-    client.post(f"/v1/models/{approved}/reject", json={"reason": "once more"})
-    page = pages.get(f"/models/{approved}").text
-    assert re.search(r'name="tracking.gain_percent"[^>]*value="20"', page)
-    summary = re.search(r'<details class="more tracking"><summary>(.*?)</summary>', page, re.S)
-    assert summary and "gain ±20\u00a0%, threshold ±20\u00a0% (±" in summary[1], "it is read before it is approved"
-    approve = f"/v1/models/{approved}/approve"
-    for wrong in (61.0, -1.0, None, "nan"):
-        assert client.post(approve, json={"tracking": {"gain_percent": wrong}}).status_code == 422, wrong
-    assert tracked(client).status_code == 404
-    limits = {"gain_percent": 12.5, "threshold_percent": 0.0, "time_scale_percent": 60.0}
-    assert client.post(approve, json={"tracking": limits}).status_code == 200
-    shown = pages.get(f"/models/{approved}").text
-    assert "gain ±12.5\u00a0%, threshold as approved, time scale ±60\u00a0%" in shown
-    assert client.get("/v1/participants/P017/tracking").json()["limits"] == limits
 
 
 @pytest.mark.browser

@@ -125,14 +125,3 @@ def test_a_stop_is_a_stop_whatever_its_body(shared_client: httpx.Client) -> None
     for body in (b"\xff\xff", b"[" * 900, b'{"reason": "a", "reason": "b"}'):
         answer = shared_client.post("/v1/stop", content=body, headers={"content-type": "application/json"})
         assert answer.status_code == 200, answer.text
-
-
-def test_every_operation_with_a_body_documents_what_it_answers(shared_client: httpx.Client) -> None:
-    operations = [
-        (path, method, operation)
-        for path, methods in shared_client.get("/openapi.json").json()["paths"].items()
-        for method, operation in methods.items()
-        if "requestBody" in operation
-    ]
-    assert len(operations) >= 14
-    assert [(path, method) for path, method, operation in operations if "400" not in operation["responses"]] == []

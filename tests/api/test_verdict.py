@@ -23,7 +23,7 @@ from stimrig.api.web.pages import report_view
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.identify.estimation import quality
-from tests.api.conftest import REAL, Service, run_test, serving, signed_in
+from tests.api.conftest import REAL, Service, run_test, serving
 from tests.harness import few_effects
 from tests.harness.patients import Patient, make_record
 from tests.identify import hidden_muscles
@@ -70,14 +70,23 @@ def uploaded(client: httpx.Client, data: Path) -> dict[str, Any]:
 
 
 @pytest.mark.slow
-def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data = record_csv(tmp_path / "noise.csv", follows=False)
-    printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
-    stored = json.loads((tmp_path / "MODEL.json").read_text())["quality"]
+@pytest.mark.parametrize("level", [False, True])
+def test_not_usable_is_said_in_each_place(
+    tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str], level: bool
+) -> None:
+    """Level held-out torque has an error and no percent."""
+    data, report = record_csv(tmp_path / "record.csv", follows=level, level=level), tmp_path / "report.html"
+    printed = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json")
+    document = json.loads((tmp_path / "MODEL.json").read_text())
+    stored, fit = document["quality"], document["fit"]
     assert stored["verdict"] == "not usable" and stored["words"].startswith("Do not use this model: ")
     assert f"not usable: {stored['words']}" in printed
+    assert (f"held out       fit {stored_model.UNDEFINED}, error" in printed) == level
+    assert (fit["held_out_fit_percent"] is fit["held_out_ceiling_percent"] is None) == level
+    assert fit["held_out_rms_nm"] > 0 and ("whose torque is constant" in stored["words"]) == level
     assert json.loads(said(capsys, "fit", data, "--json"))["quality"] == stored
-    assert stored["words"] in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
+    compared = said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
+    assert stored["words"] in compared and (stored_model.UNDEFINED in compared) == level
     pages = {"report of the command line": report.read_text("utf-8")}
     with serving(tmp_path / "service", short_dir, REAL) as (_, client):
         found = uploaded(client, data)
@@ -86,6 +95,8 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
             assert {key: answer[key] for key in ("verdict", "words", "reasons")} == {
                 key: stored[key] for key in ("verdict", "words", "reasons")
             }
+        assert (found["held_out_fit_percent"] is None) == level
+        assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
         for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
             pages[path] = client.get(path).text
         for path in ("/", "/participants/P1"):
@@ -93,28 +104,8 @@ def test_not_usable_is_said_in_each_place(tmp_path: Path, short_dir: Path, capsy
             assert '<span class="tag tag-not-usable">not usable</span>' in text, path
     for place, text in pages.items():
         assert "verdict-not-usable" in text, place
-        for words in (stored["words"], *stored["reasons"][1:]):
+        for words in (stored["words"], *stored["reasons"][1:], *[stored_model.UNDEFINED] * level):
             assert words in html.unescape(text), (place, words)
-
-
-@pytest.mark.slow
-def test_level_held_out_torque_has_no_percent(tmp_path: Path, short_dir: Path, capsys: pytest.CaptureFixture[str]):
-    data = record_csv(tmp_path / "level.csv", follows=True, level=True)
-    printed, report = said(capsys, "fit", data, "-o", tmp_path / "MODEL.json"), tmp_path / "report.html"
-    assert f"held out       fit {stored_model.UNDEFINED}, error" in printed
-    fit = json.loads((tmp_path / "MODEL.json").read_text())["fit"]
-    assert fit["held_out_fit_percent"] is None and fit["held_out_ceiling_percent"] is None
-    assert fit["held_out_rms_nm"] > 0
-    assert stored_model.UNDEFINED in said(capsys, "compare", tmp_path / "MODEL.json", data, "--html", report)
-    assert stored_model.UNDEFINED in report.read_text("utf-8")
-    with serving(tmp_path / "service", short_dir, REAL) as (_, client):
-        found = uploaded(client, data)
-        assert found["verdict"] == "not usable" and "whose torque is constant" in found["words"]
-        assert found["held_out_fit_percent"] is None and found["held_out_rms_nm"] > 0
-        assert client.get(f"/v1/models/{found['id']}/comparison").status_code == 200
-        for path in (f"/models/{found['id']}?diagnose=0", f"/models/{found['id']}/report"):
-            assert stored_model.UNDEFINED in client.get(path).text
-        assert client.get("/participants/P1").status_code == client.get("/").status_code == 200
 
 
 @pytest.mark.parametrize(
@@ -184,23 +175,6 @@ def test_undo_brings_no_model_into_use_that_is_not_usable(client: httpx.Client, 
     client.post(f"/v1/models/{better}/approve")
     assert client.post(f"/v1/models/{better}/undo").json()["id"] == poor
     assert client.get("/v1/participants/P017/model").status_code == 404
-
-
-def test_a_question_comes_before_a_model_that_is_not_usable_is_approved(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    model = run_test(client, participant)["model_id"]
-    poor = make_poor(service, model)
-    with signed_in(service) as browser:
-        page = browser.get(f"/models/{poor}?diagnose=0").text
-        assert "Test again" in page and f'href="/models/{poor}/approve"' in page
-        assert f"POST /v1/models/{poor}/approve" not in page, "not by the page's own button"
-        assert browser.get(f"/models/{model}/approve").headers["location"] == f"/models/{model}", "no question needed"
-        question = browser.get(f"/models/{poor}/approve")
-        assert question.status_code == 200 and "What the controller would risk" in question.text
-        assert "the recruitment curve is not identified" in question.text
-        assert "the error is 31 % of the torque" in question.text
-        assert f'data-call="POST /v1/models/{poor}/approve"' in question.text
 
 
 # ---- words --------------------------------------------------------------------------------------------------

@@ -133,23 +133,6 @@ def test_a_senseless_reference_is_refused_in_words(client: httpx.Client, served:
         assert answer.status_code in (400, 422), answer.text
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "empty"),
-        ("a,b\n1,2\n", "line 1"),
-        ("time_s,torque_nm\n0,1\n0.1,x\n", "line 3, column torque_nm"),
-        ("\x89HDF\r\n\x1a\n\x00\x00", "not text"),
-        ("time_s,torque_nm\n0,\ufffd1\n", "line 2"),
-    ],
-)
-def test_a_table_that_is_no_reference_is_refused_with_its_place(
-    client: httpx.Client, served: tuple[Service, str], text: str, words: str
-) -> None:
-    answer = client.post(f"/v1/models/{served[1]}/widths", json={"table": text})
-    assert answer.status_code == 422 and words in answer.json()["detail"]
-
-
 def test_a_table_says_the_same_as_its_numbers(client: httpx.Client, served: tuple[Service, str]) -> None:
     ask = f"/v1/models/{served[1]}/widths"
     numbers = {"reference_torque_nm": WANTED_NM.round(5).tolist(), "time_s": TIME_S.round(4).tolist()}
