@@ -49,11 +49,11 @@ class NotFoundError(ApiError):
         super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {fix}".strip())
 
 
-def require_found(found: T | None, what: str, name: str, fix: str = "") -> T:
+def require_found(item: T | None, what: str, name: str, fix: str = "") -> T:
     """What was asked for. Raises NotFoundError where it is None."""
-    if found is None:
+    if item is None:
         raise NotFoundError(what, name, fix)
-    return found
+    return item
 
 
 def invalid(detail: str, **extra: Any) -> ApiError:

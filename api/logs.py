@@ -50,4 +50,4 @@ def configure(process: str = "service") -> None:
     logging.basicConfig(level=logging.INFO, handlers=[handler], force=True)
     logging.captureWarnings(True)
     sys.excepthook = lambda kind, error, trace: log.critical("ended by an error", exc_info=(kind, error, trace))
-    threading.excepthook = lambda told: log.critical("a thread ended by an error", exc_info=told.exc_value)
+    threading.excepthook = lambda args: log.critical("a thread ended by an error", exc_info=args.exc_value)

@@ -47,15 +47,15 @@ def read(
     """
     called = name or (lambda number: str(paths[number]))
     records = [identify.read(path, map=columns) for path in paths]
-    say = note or (lambda _words: None)
+    report = note or (lambda _words: None)
     for number, record in enumerate(records):
         for words in record.notes:
-            say(f"{called(number)}: {words}")
+            report(f"{called(number)}: {words}")
     check_columns(records, needs, called)
     if len(records) == 1:
         return records[0]
     for words in _dropped(records, called):
-        say(words)
+        report(words)
     try:
         return join(records, [begun(path) for path in paths])
     except identify.BadRecord as error:
@@ -84,12 +84,12 @@ def check_columns(records: Sequence[Any], needs: Sequence[str], called: Callable
 
 def _dropped(records: Sequence[Any], called: Callable[[int], str]) -> list[str]:
     """What is left out of the whole since some of the parts lack it."""
-    found = []
+    messages = []
     for column in JOINT:
         lacking = [called(number) for number, record in enumerate(records) if getattr(record, column) is None]
         if 0 < len(lacking) < len(records):
-            found.append(f"{', '.join(lacking)}: no {column}, so it is left out of the joined record")
-    return found
+            messages.append(f"{', '.join(lacking)}: no {column}, so it is left out of the joined record")
+    return messages
 
 
 def begun(path: Path) -> float | None:
@@ -144,8 +144,8 @@ def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
 def write_table(record: Any, columns: dict[str, Any], out: Path) -> dict[str, Any]:
     """Write times, these columns, the segments' names and the record's further columns; how many rows."""
     also = record.columns()
-    told = [quoted(name) for name in record.segment_names]
-    segments = [told[index] for index in record.segment.tolist()]
+    quoted_names = [quoted(name) for name in record.segment_names]
+    segments = [quoted_names[index] for index in record.segment.tolist()]
     values = [column.tolist() for column in (record.time_s, *columns.values(), *also.values())]
     with out.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(["time_s", *columns, "segment", *also]) + "\n")
@@ -165,9 +165,9 @@ def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, A
         if path.name.startswith(PREFIX):
             continue  # what somebody sent in is no recording of this rig, whatever test it names
         try:
-            found = attributes(path, ["test_id", "recording_id", "outcome", "reason"])
+            fields = attributes(path, ["test_id", "recording_id", "outcome", "reason"])
         except identify.IdentifyError:
             continue
-        if found.pop("test_id") == test_id:
-            return {"found": {**found, "recording_path": str(path), "file_sha256": sha256_of(path)}}
+        if fields.pop("test_id") == test_id:
+            return {"found": {**fields, "recording_path": str(path), "file_sha256": sha256_of(path)}}
     return {"found": None}

@@ -50,25 +50,25 @@ class Settings(BaseSettings):
         default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
     )
 
-    def __init__(self, **given: Any) -> None:
+    def __init__(self, **values: Any) -> None:
         try:
-            super().__init__(**given)
+            super().__init__(**values)
         except ValidationError as error:
             raise SettingsError(refusal(error)) from error
 
     @field_validator("time_zone")
     @classmethod
-    def _known_zone(cls, given: str | None) -> str | None:
+    def _known_zone(cls, zone: str | None) -> str | None:
         """A zone that this machine knows."""
-        if given and given not in available_timezones():
+        if zone and zone not in available_timezones():
             raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
-        return given or None
+        return zone or None
 
     @field_validator("structure", mode="before")
     @classmethod
-    def _separated(cls, given: object) -> object:
+    def _separated(cls, value: object) -> object:
         """A comma-separated text, as it stands in the environment; each effect once."""
-        named = [part.strip() for part in given.split(",")] if isinstance(given, str) else given
+        named = [part.strip() for part in value.split(",")] if isinstance(value, str) else value
         if not isinstance(named, list | tuple):
             return named
         named = [name for name in named if name]
@@ -102,9 +102,9 @@ def refusal(error: ValidationError) -> str:
     """Which setting does not hold, in one line, by the name of its environment variable."""
     first = error.errors()[0]
     name = PREFIX + "_".join(str(part) for part in first["loc"]).upper()
-    says = first["msg"].removeprefix("Value error, ")
-    shown = re.sub(r"//[^/]*@", "//…@", repr(first["input"]))
-    return f"{name}: {says}" if name.endswith(SECRET) else f"{name}: {says}, not {shown}"
+    message = first["msg"].removeprefix("Value error, ")
+    value = re.sub(r"//[^/]*@", "//…@", repr(first["input"]))
+    return f"{name}: {message}" if name.endswith(SECRET) else f"{name}: {message}, not {value}"
 
 
 def loopback(host: str) -> bool:

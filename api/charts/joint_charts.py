@@ -82,27 +82,27 @@ def _figure(joint: dict[str, Any], name: str, unit: str, value: Value, title: st
     bands: list[Band] = []
     dotted: list[Curve] = []
     lines: list[Curve] = []
-    for way, column, seen in columns(joint, name):
+    for way, column, is_covered in columns(joint, name):
         y = [row[column] for row in joint[name + unit]]
         notes: list[str] = []
         if f"{name}_lower{unit}" in joint:
             lower, upper = ([row[column] for row in joint[f"{name}_{edge}{unit}"]] for edge in ("lower", "upper"))
             whole = Band(angle_deg, lower, upper, colour="series-band", listed=not bands)
-            bands += _seen_parts(whole, seen)
+            bands += _seen_parts(whole, is_covered)
             notes = fig.half_widths(whole, angle_deg)
-        if not all(seen):
+        if not all(is_covered):
             label = "" if dotted else "dotted: not seen"
             dotted.append(Curve(angle_deg, y, label, way.colour, 1.2, "dot", listed=not dotted))
-        solid = [value if was_seen else None for value, was_seen in zip(y, seen, strict=True)]
+        solid = [value if was_seen else None for value, was_seen in zip(y, is_covered, strict=True)]
         lines.append(Curve(angle_deg, solid, _label(way, joint["velocity_rad_s"][column]), way.colour, way.width,
                            marker=way.marker, size=7, every=MARK_EVERY, value=value, notes=notes))  # fmt: skip
     x = Axis("Joint angle (°)", fig.AT_ANGLE, (angle_deg[0], angle_deg[-1]))
     return Figure(x, (Axis(title),), (*dotted, *lines), tuple(bands), height=430)
 
 
-def _seen_parts(band: Band, seen: Sequence[bool]) -> list[Band]:
+def _seen_parts(band: Band, is_covered: Sequence[bool]) -> list[Band]:
     """Return the band of each stretch of two angles or more that was seen; the legend names the first of all."""
-    edges = [row for row, (before, now) in enumerate(pairwise([False, *seen, False])) if before != now]
+    edges = [row for row, (before, now) in enumerate(pairwise([False, *is_covered, False])) if before != now]
     parts = []
     for begin, end in zip(edges[::2], edges[1::2], strict=True):
         if end - begin >= 2:

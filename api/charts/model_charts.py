@@ -228,7 +228,7 @@ def mean_lag_s(linear: dict[str, Any]) -> float:
 
 COLOURS = tuple(f"series-{number}" for number in range(1, 7))
 DASHES = ("solid", "dash", "dot", "dashdot", "longdash", "longdashdot")
-MOST = len(COLOURS)
+MAX_COMPARED = len(COLOURS)
 BANDED = 3
 """With more models than this their bands would hide one another."""
 
@@ -245,8 +245,8 @@ def compared_recruitment(documents: Sequence[dict[str, Any]], names: Sequence[st
         _series(document["recruitment"]["pulse_width_us"], document["recruitment"]["torque_nm"], name, number, True)
         for number, (document, name) in enumerate(zip(documents, names, strict=True))
     ]
-    drawn = tuple(replace(band, listed=False) for band in bands if band) if len(documents) <= BANDED else ()
-    return Figure(WIDTH_AXIS, (TORQUE_AXIS,), tuple(lines), drawn, height=380)
+    bands_shown = tuple(replace(band, listed=False) for band in bands if band) if len(documents) <= BANDED else ()
+    return Figure(WIDTH_AXIS, (TORQUE_AXIS,), tuple(lines), bands_shown, height=380)
 
 
 def compared_step(curves: Sequence[dict[str, Any] | None], names: Sequence[str]) -> Figure:

@@ -13,7 +13,7 @@ from stimrig.api.jobs.curves import curves, rounded, runs
 from stimrig.api.models import explanation
 from stimrig.identify import BadRequest, Comparison, Diagnosis, Improvement, Model, Record, compare
 
-BESIDE, ALONE = [0.0, 0.66], [0.74, 1.0]
+CURVES_DOMAIN, SIDE_DOMAIN = [0.0, 0.66], [0.74, 1.0]
 """Widths of the measurement and of the recruitment curve beside it."""
 
 
@@ -102,7 +102,7 @@ def _model(model: Model, record: Record) -> LocalFigure:
     )
     curve = plotly_figure(model_charts.recruitment(model.to_dict(), page_curves), LIGHT.__getitem__)
     large["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in curve["data"]]
-    large["layout"]["xaxis"]["domain"] = BESIDE
-    large["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": ALONE, "anchor": "y4"}
+    large["layout"]["xaxis"]["domain"] = CURVES_DOMAIN
+    large["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": SIDE_DOMAIN, "anchor": "y4"}
     large["layout"]["yaxis4"] = {**curve["layout"]["yaxis"], "anchor": "x2"}
     return LocalFigure(large)

@@ -52,17 +52,17 @@ def side_by_side(
         x, y = _between(data, key, start_s, end_s)
         return Curve(x, y, label, colour, width, value=value, **more)
 
-    def left(model: dict[str, Any], label: str, colour: str, width: float) -> Curve:
+    def residual_line(model: dict[str, Any], label: str, colour: str, width: float) -> Curve:
         series = model["comparison"]["series"]
         return line(series, "residual_nm", label, colour, width, fig.RESIDUAL, panel=1, listed=False)
 
     lines = [line(curves, "torque_nm", "measured", "measured", 3.2, fig.TORQUE)]
     if changed:
         lines += [line(curves, "predicted_torque_nm", "model at first", "series-2", 1.6, fig.TORQUE, dash="dot"),
-                  left(before, "left at first", "series-2", 0.9)]  # fmt: skip
+                  residual_line(before, "left at first", "series-2", 0.9)]  # fmt: skip
     last = "model at last" if changed else "model"
     lines += [line(after["curves"], "predicted_torque_nm", last, "model", 1.8, fig.TORQUE),
-              left(after, "left at last" if changed else "residual", "residual", 1.0)]  # fmt: skip
+              residual_line(after, "left at last" if changed else "residual", "residual", 1.0)]  # fmt: skip
     panels = (Axis("Torque (N·m)", share=0.6), Axis("Residual (N·m)", share=0.35))
     x = Axis("Time (s)", fig.AT_TIME, (start_s, end_s))
     return Figure(x, panels, tuple(lines), shades=shades, labels=labels + place_labels(places), height=420)
@@ -70,15 +70,15 @@ def side_by_side(
 
 def _between(data: dict[str, Any], key: str, start_s: float, end_s: float) -> tuple[list[float], list[float | None]]:
     """Return a curve between two times, broken where the recording pauses."""
-    kept = broken_at_pauses({"time_s": data["time_s"], "torque_nm": data[key]})
-    pairs = [pair for pair in zip(kept["time_s"], kept["torque_nm"], strict=True) if start_s <= pair[0] <= end_s]
+    series = broken_at_pauses({"time_s": data["time_s"], "torque_nm": data[key]})
+    pairs = [pair for pair in zip(series["time_s"], series["torque_nm"], strict=True) if start_s <= pair[0] <= end_s]
     return [time_s for time_s, _value in pairs], [value for _time_s, value in pairs]
 
 
-def captions(told: dict[str, Any]) -> dict[str, str]:
+def captions(narrative: dict[str, Any]) -> dict[str, str]:
     """Return what stands below each figure, with its numbers."""
-    rows, noise = told["rows"], f"{told['noise_sd_nm']:.3g}"
-    first, last = (f"{row[told['error']]:.3g}" for row in (rows[0], rows[-1]))
+    rows, noise = narrative["rows"], f"{narrative['noise_sd_nm']:.3g}"
+    first, last = (f"{row[narrative['error']]:.3g}" for row in (rows[0], rows[-1]))
     words = {
         "story-torque": ("Torque measured and predicted in free run from the pulse widths (top), and measured minus "
                           f"predicted (bottom); grey band: 95 % of the noise of {noise} N·m. Error {first} N·m."),
@@ -87,6 +87,6 @@ def captions(told: dict[str, Any]) -> dict[str, str]:
     }  # fmt: skip
     if len(rows) > 1:
         words["story-torque"] += f" Error of the last model {last} N·m."
-    if told["places"]:
-        words["story-place"] = f"The worst place close up: {told['places'][0]['words'].rstrip('.')}."
+    if narrative["places"]:
+        words["story-place"] = f"The worst place close up: {narrative['places'][0]['words'].rstrip('.')}."
     return words

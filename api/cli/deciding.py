@@ -35,9 +35,9 @@ def plan_experiment(data: Sequence[Path], participant: str | None) -> dict[str, 
         made_with = " and ".join(f"{current:g} mA" for current in currents_ma)
         raise InputError(f"these recordings were made with {made_with}. Give those of one current.")
     if samples_between(record.sample_rate_hz, record.pulse_rate_hz) < LEAST_SAMPLES:
-        least = f"{LEAST_SAMPLES * record.pulse_rate_hz:g} Hz"
+        lowest_rate = f"{LEAST_SAMPLES * record.pulse_rate_hz:g} Hz"
         raise InputError(
-            f"{data[0]}: sampled at {record.sample_rate_hz:.4g} Hz; a further one is joined from {least} on."
+            f"{data[0]}: sampled at {record.sample_rate_hz:.4g} Hz; a further one is joined from {lowest_rate} on."
         )
     if any(source.current_ma is None for source in sources):  # a table that others wrote, or that was joined
         fix = "Give the rig's own recordings (HDF5), each by itself."
@@ -88,12 +88,12 @@ def check_participant(client: Client, code: str, recorded_ma: float | None) -> N
 
 
 def diagnose_together(data: Sequence[Path], recording: bytes) -> dict[str, Any]:
-    """Diagnose the recordings and a new one together; `left` is what is missing once that is added."""
+    """Diagnose the recordings and a new one together; `remaining` is what is missing once that is added."""
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         new = Path(folder) / "recording.h5"
         new.write_bytes(recording)
         record = load_record([*data, new])
         explained = identify.explain(record, progress)
     structure = held_by(explained.improvement.models[-1], record)
-    left = {"structure": structure, **explained.left.to_dict()}
-    return {"structure": [], **explained.diagnosis.to_dict(), "left": left}
+    remaining = {"structure": structure, **explained.left.to_dict()}
+    return {"structure": [], **explained.diagnosis.to_dict(), "left": remaining}

@@ -12,7 +12,7 @@ PAGE = frozenset({
 """Modules that the extra `page` brings: identification works without them."""
 
 
-def leave(*_: object) -> None:
+def exit_interrupted(*_: object) -> None:
     """End at once after Ctrl-C: nothing is begun yet, or nobody heard of it in time."""
     os.write(2, b"stimrig: interrupted\n")
     os._exit(INTERRUPTED)

@@ -181,8 +181,11 @@ def story_of(record: Any, explained: Any, structure: Sequence[str]) -> dict[str,
         for model, compared in ((models[0], explained.before), (models[-1], explained.after))
     )
     after = after if len(models) > 1 else before
-    held = held_by(models[-1], record)
-    diagnoses = (with_experiment(record, explained.diagnosis, structure), with_experiment(record, explained.left, held))
+    final_structure = held_by(models[-1], record)
+    diagnoses = (
+        with_experiment(record, explained.diagnosis, structure),
+        with_experiment(record, explained.left, final_structure),
+    )
     improvement, left_open = explained.improvement.to_dict(), only_open(vars(explained.left)) or {}
     # of what is left open the last diagnosis speaks
     improvement["refused"] = [row for row in improvement["refused"] if row["effect"] != left_open.get("effect")]

@@ -23,7 +23,7 @@ import typer
 from typer.exceptions import TyperException
 
 from stimrig.api.cli import commands
-from stimrig.api.cli.errors import INTERRUPTED, PAGE, CommandError, leave
+from stimrig.api.cli.errors import INTERRUPTED, PAGE, CommandError, exit_interrupted
 from stimrig.api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.version import software_version
@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> None:
     computes = COMPUTES.intersection(sys.argv[1:2] if arguments is None else arguments[:1])
     signal.signal(signal.SIGINT, _interrupt if computes else signal.default_int_handler)
     code = run(arguments)
-    signal.signal(signal.SIGINT, leave)
+    signal.signal(signal.SIGINT, exit_interrupted)
     if computes and code == INTERRUPTED:  # Python itself would end by the signal, where it went through an exec
         os._exit(code)
     gc.freeze()
@@ -154,7 +154,7 @@ def _interrupt(*_: object) -> None:
     """Ctrl-C: an exception, and the end of the process where it is not heard: a library may call us from its C code,
     which drops exceptions, or compute for seconds before it looks."""
     interrupted.set()
-    late = threading.Timer(GRACE_S, leave)
+    late = threading.Timer(GRACE_S, exit_interrupted)
     late.daemon = True
     late.start()
     raise KeyboardInterrupt

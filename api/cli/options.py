@@ -51,7 +51,7 @@ DataDir = Annotated[Path | None, typer.Option(help="data folder; default ./var, 
 Emulate = Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')]
 
 
-def given(**options: Any) -> dict[str, Any]:
+def set_options(**options: Any) -> dict[str, Any]:
     """Return the options that were given; of the others the environment is asked."""
     return {name: value for name, value in options.items() if value is not None}
 

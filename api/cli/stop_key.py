@@ -21,7 +21,7 @@ IDLE = ("ready", "latched", "disconnected")
 """Nothing is played and no calibration is open: a stray key must not latch the rig."""
 STATUS_S, STOP_S, HEARD_S = 0.5, 8.0, 2.0
 CONFIRMED, NOTHING = "stopped: the rig confirms that stimulation is off", "no test runs, nothing to stop"
-DOUBT = "THE STOP IS NOT CONFIRMED. Use the stimulator's own emergency switch now."
+NOT_CONFIRMED = "THE STOP IS NOT CONFIRMED. Use the stimulator's own emergency switch now."
 
 
 class StopKey(keys.StopKey):
@@ -31,15 +31,15 @@ class StopKey(keys.StopKey):
     standard input's.
     """
 
-    def __init__(self, stop: Callable[[], str], tell: Callable[[str], object], descriptor: int | None = None) -> None:
-        self.stop, self.tell = stop, tell
+    def __init__(self, stop: Callable[[], str], report: Callable[[str], object], descriptor: int | None = None) -> None:
+        self.stop, self.report = stop, report
         super().__init__(self._press, standard_input() if descriptor is None else descriptor, in_foreground)
 
     def _press(self) -> None:
         try:
-            self.tell(self.stop())
+            self.report(self.stop())
         except Exception as error:
-            self.tell(f"{DOUBT} ({type(error).__name__}: {error})")
+            self.report(f"{NOT_CONFIRMED} ({type(error).__name__}: {error})")
 
 
 def standard_input() -> int:
@@ -76,8 +76,8 @@ def at_rig(path: Path, stray: Callable[[], bool] = lambda: True) -> Callable[[],
         try:
             evidence = await rig.ask_for(StopEvidence, StopRequest(reason=REASON, by=BY), STOP_S)
         except ApiError as error:
-            return f"{DOUBT} {error.title}: {error.detail}"
-        return CONFIRMED if evidence.confirmed else f"{DOUBT} The rig says: {evidence.detail}"
+            return f"{NOT_CONFIRMED} {error.title}: {error.detail}"
+        return CONFIRMED if evidence.confirmed else f"{NOT_CONFIRMED} The rig says: {evidence.detail}"
 
     return lambda: asyncio.run(stop())
 
@@ -93,8 +93,8 @@ def at_service(url: str, token: str, stray: Callable[[], bool] = lambda: True) -
             try:
                 answer = client.post("/v1/stop", json={"reason": REASON}, timeout=STOP_S + 1.0)
             except httpx.HTTPError as error:
-                return f"{DOUBT} {url}: {error}"
-        return CONFIRMED if answer.is_success else f"{DOUBT} {url}: {answer.text[:300]}"
+                return f"{NOT_CONFIRMED} {url}: {error}"
+        return CONFIRMED if answer.is_success else f"{NOT_CONFIRMED} {url}: {answer.text[:300]}"
 
     return stop
 

@@ -17,7 +17,7 @@ DECISIONS = {
     "POST /v1/rig/angle/pose": "/v1/rig/angle",
     "PUT /v1/users/{name}/password": "/v1/users",
 }
-_PATTERNS = [(re.compile(re.sub(r"\{(\w+)\}", r"(?P<\1>[^/]+)", one)), named) for one, named in DECISIONS.items()]
+_PATTERNS = [(re.compile(re.sub(r"\{(\w+)\}", r"(?P<\1>[^/]+)", path)), named) for path, named in DECISIONS.items()]
 
 
 def document_of(method: str, path: str, body: Any = None) -> str:

@@ -63,7 +63,7 @@ class Client(Connection):
     ...     client.approve(test.model_id, "good fit")
     """
 
-    def _one(self, kind: type[D], method: str, path: str, **more: Any) -> D:
+    def _request_as(self, kind: type[D], method: str, path: str, **more: Any) -> D:
         return kind.read(self.request(method, f"/v1{path}", **more).json())
 
     def _list(self, kind: type[D], path: str, **more: Any) -> list[D]:
@@ -75,14 +75,14 @@ class Client(Connection):
 
     def rig(self) -> RigOut:
         """State, devices, newest torque and its age."""
-        return self._one(RigOut, "GET", "/rig")
+        return self._request_as(RigOut, "GET", "/rig")
 
     def stop(self, reason: str = "") -> StoppedOut:
         """Stop stimulation. Returns only if the rig confirms that stimulation has stopped.
 
         `reason` stands in the audit trail.
         """
-        return self._one(StoppedOut, "POST", "/stop", json={"reason": reason} if reason else {})
+        return self._request_as(StoppedOut, "POST", "/stop", json={"reason": reason} if reason else {})
 
     def effects(self) -> list[dict[str, Any]]:
         """The library of effects of the service."""
@@ -99,7 +99,7 @@ class Client(Connection):
 
     def participant(self, code: str) -> ParticipantOut:
         """One participant with its limits."""
-        return self._one(ParticipantOut, "GET", f"/participants/{code}")
+        return self._request_as(ParticipantOut, "GET", f"/participants/{code}")
 
     def make_participant(
         self, code: str, profile: dict[str, float] | None = None, **site: str | None
@@ -110,7 +110,7 @@ class Client(Connection):
         `placement` of the electrodes, to which models belong.
         """
         body = {"code": code, **({"profile": profile} if profile else {}), **site}
-        return self._one(ParticipantOut, "POST", "/participants", json=body)
+        return self._request_as(ParticipantOut, "POST", "/participants", json=body)
 
     def ensure_participant(self, code: str) -> ParticipantOut:
         """The participant; makes it if there is none (two requests)."""
@@ -124,19 +124,19 @@ class Client(Connection):
     ) -> ParticipantOut:
         """Say which site is stimulated, as in `make_participant`; refused where a calibration would be lost by it."""
         site = {"side": side, "muscle": muscle, "placement": placement}
-        return self._one(ParticipantOut, "PUT", f"/participants/{code}/muscle", json=site)
+        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/muscle", json=site)
 
     def set_limits(self, code: str, **limits: float) -> ParticipantOut:
         """Change the limits that are named, as `current_ma=20.0`; the others stay as they are."""
-        return self._one(ParticipantOut, "PUT", f"/participants/{code}/profile", json=limits)
+        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/profile", json=limits)
 
     def archive(self, code: str) -> ParticipantOut:
         """Put a participant into the archive: no test starts any more, and nothing is deleted."""
-        return self._one(ParticipantOut, "POST", f"/participants/{code}/archive")
+        return self._request_as(ParticipantOut, "POST", f"/participants/{code}/archive")
 
     def unarchive(self, code: str) -> ParticipantOut:
         """Take a participant out of the archive."""
-        return self._one(ParticipantOut, "POST", f"/participants/{code}/unarchive")
+        return self._request_as(ParticipantOut, "POST", f"/participants/{code}/unarchive")
 
     def notes(self, participant: str) -> list[NoteOut]:
         """The notes of a participant, newest first, the struck ones among them."""
@@ -145,16 +145,16 @@ class Client(Connection):
     def add_note(self, participant: str, kind: str, text: str = "", **more: Any) -> NoteOut:
         """Write a note. `more`: `test_id`, and the time in that test as `at_s`, or `now=True` while it runs."""
         body = {"kind": kind, "text": text, **more}
-        return self._one(NoteOut, "POST", f"/participants/{participant}/notes", json=body)
+        return self._request_as(NoteOut, "POST", f"/participants/{participant}/notes", json=body)
 
     def strike_note(self, participant: str, note_id: str) -> NoteOut:
         """Mark a note as wrong; it stays readable."""
-        return self._one(NoteOut, "POST", f"/participants/{participant}/notes/{note_id}/strike")
+        return self._request_as(NoteOut, "POST", f"/participants/{participant}/notes/{note_id}/strike")
 
     def preview(self, participant: str, **more: Any) -> PreviewOut:
         """Duration, dose and pulse widths of a test. Nothing is played. `more` as in `start_test`."""
         wait = {"timeout": OUTLOOK_S} if more.get("kind") == "adaptive" else {}
-        return self._one(PreviewOut, "POST", "/preview", json={"participant": participant, **more}, **wait)
+        return self._request_as(PreviewOut, "POST", "/preview", json={"participant": participant, **more}, **wait)
 
     def start_test(self, participant: str, **more: Any) -> TestOut:
         """Start a test, the pre-session test by default. `more`: `kind`, `segments` or `protocol`, `joins`, limits.
@@ -164,11 +164,11 @@ class Client(Connection):
         """
         if more.get("kind") == "adaptive":  # a start must be played at once or not at all, and this may take long
             self.preview(participant, **more)
-        return self._one(TestOut, "POST", "/tests", json={"participant": participant, **more})
+        return self._request_as(TestOut, "POST", "/tests", json={"participant": participant, **more})
 
     def test(self, test_id: str) -> TestOut:
         """A test as it is now."""
-        return self._one(TestOut, "GET", f"/tests/{test_id}")
+        return self._request_as(TestOut, "GET", f"/tests/{test_id}")
 
     def tests(self, participant: str) -> list[TestOut]:
         """The tests of a participant, newest first."""
@@ -200,7 +200,7 @@ class Client(Connection):
 
     def set_ran_by(self, test_id: str, name: str | None) -> TestOut:
         """Say who ran a test at the rig; None: who asked for it."""
-        return self._one(TestOut, "PUT", f"/tests/{test_id}/ran-by", json={"ran_by": name})
+        return self._request_as(TestOut, "PUT", f"/tests/{test_id}/ran-by", json={"ran_by": name})
 
     def enough(self, test_id: str) -> dict[str, Any]:
         """End a running adaptive test well, at the next pulse; its recording is identified like any other."""
@@ -208,7 +208,7 @@ class Client(Connection):
 
     def keep_plain(self, test_id: str) -> TestOut:
         """End the fit of last session's structure after a test: the plain model is offered. Refused when none runs."""
-        return self._one(TestOut, "POST", f"/tests/{test_id}/keep-plain")
+        return self._request_as(TestOut, "POST", f"/tests/{test_id}/keep-plain")
 
     def recording(self, recording_id: str) -> bytes:
         """The raw recording (HDF5), as it was sealed."""
@@ -221,7 +221,7 @@ class Client(Connection):
     def upload(self, participant: str, data: bytes | Path) -> UploadOut:
         """Send a recording of another tool (CSV or HDF5). Returns `recording_id`, its new `model`, and `warnings`."""
         content, path = data if isinstance(data, bytes) else data.read_bytes(), f"/participants/{participant}"
-        return self._one(UploadOut, "POST", f"{path}/recordings", content=content, timeout=UPLOAD_S)
+        return self._request_as(UploadOut, "POST", f"{path}/recordings", content=content, timeout=UPLOAD_S)
 
     def versions(self, participant: str) -> list[VersionOut]:
         """Model versions of a participant, newest first."""
@@ -229,7 +229,7 @@ class Client(Connection):
 
     def trend(self, participant: str) -> models.TrendOut:
         """Sessions of a participant, oldest first: figures with their uncertainty, and what changed."""
-        return self._one(models.TrendOut, "GET", f"/participants/{participant}/trend")
+        return self._request_as(models.TrendOut, "GET", f"/participants/{participant}/trend")
 
     def trend_csv(self, participant: str) -> bytes:
         """The same as a CSV file."""
@@ -237,7 +237,7 @@ class Client(Connection):
 
     def version(self, model_id: str) -> VersionOut:
         """One model version."""
-        return self._one(VersionOut, "GET", f"/models/{model_id}")
+        return self._request_as(VersionOut, "GET", f"/models/{model_id}")
 
     def model_file(self, model_id: str) -> dict[str, Any]:
         """MODEL.json of a version, as `stimrig.Model.from_dict` takes it."""
@@ -264,7 +264,7 @@ class Client(Connection):
 
     def tracking(self, participant: str) -> models.TrackingOut:
         """The trials since the approval that holds: how gain, threshold and time scale moved, and whether to ask."""
-        return self._one(models.TrackingOut, "GET", f"/participants/{participant}/tracking")
+        return self._request_as(models.TrackingOut, "GET", f"/participants/{participant}/tracking")
 
     def approve(self, model_id: str, reason: str = "", tracking: dict[str, float] | None = None) -> VersionOut:
         """Let the controller have this version; a `reason` is needed for a model that is not usable.
@@ -273,15 +273,15 @@ class Client(Connection):
         0 (not tracked) to 60; 20 where it is left out.
         """
         body = {"reason": reason} if tracking is None else {"reason": reason, "tracking": tracking}
-        return self._one(VersionOut, "POST", f"/models/{model_id}/approve", json=body)
+        return self._request_as(VersionOut, "POST", f"/models/{model_id}/approve", json=body)
 
     def reject(self, model_id: str, reason: str = "") -> VersionOut:
         """Keep this version from the controller."""
-        return self._one(VersionOut, "POST", f"/models/{model_id}/reject", json={"reason": reason})
+        return self._request_as(VersionOut, "POST", f"/models/{model_id}/reject", json={"reason": reason})
 
     def undo(self, model_id: str, reason: str = "") -> VersionOut:
         """Go back to the version this one was made from; returns that one."""
-        return self._one(VersionOut, "POST", f"/models/{model_id}/undo", json={"reason": reason})
+        return self._request_as(VersionOut, "POST", f"/models/{model_id}/undo", json={"reason": reason})
 
     def predict(self, model_id: str, pulse_width_us: Sequence[float], **more: Any) -> list[float]:
         """Mean torque in the period of each pulse, N·m, with all effects of the model. Nothing is played.
@@ -299,16 +299,16 @@ class Client(Connection):
         `time_s`, `pulse_rate_hz`, `max_pulse_width_us`, `max_rise_us`, `whole_us`. Its `segments` are for `start_test`.
         """
         body = {"reference_torque_nm": list(reference), **more}
-        return self._one(models.InversionOut, "POST", f"/models/{model_id}/widths", json=body)
+        return self._request_as(models.InversionOut, "POST", f"/models/{model_id}/widths", json=body)
 
     def curves(self, model_id: str) -> models.CurvesOut:
         """Measured and predicted torque, pulse widths and step response, for drawing."""
-        return self._one(models.CurvesOut, "GET", f"/models/{model_id}/curves")
+        return self._request_as(models.CurvesOut, "GET", f"/models/{model_id}/curves")
 
     def comparison(self, model_id: str, recording_id: str | None = None) -> models.ComparisonOut:
         """The model against its own recording, or against another one."""
         params = {"recording": recording_id} if recording_id else {}
-        return self._one(models.ComparisonOut, "GET", f"/models/{model_id}/comparison", params=params)
+        return self._request_as(models.ComparisonOut, "GET", f"/models/{model_id}/comparison", params=params)
 
     def diagnosis(self, model_id: str, progress: Progress = QUIET) -> models.DiagnosisOut:
         """What is missing in the model. `progress` as in `add_effects`."""
@@ -331,11 +331,11 @@ class Client(Connection):
 
     def job(self, job_id: str) -> JobOut:
         """Long work as it is now."""
-        return self._one(JobOut, "GET", f"/jobs/{job_id}")
+        return self._request_as(JobOut, "GET", f"/jobs/{job_id}")
 
     def cancel(self, job_id: str) -> JobOut:
         """Cancel long work. What is done already stays done."""
-        return self._one(JobOut, "DELETE", f"/jobs/{job_id}")
+        return self._request_as(JobOut, "DELETE", f"/jobs/{job_id}")
 
     def _long(self, kind: type[D], method: str, path: str, progress: Progress, **more: Any) -> D:
         answer = self.request(method, f"/v1{path}", params={"wait": False}, **more)

@@ -19,9 +19,9 @@ Act = Literal["approve", "add", "improve", "experiment", "look", "test", "fit", 
 class Gate(NamedTuple):
     """Texts of a failed check."""
 
-    found: str
+    problem: str
     risk: str  # what the controller would do wrong
-    look: str = "look at where the error sits first"  # with a model that is usable with care
+    inspect: str = "look at where the error sits first"  # with a model that is usable with care
     test: str = "the limb held still and relaxed"  # test again with, for a model that is not usable
 
 
@@ -120,7 +120,7 @@ GATES: dict[str, Gate] = {
 }
 """Each check of `stimrig.identify.estimation.quality`, and `stored_model.without_evidence`, which never refuses."""
 
-BESIDE: dict[str, str] = {
+USABLE_ADVICE: dict[str, str] = {
     "unsure": "Usable: approve it. Whether something is missing, this recording cannot tell.",
     "unexplained": "Usable: approve it. Some error is left that is not explained.",
     "missing": "Usable: approve it. An effect is possibly missing.",
@@ -134,7 +134,7 @@ def findings(document: dict[str, Any]) -> list[Finding]:
     failed = [(name, gate) for name, gate in gates.items() if not gate["passed"]]
     failed.sort(key=lambda pair: (pair[1]["severity"] != "refuse", pair[0] != "evidence"))
     return [
-        Finding(name, GATES[name].found, GATES[name].risk, gate["says"], gate["severity"] == "refuse")
+        Finding(name, GATES[name].problem, GATES[name].risk, gate["says"], gate["severity"] == "refuse")
         for name, gate in failed
     ]
 
@@ -173,11 +173,11 @@ def advice(
     if verdict == "usable":
         if missing:
             return Advice(add, f"Usable, and better with {effects}: add that first.")
-        return Advice("approve", BESIDE.get(kind or "", "Usable: approve it."))
+        return Advice("approve", USABLE_ADVICE.get(kind or "", "Usable: approve it."))
     if verdict == "usable with care":
         if missing:
             return Advice(add, f"Usable with care: add {effects} first.")
-        words = f"Usable with care: {worst.look if worst else 'look at where the error sits first'}."
+        words = f"Usable with care: {worst.inspect if worst else 'look at where the error sits first'}."
         if kind in ("nothing", "unsure") and not (failed and failed[0].gate == "evidence"):
             return Advice("approve", words)
         if experiment:
@@ -186,8 +186,8 @@ def advice(
     if verdict == "not usable":
         if missing and all(finding.gate in ("gap", "ceiling") for finding in failed if finding.severe):
             return Advice(add, f"Not usable as it is: add {effects}, or test again.")
-        again = worst.test if worst else "electrodes, fixture and load cell checked"
-        return Advice("test", f"Not usable: test again with {again}.")
+        condition = worst.test if worst else "electrodes, fixture and load cell checked"
+        return Advice("test", f"Not usable: test again with {condition}.")
     return Advice("fit", "There is no verdict on this model: test again, or fit the recording again.")
 
 

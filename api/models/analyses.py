@@ -53,11 +53,11 @@ class Analyses:
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
         """Measurement against model; with the id of another recording, the model against that one."""
-        given = {"model_json": stored_model.text(model)}
+        arguments = {"model_json": stored_model.text(model)}
         if recording_id in (None, model.recording_id):
-            return await self._find(model, "comparison", given)
+            return await self._find(model, "comparison", arguments)
         digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
-        return await self._find(model, f"comparison {digest}", given, verb="comparison", recording_id=recording_id)
+        return await self._find(model, f"comparison {digest}", arguments, verb="comparison", recording_id=recording_id)
 
     async def curves(self, model: Model) -> dict[str, Any]:
         """Measured, predicted and commanded curves, thinned to what a screen shows."""
@@ -66,36 +66,36 @@ class Analyses:
     async def diagnosis(
         self, model: Model, on_call: OnCall | None = None, *, background: bool = False
     ) -> dict[str, Any]:
-        """What is missing in the structure of a model; that of the plain one is shared by all that have it."""
-        place, kind, given = await asyncio.to_thread(self._criticised, model)
-        found = await self._find(place, kind, given, verb="diagnosis", background=background, on_call=on_call)
-        return explanation.remaining(found, model.effects, model.fit)
+        """Diagnose what the structure of a model lacks; versions with the plain structure share one diagnosis."""
+        place, kind, arguments = await asyncio.to_thread(self._criticised, model)
+        diagnosis = await self._find(place, kind, arguments, verb="diagnosis", background=background, on_call=on_call)
+        return explanation.remaining(diagnosis, model.effects, model.fit)
 
     def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
-        """With which version a diagnosis is kept, under which name, and what the worker is given for it.
+        """Return the version and the name that a diagnosis is stored under, and the arguments of its worker.
 
         A version with some of what was found missing at once has that diagnosis until all of it is added: a second
         search from there could say something else of the same recording.
         """
         if is_plain(model):
-            # what is found of the plain structure is kept with the first version made from the recording
-            own = Model.recording_id == model.recording_id
-            return self.store.first(Model, own, order=Model.created_utc), DIAGNOSIS, {}
-        own = self.known(model.id, OWN_DIAGNOSIS)  # what was said once is not taken back
-        parent = self.store.get(Model, model.parent_id) if model.parent_id and own is None else None
+            # the diagnosis of the plain structure is stored with the first version made from the recording
+            same_recording = Model.recording_id == model.recording_id
+            return self.store.first(Model, same_recording, order=Model.created_utc), DIAGNOSIS, {}
+        own_diagnosis = self.known(model.id, OWN_DIAGNOSIS)  # a diagnosis once made of this version stays
+        parent = self.store.get(Model, model.parent_id) if model.parent_id and own_diagnosis is None else None
         if parent is not None and parent.recording_id == model.recording_id:
             above = self._criticised(parent)
-            found = self.known(above[0].id, above[1])
+            diagnosis = self.known(above[0].id, above[1])
             begun_with = [] if above[1] == DIAGNOSIS else above[0].effects
-            if found and asked_for(found) > set(model.effects) - set(begun_with):
+            if diagnosis and asked_for(diagnosis) > set(model.effects) - set(begun_with):
                 return above
         return model, OWN_DIAGNOSIS, {"model_json": stored_model.text(model)}
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
-        """The diagnosis if it has been made."""
+        """Return the diagnosis, or None while there is none."""
         place, kind, _ = self._criticised(model)
-        found = self.known(place.id, kind)
-        return found and explanation.remaining(found, model.effects, model.fit)
+        diagnosis = self.known(place.id, kind)
+        return diagnosis and explanation.remaining(diagnosis, model.effects, model.fit)
 
     def experiment_before(self, first: Model) -> dict[str, Any] | None:
         """The next experiment of the diagnosis that the first model of a joined recording was made to go on from."""
@@ -120,7 +120,7 @@ class Analyses:
         self,
         model: Model,
         kind: str,
-        given: dict[str, Any],
+        arguments: dict[str, Any],
         *,
         verb: str | None = None,
         recording_id: str | None = None,
@@ -136,21 +136,21 @@ class Analyses:
             self.pool.cancel(call)  # somebody waits now: on a busy machine low priority could take minutes
             call = None
         if call is None:
-            call = self.running[key] = self.pool.submit(verb or kind, background=background, data=path, **given)
+            call = self.running[key] = self.pool.submit(verb or kind, background=background, data=path, **arguments)
         if on_call is not None:
             on_call(call)
         try:
-            found = await asyncio.shield(call.result)
-            await asyncio.to_thread(self._keep, *key, found)
+            document = await asyncio.shield(call.result)
+            await asyncio.to_thread(self._store_result, *key, document)
         finally:
             if call.result.done() and self.running.get(key) is call:
                 del self.running[key]
-        return found
+        return document
 
-    def _keep(self, model_id: str, kind: str, found: dict[str, Any]) -> None:
-        parts = {kind: {name: part for name, part in found.items() if name != IMPROVEMENT}}
-        if IMPROVEMENT in found:
-            parts[f"{IMPROVEMENT} of {kind}"] = found[IMPROVEMENT]
+    def _store_result(self, model_id: str, kind: str, result: dict[str, Any]) -> None:
+        parts = {kind: {name: part for name, part in result.items() if name != IMPROVEMENT}}
+        if IMPROVEMENT in result:
+            parts[f"{IMPROVEMENT} of {kind}"] = result[IMPROVEMENT]
         with self.store.write() as session:
             for name, document in parts.items():
                 session.merge(Analysis(model_id=model_id, kind=name, document=document, created_utc=self.clock.utc()))
@@ -174,7 +174,7 @@ class Analyses:
         reason: str = "",
         on_call: OnCall | None = None,
     ) -> Model:
-        """Fit the effects of the model and these together anew, as a new version.
+        """Fit the model's effects and the added ones together, as a new version.
 
         Raises ApiError: 409 an effect is in it already, or the recording does not ask for it and nobody forces it; 422
         no such effect, or the data do not allow the fit.
@@ -200,12 +200,12 @@ class Analyses:
             explanation.require_evidence(diagnosis, added)
         free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in (diagnosis or {}).get("free") or []}
         path = await asyncio.to_thread(self.path, model.recording_id)
-        held = stored_model.structure(stored_model.read(model))
-        wanted = [held.get(effect, free.get(effect, effect)) for effect in effects]
-        found = await self.run("fit", on_call, data=path, method=model.method, effects=wanted)
+        forms = stored_model.structure(stored_model.read(model))
+        wanted = [forms.get(effect, free.get(effect, effect)) for effect in effects]
+        fitted = await self.run("fit", on_call, data=path, method=model.method, effects=wanted)
 
         def store() -> Model:
-            row = self._child(model, added, json.loads(found["json"]), by, forced)
+            row = self._child(model, added, json.loads(fitted["json"]), by, forced)
             if forced or reason:
                 action = "force effect" if forced else "add effect"
                 self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
@@ -226,21 +226,21 @@ class Analyses:
 
         They descend from the version whose diagnosis names them.
         """
-        place, kind, given = await asyncio.to_thread(self._criticised, model)
-        await self._find(place, kind, given, verb="diagnosis", on_call=on_call)
-        found = await asyncio.to_thread(self.known, place.id, f"{IMPROVEMENT} of {kind}")
-        assert found is not None, "kept with the diagnosis"
+        place, kind, arguments = await asyncio.to_thread(self._criticised, model)
+        await self._find(place, kind, arguments, verb="diagnosis", on_call=on_call)
+        improvement = await asyncio.to_thread(self.known, place.id, f"{IMPROVEMENT} of {kind}")
+        assert improvement is not None, "kept with the diagnosis"
 
         def store() -> list[Model]:
             rows = [self._begun_from(model, place, kind)]
-            for step, document in zip(found["steps"], found["models"], strict=True):
+            for step, document in zip(improvement["steps"], improvement["models"], strict=True):
                 if step["added"] is not None:
                     rows.append(self._child(rows[-1], [step["added"]], document, by))
                 step["model_id"] = rows[-1].id
             return rows
 
         rows = await asyncio.to_thread(store)
-        return {key: value for key, value in found.items() if key != "models"}, rows
+        return {key: value for key, value in improvement.items() if key != "models"}, rows
 
     def _begun_from(self, model: Model, place: Model, kind: str) -> Model:
         """The version whose structure was diagnosed; that of the plain structure may be kept with another."""

@@ -57,20 +57,20 @@ async def carry(analyses: Analyses, plain: Model, path: str, on_call: OnCall | N
     if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
         return plain
     try:
-        found = await analyses.run("carry", on_call, data=path, model_json=stored_model.text(earlier), **how)
+        carried = await analyses.run("carry", on_call, data=path, model_json=stored_model.text(earlier), **how)
     except (ApiError, OSError, ValueError) as error:  # all that a call can end with
-        found = {"json": None, "found": _not_carried(error)}
-    return await asyncio.to_thread(_store, analyses.versions, found, plain, earlier)
+        carried = {"json": None, "found": _not_carried(error)}
+    return await asyncio.to_thread(_store, analyses.versions, carried, plain, earlier)
 
 
-def _store(versions: Versions, found: dict[str, Any], plain: Model, earlier: Model) -> Model:
+def _store(versions: Versions, carried: dict[str, Any], plain: Model, earlier: Model) -> Model:
     """Keep the finding with the plain version, and the child, where there is one; return which of them is offered."""
-    finding = {key: value for key, value in found["found"].items() if key != "carried_from"}
+    finding = {key: value for key, value in carried["found"].items() if key != "carried_from"}
     finding["from_model_id"] = earlier.id
     versions.note_carried(plain.id, finding, earlier.id if finding["why"] == "plain-before" else None)
-    if found["json"] is None:
+    if carried["json"] is None:
         return versions.get(plain.id)
-    document = json.loads(found["json"])
+    document = json.loads(carried["json"])
     document["extra"] = {**(document.get("extra") or {}), "parent": plain.id}
     child = versions.add(
         json.dumps(document), plain.participant, plain.recording_id, plain.created_by, plain.id,
@@ -99,12 +99,12 @@ async def refuse_unknown(settings: Settings, worker: Callable[..., Worker] = Wor
         return
     pool = Pool(1, worker)
     try:
-        found = await pool.submit("effects").result
+        library = await pool.submit("effects").result
     except ApiError as error:
         raise OSError(f"the library of effects cannot be read: {error}") from error
     finally:
         await pool.close()
-    known = sorted(entry["id"] for entry in found["effects"])
+    known = sorted(entry["id"] for entry in library["effects"])
     unknown = [effect for effect in settings.structure if effect not in known]
     if unknown:
         raise OSError(f"STIMRIG_STRUCTURE: no effect is called {', '.join(unknown)}. Take some of {', '.join(known)}.")
@@ -113,30 +113,30 @@ async def refuse_unknown(settings: Settings, worker: Callable[..., Worker] = Wor
 def carried_context(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> dict[str, Any] | None:
     """What `model.html` shows of what was carried over: to the plain version, or to its child in that structure.
 
-    None where its recording was asked nothing of the kind. `new` is None as long as there is no diagnosis; `again`:
-    those left out that the diagnosis asks for; `better`: the carried version is.
+    None where its recording was asked nothing of the kind. `new` is None without a diagnosis; `again`: those left out
+    that the diagnosis asks for; `better`: the carried version is.
     """
-    found = row.carried
-    if found is None or found["why"] == "plain-before":
+    carried = row.carried
+    if carried is None or carried["why"] == "plain-before":
         return None
-    is_plain, earlier = row.carried_from_id is None, versions.get(found["from_model_id"])
+    is_plain, earlier = row.carried_from_id is None, versions.get(carried["from_model_id"])
     wanted = set() if diagnosis is None else asked_for(diagnosis)  # what it only names, it does not ask for
     missing = [entry for entry in (diagnosis or {}).get("missing", []) if entry["effect"] in wanted]
-    known = [effect["effect"] for effect in found["effects"]]
-    again = {entry["effect"] for entry in missing} & {*found["no_longer_needed"], *found["undecided"]}
-    left = [effect for effect in found["effects"] if effect["effect"] not in again]
+    known = [effect["effect"] for effect in carried["effects"]]
+    reappearing = {entry["effect"] for entry in missing} & {*carried["no_longer_needed"], *carried["undecided"]}
+    absent = [effect for effect in carried["effects"] if effect["effect"] not in reappearing]
     below = [other for other in versions.lineage(row) if other.parent_id == row.id and other.carried_from_id]
     return {
         "earlier": {"id": earlier.id, "created_utc": earlier.created_utc},
-        "kept": [effect for effect in found["effects"] if effect["needed"]],
-        "dropped": [effect for effect in left if effect["needed"] is False],
-        "undecided": [effect for effect in left if effect["needed"] is None],
+        "kept": [effect for effect in carried["effects"] if effect["needed"]],
+        "dropped": [effect for effect in absent if effect["needed"] is False],
+        "undecided": [effect for effect in absent if effect["needed"] is None],
         "new": None
         if diagnosis is None
         else [name_of(entry["effect"], {entry["effect"]: entry}) for entry in missing if entry["effect"] not in known],
-        "again": [effect["name"] for effect in found["effects"] if effect["effect"] in again],
+        "again": [effect["name"] for effect in carried["effects"] if effect["effect"] in reappearing],
         "other": next((other.id for other in below), None) if is_plain else row.parent_id,
-        "better": found["offered"] == "carried",
+        "better": carried["offered"] == "carried",
         "is_plain": is_plain,
-        "reason": found["reason"],
+        "reason": carried["reason"],
     }

@@ -121,8 +121,8 @@ def same_current(before: State, now: State) -> bool:
 
 def changed(before: State, now: State) -> list[dict[str, Any]]:
     """The differences beyond twice their uncertainty, the surest first."""
-    found = [difference(name, before, now) for name in comparable(before, now)]
-    return sorted((one for one in found if one and one["beyond"]), key=lambda one: -one["times"])
+    differences = [difference(name, before, now) for name in comparable(before, now)]
+    return sorted((item for item in differences if item and item["beyond"]), key=lambda item: -item["times"])
 
 
 # ---- in words -----------------------------------------------------------------------------------------------------
@@ -222,22 +222,24 @@ def _sentence(change: dict[str, Any], day: str) -> str:
 
 def doubt_sentences(before: State, now: State) -> list[str]:
     """What puts the comparison in doubt, a sentence each: current, method, effects and noted conditions that differ."""
-    found = []
+    reasons = []
     if before.current_ma is None or now.current_ma is None:
-        found.append("The current of a recording is not known: threshold and plateau compare only at the same current.")
+        reasons.append(
+            "The current of a recording is not known: threshold and plateau compare only at the same current."
+        )
     elif not same_current(before, now):
         was, now_is = (value_words(state.current_ma, NAMES["current_ma"]) for state in (before, now))
-        found.append(f"The current was {was}, now it is {now_is}: threshold and plateau are not compared.")
+        reasons.append(f"The current was {was}, now it is {now_is}: threshold and plateau are not compared.")
     large = "only large differences are told"
     if before.method != now.method:
-        found.append(f"The methods differ ({before.method}, then {now.method}): {large}.")
+        reasons.append(f"The methods differ ({before.method}, then {now.method}): {large}.")
     if sorted(before.structure) != sorted(now.structure):
         old, new = (effects_words(state.structure) or "none" for state in (before, now))
         differ = f"The models' effects differ ({old}, then {new})"
         ways = f"The models describe {new} in different ways"
-        found.append(f"{ways if old == new else differ}: {large}.")
+        reasons.append(f"{ways if old == new else differ}: {large}.")
     noted = [(kind, dict(before.notes).get(kind, ""), dict(now.notes).get(kind, "")) for kind in KINDS]
     for kind, first, second in noted:
         if first.split() != second.split():
-            found.append(f"The notes on {KINDS[kind]} differ: “{first[:80] or '–'}”, then “{second[:80] or '–'}”.")
-    return found
+            reasons.append(f"The notes on {KINDS[kind]} differ: “{first[:80] or '–'}”, then “{second[:80] or '–'}”.")
+    return reasons

@@ -45,8 +45,8 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
     to_add = [entry for entry in [*missing, *free] if entry["effect"] in wanted]
     conclusion = conclude(diagnosis)
     noise = conclusion.kind == "nothing" and not (comparison and stands_out(comparison))
-    found = comparison or {}
-    where = [] if noise else found.get("where") or diagnosis.get("where") or []
+    compared = comparison or {}
+    where = [] if noise else compared.get("where") or diagnosis.get("where") or []
     places = [place(entry, number) for number, entry in enumerate(where, start=1)]
     mostly = f" It sits mostly here: {places[0]['words']}." if places and conclusion.kind == "unexplained" else ""
     experiment = diagnosis.get("experiment")
@@ -61,8 +61,8 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
         "likely": [name_of(entry["effect"], library) for entry in to_add if is_likely(entry)],
         "structure": effects_words(diagnosis.get("structure") or []) or "plain",
         "places": places,
-        "splits": [] if noise else splits(found),
-        "tests": (found.get("tests") or {}).get("tests", []),
+        "splits": [] if noise else splits(compared),
+        "tests": (compared.get("tests") or {}).get("tests", []),
         "experiment": experiment and tidy_experiment(experiment, library),
         "others": others(diagnosis, library),
         "notes": diagnosis.get("notes") or [],
@@ -76,21 +76,24 @@ def remaining(diagnosis: dict[str, Any], effects: Sequence[str], fit: Mapping[st
     `fit`: the statistics of that version.
     """
     named = {entry["effect"] for key in ("missing", "free") for entry in diagnosis.get(key) or []}
-    held = named & set(effects)
-    if not held:
+    included = named & set(effects)
+    if not included:
         return diagnosis
     base, experiment = diagnosis.get("base") or {}, diagnosis.get("experiment")
-    left = {
+    reduced = {
         **diagnosis,
-        **{key: [row for row in diagnosis.get(key) or [] if row["effect"] not in held] for key in ("missing", "free")},
-        "add": [effect for effect in diagnosis.get("add", sorted(named)) if effect not in held],
+        **{
+            key: [row for row in diagnosis.get(key) or [] if row["effect"] not in included]
+            for key in ("missing", "free")
+        },
+        "add": [effect for effect in diagnosis.get("add", sorted(named)) if effect not in included],
         "base": {**base, **{key: fit[key] for key in base if key in fit}},
-        "structure": [*(diagnosis.get("structure") or []), *sorted(held)],
-        "experiment": None if experiment and experiment["effect"] in held else experiment,
+        "structure": [*(diagnosis.get("structure") or []), *sorted(included)],
+        "experiment": None if experiment and experiment["effect"] in included else experiment,
     }
-    conclusion = conclude(left)
+    conclusion = conclude(reduced)
     plain = [f"{conclusion.title}. {conclusion.words}", conclusion.advice]
-    return {**left, "conclusion": asdict(conclusion), "plain": plain}
+    return {**reduced, "conclusion": asdict(conclusion), "plain": plain}
 
 
 def decided(experiment: Mapping[str, Any] | None, diagnosis: Mapping[str, Any], effects: Sequence[str]) -> str:
@@ -187,7 +190,7 @@ def how_sure(chance: float | None) -> str:
 def _labelled(parameters: Mapping[str, Any], known: Mapping[str, Any], form: str | None) -> dict[str, Any]:
     """Each parameter with what it is in this form, and its name without the unit, as the equation has it."""
     forms = sorted(known.get("forms") or [], key=lambda each: each.get("name") == form)
-    about = {one["name"]: one.get("about") or "" for each in forms for one in each["parameters"]}
+    about = {parameter["name"]: parameter.get("about") or "" for each in forms for parameter in each["parameters"]}
     return {
         name: {**value, "label": about.get(name, "") or parameter_words(name), "symbol": without_unit(name)}
         for name, value in parameters.items()
@@ -210,7 +213,7 @@ def place(entry: Mapping[str, Any], number: int) -> dict[str, Any]:
 
 def splits(comparison: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Split the error into classes, each class with its share of what is left above the noise."""
-    found = []
+    tables = []
     for kind, title in SPLITS.items():
         rows = list((comparison.get("by") or {}).get(kind) or [])
         while kind == "frequency" and len(rows) > 1 and rows[-1]["share_of_excess"] < LEAST_SHARE:
@@ -219,9 +222,9 @@ def splits(comparison: Mapping[str, Any]) -> list[dict[str, Any]]:
             named = [
                 {**row, "words": segment_words(row["label"]) if kind == "segment" else row["label"]} for row in rows
             ]
-            most = max(row["share_of_excess"] for row in rows) or 1.0
-            found.append({"title": title, "rows": named, "most": most})
-    return found
+            largest_share = max(row["share_of_excess"] for row in rows) or 1.0
+            tables.append({"title": title, "rows": named, "most": largest_share})
+    return tables
 
 
 def tidy_experiment(experiment: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
@@ -285,13 +288,13 @@ NOT_TESTED = "It was not tested on this recording: the recording lacks the colum
 
 def require_evidence(diagnosis: Mapping[str, Any], added: Sequence[str]) -> None:
     """Refuse effects that the recording does not ask for. Raises ApiError: 409, with the reason for each effect."""
-    if found := refusals(diagnosis, added):
-        detail = " ".join(f"{effect}: {reason}" for effect, reason in found.items())
+    if reasons := refusals(diagnosis, added):
+        detail = " ".join(f"{effect}: {reason}" for effect, reason in reasons.items())
         detail += (
             " To add it against the evidence, send `force` and a reason; the held-out error then shows its effect."
         )
         title = "The recording gives no evidence for this effect"
-        raise ApiError(409, "effect-not-there", title, detail, reasons=found)
+        raise ApiError(409, "effect-not-there", title, detail, reasons=reasons)
 
 
 def refusals(diagnosis: Mapping[str, Any], added: Sequence[str]) -> dict[str, str]:

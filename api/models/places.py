@@ -19,17 +19,17 @@ def site_of(row: Participant) -> Site:
 
 def holds_at(site: list[Any] | None, row: Participant) -> bool:
     """Whether all is still where it was when this was written down."""
-    return kept(site) == site_of(row)
+    return stored_site(site) == site_of(row)
 
 
 def site_of_recording(recording: Recording, test: Test | None) -> Site | None:
     """Where a recording's test stimulated; None: it was uploaded before that was kept."""
     if test is not None:
         return test.plan.get("side"), test.plan.get("muscle"), test.plan.get("placement")
-    return kept(recording.site)
+    return stored_site(recording.site)
 
 
-def kept(site: list[Any] | None) -> Site | None:
+def stored_site(site: list[Any] | None) -> Site | None:
     """A site as it was written down."""
     return None if site is None else (site[0], site[1], site[2])
 
@@ -45,6 +45,6 @@ def place_of(row: Test) -> Place:
     return plan.get("side"), plan.get("muscle"), plan.get("placement"), plan.get("profile", {}).get("current_ma")
 
 
-def differ(one: Place, other: Place) -> bool:
+def differ(place: Place, other: Place) -> bool:
     """Whether two places are known to be different ones."""
-    return any(a is not None and b is not None and a != b for a, b in zip(one, other, strict=True))
+    return any(a is not None and b is not None and a != b for a, b in zip(place, other, strict=True))

@@ -155,8 +155,8 @@ class Versions:
         One that holds any of `with_evidence` without evidence is passed over: it was made before anybody had looked.
         """
         rows = self.store.all(Model, Model.parent_id == parent.id, Model.recording_id == parent.recording_id)
-        alike = [row for row in rows if sorted(row.effects) == sorted(effects)]
-        return next((row for row in alike if set(with_evidence).isdisjoint(row.fit["without_evidence"])), None)
+        candidates = [row for row in rows if sorted(row.effects) == sorted(effects)]
+        return next((row for row in candidates if set(with_evidence).isdisjoint(row.fit["without_evidence"])), None)
 
     def lineage(self, model: Model) -> list[Model]:
         """The versions from the first one of the recording to this one, then its newest descendants."""
@@ -253,8 +253,8 @@ class Versions:
         session.add(decision)
         detail: dict[str, Any] = {"shown": {name: value for name, value in row.fit.items() if name != "figures"}}
         detail |= {"tracking": decision.tracking} if decision.tracking else {}
-        action, told = "approve" if approved else "reject", {"participant": person.code, "reason": reason}
-        locking.write(session, person, now, by, action, row.id, **told, **detail)
+        action, entry = "approve" if approved else "reject", {"participant": person.code, "reason": reason}
+        locking.write(session, person, now, by, action, row.id, **entry, **detail)
         return decision
 
     def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
@@ -289,8 +289,8 @@ class Versions:
     def all_approved(self, participants: Collection[str]) -> dict[str, Approval]:
         """The same for many participants at once, in one query."""
         now = self.clock.utc()
-        found = self._last_approvals(participants)
-        return {code: row for code, row in found.items() if row.expires_utc is None or row.expires_utc > now}
+        approvals = self._last_approvals(participants)
+        return {code: row for code, row in approvals.items() if row.expires_utc is None or row.expires_utc > now}
 
     def last_approved(self, participant: str) -> Model | None:
         """The version approved last and not rejected since, whether or not its day is over."""

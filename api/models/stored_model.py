@@ -47,7 +47,7 @@ def text(row: Model) -> str:
 
 def structure(document: Mapping[str, Any]) -> dict[str, str]:
     """The effects that a model holds, each with its form where it names one: `id:form`."""
-    forms = {one["id"]: one.get("form") or "" for one in document.get("effects") or []}
+    forms = {effect["id"]: effect.get("form") or "" for effect in document.get("effects") or []}
     return {name: f"{name}:{form}".removesuffix(":") for name, form in forms.items()}
 
 
@@ -69,8 +69,8 @@ FIT = (
 
 def repetition(document: Mapping[str, Any]) -> dict[str, Any]:
     """What repeats in the record of a MODEL.json, with `sentences`; None for each where it is not known."""
-    found = document["fit"].get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
-    return {**found, "sentences": repetition_sentences(document["fit"])}
+    statistics = document["fit"].get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
+    return {**statistics, "sentences": repetition_sentences(document["fit"])}
 
 
 def figures(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -93,11 +93,11 @@ def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> N
     """Judge a new version that holds such effects: it is used with care at best, and says why."""
     if not effects:
         return
-    judged, says = document["quality"], f"added without evidence: {', '.join(effects)}"
-    judged["gates"]["evidence"] = {"passed": False, "severity": "care", "says": says, "effects": list(effects)}
-    judged["reasons"] = [*judged["reasons"], says]
+    judged, reason = document["quality"], f"added without evidence: {', '.join(effects)}"
+    judged["gates"]["evidence"] = {"passed": False, "severity": "care", "says": reason, "effects": list(effects)}
+    judged["reasons"] = [*judged["reasons"], reason]
     if judged["verdict"] == "usable":
-        judged |= {"verdict": "usable with care", "words": f"{says.capitalize()}."}
+        judged |= {"verdict": "usable with care", "words": f"{reason.capitalize()}."}
 
 
 @dataclass(frozen=True)
@@ -144,14 +144,14 @@ def dynamics(document: Mapping[str, Any]) -> dict[str, Any]:
     Tω and ζ are those of eq. (31) with damping: 1 / (Tω² s² + 2 ζ Tω s + 1).
     """
     linear = document["linear"]
-    found: dict[str, Any] = {key: linear.get(key) for key in ("time_constant_s", "damping", "delay_s")}
+    values: dict[str, Any] = {key: linear.get(key) for key in ("time_constant_s", "damping", "delay_s")}
     step_s = linear.get("step_s") or 1.0 / document["sample_rate_hz"]
     poles = _poles(linear["a"], step_s)
-    found["poles_per_s"] = [[round(pole.real, 4), round(pole.imag, 4)] for pole in poles]
-    if found["time_constant_s"] is None and len(poles) == 2 and abs(poles[0] * poles[1]) > 0:
+    values["poles_per_s"] = [[round(pole.real, 4), round(pole.imag, 4)] for pole in poles]
+    if values["time_constant_s"] is None and len(poles) == 2 and abs(poles[0] * poles[1]) > 0:
         speed = math.sqrt(abs(poles[0] * poles[1]))
-        found["time_constant_s"], found["damping"] = 1.0 / speed, -(poles[0] + poles[1]).real / 2 / speed
-    return found
+        values["time_constant_s"], values["damping"] = 1.0 / speed, -(poles[0] + poles[1]).real / 2 / speed
+    return values
 
 
 def _poles(a: list[float], step_s: float) -> list[complex]:
@@ -192,7 +192,7 @@ UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "d
 def muscle_figures(document: Mapping[str, Any]) -> dict[str, Figure]:
     """Threshold, plateau, dynamics, and the main parameter of each effect as `effect.parameter`."""
     stored, read_off = document["uncertainty"]["figures"], dynamics(document)
-    found = {
+    figures = {
         name: stored.get(name) or {"value": read_off.get(name), "sd": None, "unit": unit}
         for name, unit in UNITS.items()
     }
@@ -200,13 +200,13 @@ def muscle_figures(document: Mapping[str, Any]) -> dict[str, Figure]:
         known = effect.get("parameters") or {}
         for name in [*(name for name in fact_of(effect["id"], "main", ()) if name in known), *known][:1]:
             figure = {"unit": "1", **known[name]}
-            found[f"{effect['id']}.{name}"] = {
+            figures[f"{effect['id']}.{name}"] = {
                 "value": figure["value"],
                 "sd": figure["sd"],
                 "unit": figure["unit"],
                 "form": effect.get("form") or "",
             }
-    return found
+    return figures
 
 
 def threshold_us(row: Model) -> float | None:

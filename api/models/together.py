@@ -19,7 +19,7 @@ from stimrig.api.store.tables import Model, Recording, Test
 JOINT_EFFECTS = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
 """What the torque does with angle and velocity, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):
 fitted where nothing else is asked for."""
-MOST = 20
+MAX_RECORDINGS = 20
 ANGLE = "angle_rad"
 
 
@@ -49,10 +49,10 @@ async def fit(
     if len(rows) > 1:
         needs = [ANGLE] if {*ids} & {*_ids(JOINT_EFFECTS)} else []
         whole = await join(analyses, [row.id for row in rows], participant, needs)
-    found = await analyses.run("fit", on_call, data=whole.path, effects=list(effects))
+    fitted = await analyses.run("fit", on_call, data=whole.path, effects=list(effects))
 
     def store() -> Model:
-        row = analyses.versions.add(found["json"], participant, whole.id, by)
+        row = analyses.versions.add(fitted["json"], participant, whole.id, by)
         analyses.store.note(analyses.clock, by, "fit recordings together", row.id, recordings=list(recordings))
         return row
 
@@ -85,13 +85,13 @@ async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs
     """
     paths = [await asyncio.to_thread(analyses.path, part) for part in parts]
     settings = analyses.settings
-    made = settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"  # all that a worker may write to
-    path = settings.recordings_dir / made.name
+    export = settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"  # all that a worker may write to
+    path = settings.recordings_dir / export.name
     try:
-        found = await analyses.run("join", urgent=True, parts=paths, out=str(made), needs=list(needs))
-        await asyncio.to_thread(made.replace, uploads.part_of(path))
+        joined = await analyses.run("join", urgent=True, parts=paths, out=str(export), needs=list(needs))
+        await asyncio.to_thread(export.replace, uploads.part_of(path))
     except BaseException as error:
-        made.unlink(missing_ok=True)
+        export.unlink(missing_ok=True)
         if isinstance(error, ApiError):
             place, _, number = str(error.extra.get("place", "")).partition("recording ")
             if not place and number.isdecimal():
@@ -99,7 +99,7 @@ async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs
                 error.detail = error.detail.replace(f"recording {number}", named, 1)
                 error.extra["place"] = named
         raise
-    stored = asyncio.to_thread(_store_joined, analyses, path, found["file_sha256"], participant, list(parts))
+    stored = asyncio.to_thread(_store_joined, analyses, path, joined["file_sha256"], participant, list(parts))
     return await asyncio.shield(stored)
 
 
@@ -126,5 +126,5 @@ def warnings(session: Session, recording_id: str) -> list[str]:
     """What was found doubtful about a recording, in sentences: by the rig, or when its first model was made."""
     recording = session.get(Recording, recording_id)
     test = session.get(Test, recording.test_id) if recording is not None and recording.test_id else None
-    found = test.summary.get("warnings") if test is not None else recording and recording.warnings
-    return list(found or [])
+    sentences = test.summary.get("warnings") if test is not None else recording and recording.warnings
+    return list(sentences or [])

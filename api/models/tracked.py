@@ -98,8 +98,10 @@ class TrackedVersions:
         if approval.id not in self._earlier:
             before = (Approval.participant == approval.participant, Approval.id < approval.id)
             last = self.store.all(Approval, *before, order=Approval.id.desc(), limit=MOST_EARLIER)
-            alike = [one for one in last[::-1] if not self.elsewhere(one, self.places(approval))]
-            sessions = [[row.step["now"] for row in self.rows(one.id) if row.step is not None] for one in alike]
+            comparable = [previous for previous in last[::-1] if not self.elsewhere(previous, self.places(approval))]
+            sessions = [
+                [row.step["now"] for row in self.rows(previous.id) if row.step is not None] for previous in comparable
+            ]
             self._earlier[approval.id] = [levels for levels in sessions if levels]
         return self._earlier[approval.id]
 
@@ -110,7 +112,7 @@ class TrackedVersions:
 
     def elsewhere(self, approval: Approval, places: list[Place]) -> bool:
         """Whether an approved model is known to be one of another side, muscle or current than these places."""
-        return any(differ(own, place) for own in self.places(approval) for place in places)
+        return any(differ(approved_place, place) for approved_place in self.places(approval) for place in places)
 
     def text(self, approval: Approval) -> str:
         """The approved MODEL.json. Raises ApiError (500) where it is damaged."""
@@ -119,10 +121,12 @@ class TrackedVersions:
     def rows(self, approval_id: int) -> list[Tracked]:
         """The trials of an approval, the oldest first, without what was served."""
         with self.store.read() as session:
-            found = session.query(Tracked).options(defer(Tracked.document)).filter(Tracked.approval_id == approval_id)
-            return list(found.order_by(Tracked.number))
+            query = session.query(Tracked).options(defer(Tracked.document)).filter(Tracked.approval_id == approval_id)
+            return list(query.order_by(Tracked.number))
 
-    def keep(self, trial: Trial, found: dict[str, Any], last_sample_unix_s: float | None = None) -> Tracked | None:
+    def add_trial(
+        self, trial: Trial, result: dict[str, Any], last_sample_unix_s: float | None = None
+    ) -> Tracked | None:
         """Write down what a trial said, and serve what may be served after it.
 
         Nothing is moved by a trial that is noted already, or whose approval holds no longer.
@@ -131,7 +135,7 @@ class TrackedVersions:
         ----------
         trial : Trial
             The trial.
-        found : dict
+        result : dict
             `step` and `model` (`stimrig.api.jobs.tracking_verbs`), or the `reason` why it was not followed.
         last_sample_unix_s : float, optional
             When its last sample came.
@@ -141,25 +145,25 @@ class TrackedVersions:
         Tracked or None
             The row; None where the trial had been noted.
         """
-        approval, step = trial.approval, found.get("step")
+        approval, step = trial.approval, result.get("step")
         with self.store.write() as session:  # no approval slips in between looking and writing
             if session.get(Tracked, trial.test.id) is not None:
                 return None
             holding = self.versions.approved(approval.participant)
             if step is not None and (holding is None or holding.id != approval.id):
-                step, found = None, {**found, "reason": SUPERSEDED}
+                step, result = None, {**result, "reason": SUPERSEDED}
             now = self.clock.utc()
             row = Tracked(test_id=trial.test.id, approval_id=approval.id, number=trial.number, at_utc=now)
             row.participant, row.model_id = approval.participant, approval.model_id
-            row.recording_id, row.error_percent = trial.test.recording_id, found.get("error_percent")
-            row.outcome, row.reason = NOT_FOLLOWED, found.get("reason", "")
+            row.recording_id, row.error_percent = trial.test.recording_id, result.get("error_percent")
+            row.outcome, row.reason = NOT_FOLLOWED, result.get("reason", "")
             if step is not None:
                 row.outcome, row.reason, row.step = step["outcome"], "", step
-                row.ask = tracking.ask(trial.number, step, trial.alarms)
+                row.ask = tracking.new_test_reason(trial.number, step, trial.alarms)
             elif trial.model_json and row.reason != SUPERSEDED and self._unfollowed_before(approval.id):
                 row.ask = tracking.not_followed(trial.number)
             if step is not None or row.ask is not None:
-                row.document = body = self._document(trial, row, found.get("model", ""))
+                row.document = body = self._document(trial, row, result.get("model", ""))
                 row.etag = hashlib.sha256(body).hexdigest()
                 if step is not None and last_sample_unix_s is not None:
                     row.delay_s = round(self.clock.unix_s() - last_sample_unix_s, 3)
@@ -171,7 +175,7 @@ class TrackedVersions:
     def _document(self, trial: Trial, row: Tracked, model_json: str) -> bytes:
         """What is served from now on: the moved model, or where a person is asked the last one within the limits."""
         approval, step = trial.approval, row.step or {}
-        told = {
+        tracking_info = {
             "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id, "at_utc": row.at_utc,
             **{key: step.get(key) for key in OF_STEP}, "limits": approval.tracking, "outcome": row.outcome,
         }  # fmt: skip
@@ -181,9 +185,9 @@ class TrackedVersions:
             before = self.newest(approval.id)
             document = json.loads(trial.model_json if before is None or before.document is None else before.document)
             none = {"trial": 0, "test_id": None, "at_utc": approval.at_utc, **dict.fromkeys((*OF_STEP, "outcome"))}
-            told = document.get("tracking") or told | none
-        document["model_id"] = f"{approval.model_id}.{approval.id}.{told['trial']}"
-        document["tracking"] = {**told, "ask": row.ask}
+            tracking_info = document.get("tracking") or tracking_info | none
+        document["model_id"] = f"{approval.model_id}.{approval.id}.{tracking_info['trial']}"
+        document["tracking"] = {**tracking_info, "ask": row.ask}
         return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
 
     def _unfollowed_before(self, approval_id: int) -> bool:
@@ -230,7 +234,7 @@ class TrackedVersions:
         """The version itself, or the one from which it was tracked. Raises ApiError (404)."""
         return self.versions.get(parts(model_id)[0])
 
-    def asks(self, approval_id: int) -> str | None:
+    def new_test_reason(self, approval_id: int) -> str | None:
         """Why a new test is needed now; None where none is."""
         row = self.newest(approval_id)
         return row.ask if row else None
@@ -249,7 +253,7 @@ class TrackedVersions:
             "served_utc": served.at_utc,
             "served_trial": json.loads(served.body).get("tracking", {}).get("trial", 0),
             "etag": served.etag,
-            "ask": self.asks(approval.id),
+            "ask": self.new_test_reason(approval.id),
             "trials": [trial_document(row) for row in self.rows(approval.id)],
         }
 
@@ -257,9 +261,9 @@ class TrackedVersions:
 def trial_document(row: Tracked) -> dict[str, Any]:
     """A trial as clients see it."""
     step = row.step or {}
-    found = ("now", "coming", "effects", "error_nm", "expected_error_nm", "disturbed_s", "distance")
-    kept = ("number", "test_id", "recording_id", "at_utc", "outcome", "reason", "ask", "error_percent", "delay_s")
-    return {**{name: getattr(row, name) for name in kept}, **{name: step.get(name) for name in found}}
+    step_fields = ("now", "coming", "effects", "error_nm", "expected_error_nm", "disturbed_s", "distance")
+    row_fields = ("number", "test_id", "recording_id", "at_utc", "outcome", "reason", "ask", "error_percent", "delay_s")
+    return {**{name: getattr(row, name) for name in row_fields}, **{name: step.get(name) for name in step_fields}}
 
 
 def parts(model_id: str) -> tuple[str, int, int]:

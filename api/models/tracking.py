@@ -56,12 +56,12 @@ class Limits(BaseModel):
 
         The muscle changes all the same where the model is held.
         """
-        return Limits(**{name: given or USUAL_PERCENT for name, given in self.model_dump().items()}).bounds(
+        return Limits(**{name: percent or USUAL_PERCENT for name, percent in self.model_dump().items()}).bounds(
             threshold_us
         )
 
 
-def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
+def new_test_reason(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
     """Why a person has to be asked after a trial; None where the next one is expected within the bounds.
 
     The bounds are for what is expected, not for its band.
@@ -96,14 +96,14 @@ def ask(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
 def _beyond(name: str, value: float, low: float, high: float) -> str:
     """Where rounding would write the limit itself, the sentence says "just beyond" instead of a number."""
     if name == "threshold_shift_us":
-        moved, most = f"{value:+.1f}", f"{high:.3g}"
-        if abs(float(moved)) <= float(most):
-            return f"just beyond the {most} µs that it may move."
-        return f"to have moved by {moved} µs; {most} µs either way are allowed."
-    percent, least, most = f"{100.0 * value:.1f}", f"{100.0 * low:g}", f"{100.0 * high:g}"
-    if float(least) <= float(percent) <= float(most):
-        return f"just beyond the {least} to {most} % of the approved one that are allowed."
-    return f"to be {percent} % of the approved one; {least} to {most} % are allowed."
+        moved, upper = f"{value:+.1f}", f"{high:.3g}"
+        if abs(float(moved)) <= float(upper):
+            return f"just beyond the {upper} µs that it may move."
+        return f"to have moved by {moved} µs; {upper} µs either way are allowed."
+    percent, lower, upper = f"{100.0 * value:.1f}", f"{100.0 * low:g}", f"{100.0 * high:g}"
+    if float(lower) <= float(percent) <= float(upper):
+        return f"just beyond the {lower} to {upper} % of the approved one that are allowed."
+    return f"to be {percent} % of the approved one; {lower} to {upper} % are allowed."
 
 
 def not_followed(number: int) -> str:
@@ -145,15 +145,15 @@ def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
     same_day, time = local_day(since_utc) == local_day(known[-1]["at_utc"]), clock(since_utc)[:5]
     day_of_month, _, month = day(since_utc).partition(" ")
     than = f"at {time}" if same_day else f"on {day_of_month} {month} at {time}"
-    found = []
+    changes = []
     for name, (what, less, more) in CHANGES.items():
         value, middle = now[name]["value"], MIDDLES[name]
         change = f"{abs(value):.1f} µs" if name == "threshold_shift_us" else _percent(value)
         if now[name]["high"] < middle or now[name]["low"] > middle:
             way = less if now[name]["high"] < middle else more
-            found.append(f"In trial {number} the {what} is {change} {way} than {than}.")
-    if found:
-        return found
+            changes.append(f"In trial {number} the {what} is {change} {way} than {than}.")
+    if changes:
+        return changes
     ends = [(abs(now[name][end] - MIDDLES[name]), NARROW[name]) for name in MIDDLES for end in ("low", "high")]
     if all(distance <= narrow for distance, narrow in ends):
         return [f"In trial {number} the muscle is as it was {than}."]

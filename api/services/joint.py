@@ -115,7 +115,9 @@ EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}(:[a-z0-9_
 class TogetherIn(Body):
     """Recordings of one participant that are to be fitted as one."""
 
-    recordings: Annotated[list[RecordingId], Field(min_length=1, max_length=together.MOST), AfterValidator(_once)]
+    recordings: Annotated[
+        list[RecordingId], Field(min_length=1, max_length=together.MAX_RECORDINGS), AfterValidator(_once)
+    ]
     effects: Annotated[list[EffectId], Field(max_length=20)] = Field(
         default=list(together.JOINT_EFFECTS), description="of the model; needs the joint's angle in each recording"
     )

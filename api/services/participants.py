@@ -159,7 +159,7 @@ def effect_on_open_work(context: Context, code: str) -> str:
 
 def loses_calibration(row: Participant, body: MuscleIn) -> bool:
     """Whether a calibration is lost: it was found at another site than the new one."""
-    is_calibrated = any(row.profile.get(name) is not None for name in profiles.FOUND)
+    is_calibrated = any(row.profile.get(name) is not None for name in profiles.CALIBRATION_FIELDS)
     pairs = zip(site_of(row), site_in(body), strict=True)
     return is_calibrated and any(before is not None and before != after for before, after in pairs)
 
@@ -196,7 +196,7 @@ def change_site(
             require_confirmation(confirm, title, f"Yes, it is {after}", changes, warnings, refusal)
         if here != site_in(body):
             if lost:
-                row.profile = {**row.profile, **dict.fromkeys(profiles.FOUND)}
+                row.profile = {**row.profile, **dict.fromkeys(profiles.CALIBRATION_FIELDS)}
             row.side, row.muscle, row.placement = site_in(body)
             locking.write(session, row, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
     return row

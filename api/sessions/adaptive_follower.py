@@ -67,7 +67,7 @@ class News:
 class Turn:
     """One boundary: what is asked, and what came of it."""
 
-    laid: int
+    scheduled: int
     questions: int = 0
     """1: with early samples; 2: with the newest ones."""
     advice: Advice | None = None
@@ -97,7 +97,7 @@ class Follower(Watcher):
     the participant's models; `reach`: what was said of the target before the test.
     """
 
-    watches, left = "choosing", "fixed"
+    watching_state, failed_state = "choosing", "fixed"
     log = log
 
     def __init__(
@@ -130,11 +130,11 @@ class Follower(Watcher):
     def give_up(self, why: str) -> None:
         """As `Watcher`; the fixed plan plays on at once, without rest for somebody who would choose."""
         super().give_up(why)
-        self._tasks.begin(self._leave(self._turn.laid))
+        self._tasks.begin(self._release(self._turn.scheduled))
 
-    async def _leave(self, laid: int) -> None:
+    async def _release(self, scheduled: int) -> None:
         with contextlib.suppress(ApiError):  # then it plays on once the rig's patience is over
-            await self.rig.ask(ExtendRequest(test_id=self.plan.test_id, key=self.key, after=laid, segments=[]))
+            await self.rig.ask(ExtendRequest(test_id=self.plan.test_id, key=self.key, after=scheduled, segments=[]))
 
     def document(self) -> dict[str, Any]:
         """As `Watcher`."""
@@ -150,7 +150,7 @@ class Follower(Watcher):
         """As `Watcher`."""
         self._newest, self._received_s = event, self.clock.monotonic_s()
         self._new.add(event)
-        if event.laid != self._turn.laid:
+        if event.laid != self._turn.scheduled:
             self._turn = Turn(event.laid)
         if event.ended_by or self.status.state != "choosing":
             return
@@ -232,7 +232,7 @@ class Follower(Watcher):
         before = self.status.state, self.status.ended
         chosen = [SegmentPlan(**segment) for segment in advice.document["segments"]]
         ended = {"enough": "known-enough", "spent": self._spent()}.get(kind, "")
-        request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.laid, segments=chosen)
+        request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.scheduled, segments=chosen)
         if ended:
             request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
             # at once: what comes while the rig answers is neither asked about, nor told as what the end was decided on
@@ -266,7 +266,9 @@ class Follower(Watcher):
         segments = []
         for segment in event.laid_segments:
             count = round(segment.end_s * rate_hz) - len(widths)
-            own = next(sources[segment.by], []) if segment.by in sources else []  # rest, while it waits or ends
+            source_widths = (
+                next(sources[segment.by], []) if segment.by in sources else []
+            )  # rest, while it waits or ends
             segments.append((segment.name, len(widths), len(widths) + count))
-            widths += [*own, *[0.0] * count][:count]
+            widths += [*source_widths, *[0.0] * count][:count]
         return widths, segments

@@ -49,16 +49,16 @@ class KeyFor(PlanIn):
 def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
     """The plan, as it is kept with the key. Raises ApiError: 422 wider than the participant's limits."""
     for name in ("current_ma", "max_pulse_width_us"):
-        asked, own = getattr(plan, name), participant.profile.get(name)
-        if own is None or not asked <= own:
+        value, limit = getattr(plan, name), participant.profile.get(name)
+        if limit is None or not value <= limit:
             unit = LIMITS[name].unit
-            detail = f"{LIMITS[name].words}: {asked:g} {unit} is above the limit of today, {own or 0:g} {unit}."
+            detail = f"{LIMITS[name].words}: {value:g} {unit} is above the limit of today, {limit or 0:g} {unit}."
             raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
     return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
 
 
 async def start(
-    runner: Runner, lock: asyncio.Lock, store: Store, who: Principal, body: TestIn, tags: Tags | None
+    runner: Runner, lock: asyncio.Lock, store: Store, principal: Principal, body: TestIn, tags: Tags | None
 ) -> Test:
     """Start a test; where a controller's key asks for it, within its plan.
 
@@ -67,16 +67,16 @@ async def start(
     Raises ApiError: 403 outside the key or its plan, and by how much; 409 no model of its participant is approved; else
     as `Runner.start`.
     """
-    if who.participant is None:
-        return await runner.start(body, who.name, holder=who.token_hash, tags=tags)
+    if principal.participant is None:
+        return await runner.start(body, principal.name, holder=principal.token_hash, tags=tags)
     async with lock:  # no two trials share the last one that is left
         try:
-            _refuse_kind(who, body)
-            participant: Participant = await asyncio.to_thread(store.get, Participant, who.participant)
+            _refuse_kind(principal, body)
+            participant: Participant = await asyncio.to_thread(store.get, Participant, principal.participant)
             model = await asyncio.to_thread(_model_sent, runner, body, tags or ())
-            body = await _within_plan(runner, store, who, body, participant)
+            body = await _within_plan(runner, store, principal, body, participant)
             version = (str(participant.version),)  # what the plan and the model were looked at with
-            return await runner.start(body, who.name, holder=who.token_hash, tags=version, model=model)
+            return await runner.start(body, principal.name, holder=principal.token_hash, tags=version, model=model)
         except ChangedError:
             raise trial_overtaken() from None
         except ApiError as error:
@@ -86,19 +86,23 @@ async def start(
             raise ApiError(error.status, error.code, title, NEUTRAL[error.code]) from None
 
 
-async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestIn, participant: Participant) -> TestIn:
+async def _within_plan(
+    runner: Runner, store: Store, principal: Principal, body: TestIn, participant: Participant
+) -> TestIn:
     """The test with the plan's limits, where the plan allows it."""
-    plan = who.plan or {}
-    begun = (Test.requested_by == who.name, Test.state != "refused")  # what the rig refused was no trial
+    plan = principal.plan or {}
+    begun = (Test.requested_by == principal.name, Test.state != "refused")  # what the rig refused was no trial
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
         raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
     limits: dict[str, Any] = {}
     for name in ("current_ma", "max_pulse_width_us"):
-        asked = body.profile.sent().get(name) if body.profile else None
+        requested = body.profile.sent().get(name) if body.profile else None
         unit = LIMITS[name].unit
-        if asked is not None and not asked <= plan[name]:
-            raise beyond(f"{name} {asked:g} {unit} is above the plan's {plan[name]:g} {unit}")
-        limits[name] = min(value for value in (asked, plan[name], participant.profile.get(name)) if value is not None)
+        if requested is not None and not requested <= plan[name]:
+            raise beyond(f"{name} {requested:g} {unit} is above the plan's {plan[name]:g} {unit}")
+        limits[name] = min(
+            value for value in (requested, plan[name], participant.profile.get(name)) if value is not None
+        )
     narrowed = body.model_copy(update={"profile": (body.profile or ProfileIn()).model_copy(update=limits)})
     preview = await runner.preview(narrowed)
     if not preview["duration_s"] <= plan["max_duration_s"] + 1e-9:
@@ -109,9 +113,9 @@ async def _within_plan(runner: Runner, store: Store, who: Principal, body: TestI
     return narrowed
 
 
-def _refuse_kind(who: Principal, body: TestIn) -> None:
-    if body.participant != who.participant:
-        raise outside(who.participant)
+def _refuse_kind(principal: Principal, body: TestIn) -> None:
+    if body.participant != principal.participant:
+        raise outside(principal.participant)
     if body.kind != SEQUENCE:
         raise beyond(f"The kind is {body.kind!r}. Send kind {SEQUENCE!r}")
     if body.segments is None:
@@ -131,13 +135,15 @@ def _model_sent(runner: Runner, body: TestIn, sent: Tags) -> str:
     served = runner.versions.served(body.participant)
     if served is None:
         raise unapproved(body.participant)
-    tags = [found.etag.strip('"') for found in (served, runner.trials.tracked.served(body.participant)) if found]
+    tags = [
+        document.etag.strip('"') for document in (served, runner.trials.tracked.served(body.participant)) if document
+    ]
     if (tag := next((tag for tag in tags if tag in sent), None)) is None:
         raise trial_overtaken()
     own_hz = float(json.loads(served.body)["pulse_rate_hz"])
     if not abs(body.pulse_rate_hz - own_hz) <= SAME_RATE * own_hz:
-        asked = f"pulse_rate_hz {body.pulse_rate_hz:g} is not the approved model's {own_hz:g}"
-        raise beyond(f"{asked} (40, where none is sent). Send the model's pulse_rate_hz")
+        mismatch = f"pulse_rate_hz {body.pulse_rate_hz:g} is not the approved model's {own_hz:g}"
+        raise beyond(f"{mismatch} (40, where none is sent). Send the model's pulse_rate_hz")
     return tag
 
 
@@ -169,8 +175,8 @@ def refuse_maker_without(maker: Principal) -> None:
     """403 to whoever lacks a scope that a key holds: it may do nothing that its maker may not."""
     lacking = [str(scope) for scope in KEY_SCOPES if not maker.may(scope)]
     if lacking:
-        who = maker.name
-        detail = f"A key holds {', '.join(KEY_SCOPES)}. Who makes one holds them all; {who} lacks {', '.join(lacking)}."
+        held_by_key = ", ".join(KEY_SCOPES)
+        detail = f"A key holds {held_by_key}. Who makes one holds them all; {maker.name} lacks {', '.join(lacking)}."
         raise forbidden(detail)
 
 
@@ -196,11 +202,13 @@ def make_key(
         Versions of the participant that it is made on.
     """
     text, now = f"stimrig_{secrets.token_urlsafe(32)}", auth.clock.utc()
-    own = f"{name} ({digest(text)[:6]})"
+    unique_name = f"{name} ({digest(text)[:6]})"
     with auth.store.write() as session:
         person = require_found(session.get(Participant, participant), "participant", participant)
         locking.check(session, person, tags)
-        row = Token(hash=digest(text), prefix=text[:12], name=own, created_utc=now, participant=participant, plan=plan)
+        row = Token(
+            hash=digest(text), prefix=text[:12], name=unique_name, created_utc=now, participant=participant, plan=plan
+        )
         row.scopes, row.made_by, row.expires_utc = (
             [str(scope) for scope in KEY_SCOPES],
             made_by,
@@ -208,7 +216,7 @@ def make_key(
         )
         session.add(row)
         bound = {"participant": participant, "plan": plan, "until": row.expires_utc}
-        locking.write(session, person, now, by, "issue token", own, scopes=row.scopes, **bound)
+        locking.write(session, person, now, by, "issue token", unique_name, scopes=row.scopes, **bound)
     return text, row, person.version
 
 

@@ -53,7 +53,7 @@ class JointTests(Watched):
         if plan.kind == HELD:
             target = await asyncio.to_thread(self._target, plan, angle_in, shared)
             angle.target_rad = document["target_rad"] = target
-            segments, bounds = shared.held, None
+            segments, bounds = shared.hold_segments, None
         else:
             angle.still_s = joint_plan.STILL_S[plan.kind] if angle_in.still_s is None else angle_in.still_s
             bounds = self._bounds(body, plan, shared)
@@ -163,12 +163,12 @@ class JointTests(Watched):
         assert range_rad is not None
         shared = await self._layout(plan, range_rad, None, preview_s)
         rows = await asyncio.to_thread(self.today, plan.participant)
-        held = await asyncio.to_thread(self.targets, plan.participant, shared)
+        targets = await asyncio.to_thread(self.targets, plan.participant, shared)
         newest = {kind: next((row.id for row in rows if row.kind == kind), None) for kind in (PASSIVE, MOVING)}
         return {
             "range_rad": list(range_rad),
-            "targets": held,
-            "next_rad": next((row["angle_rad"] for row in held if not row["done"]), None),
+            "targets": targets,
+            "next_rad": next((row["angle_rad"] for row in targets if not row["done"]), None),
             "tests": newest,
             "doses": shared.doses,
             "known": shared.known,
@@ -202,8 +202,8 @@ class JointWatcher(Watcher):
     status: JointStatus
     log = logging.getLogger("stimrig.joint")
 
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
         self._since_s: float | None = None
         """Since when pulses follow one another, and the newest one, on the test's clock."""
         self._last_s = 0.0

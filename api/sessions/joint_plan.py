@@ -128,7 +128,7 @@ def _rounded(angle_rad: float, low: float, high: float) -> float:
     return inside[0] if inside else angle_rad
 
 
-def held(curve: Curve, largest_us: float, stair_s: float, rate_hz: float) -> list[Segment]:
+def hold_segments(curve: Curve, largest_us: float, stair_s: float, rate_hz: float) -> list[Segment]:
     """A short staircase with rest around it."""
     top = curve.torque(largest_us)
     return [
@@ -191,7 +191,7 @@ class Layout:
     """The guided tests of a participant."""
 
     targets_rad: list[float]  # angles to hold
-    held: list[Segment]  # of one held test
+    hold_segments: list[Segment]  # of one held test
     moving: list[Segment]
     doses: dict[str, float]
     """Expected torque-time: of the paper's test, one held test, all of them, the moving one, and all together; N·m·s,
@@ -214,10 +214,10 @@ def layout(
     limits, µs; `moving_s`: the longest moving test without its safe end, s.
     """
     angles, paper = targets(range_rad), torque_time(paper_us, rate_hz, curve)
-    full = torque_time(widths_of(held(curve, largest_us, LONGEST_STAIR_S, rate_hz)), rate_hz, curve)
+    full = torque_time(widths_of(hold_segments(curve, largest_us, LONGEST_STAIR_S, rate_hz)), rate_hz, curve)
     planned = PLANNED_SHARE * paper
     fits = HELD_SHARE * planned / (full * len(angles)) if angles and full > 0 else 0.0
-    stairs = held(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
+    stairs = hold_segments(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
     each = torque_time(widths_of(stairs), rate_hz, curve)
     levels = moving(curve, largest_us, max(planned - each * len(angles), 0.0), moving_s, rate_hz)
     doses = {"paper": paper, "held_each": each, "held": each * len(angles)}
@@ -285,7 +285,7 @@ class Coverage:
         kind = ROWS[row]
         return kind is not None and (kind[1] == "slow" or 0 < column < self.columns - 1)
 
-    def seen(self, row: int, column: int) -> bool:
+    def covered(self, row: int, column: int) -> bool:
         """Return whether the joint was in a cell for long enough; a hair less, for sums of samples."""
         return self.time_s[row][column] >= self.seen_s - 1e-6
 
@@ -293,7 +293,7 @@ class Coverage:
     def share(self) -> float:
         """Share of the needed cells that were seen, 0 to 1."""
         needed = [cell for cell in product(range(len(ROWS)), range(self.columns)) if self.needed(*cell)]
-        return sum(self.seen(*cell) for cell in needed) / len(needed)
+        return sum(self.covered(*cell) for cell in needed) / len(needed)
 
     @property
     def enough(self) -> bool:
@@ -306,7 +306,7 @@ class Coverage:
         for kind in MISSING_ORDER:
             row, edge = ROWS.index(kind), None
             for column in range(self.columns + 1):
-                is_open = column < self.columns and self.needed(row, column) and not self.seen(row, column)
+                is_open = column < self.columns and self.needed(row, column) and not self.covered(row, column)
                 if is_open and edge is None:
                     edge = self.edges_rad[column]
                 elif not is_open and edge is not None:

@@ -124,7 +124,7 @@ class Watcher:
     and `ended`. `publish`: called whenever there is something new for pages.
     """
 
-    watches, left = "watching", "alone"
+    watching_state, failed_state = "watching", "alone"
     """States: while all goes well, and after it did not."""
     log = logging.getLogger("stimrig.sessions")
 
@@ -163,8 +163,8 @@ class Watcher:
 
     def give_up(self, why: str) -> None:
         """Watch no more."""
-        if self.status.state == self.watches:
-            self.status.state, self.status.problem = self.left, self.problem(why)
+        if self.status.state == self.watching_state:
+            self.status.state, self.status.problem = self.failed_state, self.problem(why)
             self.log.warning("%s", self.status.problem, extra={"test_id": self.plan.test_id})
             self.publish()
 

@@ -16,7 +16,7 @@ from stimrig.api.store import Store, audit
 from stimrig.api.store.tables import Note, Participant, Test
 
 KINDS: tuple[NoteKind, ...] = get_args(NoteKind)
-MOST = 2000
+MAX_NOTES = 2000
 """Notes of one participant."""
 
 
@@ -32,8 +32,8 @@ class Notes:
 
     def test_notes(self, test_id: str) -> list[Note]:
         """The notes of one test by their time in it; those on the whole of it first."""
-        found = self.store.all(Note, Note.test_id == test_id, order=Note.at_utc)
-        return sorted(found, key=lambda note: -1.0 if note.at_s is None else note.at_s)
+        notes = self.store.all(Note, Note.test_id == test_id, order=Note.at_utc)
+        return sorted(notes, key=lambda note: -1.0 if note.at_s is None else note.at_s)
 
     def add(self, participant: str, body: NoteIn, by: str, now_s: float | None = None) -> Note:
         """Write a note.
@@ -72,7 +72,7 @@ class Notes:
     def _check(self, session: Session, participant: str, body: NoteIn) -> None:
         require_found(session.get(Participant, participant), "participant", participant)
         count = session.scalar(select(func.count()).where(Note.participant == participant)) or 0
-        if count >= MOST:
+        if count >= MAX_NOTES:
             detail = f"{participant} has {count} notes, as many as are kept. Write the next one elsewhere."
             raise ApiError(409, "too-many-notes", "There are too many notes", detail)
         if body.test_id is None:
@@ -105,5 +105,5 @@ def duration_s(test: Test) -> float:
     """How long a test lasted; how long it is planned to last while it runs."""
     played = test.summary.get("duration_s")
     planned = (test.plan.get("preview") or {}).get("duration_s")
-    found = float(played if played is not None else planned or 0.0)
-    return found if math.isfinite(found) else 0.0
+    duration = float(played if played is not None else planned or 0.0)
+    return duration if math.isfinite(duration) else 0.0

@@ -50,7 +50,7 @@ class Current:
     """The end of the right was told to the rig."""
     changes: list[dict[str, Any]] = field(default_factory=list)
     """Those of the participant that have withdrawn it."""
-    looking: asyncio.Lock = field(default_factory=asyncio.Lock)
+    state_lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     missed: int = 0
     """How often in a row the rig, asked for its state, did not name it."""
     let_go: asyncio.Event = field(default_factory=asyncio.Event)
@@ -105,7 +105,7 @@ class Playing:
         current = self.current
         if current is None:
             return
-        async with current.looking:
+        async with current.state_lock:
             version, changes, lost = current.version, list[dict[str, Any]](), self.is_over(current)
             if not lost:  # by time it is known here, also where the store cannot be read
                 version, changes, lost = await asyncio.to_thread(self.find_changes, current)
@@ -188,9 +188,9 @@ def right_ended() -> ApiError:
 
 def busy(current: Current) -> ApiError:
     """409, naming the holder."""
-    who = current.by
+    holder_name = current.by
     detail = (
-        f"{current.test_id} for participant {current.participant}, started by {who}, uses the rig. "
+        f"{current.test_id} for participant {current.participant}, started by {holder_name}, uses the rig. "
         "Wait for its end, or stop it."
     )
     return ApiError(409, "rig-busy", "Another test is running", detail, holder=current.holder)

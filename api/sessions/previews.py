@@ -17,7 +17,7 @@ from stimrig.api.store.tables import Participant
 
 VALID_S = 300.0
 """How long a shown plan may be started."""
-MOST = 20
+CAPACITY = 20
 """Previews that are kept; the oldest goes first."""
 
 
@@ -49,29 +49,29 @@ class Previews:
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
-        self._kept: dict[str, Preview] = {}
+        self._previews: dict[str, Preview] = {}
 
-    def keep(self, body: TestIn, planned: Planned, answer: dict[str, Any], row: Participant) -> str:
+    def add(self, body: TestIn, planned: Planned, answer: dict[str, Any], row: Participant) -> str:
         """Keep a preview; its hash."""
         now_s, now_unix_s = self.clock.monotonic_s(), self.clock.unix_s()
         preview = Preview(body, planned, answer, dict(row.profile), site_of(row), now_s, now_unix_s)
         plan_hash = preview.hash
-        self._kept.pop(plan_hash, None)
-        self._kept[plan_hash] = preview
-        for old in list(self._kept)[:-MOST]:
-            del self._kept[old]
+        self._previews.pop(plan_hash, None)
+        self._previews[plan_hash] = preview
+        for old in list(self._previews)[:-CAPACITY]:
+            del self._previews[old]
         return plan_hash
 
     def find(self, participant: str, plan_hash: str) -> Preview:
         """A preview that may be started, or was. Raises ApiError (410): unknown, another participant's, or too old."""
-        found = self._kept.get(plan_hash)
-        if found is None or found.body.participant != participant:
+        preview = self._previews.get(plan_hash)
+        if preview is None or preview.body.participant != participant:
             raise _gone("It is not known, or the service was restarted since.")
         # both clocks: one stands still while the machine sleeps, the other may be set
-        ages_s = self.clock.monotonic_s() - found.made_s, self.clock.unix_s() - found.made_unix_s
-        if found.test_id is None and not all(0 <= age_s <= VALID_S for age_s in ages_s):
+        ages_s = self.clock.monotonic_s() - preview.made_s, self.clock.unix_s() - preview.made_unix_s
+        if preview.test_id is None and not all(0 <= age_s <= VALID_S for age_s in ages_s):
             raise _gone(f"It is valid for {VALID_S / 60:.0f} minutes; what it shows may have changed.")
-        return found
+        return preview
 
 
 def refuse_changed(preview: Preview, row: Participant) -> None:

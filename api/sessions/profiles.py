@@ -26,8 +26,8 @@ class Named:
     label: str
     unit: str
     bound: str
-    least: float
-    most: float
+    lowest: float
+    highest: float
 
 
 LIMITS: dict[str, Named] = {
@@ -37,38 +37,38 @@ LIMITS: dict[str, Named] = {
         "torque that stops a test", "Torque that stops a test (N·m)", "N·m", "torque_nm", 0.1, 200.0
     ),
 }
-FOUND = ("sensory_pulse_width_us", "motor_pulse_width_us", "set_at_utc", "expires_at_utc")
-"""What only a calibration finds."""
+CALIBRATION_FIELDS = ("sensory_pulse_width_us", "motor_pulse_width_us", "set_at_utc", "expires_at_utc")
+"""Fields of a profile that only a calibration sets."""
 JUMP = 1.25
 """More than a quarter above the last value is a jump: a slip of the keyboard is mostly a factor of two or ten."""
 
 
 def calibration(profile: Profile, now_utc: str) -> Literal["none", "valid", "expired"]:
-    """How the calibration stands."""
-    if all(profile.get(name) is None for name in FOUND):
+    """Return the state of the calibration."""
+    if all(profile.get(name) is None for name in CALIBRATION_FIELDS):
         return "none"
     expires = profile.get("expires_at_utc")
     valid = expires is not None and unix_of(now_utc) < unix_of(expires)
     return "valid" if valid else "expired"
 
 
-def changed(profile: Profile, asked: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
+def changed(profile: Profile, changes: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
     """The profile with some limits changed, and why the calibration does not hold with it: empty where nothing is lost.
 
     What a calibration found stays where no limit is wider than it was; it goes where one is, and where the comfort
     maximum falls below the motor threshold.
     """
-    new = {**profile, **asked}
-    if RANGE in asked and asked[RANGE] is None:
+    new = {**profile, **changes}
+    if RANGE in changes and changes[RANGE] is None:
         del new[RANGE]
         new.pop(SET_AT, None)
-    if all(profile.get(name) is None for name in FOUND):
+    if all(profile.get(name) is None for name in CALIBRATION_FIELDS):
         return new, ""
     voids = next((_above(name, new[name], profile[name]) for name in LIMITS if not (new[name] <= profile[name])), "")
     motor_us = profile.get("motor_pulse_width_us") or 0.0
     if not voids and not (new["max_pulse_width_us"] >= motor_us):
         voids = f"the muscle moves from {motor_us:g} µs on, above the new {new['max_pulse_width_us']:g} µs"
-    return ({**new, **dict.fromkeys(FOUND)} if voids else new), voids
+    return ({**new, **dict.fromkeys(CALIBRATION_FIELDS)} if voids else new), voids
 
 
 def _above(name: str, value: float, was: float) -> str:
@@ -83,15 +83,15 @@ def jumps(profile: Profile, new: Profile) -> list[str]:
     """
     if not profile:
         return []
-    found = [
+    rises = [
         _rise(limit.words, profile[name], new[name], limit.unit)
         for name, limit in LIMITS.items()
         if not (new[name] <= JUMP * profile[name])
     ]
     was_uc, charge_uc = charge(profile), charge(new)
-    if not found and not (charge_uc <= JUMP * was_uc):
-        found.append(_rise("charge of the widest pulse", was_uc, charge_uc, "µC"))
-    return found
+    if not rises and not (charge_uc <= JUMP * was_uc):
+        rises.append(_rise("charge of the widest pulse", was_uc, charge_uc, "µC"))
+    return rises
 
 
 def charge(profile: Profile) -> float:
@@ -107,38 +107,38 @@ def highest(limits: Mapping[str, Bound], name: str) -> tuple[float, str]:
     """The most that this rig takes of a limit, and whose bound that is."""
     bound = limits.get(LIMITS[name].bound)
     if bound is None or bound.hi is None:
-        return LIMITS[name].most, "any rig's"
+        return LIMITS[name].highest, "any rig's"
     return bound.hi, bound.owner
 
 
-def takes(name: str, limits: Mapping[str, Bound]) -> str:
-    """What this rig takes of a limit, beside its field."""
-    limit, (most, owner) = LIMITS[name], highest(limits, name)
-    return f"at least {limit.least:g}, at most {most:g} {limit.unit} ({owner})"
+def range_help(name: str, limits: Mapping[str, Bound]) -> str:
+    """Describe the range that this rig accepts for a limit, for the help text of its field."""
+    limit, (highest_value, owner) = LIMITS[name], highest(limits, name)
+    return f"at least {limit.lowest:g}, at most {highest_value:g} {limit.unit} ({owner})"
 
 
-def outside(asked: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
-    """Which of the limits that are asked for this rig would refuse, by name, in words.
+def outside(requested: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
+    """List the requested limits that this rig would refuse: the reason by the limit's name.
 
-    `asked`: the ones that change. `profile`: the participant's, with the others. `limits`: as the rig tells them; where
-    it has not, the widest of any rig.
+    `requested`: the changed limits. `profile`: the participant's limits. `limits`: the rig's own bounds; where they are
+    unknown, the widest of any rig apply.
     """
-    found = {}
-    for name in [name for name in LIMITS if name in asked]:
-        value = asked[name]
-        limit, (most, owner) = LIMITS[name], highest(limits, name)
-        if not (limit.least <= value <= most):
-            bounds = f"at least {limit.least:g} and at most {most:g} {limit.unit}"
-            found[name] = f"{value:g} {limit.unit} is not {bounds}, as this rig asks ({owner})"
+    errors = {}
+    for name in [name for name in LIMITS if name in requested]:
+        value = requested[name]
+        limit, (highest_value, owner) = LIMITS[name], highest(limits, name)
+        if not (limit.lowest <= value <= highest_value):
+            bounds = f"at least {limit.lowest:g} and at most {highest_value:g} {limit.unit}"
+            errors[name] = f"{value:g} {limit.unit} is not {bounds}, as this rig asks ({owner})"
     phase = limits.get("charge_per_phase_uc")
-    of_charge = [name for name in ("max_pulse_width_us", "current_ma") if name in asked]
-    known = {**profile, **asked}.keys() >= {"max_pulse_width_us", "current_ma"}
-    if not found and of_charge and known and phase is not None and phase.hi is not None:
-        charge_uc = charge({**profile, **asked})
+    of_charge = [name for name in ("max_pulse_width_us", "current_ma") if name in requested]
+    known = {**profile, **requested}.keys() >= {"max_pulse_width_us", "current_ma"}
+    if not errors and of_charge and known and phase is not None and phase.hi is not None:
+        charge_uc = charge({**profile, **requested})
         if not (charge_uc <= phase.hi):
-            most = f"above the {phase.hi:g} µC that this rig takes ({phase.owner})"
-            found[of_charge[0]] = f"with it a pulse carries {charge_uc:.3g} µC, {most}"
-    return found
+            above = f"above the {phase.hi:g} µC that this rig takes ({phase.owner})"
+            errors[of_charge[0]] = f"with it a pulse carries {charge_uc:.3g} µC, {above}"
+    return errors
 
 
 # The range of joint angles: a straight elbow has the angle 0; flexion is positive. Programs send radians, pages show
@@ -157,15 +157,15 @@ def rising_range(range_rad: tuple[float, float]) -> tuple[float, float]:
     """A range as it was sent. Raises ValueError where it is no range, or too narrow to move in."""
     low, high = range_rad
     if not (high - low >= NARROWEST_RAD - 1e-9):
-        least = f"{math.degrees(NARROWEST_RAD):.0f}° ({NARROWEST_RAD:.2f} rad)"
-        raise ValueError(f"the second angle must be at least {least} above the first")
+        narrowest = f"{math.degrees(NARROWEST_RAD):.0f}° ({NARROWEST_RAD:.2f} rad)"
+        raise ValueError(f"the second angle must be at least {narrowest} above the first")
     return range_rad
 
 
 def range_of(profile: Profile) -> tuple[float, float] | None:
     """The participant's range, rad; None where there is none."""
-    found = profile.get(RANGE)
-    return None if found is None else (float(found[0]), float(found[1]))
+    range_rad = profile.get(RANGE)
+    return None if range_rad is None else (float(range_rad[0]), float(range_rad[1]))
 
 
 def range_outdated(profile: Profile, set_at_utc: str | None) -> bool:
@@ -184,9 +184,9 @@ def range_words(range_rad: Sequence[float]) -> str:
     return f"{low}° … {high}°"
 
 
-def range_outside(asked: Profile, rig_rad: Sequence[float] | None) -> dict[str, str]:
-    """Why this rig would refuse the range that is asked for, by its field; empty where it takes it."""
-    range_rad = range_of(asked)
+def range_outside(requested: Profile, rig_rad: Sequence[float] | None) -> dict[str, str]:
+    """Return why this rig would refuse the requested range, by field; empty where it accepts the range."""
+    range_rad = range_of(requested)
     if range_rad is None or range_within(range_rad, rig_rad):
         return {}
     assert rig_rad is not None

@@ -60,7 +60,7 @@ Code = Annotated[
 
 
 def _limit(name: str, description: str) -> Any:
-    return Field(ge=LIMITS[name].least, le=LIMITS[name].most, description=description)
+    return Field(ge=LIMITS[name].lowest, le=LIMITS[name].highest, description=description)
 
 
 CurrentMa = Annotated[FiniteFloat, _limit("current_ma", "fixed current of every pulse, mA")]
@@ -72,7 +72,7 @@ RangeRad = Annotated[
     AfterValidator(profiles.rising_range),
     Field(strict=False, description="lowest and highest joint angle, rad; elbow: 0 is straight, flexion is positive"),
 ]
-ReferenceNm = Annotated[FiniteFloat, Field(ge=-LIMITS["max_torque_nm"].most, le=LIMITS["max_torque_nm"].most)]
+ReferenceNm = Annotated[FiniteFloat, Field(ge=-LIMITS["max_torque_nm"].highest, le=LIMITS["max_torque_nm"].highest)]
 
 
 class Body(BaseModel):
@@ -113,8 +113,8 @@ class ProfileIn(Body):
     def sent(self) -> dict[str, Any]:
         """The limits that were sent, as a profile keeps them."""
         sent = self.model_dump(exclude_unset=True)
-        if (own := sent.get(profiles.RANGE)) is not None:
-            sent[profiles.RANGE] = list(own)
+        if (range_rad := sent.get(profiles.RANGE)) is not None:
+            sent[profiles.RANGE] = list(range_rad)
         return sent
 
 
@@ -191,10 +191,10 @@ class TestIn(Labels, Body):
     )
     pulse_rate_hz: RateHz = 40.0
     max_pulse_width_us: FiniteFloat | None = Field(
-        default=None, ge=LIMITS["max_pulse_width_us"].least, description="for this test alone, if tighter, µs"
+        default=None, ge=LIMITS["max_pulse_width_us"].lowest, description="for this test alone, if tighter, µs"
     )
     max_torque_nm: FiniteFloat | None = Field(
-        default=None, ge=LIMITS["max_torque_nm"].least, description="for this test alone, if tighter, N·m"
+        default=None, ge=LIMITS["max_torque_nm"].lowest, description="for this test alone, if tighter, N·m"
     )
     ran_by: PersonName | None = Field(
         default=None, description="who runs it at the rig, if that is not who asks for it"
@@ -380,7 +380,7 @@ class TokenIn(Body):
     ) = None
 
 
-def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
+def limits_of(body: TestIn, participant_profile: dict[str, Any] | None) -> dict[str, Any]:
     """The limits of a test, as fields of a `TestPlan`.
 
     The participant's profile stays whole (thresholds, day, rest), so that the rig judges the calibration that a person
@@ -390,7 +390,7 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
     ----------
     body : TestIn
         The request; of its `profile`, only the fields that were sent count.
-    own : dict or None
+    participant_profile : dict or None
         The participant's profile.
 
     Raises
@@ -399,16 +399,21 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
         422: the participant has no limits; a limit is wider than the participant's, which it is and by how much.
     """
     width_us, torque_nm = body.max_pulse_width_us, body.max_torque_nm
-    asked = body.profile.sent() if body.profile else {}
-    if lacking := [name for name in LIMITS if (own or {}).get(name) is None]:
+    requested = body.profile.sent() if body.profile else {}
+    if lacking := [name for name in LIMITS if (participant_profile or {}).get(name) is None]:
         detail = (
             f"{body.participant} has no {', '.join(lacking)}. Set all of them: PUT /v1/participants/{{code}}/profile."
         )
         raise ApiError(422, "no-limits", "The participant has no limits", detail)
-    assert own is not None
-    profile = Profile(**own)
-    wider = [words for name in LIMITS if name in asked if (words := _wider(name, asked[name], getattr(profile, name)))]
-    range_rad = profiles.range_of(asked)
+    assert participant_profile is not None
+    profile = Profile(**participant_profile)
+    wider = [
+        words
+        for name in LIMITS
+        if name in requested
+        if (words := _wider(name, requested[name], getattr(profile, name)))
+    ]
+    range_rad = profiles.range_of(requested)
     if range_rad is not None and profile.angle_range_rad is None:
         wider.append(
             f"{profiles.RANGE} {profiles.range_words(range_rad)} narrows nothing: {body.participant} has no range"
@@ -423,23 +428,23 @@ def limits_of(body: TestIn, own: dict[str, Any] | None) -> dict[str, Any]:
     return {
         "profile": profile.model_copy(
             update={
-                "current_ma": asked.get("current_ma", profile.current_ma),
+                "current_ma": requested.get("current_ma", profile.current_ma),
                 profiles.RANGE: range_rad or profile.angle_range_rad,
             }
         ),
-        "max_pulse_width_us": tighter(width_us, asked.get("max_pulse_width_us")),
-        "max_torque_nm": tighter(torque_nm, asked.get("max_torque_nm")),
+        "max_pulse_width_us": tighter(width_us, requested.get("max_pulse_width_us")),
+        "max_torque_nm": tighter(torque_nm, requested.get("max_torque_nm")),
     }
 
 
-def _wider(name: str, asked: float, own: float) -> str | None:
-    if asked <= own:  # a number that compares with nothing is wider
+def _wider(name: str, value: float, limit: float) -> str | None:
+    if value <= limit:  # a number that compares with nothing is wider
         return None
     unit = LIMITS[name].unit
-    return f"{name} {asked:g} {unit} is above the participant's {own:g} {unit} by {asked - own:g}"
+    return f"{name} {value:g} {unit} is above the participant's {limit:g} {unit} by {value - limit:g}"
 
 
-def tighter(one: float | None, other: float | None) -> float | None:
-    """The smaller of those that are given."""
-    given = [value for value in (one, other) if value is not None]
-    return min(given) if given else None
+def tighter(first: float | None, second: float | None) -> float | None:
+    """Return the smaller of the two limits; None where neither is set."""
+    values = [value for value in (first, second) if value is not None]
+    return min(values) if values else None

@@ -141,7 +141,7 @@ class RigClient:
                     writer.write(request)
                     line = await reader.readline()
                     reply = messages.Reply.model_validate_json(line)
-                    self._take_state(message, reply)
+                    self._receive_state(message, reply)
                     return reply
                 finally:
                     writer.close()
@@ -183,7 +183,7 @@ class RigClient:
         try:
             while line := await reader.readline():
                 self._heard_s = self.clock.monotonic_s()
-                self._take(json.loads(line), subscription.id)
+                self._receive(json.loads(line), subscription.id)
         finally:
             poll.cancel()
 
@@ -202,7 +202,7 @@ class RigClient:
             except Exception:
                 log.exception("the rig's state could not be taken")
 
-    def _take(self, message: dict[str, Any], subscription_id: int) -> None:
+    def _receive(self, message: dict[str, Any], subscription_id: int) -> None:
         if "event" in message:
             event = _events.validate_python(message)
             if isinstance(event, messages.StateEvent):
@@ -214,14 +214,14 @@ class RigClient:
             self.status = messages.Status.model_validate(reply.body)
             self.connected = True
             tell_all(self.link_listeners, self.connected)
-        asked, future = self._waiting.get(reply.id, (None, None))
-        self._take_state(asked, reply)
+        request, future = self._waiting.get(reply.id, (None, None))
+        self._receive_state(request, reply)
         if future is not None and not future.done():
             future.set_result(reply)
 
-    def _take_state(self, asked: Any, reply: messages.Reply) -> None:
+    def _receive_state(self, request: Any, reply: messages.Reply) -> None:
         """Keep a state as it is read: who asked for it may come to it after a later one."""
-        if isinstance(asked, requests.StatusRequest) and reply.ok:
+        if isinstance(request, requests.StatusRequest) and reply.ok:
             with contextlib.suppress(ValidationError):  # `ask_for` says it
                 self.status = messages.Status.model_validate(reply.body)
 

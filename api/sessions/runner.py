@@ -115,25 +115,25 @@ class Runner(Playing):
         """
         if body.plan_hash is None:
             return await self._begin(body, by, holder, tags, model)
-        shown = self.previews.find(body.participant, body.plan_hash)
-        async with shown.starting:
-            if shown.test_id is None:
-                return await self._begin(shown.body, by, holder, tags, model, shown)
-        return await asyncio.to_thread(self.store.get, Test, shown.test_id)
+        preview = self.previews.find(body.participant, body.plan_hash)
+        async with preview.starting:
+            if preview.test_id is None:
+                return await self._begin(preview.body, by, holder, tags, model, preview)
+        return await asyncio.to_thread(self.store.get, Test, preview.test_id)
 
     async def _begin(
-        self, body: TestIn, by: str, holder: str, tags: Tags | None, model: str, shown: Preview | None = None
+        self, body: TestIn, by: str, holder: str, tags: Tags | None, model: str, preview: Preview | None = None
     ) -> Test:
         tokens = await asyncio.to_thread(self.tokens_of, holder)
         await self.let_end()
         self.refuse_second()
         # what an adaptive test can reach is computed now, and not while others wait, and then remembered
-        if body.kind == ADAPTIVE and shown is None:
+        if body.kind == ADAPTIVE and preview is None:
             await self._planned(body, await self._participant(body))
         async with self.start_lock:
             self.refuse_second()
             participant = await self._participant(body)
-            return await self._start(body, participant, by, shown, tokens, tags, model)
+            return await self._start(body, participant, by, preview, tokens, tags, model)
 
     def _check(self, code: str, tags: Tags | None) -> None:
         with self.store.read() as session:
@@ -149,15 +149,17 @@ class Runner(Playing):
         return participant
 
     async def _start(
-        self, body: TestIn, participant: Participant, by: str, shown: Preview | None, tokens: list[str],
+        self, body: TestIn, participant: Participant, by: str, seen_preview: Preview | None, tokens: list[str],
         tags: Tags | None, model: str,
     ) -> Test:  # fmt: skip
         await asyncio.to_thread(self._check, body.participant, tags)  # then the preview may differ for no other reason
-        if shown is None:
+        if seen_preview is None:
             planned = await self._planned(body, participant)
         else:
-            refuse_changed(shown, participant)
-            planned = replace(shown.planned, plan=shown.planned.plan.model_copy(update={"test_id": self._new_id()}))
+            refuse_changed(seen_preview, participant)
+            planned = replace(
+                seen_preview.planned, plan=seen_preview.planned.plan.model_copy(update={"test_id": self._new_id()})
+            )
         plan = planned.plan
         until_utc = await asyncio.to_thread(self.until_utc, tokens)
         current = self.current = Current(
@@ -167,18 +169,18 @@ class Runner(Playing):
         self.pool.cancel_background()
         try:
             preview = await self._previewed(plan)
-            if shown is not None and not same(shown.answer, preview):
+            if seen_preview is not None and not same(seen_preview.answer, preview):
                 raise not_what_was_seen()
             row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant, tags, model)
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
-            if shown is not None:
-                shown.test_id = plan.test_id
+            if seen_preview is not None:
+                seen_preview.test_id = plan.test_id
             self._tasks.begin(self.look_again_and_again(current))
         except BaseException:
             self.current = None
-            self._leave()
+            self._unwatch_all()
             raise
         try:
             return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
@@ -273,7 +275,7 @@ class Runner(Playing):
         tags: Tags | None, model: str,
     ) -> Test:  # fmt: skip
         now, plan, by = self.clock.utc(), planned.plan, current.by
-        kept: dict[str, Any] = {
+        stored_plan: dict[str, Any] = {
             **plan.model_dump(),
             "preview": preview,
             "joins": body.joins,
@@ -291,12 +293,12 @@ class Runner(Playing):
                 raise right_ended()
             row = Test(
                 id=plan.test_id, participant=plan.participant, kind=plan.kind, state="requested",
-                plan={**kept, "participant_version": version}, summary={}, reason="", requested_by=by,
+                plan={**stored_plan, "participant_version": version}, summary={}, reason="", requested_by=by,
                 requested_utc=now, ran_by=other_than(by, body.ran_by),
             )  # fmt: skip
-            told = {"participant": plan.participant, "kind": plan.kind, "shown": dose, "version": version}
-            told |= {"model": model} if model else {}
-            locking.write(session, row, now, by, "start test", plan.test_id, **told)
+            entry = {"participant": plan.participant, "kind": plan.kind, "shown": dose, "version": version}
+            entry |= {"model": model} if model else {}
+            locking.write(session, row, now, by, "start test", plan.test_id, **entry)
             session.add(row)
             current.version = version
         log.info("test requested, kind %s", plan.kind, extra={"test_id": plan.test_id})
@@ -307,7 +309,7 @@ class Runner(Playing):
         row = await self._participant(body)
         planned = await self._planned(body, row)
         answer = await self._previewed(planned.plan)
-        return {**answer, **planned.extra, "plan_hash": self.previews.keep(body, planned, answer, row)}
+        return {**answer, **planned.extra, "plan_hash": self.previews.add(body, planned, answer, row)}
 
     async def _previewed(self, plan: messages.TestPlan) -> dict[str, Any]:
         curve = await asyncio.to_thread(self._recruitment, plan.participant)
@@ -346,9 +348,9 @@ class Runner(Playing):
 
         Raises ApiError: 409 it does not run, or is ending; 422 it has a fixed plan.
         """
-        found = await self.rig.ask_for(messages.Extended, requests.EnoughRequest(test_id=row.id, by=by, at_once=True))
+        answer = await self.rig.ask_for(messages.Extended, requests.EnoughRequest(test_id=row.id, by=by, at_once=True))
         self.kinds[row.kind].said_enough(row.id)
-        return found
+        return answer
 
     async def _note(self, by: str, action: str, subject: str, **detail: Any) -> None:
         """Write a stop down; a database that is slow or gone does not keep its answer back."""
@@ -388,7 +390,7 @@ class Runner(Playing):
         """A test whose end was lost on the way must not hold the rig for ever."""
         self._look_for_end(status, MISSED_POLLS, f"the rig is {status.state} and no longer plays this test")
 
-    def _look_for_end(self, status: messages.Status, most: int, why: str) -> None:
+    def _look_for_end(self, status: messages.Status, max_missed: int, why: str) -> None:
         """Take the current test's end as missed where so many states running did not name it.
 
         A start under way learns by itself what became of it.
@@ -397,7 +399,7 @@ class Runner(Playing):
         if current is None or not current.started or current.ending:
             return
         current.missed = 0 if status.test_id == current.test_id else current.missed + 1
-        if current.missed >= most:
+        if current.missed >= max_missed:
             current.ending = True
             self._follow(current.test_id, self._recover(current.test_id, why))
 
@@ -442,9 +444,9 @@ class Runner(Playing):
         if self.current is not None and self.current.test_id == test_id:
             self.current.let_go.set()
             self.current = None
-            self._leave()
+            self._unwatch_all()
 
-    def _leave(self) -> None:
+    def _unwatch_all(self) -> None:
         for kind in self.kinds.all:
             kind.unwatch()
 
@@ -480,13 +482,13 @@ class Runner(Playing):
     def announce(self, test_id: str) -> None:
         """Tell the listeners of the live channel how the test stands; in the order in which it is called."""
         read = asyncio.get_running_loop().run_in_executor(self._telling, self._read_document, test_id)
-        read.add_done_callback(self._tell)
+        read.add_done_callback(self._publish_document)
 
     def _read_document(self, test_id: str) -> dict[str, Any] | None:
         row = self.store.get(Test, test_id)
         return None if row is None else self.document(row)
 
-    def _tell(self, read: asyncio.Future[dict[str, Any] | None]) -> None:
+    def _publish_document(self, read: asyncio.Future[dict[str, Any] | None]) -> None:
         if read.cancelled():
             return
         if (error := read.exception()) is not None:
@@ -502,8 +504,8 @@ class Runner(Playing):
         self, participant: str, models: list[dict[str, Any]], limit: int | None = None
     ) -> list[dict[str, Any]]:
         """A participant's tests, newest first; `models`: documents of all of the participant's, read at once."""
-        fits, own = {model["id"]: model for model in models}, Test.participant == participant
-        rows = self.lifecycle.store.all(Test, own, order=Test.requested_utc.desc(), limit=limit)
+        fits, of_participant = {model["id"]: model for model in models}, Test.participant == participant
+        rows = self.lifecycle.store.all(Test, of_participant, order=Test.requested_utc.desc(), limit=limit)
         return [self.document(row, fits) for row in rows]
 
     async def close(self) -> None:

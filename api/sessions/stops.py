@@ -18,7 +18,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.rig.messages import StopEvidence
 
-KEPT = 200
+CAPACITY = 200
 
 
 @dataclass(frozen=True)
@@ -40,27 +40,27 @@ class StopLog:
     """
 
     def __init__(self) -> None:
-        self._told: dict[str, StopResult] = {}
+        self._results: dict[str, StopResult] = {}
 
-    def keep(self, told: StopResult) -> str:
+    def add(self, result: StopResult) -> str:
         """Keep an answer; its key."""
-        while len(self._told) >= KEPT:
-            self._told.pop(next(iter(self._told)))
+        while len(self._results) >= CAPACITY:
+            self._results.pop(next(iter(self._results)))
         key = secrets.token_urlsafe(16)
-        self._told[key] = told
+        self._results[key] = result
         return key
 
     def get(self, key: str) -> StopResult:
         """An answer by its key; 404 where it is kept no longer."""
-        told = self._told.get(key)
-        if told is None:
+        result = self._results.get(key)
+        if result is None:
             detail = (
                 "The service was restarted, or many stops came after this one. The bar above shows what the rig "
                 "does now. If it does not say that the rig has stopped, press Stop, or use the "
                 "emergency switch on the stimulator. The audit trail lists each stop."
             )
             raise ApiError(404, "not-found", "The result of this stop is no longer kept here", detail)
-        return told
+        return result
 
 
 RIGHT_S = 24 * 3600.0
@@ -80,8 +80,8 @@ class StopRights:
 
     def give(self, name: str, test_id: str | None) -> str:
         """A right for the page of `name`, which shows this test or none."""
-        said = [name, test_id, round(self.clock.unix_s())]
-        words = json.dumps(said, separators=(",", ":"), ensure_ascii=False).encode()
+        claims = [name, test_id, round(self.clock.unix_s())]
+        words = json.dumps(claims, separators=(",", ":"), ensure_ascii=False).encode()
         return f"{_text(words)}.{_text(self._sign(words))}"
 
     def holder(self, text: str | None, running: Collection[str | None] = ()) -> str | None:
@@ -90,13 +90,13 @@ class StopRights:
             return None
         words, _, mark = text.partition(".")
         try:
-            said = base64.urlsafe_b64decode(words + "=" * (-len(words) % 4))
+            claims = base64.urlsafe_b64decode(words + "=" * (-len(words) % 4))
             signed = base64.urlsafe_b64decode(mark + "=" * (-len(mark) % 4))
         except (binascii.Error, ValueError):
             return None
-        if not hmac.compare_digest(signed, self._sign(said)):
+        if not hmac.compare_digest(signed, self._sign(claims)):
             return None
-        name, test_id, given_s = json.loads(said)
+        name, test_id, given_s = json.loads(claims)
         young = self.clock.unix_s() - given_s <= RIGHT_S
         return name if young or (test_id is not None and test_id in running) else None
 

@@ -103,8 +103,8 @@ class Trials(Kind):
                 trial = await asyncio.to_thread(self.tracked.open_trial, test_id)
                 if trial is None:
                     return None
-                found = await self._examine(trial)
-                row = await asyncio.to_thread(self.tracked.keep, trial, found, last_sample_unix_s)
+                result = await self._examine(trial)
+                row = await asyncio.to_thread(self.tracked.add_trial, trial, result, last_sample_unix_s)
         if row is not None:
             log.info("trial %d: %s %s", row.number, row.outcome, row.reason, extra={"test_id": test_id})
         return row
@@ -142,10 +142,11 @@ class Trials(Kind):
             Recording.participant == recording.participant, Recording.test_id.is_not(None),
             Recording.created_utc > since.created_utc, Recording.created_utc < recording.created_utc,
         )  # fmt: skip
-        found = self.store.all(Recording, *conditions, order=Recording.created_utc.desc(), limit=MOST_BETWEEN)[::-1]
-        tests = {row.id: row for row in self.store.all(Test, Test.id.in_([row.test_id for row in found]))}
-        own = place_of(trial.test)
-        here = [row for row in found if row.test_id in tests and not differ(place_of(tests[row.test_id]), own)]
+        newest_first = Recording.created_utc.desc()
+        recordings = self.store.all(Recording, *conditions, order=newest_first, limit=MOST_BETWEEN)[::-1]
+        tests = {row.id: row for row in self.store.all(Test, Test.id.in_([row.test_id for row in recordings]))}
+        place = place_of(trial.test)
+        here = [row for row in recordings if row.test_id in tests and not differ(place_of(tests[row.test_id]), place)]
         return [row.path for row in (here if trial.state else [since, *here])]
 
     # ---- the service's own day ---------------------------------------------------------------------------------
@@ -155,18 +156,18 @@ class Trials(Kind):
         self._tasks.begin(self._resume())
 
     async def _resume(self) -> None:
-        for approval, left in await asyncio.to_thread(self._left):
+        for approval, open_trials in await asyncio.to_thread(self._unfollowed):
             try:
-                for test_id in left:
+                for test_id in open_trials:
                     await self.follow(test_id)
             except ApiError as error:  # a damaged model: the other participants' trials are followed all the same
                 log.warning("trials with %s are not followed: %s", approval.model_id, error)
             await self._warm(approval.participant)
 
-    def _left(self) -> list[tuple[Approval, list[str]]]:
+    def _unfollowed(self) -> list[tuple[Approval, list[str]]]:
         """Approvals that hold and allow tracking, each with its trials that are not noted, oldest first."""
-        given = self.store.all(Approval, Approval.approved, Approval.expires_utc > self.clock.utc())
-        holding = [self.tracked.allowing(code) for code in dict.fromkeys(row.participant for row in given)]
+        approvals = self.store.all(Approval, Approval.approved, Approval.expires_utc > self.clock.utc())
+        holding = [self.tracked.allowing(code) for code in dict.fromkeys(row.participant for row in approvals)]
         return [(approval, self._open_trials(approval)) for approval in holding if approval is not None]
 
     def _open_trials(self, approval: Approval) -> list[str]:

@@ -24,7 +24,7 @@ from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect, HTTPConnection
 
 from stimrig.api.errors import ApiError, forbidden, not_answering
-from stimrig.api.models.places import kept, site_of
+from stimrig.api.models.places import site_of, stored_site
 from stimrig.api.models.registry import Versions
 from stimrig.api.people.auth import Principal, Scope, outside
 from stimrig.api.sessions.controllers import unapproved
@@ -154,7 +154,7 @@ def refuse_outside(registry: Versions, principal: Principal, method: str, path: 
     if not _opens(registry, principal.participant, method, path):
         raise outside(principal.participant)
     row: Participant = registry.store.get(Participant, principal.participant)
-    if kept((principal.plan or {}).get("site")) != site_of(row):
+    if stored_site((principal.plan or {}).get("site")) != site_of(row):
         detail = "The participant is stimulated at another site now. A person makes a key for it."
         raise ApiError(403, "other-site", "This key is of another site", detail)
 

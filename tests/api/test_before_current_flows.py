@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api.sessions.previews import MOST, VALID_S
+from stimrig.api.sessions.previews import CAPACITY, VALID_S
 from stimrig.api.store.tables import Participant
 from stimrig.rig import messages as m
 from tests.api.conftest import Service, SetClock, run_test, wait_done
@@ -78,7 +78,7 @@ def test_a_plan_is_of_one_participant_and_complete(tab: httpx.Client, client: ht
     assert "all else is as it was previewed" in refused["detail"]
     assert tab.post("/v1/tests", json=asked).status_code == 403, "a start carries the session's CSRF token"
     assert service.rig.starts == 0
-    for _ in range(MOST + 1):
+    for _ in range(CAPACITY + 1):
         client.post("/v1/preview", json={"participant": "P018"})
     assert client.post("/v1/tests", json=asked).status_code == 202, "the same preview is kept once"
 

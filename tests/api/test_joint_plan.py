@@ -49,7 +49,10 @@ def test_without_a_model_the_calibration_stands_in() -> None:
     curve = curve_of(None, 300.0, 120.0)
     assert not curve.known and curve.torque(120.0) == 0.0 and curve.torque(210.0) == pytest.approx(0.5)
     found = layout((0.2, 1.9), curve, 300.0, PAPER_US, RATE_HZ)
-    assert found.share <= 1.0 and min(w for w in widths_of(found.held) if w) < 165 <= max(widths_of(found.held)) <= 256
+    assert (
+        found.share <= 1.0
+        and min(w for w in widths_of(found.hold_segments) if w) < 165 <= max(widths_of(found.hold_segments)) <= 256
+    )
     assert curve_of(None, 300.0, None).torque(90.0) == 0.0
     assert not curve_of({"pulse_width_us": [0, 300], "torque_nm": [0, 0]}, 300.0, None).known, "a muscle that is dead"
 
@@ -57,7 +60,7 @@ def test_without_a_model_the_calibration_stands_in() -> None:
 def test_the_plans_pass_the_rigs_limits() -> None:
     """Built as the rig builds them: no jump that startles, nothing above the widest pulse."""
     found = layout((0.2, 1.9), curve_of(sigmoid(150, 25, 8.0), 300.0, None), 300.0, PAPER_US, RATE_HZ)
-    for segments in (found.held, found.moving, joint_plan.passive(20.0, RATE_HZ)):
+    for segments in (found.hold_segments, found.moving, joint_plan.passive(20.0, RATE_HZ)):
         plan = TestPlan.model_validate({**TEST.model_dump(), "segments": segments})
         built = build(plan, for_profile(HARD_LIMITS, plan.profile))
         assert built.pulse_width_us.tolist() == pytest.approx(widths_of(segments))
@@ -143,9 +146,9 @@ def test_a_cell_is_seen_after_its_time_and_not_before() -> None:
     row, column = found.cell(1.0, 0.4)
     for k in range(40):
         found.add(k / SAMPLES_HZ, 1.0, 0.4)
-    assert not found.seen(row, column)
+    assert not found.covered(row, column)
     found.add(40 / SAMPLES_HZ, 1.0, 0.4)
-    assert found.seen(row, column)
+    assert found.covered(row, column)
 
 
 @pytest.mark.parametrize(

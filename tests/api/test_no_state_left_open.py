@@ -157,9 +157,9 @@ def test_a_message_that_cannot_be_taken_costs_one_connection_at_most(
         if not failures:
             failures.append(message)
             raise RuntimeError("unexpected")
-        RigClient._take(rig, message, subscription_id)
+        RigClient._receive(rig, message, subscription_id)
 
-    monkeypatch.setattr(rig, "_take", once)
+    monkeypatch.setattr(rig, "_receive", once)
     soon(lambda: failures and rig.connected, 20)  # its next poll is the message; then it connects anew
     assert run_test(client, participant)["state"] == "completed"
 

@@ -107,7 +107,7 @@ def test_a_limit_begins_where_a_stimulator_does(name: str, least: float) -> None
 
 
 def test_the_least_limits_are_the_stimulators_finest_steps() -> None:
-    least = {name: limit.least for name, limit in profiles.LIMITS.items()}
+    least = {name: limit.lowest for name, limit in profiles.LIMITS.items()}
     assert (least["current_ma"], least["max_pulse_width_us"]) == (FINEST.current_ma, FINEST.shortest_us)
 
 
@@ -148,7 +148,7 @@ def test_of_many_at_once_one_wins_and_the_others_are_told(client: httpx.Client, 
 def test_a_tighter_limit_keeps_the_calibration(asked: dict[str, float], words: str) -> None:
     profile, voids = profiles.changed(CALIBRATED, asked)
     assert words in voids and bool(voids) == bool(words)
-    assert profile == {**CALIBRATED, **asked, **(dict.fromkeys(profiles.FOUND) if words else {})}
+    assert profile == {**CALIBRATED, **asked, **(dict.fromkeys(profiles.CALIBRATION_FIELDS) if words else {})}
 
 
 def test_a_calibration_is_lost_knowingly_alone(client: httpx.Client, tight: dict[str, float]) -> None:
@@ -159,7 +159,7 @@ def test_a_calibration_is_lost_knowingly_alone(client: httpx.Client, tight: dict
     assert client.put(f"{P}/profile", params=token, json={"current_ma": 13.0}).status_code == 409, "just that change"
     assert client.put(f"{P}/profile", params=token, json=asked).status_code == 200
     profile = client.get(P).json()["profile"]
-    assert [profile[name] for name in profiles.FOUND] == [None] * 4 and profile | asked == profile
+    assert [profile[name] for name in profiles.CALIBRATION_FIELDS] == [None] * 4 and profile | asked == profile
 
 
 def test_a_calibration_takes_the_participants_own_limits(

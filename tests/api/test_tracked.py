@@ -59,7 +59,7 @@ class Trials(Clinic):
         given: dict[str, Any] = {name: getattr(trial, name) for name in ("state", "missed", "bounds", "model_json")}
         given |= {"data": str(self.folder / "trial.h5"), "reference_torque_nm": None, "between": []}
         found = {"reason": trial.problem} if trial.problem else stub_worker.track(lambda *_: None, **given)
-        return self.tracked.keep(trial, found)
+        return self.tracked.add_trial(trial, found)
 
     def served(self) -> dict[str, Any]:
         """What the controller is served."""
@@ -378,7 +378,7 @@ def test_bounds_are_in_the_quantities_units() -> None:
     ],
 )
 def test_beyond_a_bound_a_person_is_asked(coming: dict[str, Any], words: str) -> None:
-    said = tracking.ask(4, step(**coming), Limits().bounds(80.0))
+    said = tracking.new_test_reason(4, step(**coming), Limits().bounds(80.0))
     assert said is not None and words in said and said.endswith(tracking.NEW_TEST)
 
 
@@ -386,10 +386,10 @@ def test_beyond_a_bound_a_person_is_asked(coming: dict[str, Any], words: str) ->
     "coming", [{}, {"gain": 0.8}, {"gain": 1.2}, {"threshold_shift_us": 16.0}, {"time_scale": 0.81}]
 )
 def test_within_them_nobody_is_asked(coming: dict[str, float]) -> None:
-    assert tracking.ask(4, step(**coming), Limits().bounds(80.0)) is None
+    assert tracking.new_test_reason(4, step(**coming), Limits().bounds(80.0)) is None
 
 
 def test_next_to_no_torque_asks_for_a_look_at_the_electrodes_first() -> None:
-    said = tracking.ask(3, step("no-torque"), Limits().bounds(80.0))
+    said = tracking.new_test_reason(3, step("no-torque"), Limits().bounds(80.0))
     assert said is not None and said.startswith("In trial 3 the pulses gave next to no torque. Look at the electrodes")
     assert said.endswith(tracking.NEW_TEST)

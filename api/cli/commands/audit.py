@@ -11,7 +11,7 @@ import typer
 
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.files import write
-from stimrig.api.cli.options import Json, given
+from stimrig.api.cli.options import Json, set_options
 from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.errors import ApiError
 from stimrig.api.settings import Settings
@@ -71,7 +71,7 @@ def export(
 
 def settings_of(data: Path | None) -> Settings:
     """The service's settings, perhaps with another data folder."""
-    return Settings(**given(data_dir=data))
+    return Settings(**set_options(data_dir=data))
 
 
 def open_store(settings: Settings) -> closing[Store]:

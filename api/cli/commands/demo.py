@@ -32,12 +32,12 @@ def demo(
 ) -> None:
     """One whole pre-session test on the emulated rig: serial line, CAN bus, REST, model, approval, fetch."""
     began = time.monotonic()
-    tell: Callable[..., None] = (lambda *_: None) if as_json else say
+    print_step: Callable[..., None] = (lambda *_: None) if as_json else say
     folder = data or Path("var") / "demo" / datetime.now().strftime("%Y%m%d-%H%M%S")
     token = secrets.token_urlsafe(32)
-    tell("starting the emulated rig, the rig process and the service")
+    print_step("starting the emulated rig, the rig process and the service")
     with Services(Settings(data_dir=folder, port=0, rig_file=None), emulate.split(), token) as services:
-        result = play(services, token, tell)
+        result = play(services, token, print_step)
     result["files"] = write_files(folder, result)
     result["seconds"] = round(time.monotonic() - began, 1)
     if as_json:
@@ -49,16 +49,16 @@ def demo(
     say(f"{'done in':14} {result['seconds']} s")
 
 
-def play(services: Services, token: str, tell: Callable[..., None]) -> dict[str, Any]:
+def play(services: Services, token: str, print_step: Callable[..., None]) -> dict[str, Any]:
     """Go the whole path, over HTTP only."""
     children = [child for child in (services.emulator, services.rig) if child is not None]
     with Client(services.url, token) as client:
-        tell(f"service at {services.url}; participant {PARTICIPANT}; the test runs in real time")
+        print_step(f"service at {services.url}; participant {PARTICIPANT}; the test runs in real time")
         before, began = [_processor_s(child) for child in children], time.monotonic()
         test = run_test(client, PARTICIPANT, services.watch)
         percent = [100 / (time.monotonic() - began) * (_processor_s(child) - used)
                    for child, used in zip(children, before, strict=True)]  # fmt: skip
-        tell("approving the model; fetching it as the controller (ETag, then 304)")
+        print_step("approving the model; fetching it as the controller (ETag, then 304)")
         model = approve_and_fetch(client, test["model_id"])
         curves = client.curves(test["model_id"]).to_dict()
     shares = {child.name: round(share, 1) for child, share in zip(children, percent, strict=True)}
@@ -80,10 +80,10 @@ def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
     client.approve(model_id, "demo")
     with Client(client.url, client.issue_token("controller", ["read-model"])) as controller:
         first = controller.approved_model(PARTICIPANT)
-        again = controller.approved_model(PARTICIPANT, first)
+        second = controller.approved_model(PARTICIPANT, first)
     if first.document.get("model_id") != model_id:
         raise CommandError("the controller got another model than the approved one")
-    if again.changed:
+    if second.changed:
         raise CommandError("the service sent the model a second time, although nothing had changed")
     return first.document
 

@@ -20,7 +20,7 @@ from typing import Annotated, Any, Literal, get_args
 
 import typer
 
-from stimrig.api.cli.options import Json, given
+from stimrig.api.cli.options import Json, set_options
 from stimrig.api.cli.terminal import say, say_json
 from stimrig.api.settings import Settings
 
@@ -272,7 +272,7 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check devices, permissions, disk, priority; say how to fix each. Sends nothing. Exit 1 if one fails."""
-    findings = examine(Settings(**given(rig_file=rig, data_dir=data, rig_socket=socket)))
+    findings = examine(Settings(**set_options(rig_file=rig, data_dir=data, rig_socket=socket)))
     worst = max((finding.verdict for finding in findings), key=get_args(Verdict).index, default="ok")
     if as_json:
         say_json({"verdict": worst, "findings": [asdict(finding) for finding in findings]})

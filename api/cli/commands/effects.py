@@ -36,11 +36,11 @@ def effects(
         return
     from stimrig.identify import effects as library
 
-    found = library.library()
+    entries = library.library()
     if as_json:
-        say_json({"effects": found})
+        say_json({"effects": entries})
         return
-    for entry in found:
+    for entry in entries:
         say(*effect_lines(entry), "")
 
 
@@ -54,12 +54,12 @@ def _own_text(path: Path, wanted: str | None, name: str) -> str:
     if name in registry():
         raise InputError(f"--name {name}: an effect is called so already. Give another name.")
     free = [entry for entry in load_model(path).effects if "shape" in entry]
-    found = [entry for entry in free if wanted in (None, entry["id"])]
-    known = known_form(found[-1]) if found else None
+    matches = [entry for entry in free if wanted in (None, entry["id"])]
+    known = known_form(matches[-1]) if matches else None
     if known is None or known[0].shape is None:
         names = ", ".join(str(entry["id"]) for entry in free) or "none"
         raise InputError(f"{path}: no free effect{f' {wanted!r}' if wanted else ''} in it. It has {names}.")
-    estimates = found[-1]["parameters"]
+    estimates = matches[-1]["parameters"]
     try:
         values = {
             p.name: (float(estimates[p.name]["value"]), float(estimates[p.name]["sd"])) for p in known[1].parameters

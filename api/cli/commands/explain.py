@@ -85,5 +85,5 @@ def story_lines(document: dict[str, Any]) -> list[str]:
 
 def _named(item: dict[str, Any]) -> str:
     """Write which effect is missing, how sure that is, and what it is."""
-    sure = f" ({item['sure_words']})" if item["sure_words"] else ""
-    return f"{item['id']}{sure}: {item['plain']}"
+    certainty = f" ({item['sure_words']})" if item["sure_words"] else ""
+    return f"{item['id']}{certainty}: {item['plain']}"

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.options import DataDir, RigFile, given
+from stimrig.api.cli.options import DataDir, RigFile, set_options
 from stimrig.api.cli.stop_key import StopKey, at_rig
 from stimrig.api.cli.supervisor import Services
 from stimrig.api.cli.terminal import say
@@ -30,7 +30,7 @@ def serve(
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
-    settings = Settings(**given(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
+    settings = Settings(**set_options(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
     attached = rig_status(settings, emulate) if settings.rig_socket else None
     services = Services(settings, emulate.split(), attach=settings.rig_socket)
     with contextlib.suppress(KeyboardInterrupt), services:
@@ -74,7 +74,7 @@ def rig_status(settings: Settings, emulate: str) -> Status:
 
 def welcome(services: Services, attached: Status | None) -> list[str]:
     """Write where the service is, how to get in, and what keeps the rig from working, if anything does."""
-    settings, url, drawn = services.settings, services.url, services.api.ready["drawn_token"]
+    settings, url, new_token = services.settings, services.url, services.api.ready["drawn_token"]
     devices = f"rig file {settings.rig_file}" if settings.rig_file else "the emulated rig"
     if attached:
         devices, state = f"the rig at {settings.rig_socket}", attached.state
@@ -82,8 +82,11 @@ def welcome(services: Services, attached: Status | None) -> list[str]:
     else:
         state, why = services.rig.ready.get("state", "ready"), services.rig.last_words()
     lines = [f"stimrig serves {url}/ with {devices}; data and logs in {settings.data_dir.absolute()}"]
-    if drawn:
-        lines += [f"first administrator's token, shown this once: {drawn}", f"sign in: {url}/sign-in#token={drawn}"]
+    if new_token:
+        lines += [
+            f"first administrator's token, shown this once: {new_token}",
+            f"sign in: {url}/sign-in#token={new_token}",
+        ]
     elif settings.admin_token:
         lines += ["the administrator's token is the one in STIMRIG_ADMIN_TOKEN"]
     else:

@@ -19,7 +19,7 @@ from stimrig.api.cli import deciding
 from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.cli.errors import CommandError, InputError
 from stimrig.api.cli.files import writing
-from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, given
+from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, set_options
 from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
 from stimrig.api.cli.supervisor import Services
@@ -77,8 +77,8 @@ def test(
 
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
-    bounds = given(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time, anyway=anyway or None)
-    request = kind_of_test(adaptive, protocol, target, bounds) | given(**labels)
+    bounds = set_options(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time, anyway=anyway or None)
+    request = kind_of_test(adaptive, protocol, target, bounds) | set_options(**labels)
     if decide and (adaptive or protocol is not None):
         raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
     token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
@@ -148,7 +148,7 @@ def kind_of_test(adaptive: bool, protocol: str | None, target: str, bounds: dict
     if not adaptive:
         if bounds or target:
             raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
-        return given(protocol=protocol)
+        return set_options(protocol=protocol)
     if protocol is not None:
         raise InputError("--protocol is for a fixed test; leave it out, or leave out --adaptive.")
     for option, name in (("--max-time", "max_duration_s"), ("--max-torque-time", "max_torque_time_nm_s")):
@@ -178,7 +178,7 @@ def on_own_services(
     rig: Path | None, data: Path | None, emulate: str, participant: str, request: dict[str, Any]
 ) -> dict[str, Any]:
     """Start rig and service for this one test."""
-    settings, token, over = Settings(**given(rig_file=rig, data_dir=data)), secrets.token_urlsafe(32), Event()
+    settings, token, over = Settings(**set_options(rig_file=rig, data_dir=data)), secrets.token_urlsafe(32), Event()
     settings.port = 0
     with (
         Services(settings, emulate.split(), token) as services,

@@ -46,7 +46,7 @@ async def show(request: Request, context: Ctx, _principal: Tester, code: str) ->
     low_us, high_us = fine_range(status)
     texts = {"current_ma": number_text(row.profile["current_ma"]), "step_us": number_text(DEFAULTS.step_us)}
     help_texts = {
-        "current_ma": profiles.takes("current_ma", status.limits if status else {}),
+        "current_ma": profiles.range_help("current_ma", status.limits if status else {}),
         "step_us": f"{low_us:g} to {high_us:g} µs",
     }
     return page(

@@ -31,7 +31,7 @@ def fields(profile: Mapping[str, Any], status: Status | None) -> list[dict[str, 
     entries = [
         {
             "name": name, "id": name, "label": limit.label, "type": "number", "empty": "",
-            "text": number_text(profile[name]) if name in profile else "", "help": profiles.takes(name, bounds),
+            "text": number_text(profile[name]) if name in profile else "", "help": profiles.range_help(name, bounds),
         }
         for name, limit in profiles.LIMITS.items()
     ]  # fmt: skip

@@ -270,7 +270,7 @@ def step(context: Context, row: Participant, principal: Principal) -> Step:
         served_until=local_time.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
         lacks_key="" if not keyless else "mine" if principal.may(Scope.APPROVE_MODEL) else "another's",
         archived_since=local_time.when(row.archived_utc) if row.archived_utc else "",
-        needs_test=served is not None and context.tracked.asks(served.id) is not None,
+        needs_test=served is not None and context.tracked.new_test_reason(served.id) is not None,
         unstored=kept_by_rig is not None and kept_by_rig.participant == row.code,
     )
     return next_step(now)

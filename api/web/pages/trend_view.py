@@ -13,7 +13,7 @@ from fastapi.responses import Response
 from stimrig.api import local_time
 from stimrig.api.charts import model_charts, trend_charts
 from stimrig.api.charts.drawing import Figures
-from stimrig.api.charts.model_charts import MOST
+from stimrig.api.charts.model_charts import MAX_COMPARED
 from stimrig.api.errors import ApiError
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.trend import Session, newest_changes
@@ -46,7 +46,7 @@ def trend(request: Request, context: Ctx, _principal: ModelReader, code: str) ->
         session_rows=trend_charts.session_rows(documents),
         changes=newest_changes(sessions),
         columns=[(name.words, "" if name.unit == "1" else name.unit) for name in map(changes.name_of, COLUMNS)],
-        most=MOST,
+        most=MAX_COMPARED,
     )
 
 
@@ -91,8 +91,8 @@ async def compare(
 async def chosen(context: Context, model_ids: list[str] | None) -> list[Model]:
     """Return the models, the oldest first; 422 if they are too few, too many, or of different participants."""
     ids = list(dict.fromkeys(model_ids or []))
-    if not 2 <= len(ids) <= MOST:
-        detail = f"{len(ids)} are chosen. Go back and choose 2 to {MOST} models of the participant."
+    if not 2 <= len(ids) <= MAX_COMPARED:
+        detail = f"{len(ids)} are chosen. Go back and choose 2 to {MAX_COMPARED} models of the participant."
         raise ApiError(422, "two-models", "Choose two models or more to compare", detail)
     rows = [await asyncio.to_thread(context.versions.get, model_id) for model_id in ids]
     other = next((row for row in rows if row.participant != rows[0].participant), None)

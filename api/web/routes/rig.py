@@ -70,7 +70,7 @@ async def stop_on_page(request: Request, context: Context, press: Press) -> Resp
         answer = error
     right, test_id = getattr(request.state, "stop_right", None), current.test_id if current else None
     result = StopResult(press.by, press.reason, context.clock.utc(), test_id, right, answer)
-    return RedirectResponse(f"/stopped/{context.stops.keep(result)}", 303)
+    return RedirectResponse(f"/stopped/{context.stops.add(result)}", 303)
 
 
 @router.post("/rearm", **describe_answer(RigOut))
