@@ -10,7 +10,7 @@ from pathlib import Path
 
 
 class Clock:
-    """The world's clock."""
+    """The system clock."""
 
     def unix_s(self) -> float:
         """Seconds since 1970, UTC."""
@@ -61,7 +61,7 @@ def set_zone(name: str) -> None:
 
 
 def zone_name() -> str:
-    """What the time zone is called in which times are shown, as Europe/Berlin; empty where the machine does not say."""
+    """Return the name of the display time zone, as Europe/Berlin; empty where the machine has none."""
     if named := os.environ.get("TZ", "").removeprefix(":"):
         return named
     _, mark, name = os.path.realpath("/etc/localtime").partition("/zoneinfo/")

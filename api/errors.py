@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 RIG_STATUS = {"refused": 422, "rest-needed": 422, "bad-plan": 422, "disconnected": 503, "internal": 502}
-"""Which HTTP status answers each of the rig's refusals; every other one is answered by 409."""
+"""HTTP status of each of the rig's refusals; every other one is answered by 409."""
 
 
 class ApiError(Exception):
@@ -43,14 +43,14 @@ class ApiError(Exception):
 
 
 class NotFoundError(ApiError):
-    """What was asked for is not there."""
+    """The requested item does not exist."""
 
     def __init__(self, what: str, name: str, fix: str = "") -> None:
         super().__init__(404, "not-found", f"No such {what}", f"There is no {what} {name!r}. {fix}".strip())
 
 
 def require_found(item: T | None, what: str, name: str, fix: str = "") -> T:
-    """What was asked for. Raises NotFoundError where it is None."""
+    """Return the item. Raises NotFoundError: it is None."""
     if item is None:
         raise NotFoundError(what, name, fix)
     return item
@@ -67,7 +67,7 @@ def forbidden(detail: str) -> ApiError:
 
 
 def not_answering() -> ApiError:
-    """503: the database is gone, or somebody else has been writing for long."""
+    """503: the database is unavailable, or locked for too long."""
     return ApiError(503, "database", "The database does not answer", "Nothing was changed. Try again in a minute.")
 
 
@@ -105,6 +105,6 @@ class SettingsError(Exception):
 
 
 def from_rig(problem: RigProblem, **extra: Any) -> ApiError:
-    """The rig's refusal as an API problem."""
+    """Return the rig's refusal as an API problem."""
     status = RIG_STATUS.get(problem.code, 409)
     return ApiError(status, f"rig-{problem.code}", problem.title, problem.detail, **extra)

@@ -10,7 +10,7 @@ from contextvars import ContextVar
 
 log = logging.getLogger("stimrig")
 current_test: ContextVar[str | None] = ContextVar("test_id", default=None)
-"""The test that is being dealt with: every line that comes of it carries its id, whoever writes the line."""
+"""Id of the current test, added to every log line written on its behalf."""
 current_request: ContextVar[str | None] = ContextVar("request_id", default=None)
 """The HTTP request that is being answered, and what it started in the background; `RequestId` draws the id."""
 

@@ -27,7 +27,7 @@ def read(
     name: Callable[[int], str] | None = None,
     note: Callable[[str], None] | None = None,
 ) -> Any:
-    """A record of one file, or of several joined.
+    """Read one file, or several joined to one record.
 
     Parameters
     ----------
@@ -83,7 +83,7 @@ def check_columns(records: Sequence[Any], needs: Sequence[str], called: Callable
 
 
 def _dropped(records: Sequence[Any], called: Callable[[int], str]) -> list[str]:
-    """What is left out of the whole since some of the parts lack it."""
+    """List the columns that are dropped since some of the parts lack them."""
     messages = []
     for column in JOINT:
         lacking = [called(number) for number, record in enumerate(records) if getattr(record, column) is None]
@@ -156,7 +156,7 @@ def write_table(record: Any, columns: dict[str, Any], out: Path) -> dict[str, An
 
 
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:
-    """The sealed recording of a test, when the service did not hear of its end."""
+    """Find the sealed recording of a test whose end the service missed."""
     from stimrig.api.store.uploads import PREFIX
     from stimrig.identify.records.recording import attributes
 

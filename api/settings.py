@@ -59,7 +59,7 @@ class Settings(BaseSettings):
     @field_validator("time_zone")
     @classmethod
     def _known_zone(cls, zone: str | None) -> str | None:
-        """A zone that this machine knows."""
+        """Check that this machine knows the zone."""
         if zone and zone not in available_timezones():
             raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
         return zone or None
@@ -67,7 +67,7 @@ class Settings(BaseSettings):
     @field_validator("structure", mode="before")
     @classmethod
     def _separated(cls, value: object) -> object:
-        """A comma-separated text, as it stands in the environment; each effect once."""
+        """Split a comma-separated text from the environment; each effect once."""
         named = [part.strip() for part in value.split(",")] if isinstance(value, str) else value
         if not isinstance(named, list | tuple):
             return named
@@ -99,7 +99,7 @@ class Settings(BaseSettings):
 
 
 def refusal(error: ValidationError) -> str:
-    """Which setting does not hold, in one line, by the name of its environment variable."""
+    """Describe the invalid setting in one line, by the name of its environment variable."""
     first = error.errors()[0]
     name = PREFIX + "_".join(str(part) for part in first["loc"]).upper()
     message = first["msg"].removeprefix("Value error, ")

@@ -1,4 +1,4 @@
-"""The experiment that decides, from recordings that are there: what is asked of the rig, and what both then say."""
+"""Plans the deciding experiment from existing recordings, and diagnoses them together with its recording."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What ends a verb: one line on standard error and an exit code."""
+"""Errors that end a command: one line on standard error and an exit code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PAGE = frozenset({
 
 
 def exit_interrupted(*_: object) -> None:
-    """End at once after Ctrl-C: nothing is begun yet, or nobody heard of it in time."""
+    """Exit at once after Ctrl-C: nothing has begun, or the interrupt was not handled in time."""
     os.write(2, b"stimrig: interrupted\n")
     os._exit(INTERRUPTED)
 
@@ -38,4 +38,4 @@ class InputError(CommandError):
 
 
 class LaunchError(CommandError):
-    """A process did not come up, or ended."""
+    """A process did not start, or ended."""

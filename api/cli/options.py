@@ -52,7 +52,7 @@ Emulate = Annotated[str, typer.Option(help='options for the emulator, e.g. "--pa
 
 
 def set_options(**options: Any) -> dict[str, Any]:
-    """Return the options that were given; of the others the environment is asked."""
+    """Return the options that are set; the environment supplies the others."""
     return {name: value for name, value in options.items() if value is not None}
 
 

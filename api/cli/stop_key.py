@@ -100,5 +100,5 @@ def at_service(url: str, token: str, stray: Callable[[], bool] = lambda: True) -
 
 
 def _rests(rig: dict[str, Any]) -> bool:
-    """Tell whether a service knows that its rig plays nothing: what the rig says may come late, and not at all."""
+    """Return whether a service knows that its rig plays nothing; the rig's own state may arrive late or never."""
     return rig["state"] in IDLE and rig["connected"] and rig["age_s"] < HEARD_S and rig["holder"] is None

@@ -199,7 +199,7 @@ class Services:
 
     @property
     def emulated(self) -> bool:
-        """Whether no person is connected: the emulator was started here, or runs behind the rig that is attached to."""
+        """Return whether no person is connected: the emulator was started here, or runs behind the attached rig."""
         return self.emulator is not None or (self.attached and self.settings.emulated)
 
     @property

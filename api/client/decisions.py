@@ -1,4 +1,4 @@
-"""Which requests decide something, and which document's `ETag` each sends as `If-Match`: for clients and tests."""
+"""The requests that decide, and the document whose `ETag` each sends as `If-Match`: for clients and tests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What workers find out about a model, kept with it: comparison, curves, diagnosis; and effects added to it."""
+"""Comparison, curves and diagnosis of a model, computed by workers and stored with it; adds effects to a model."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ log = logging.getLogger("stimrig.analyses")
 OnCall = Callable[[Job], None]
 """Takes the job of a worker that begins: a page shows its progress."""
 DIAGNOSIS, OWN_DIAGNOSIS = "diagnosis", "diagnosis of its structure"
-"""The names under which those of the plain structure and of another are kept."""
+"""Names of the stored diagnosis: of the plain structure, and of a version's own structure."""
 IMPROVEMENT = "improvement"
-"""What a diagnosis found by the way, kept apart: the models with the effects that it names."""
+"""By-product of a diagnosis, stored separately: the models with the effects that it names."""
 HALF_DONE = 0.5
-"""From here on a diagnosis of low priority is left to finish when somebody begins to wait for it."""
+"""From this progress on, a low-priority diagnosis is not restarted when a request begins to wait for it."""
 
 
 def is_plain(model: Model) -> bool:
-    """Whether a version's structure is the plain one: no effects around f(u) and a G of second order."""
+    """Return whether the version has the plain structure: no effects around f(u) and a G of second order."""
     return not model.effects and stored_model.is_plain(stored_model.read(model))
 
 
@@ -47,7 +47,7 @@ class Analyses:
         self._library: list[str] | None = None
 
     def path(self, recording_id: str) -> str:
-        """Where a recording lies."""
+        """Return the path of a recording."""
         recording = self.store.get(Recording, recording_id)
         return require_found(recording, "recording", recording_id, "A model's document names its recording.").path
 
@@ -98,12 +98,12 @@ class Analyses:
         return diagnosis and explanation.remaining(diagnosis, model.effects, model.fit)
 
     def experiment_before(self, first: Model) -> dict[str, Any] | None:
-        """The next experiment of the diagnosis that the first model of a joined recording was made to go on from."""
+        """Return the next experiment of the diagnosis that a joined recording's first model follows up."""
         before = self.known_diagnosis(self.versions.get(first.parent_id)) if first.parent_id else None
         return (before or {}).get("experiment")
 
     async def diagnose_ahead(self, model: Model) -> None:
-        """Diagnose before anybody asks, with low priority; a new test ends it, and only the log says so."""
+        """Diagnose in advance at low priority; a new test cancels it, which is only logged."""
         try:
             await self.diagnosis(model, background=True)
         except ApiError as error:
@@ -112,7 +112,7 @@ class Analyses:
             log.exception("diagnosis of %s in the background", model.id)
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
-        """A finding if it has been made."""
+        """Return a stored analysis, or None."""
         row = self.store.get(Analysis, (model_id, kind))
         return row.document if row else None
 
@@ -243,7 +243,7 @@ class Analyses:
         return {key: value for key, value in improvement.items() if key != "models"}, rows
 
     def _begun_from(self, model: Model, place: Model, kind: str) -> Model:
-        """The version whose structure was diagnosed; that of the plain structure may be kept with another."""
+        """Return the version whose structure was diagnosed; for the plain structure it may be another one."""
         if kind == OWN_DIAGNOSIS:
             return place
         return next((row for row in [place, *self.versions.ancestry(model)] if is_plain(row)), model)
@@ -251,7 +251,7 @@ class Analyses:
     def _child(
         self, parent: Model, added: list[str], document: dict[str, Any], by: str, forced: Sequence[str] = ()
     ) -> Model:
-        """The version with effects more than its parent; made of the document where there is none."""
+        """Return the child with these added effects; create it from the document where there is none."""
         same = self.versions.child_with(parent, [*parent.effects, *added], set(added) - set(forced))
         if same is not None:
             return same

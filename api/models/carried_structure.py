@@ -80,7 +80,7 @@ def _store(versions: Versions, carried: dict[str, Any], plain: Model, earlier: M
 
 
 def _not_carried(error: Exception) -> dict[str, Any]:
-    """The finding where the structure could not be fitted."""
+    """Return the finding for a structure that could not be fitted."""
     why, parts = (error.code, [error.title, error.detail]) if isinstance(error, ApiError) else ("failed", [str(error)])
     sentences = ["The structure of the last session was not fitted", *filter(None, parts)]
     reason = " ".join(f"{part.rstrip('.')}." for part in sentences)
@@ -111,7 +111,7 @@ async def refuse_unknown(settings: Settings, worker: Callable[..., Worker] = Wor
 
 
 def carried_context(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> dict[str, Any] | None:
-    """What `model.html` shows of what was carried over: to the plain version, or to its child in that structure.
+    """Return the context of `model.html` on the carried structure, for the plain version or its carried child.
 
     None where its recording was asked nothing of the kind. `new` is None without a diagnosis; `again`: those left out
     that the diagnosis asks for; `better`: the carried version is.

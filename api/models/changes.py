@@ -17,11 +17,11 @@ from stimrig.api.effect_words import effect_words, effects_words, fact_of, param
 from stimrig.api.models.stored_model import Figure
 
 BEYOND = 2.0
-"""A change is told where it is more than so many times its uncertainty."""
+"""A change is reported above this multiple of its uncertainty."""
 SAME_CURRENT = 0.01
 """Currents that differ by at most this share are the same."""
 OF_THE_CURVE = ("threshold_us", "plateau_nm")
-"""What changes with the current alone: not compared across two currents."""
+"""Figures that depend on the current: not compared across two currents."""
 FLOORS = {
     "threshold_us": ((0.0, 2.5), (0.0, 10.0)),
     "plateau_nm": ((0.02, 0.0), (0.15, 0.0)),
@@ -32,12 +32,12 @@ FLOORS = {
 """The least uncertainty of a difference, a share of the value and an amount in the unit of the figure: in the same
 structure, and where method or effects differ (fatigue in a model raises its plateau)."""
 OF_EFFECT = ((0.1, 0.0), (0.3, 0.0))
-"""The same of the parameter of an effect."""
+"""The same for a parameter of an effect."""
 
 
 @dataclass(frozen=True)
 class State:
-    """What is compared: a model's figures, and under which conditions they were found."""
+    """A model's figures and the conditions under which they were estimated."""
 
     figures: dict[str, Figure]
     method: str
@@ -48,7 +48,7 @@ class State:
     """Kind and text of what was noted on the conditions."""
 
     def same_structure(self, other: State) -> bool:
-        """Whether method and effects are the same."""
+        """Return whether method and effects are equal."""
         return self.method == other.method and sorted(self.structure) == sorted(other.structure)
 
 
@@ -62,7 +62,7 @@ def structure_of(effects: Collection[str], figures: dict[str, Figure]) -> tuple[
 
 
 def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
-    """How far a figure moved, and how sure that is; None where it cannot be said.
+    """Return the change of a figure and its uncertainty; None where it is unknown.
 
     `figure`, `unit`, `before`, `now`, `difference` and `uncertainty` (one standard deviation of the difference) in that
     unit; `percent` of the value before; `times`, the difference over its uncertainty; `beyond`.
@@ -90,7 +90,7 @@ def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
 
 
 def uncertainty(name: str, figure: Figure) -> float | None:
-    """The uncertainty of a figure, in its unit, such that of two alike they add up to that of their difference."""
+    """Return the uncertainty of a figure in its unit; those of two figures add up to that of their difference."""
     if figure.get("value") is None or figure.get("sd") is None:
         return None
     return math.hypot(figure["sd"], _floor(name, True, figure["value"]) / math.sqrt(2))
@@ -102,7 +102,7 @@ def _floor(name: str, same: bool, value: float) -> float:
 
 
 def comparable(before: State, now: State) -> list[str]:
-    """The figures that both have and that mean the same in both."""
+    """List the figures that both models have with the same meaning."""
     names = [
         name for name, figure in now.figures.items()
         if name in before.figures and before.figures[name].get("form") == figure.get("form")
@@ -113,14 +113,14 @@ def comparable(before: State, now: State) -> list[str]:
 
 
 def same_current(before: State, now: State) -> bool:
-    """Whether the current was the same, as far as it is known."""
+    """Return whether the currents are equal, as far as they are known."""
     if before.current_ma is None or now.current_ma is None:
         return True
     return abs(before.current_ma - now.current_ma) <= SAME_CURRENT * max(before.current_ma, now.current_ma)
 
 
 def changed(before: State, now: State) -> list[dict[str, Any]]:
-    """The differences beyond twice their uncertainty, the surest first."""
+    """List the differences beyond twice their uncertainty, the most certain first."""
     differences = [difference(name, before, now) for name in comparable(before, now)]
     return sorted((item for item in differences if item and item["beyond"]), key=lambda item: -item["times"])
 
@@ -162,7 +162,7 @@ KINDS = {"electrodes": "electrodes", "side": "the side", "posture": "posture"}
 
 
 def name_of(figure: str, unit: str = "1") -> Name:
-    """A figure's name; of an effect's parameter, the effect and the parameter without its unit."""
+    """Return a figure's name; for an effect's parameter, the effect and the parameter without its unit."""
     if figure in NAMES:
         return NAMES[figure]
     effect, _dot, parameter = figure.partition(".")
@@ -170,7 +170,7 @@ def name_of(figure: str, unit: str = "1") -> Name:
 
 
 def value_words(value: float | None, name: Name, unit: bool = True) -> str:
-    """A value in the unit in which it is shown."""
+    """Format a value in its display unit."""
     if value is None:
         return "–"
     scaled = value * name.factor
@@ -185,7 +185,7 @@ def dose_words(charge_uc: float | None) -> str:
 
 
 def uncertain_words(value: float | None, uncertainty: float | None, name: Name, sign: bool = False) -> str:
-    """A value with twice its uncertainty, without the unit; a difference has its sign."""
+    """Format a value with twice its uncertainty, without the unit; a difference has its sign."""
     if uncertainty and name.digits is None:  # as many digits as are known
         name = replace(name, digits=max(0, _digits(BEYOND * uncertainty * name.factor) - 1))
     words = value_words(value, name, unit=False)
@@ -201,14 +201,14 @@ def _digits(value: float) -> int:
 
 
 def sentences(before: State, now: State, since_utc: str) -> list[str]:
-    """What changed beyond its uncertainty, a sentence each; one that says so where nothing did."""
+    """Describe each change beyond its uncertainty in a sentence; without changes, one sentence says that."""
     day = local_time.day(since_utc)
     moved = [_sentence(each, day) for each in changed(before, now)]
     return moved or [f"Nothing changed beyond its uncertainty since {day}."]
 
 
 def _sentence(change: dict[str, Any], day: str) -> str:
-    """A change, and how sure it is. Of a falling curve the plateau's size is compared."""
+    """Describe a change and its certainty. For a falling curve the plateau's magnitude is compared."""
     name, first, second = name_of(change["figure"], change["unit"]), change["before"], change["now"]
     if first * second < 0:
         return f"{name.words}: {value_words(second, name)}, it was {value_words(first, name)} on {day}."
@@ -221,7 +221,7 @@ def _sentence(change: dict[str, Any], day: str) -> str:
 
 
 def doubt_sentences(before: State, now: State) -> list[str]:
-    """What puts the comparison in doubt, a sentence each: current, method, effects and noted conditions that differ."""
+    """Describe what limits the comparison, a sentence each: current, method, effects or notes that differ."""
     reasons = []
     if before.current_ma is None or now.current_ma is None:
         reasons.append(

@@ -1,4 +1,4 @@
-"""Why a model fails, as the page and the reports show it: words and numbers put together from what workers found."""
+"""Explains why a model fails, for the page and the reports: words and numbers from the workers' results."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SPLITS: dict[str, str] = {
     "frequency": "By frequency",
 }
 OWN_SHARE = 0.05
-"""Share by which the error of a model may differ once it is fitted anew."""
+"""Share by which the error of a model may differ after a new fit."""
 LEAST_SHARE = 0.005
 """Octaves above the last one with a larger share are not shown."""
 PARTS = {
@@ -31,7 +31,7 @@ PARTS = {
     "g": "g(x, ẋ), the active torque over angle and velocity",
     "h": "h(x, ẋ), the passive torque over angle and velocity",
 }
-"""Where an effect stands in the paper's Fig. 2."""
+"""Position of an effect in the paper's Fig. 2."""
 
 
 def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
 
 
 def remaining(diagnosis: dict[str, Any], effects: Sequence[str], fit: Mapping[str, Any]) -> dict[str, Any]:
-    """What a diagnosis still finds missing in a version that holds some of the effects that it names.
+    """Reduce a diagnosis to what is still missing in a version that has some of the effects it names.
 
     `fit`: the statistics of that version.
     """
@@ -120,7 +120,7 @@ def decided(experiment: Mapping[str, Any] | None, diagnosis: Mapping[str, Any], 
 
 
 def name_of(effect: str, library: Mapping[str, Any]) -> str:
-    """The name of an effect for people."""
+    """Return the display name of an effect."""
     return (library.get(effect) or {}).get("name") or effect_words(effect)
 
 
@@ -166,7 +166,7 @@ def free_card(entry: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str,
 
 
 def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The free effects that a model holds, as `free_card` describes what a diagnosis found."""
+    """Describe the free effects of a model as `free_card` does those of a diagnosis."""
     return [
         {
             "id": effect["id"],
@@ -183,12 +183,12 @@ def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
 
 
 def how_sure(chance: float | None) -> str:
-    """A probability that an effect is missing, in words and as a number."""
+    """Format the probability that an effect is missing, in words and as a number."""
     return "" if chance is None else f"{sure(chance)} missing · {probability(chance)}"
 
 
 def _labelled(parameters: Mapping[str, Any], known: Mapping[str, Any], form: str | None) -> dict[str, Any]:
-    """Each parameter with what it is in this form, and its name without the unit, as the equation has it."""
+    """Label each parameter with its meaning in this form and its symbol in the equation."""
     forms = sorted(known.get("forms") or [], key=lambda each: each.get("name") == form)
     about = {parameter["name"]: parameter.get("about") or "" for each in forms for parameter in each["parameters"]}
     return {
@@ -249,7 +249,7 @@ def _seconds(settings: Mapping[str, Any], pulse_rate_hz: float | None) -> str:
 
 
 def others(diagnosis: Mapping[str, Any], library: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The effects that were tried and are not named, with the reason, best first."""
+    """List the effects that were tried and rejected, with the reason, best first."""
     named = {entry["effect"] for entry in diagnosis["missing"]}
     return [
         {"id": row["effect"], "name": name_of(row["effect"], library), "reason": row["reason"]}
@@ -259,7 +259,7 @@ def others(diagnosis: Mapping[str, Any], library: Mapping[str, Any]) -> list[dic
 
 
 def versions(rows: Sequence[Mapping[str, Any]], current: str) -> list[dict[str, Any]]:
-    """The versions of one recording in the order in which they descend from each other."""
+    """List the versions of one recording in order of descent."""
     return [{"reason": None, **row, "label": label(row), "current": row["id"] == current} for row in rows]
 
 
@@ -273,7 +273,7 @@ def label(row: Mapping[str, Any]) -> str:
 
 
 def step_versions(improvement: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The steps of an improvement as versions."""
+    """Return the steps of an improvement as versions."""
     undecided = {"decision": None, "served": False, "undone": False, "noise_sd_nm": improvement["noise_sd_nm"]}
     steps = enumerate(improvement["steps"])
     return versions(
@@ -298,7 +298,7 @@ def require_evidence(diagnosis: Mapping[str, Any], added: Sequence[str]) -> None
 
 
 def refusals(diagnosis: Mapping[str, Any], added: Sequence[str]) -> dict[str, str]:
-    """Why the recording does not ask for these effects: those only for which there is a reason.
+    """Return why the recording gives no evidence for these effects; an effect without a reason is left out.
 
     There is none against an effect that cannot be told from one that is asked for.
     """

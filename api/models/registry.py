@@ -33,7 +33,7 @@ log = logging.getLogger("stimrig.models")
 COLUMNS = tuple(column.name for column in Model.__table__.columns if column.name not in ("document", "etag", "fit"))
 """Columns of a version that clients see as they are."""
 POOR = ("not usable", "unknown")
-"""The verdicts with which an approval needs a reason."""
+"""Verdicts that require a reason for an approval."""
 AT_ONCE = 16
 """Decisions that are read from the database at a time, the newest first."""
 WORDS, LETTERS, DIFFERENT = 3, 10, 5
@@ -45,7 +45,7 @@ WHAT_TO_WRITE = (
 
 
 def is_reason(text: str) -> bool:
-    """Whether a text says something: a few different words, none of them one letter held down."""
+    """Return whether a text is a usable reason: several different words, none a repeated letter."""
     words = [word.casefold() for word in re.findall(r"[^\W\d_]+", text)]
     letters = "".join(words)
     return (
@@ -58,7 +58,7 @@ def is_reason(text: str) -> bool:
 
 @dataclass(frozen=True)
 class Served:
-    """What the controller fetches: the bytes and their tag."""
+    """The document served to the controller: the bytes and their tag."""
 
     body: bytes
     etag: str
@@ -130,7 +130,7 @@ class Versions:
             row.carried, row.carried_from_id = carried, carried_from_id
 
     def get(self, model_id: str) -> Model:
-        """A version by its id."""
+        """Return a version by its id."""
         fix = "GET /v1/participants/{code}/models lists a participant's."
         return require_found(self.store.get(Model, model_id), "model", model_id, fix)
 
@@ -150,7 +150,7 @@ class Versions:
         return [self._document(row, newest.get(row.id), holding) for row in rows]
 
     def child_with(self, parent: Model, effects: list[str], with_evidence: Collection[str] = ()) -> Model | None:
-        """A version of the same recording, made from `parent`, that holds exactly these effects.
+        """Return the child of `parent`, of the same recording, that has exactly these effects.
 
         One that holds any of `with_evidence` without evidence is passed over: it was made before anybody had looked.
         """
@@ -159,7 +159,7 @@ class Versions:
         return next((row for row in candidates if set(with_evidence).isdisjoint(row.fit["without_evidence"])), None)
 
     def lineage(self, model: Model) -> list[Model]:
-        """The versions from the first one of the recording to this one, then its newest descendants."""
+        """List the versions from the recording's first one to this one, then its newest descendants."""
         path = self.ancestry(model)
         children = self.store.all(Model, Model.recording_id == model.recording_id, order=Model.created_utc)
         while below := [row for row in children if row.parent_id == path[-1].id]:
@@ -167,7 +167,7 @@ class Versions:
         return path
 
     def ancestry(self, model: Model) -> list[Model]:
-        """The versions from the first one of the recording to this one."""
+        """List the versions from the recording's first one to this one."""
         rows = {row.id: row for row in self.store.all(Model, Model.recording_id == model.recording_id)}
         path = [model]
         while path[0].parent_id in rows:
@@ -237,7 +237,7 @@ class Versions:
         self, session: Session, row: Model, approved: bool, by: str, reason: str,
         tracking: dict[str, float] | None = None,
     ) -> Approval:  # fmt: skip
-        """Write a decision and its entry, with what the person was shown of the model."""
+        """Write a decision and its audit entry, with the figures that the person was shown."""
         now, person = self.clock.utc(), session.get_one(Participant, row.participant)
         decision = Approval(
             model_id=row.id,
@@ -258,7 +258,7 @@ class Versions:
         return decision
 
     def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
-        """Where a version's recording was made, and with what current, mA; None: not known."""
+        """Return the site and current (mA) of a version's recording; None: unknown."""
         with self.store.read() as session:
             return self._measured_at(session, row)
 
@@ -268,7 +268,7 @@ class Versions:
         return site_of_recording(recording, test), None if test is None else place_of(test)[3]
 
     def _site(self, session: Session, row: Model, person: Participant, approved: bool) -> list[Any]:
-        """The participant's site; 409 where a model is to be approved that was measured at another one."""
+        """Return the participant's site; 409 where the model to approve was measured at another one."""
         here, (there, _current) = site_of(person), self._measured_at(session, row)
         if approved and there not in (None, here):
             detail = (
@@ -279,21 +279,21 @@ class Versions:
         return list(here)
 
     def decision(self, model_id: str) -> Approval | None:
-        """The newest decision on a version."""
+        """Return the newest decision on a version."""
         return self.store.first(Approval, Approval.model_id == model_id, order=Approval.id.desc())
 
     def approved(self, participant: str) -> Approval | None:
-        """The approval that holds for a participant today."""
+        """Return the participant's valid approval of today."""
         return self.all_approved([participant]).get(participant)
 
     def all_approved(self, participants: Collection[str]) -> dict[str, Approval]:
-        """The same for many participants at once, in one query."""
+        """Return the valid approvals of many participants, in one query."""
         now = self.clock.utc()
         approvals = self._last_approvals(participants)
         return {code: row for code, row in approvals.items() if row.expires_utc is None or row.expires_utc > now}
 
     def last_approved(self, participant: str) -> Model | None:
-        """The version approved last and not rejected since, whether or not its day is over."""
+        """Return the version approved last and not rejected since, whether or not the approval has expired."""
         last = self._last_approvals([participant]).get(participant)
         return None if last is None else self.get(last.model_id)
 
@@ -314,7 +314,7 @@ class Versions:
         return newest
 
     def all_approved_ones(self, participant: str) -> list[Model]:
-        """The versions that were approved and not rejected since, oldest first, the last one of each recording."""
+        """List the versions approved and not rejected since, oldest first, the last one of each recording."""
         decided = self.store.all(Approval, Approval.participant == participant, order=Approval.id)
         newest = {decision.model_id: decision for decision in decided}
         in_order = sorted(newest.values(), key=lambda decision: decision.id, reverse=True)
@@ -322,7 +322,7 @@ class Versions:
         return list({row.recording_id: row for row in rows[::-1]}.values())
 
     def served(self, participant: str) -> Served | None:
-        """What the controller gets, or None where nothing is approved. Raises ApiError (500) where that is damaged."""
+        """Return the model served to the controller; None without an approval. Raises ApiError (500): damaged."""
         approval = self.approved(participant)
         if approval is None:
             return None
@@ -344,7 +344,7 @@ class Versions:
         return {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
 
     def quality(self, row: Model) -> dict[str, Any]:
-        """The verdict of a version, kept beside its figures."""
+        """Return the verdict of a version from its stored figures."""
         return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
 
     def document(self, row: Model) -> dict[str, Any]:

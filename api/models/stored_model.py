@@ -46,20 +46,20 @@ def text(row: Model) -> str:
 
 
 def structure(document: Mapping[str, Any]) -> dict[str, str]:
-    """The effects that a model holds, each with its form where it names one: `id:form`."""
+    """Return the effects of a model, each with its form where it has one: `id:form`."""
     forms = {effect["id"]: effect.get("form") or "" for effect in document.get("effects") or []}
     return {name: f"{name}:{form}".removesuffix(":") for name, form in forms.items()}
 
 
 def is_plain(document: Mapping[str, Any]) -> bool:
-    """Whether its structure is the plain one: no effects around f(u) and a G of second order."""
+    """Return whether the structure is the plain one: no effects around f(u) and a G of second order."""
     return not structure(document) and "time_constant_s" in document["linear"]
 
 
 # ---- verdict and fit ----------------------------------------------------------------------------------------------
 
 UNDEFINED = "not defined: the torque is level there"
-"""What stands where a model has an error but no best-fit %."""
+"""Placeholder for a model that has an error but no best-fit %."""
 NO_VERDICT = {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
 FIT = (
     "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
@@ -68,13 +68,13 @@ FIT = (
 
 
 def repetition(document: Mapping[str, Any]) -> dict[str, Any]:
-    """What repeats in the record of a MODEL.json, with `sentences`; None for each where it is not known."""
+    """Return the repetition statistics of a MODEL.json, with `sentences`; None for unknown ones."""
     statistics = document["fit"].get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
     return {**statistics, "sentences": repetition_sentences(document["fit"])}
 
 
 def figures(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The few numbers of a MODEL.json that a person looks at first."""
+    """Return the headline figures of a MODEL.json."""
     return {name: document["fit"].get(name) for name in FIT}
 
 
@@ -90,7 +90,7 @@ def without_evidence(document: Mapping[str, Any]) -> list[str]:
 
 
 def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> None:
-    """Judge a new version that holds such effects: it is used with care at best, and says why."""
+    """Mark a version with effects added without evidence: its verdict is "usable with care" at best."""
     if not effects:
         return
     judged, reason = document["quality"], f"added without evidence: {', '.join(effects)}"
@@ -102,7 +102,7 @@ def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> N
 
 @dataclass(frozen=True)
 class Followed:
-    """How much of the torque a model follows: the figure that says how good it is, the same on every page.
+    """Return how much of the torque a model explains: the same figure of merit on every page.
 
     Best fit, and the most that the sensor noise allows on the same pulses, %; None where it is not defined. `where`:
     the pulses it was found on, as the beginning of a sentence.
@@ -169,7 +169,7 @@ def _poles(a: list[float], step_s: float) -> list[complex]:
 
 
 def validity(document: Mapping[str, Any]) -> str | None:
-    """What the model holds for, in one sentence; None where it does not say."""
+    """Describe the model's range of validity in one sentence; None where it is not stated."""
     known = document.get("valid_for") or {}
     named = []
     if known.get("pulse_width_us"):
@@ -190,7 +190,7 @@ UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "d
 
 
 def muscle_figures(document: Mapping[str, Any]) -> dict[str, Figure]:
-    """Threshold, plateau, dynamics, and the main parameter of each effect as `effect.parameter`."""
+    """Return threshold, plateau, dynamics, and the main parameter of each effect as `effect.parameter`."""
     stored, read_off = document["uncertainty"]["figures"], dynamics(document)
     figures = {
         name: stored.get(name) or {"value": read_off.get(name), "sd": None, "unit": unit}

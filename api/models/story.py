@@ -12,7 +12,7 @@ from stimrig.identify.conclusion import why_ended
 from stimrig.identify.healing import healed_places, place_words
 
 SAME = 0.995
-"""An error that is larger than this share of the one before has not fallen."""
+"""An error above this share of the previous one counts as not reduced."""
 
 
 def story(

@@ -91,7 +91,7 @@ class TrackedVersions:
         return trial
 
     def earlier(self, approval: Approval) -> list[list[dict[str, Any]]]:
-        """The levels of the trials under this person's earlier approvals, oldest first; read once for an approval.
+        """Return the levels of the trials under the participant's earlier approvals, oldest first; cached by approval.
 
         Those of another side, muscle or current say nothing here.
         """
@@ -106,12 +106,12 @@ class TrackedVersions:
         return self._earlier[approval.id]
 
     def places(self, approval: Approval) -> list[Place]:
-        """Where the test of the approved model stimulated; nothing is known of an uploaded recording."""
+        """Return the place of the approved model's test; empty for an uploaded recording."""
         model: Model = self.store.get(Model, approval.model_id)
         return [place_of(test) for test in self.store.all(Test, Test.recording_id == model.recording_id)]
 
     def elsewhere(self, approval: Approval, places: list[Place]) -> bool:
-        """Whether an approved model is known to be one of another side, muscle or current than these places."""
+        """Return whether an approved model is known to be of another side, muscle or current than these places."""
         return any(differ(approved_place, place) for approved_place in self.places(approval) for place in places)
 
     def text(self, approval: Approval) -> str:
@@ -119,7 +119,7 @@ class TrackedVersions:
         return stored_model.text(self.versions.get(approval.model_id))
 
     def rows(self, approval_id: int) -> list[Tracked]:
-        """The trials of an approval, the oldest first, without what was served."""
+        """Return the trials of an approval, oldest first, without the served documents."""
         with self.store.read() as session:
             query = session.query(Tracked).options(defer(Tracked.document)).filter(Tracked.approval_id == approval_id)
             return list(query.order_by(Tracked.number))
@@ -127,7 +127,7 @@ class TrackedVersions:
     def add_trial(
         self, trial: Trial, result: dict[str, Any], last_sample_unix_s: float | None = None
     ) -> Tracked | None:
-        """Write down what a trial said, and serve what may be served after it.
+        """Store the result of a trial and the document to serve after it.
 
         Nothing is moved by a trial that is noted already, or whose approval holds no longer.
 
@@ -173,7 +173,7 @@ class TrackedVersions:
         return row
 
     def _document(self, trial: Trial, row: Tracked, model_json: str) -> bytes:
-        """What is served from now on: the moved model, or where a person is asked the last one within the limits."""
+        """Return the document to serve: the tracked model, or the last one within the limits, with `ask` set."""
         approval, step = trial.approval, row.step or {}
         tracking_info = {
             "approved_model_id": approval.model_id, "trial": row.number, "test_id": row.test_id, "at_utc": row.at_utc,
@@ -191,19 +191,19 @@ class TrackedVersions:
         return json.dumps(document, ensure_ascii=False, allow_nan=False).encode()
 
     def _unfollowed_before(self, approval_id: int) -> bool:
-        """Whether the last trial could not be followed."""
+        """Return whether the last trial could not be followed."""
         rows = self.rows(approval_id)
         return bool(rows) and rows[-1].outcome == NOT_FOLLOWED
 
     # ---- what is served ----------------------------------------------------------------------------------------
 
     def newest(self, approval_id: int) -> Tracked | None:
-        """The trial after which something was served last."""
+        """Return the newest trial with a served document."""
         conditions = (Tracked.approval_id == approval_id, Tracked.document.is_not(None))
         return self.store.first(Tracked, *conditions, order=Tracked.number.desc())
 
     def served(self, participant: str) -> Served | None:
-        """The newest tracked version of the approval that holds, else the approved model itself; None without one.
+        """Return the newest tracked version of the valid approval, else the approved model; None without an approval.
 
         Raises ApiError: 500 the approved model is damaged.
         """
@@ -235,7 +235,7 @@ class TrackedVersions:
         return self.versions.get(parts(model_id)[0])
 
     def new_test_reason(self, approval_id: int) -> str | None:
-        """Why a new test is needed now; None where none is."""
+        """Return why a new test is needed; None where none is."""
         row = self.newest(approval_id)
         return row.ask if row else None
 
@@ -259,7 +259,7 @@ class TrackedVersions:
 
 
 def trial_document(row: Tracked) -> dict[str, Any]:
-    """A trial as clients see it."""
+    """Return a trial's document for clients."""
     step = row.step or {}
     step_fields = ("now", "coming", "effects", "error_nm", "expected_error_nm", "disturbed_s", "distance")
     row_fields = ("number", "test_id", "recording_id", "at_utc", "outcome", "reason", "ask", "error_percent", "delay_s")

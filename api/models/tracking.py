@@ -52,7 +52,7 @@ class Limits(BaseModel):
         return {name: (middle - half, middle + half) for (name, middle), half in around if half > 0.0}
 
     def alarms(self, threshold_us: float | None) -> Bounds:
-        """Beyond what a person is asked: the bounds, and the usual ones of what stays as approved.
+        """Return the bounds beyond which a new test is requested; quantities that are not tracked have the usual ones.
 
         The muscle changes all the same where the model is held.
         """
@@ -62,7 +62,7 @@ class Limits(BaseModel):
 
 
 def new_test_reason(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
-    """Why a person has to be asked after a trial; None where the next one is expected within the bounds.
+    """Return why a new test is needed after a trial; None where the next trial is expected within the bounds.
 
     The bounds are for what is expected, not for its band.
 
@@ -94,7 +94,7 @@ def new_test_reason(number: int, step: Mapping[str, Any], bounds: Bounds) -> str
 
 
 def _beyond(name: str, value: float, low: float, high: float) -> str:
-    """Where rounding would write the limit itself, the sentence says "just beyond" instead of a number."""
+    """Describe a value beyond its limits; where rounding would show the limit itself, as "just beyond"."""
     if name == "threshold_shift_us":
         moved, upper = f"{value:+.1f}", f"{high:.3g}"
         if abs(float(moved)) <= float(upper):
@@ -133,7 +133,7 @@ NARROW = {"gain": 0.05, "threshold_shift_us": 5.0, "time_scale": 0.1}
 
 
 def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
-    """What has changed by the newest trial that the model learnt from; only what its bands are sure of.
+    """Describe the changes up to the newest trial that moved the model, where its bands exclude no change.
 
     `trials`: as `stimrig.api.models.tracked.trial_document` gives them, the oldest first; `since_utc`: when the
     recording of the approved model was made.

@@ -86,7 +86,7 @@ class AdaptiveTests(Watched):
         return Planned(plan, {"target": how["target"], "reach": reach, "bounds": bounds.model_dump()}, how)
 
     async def _outlook(self, wanted: dict[str, Any]) -> dict[str, Any]:
-        """What the test can reach. One after the other, so that a test which begins waits for one at most."""
+        """Estimate what the test can reach. Serialised: a starting test waits for at most one estimate."""
         name = hashlib.sha256(repr(wanted).encode()).hexdigest()
         if name in self._outlooks:
             return self._outlooks[name]
@@ -101,7 +101,7 @@ class AdaptiveTests(Watched):
             return self._outlooks[name]
 
     def _known(self, plan: TestPlan) -> list[str]:
-        """The participant's models at the place of a plan, oldest first."""
+        """List the participant's models at the place of a plan, oldest first."""
         person = self.versions.store.get(Participant, plan.participant)
         return self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
 

@@ -51,7 +51,7 @@ class Advice:
 
 @dataclass
 class News:
-    """What the rig has sent since the last question: samples as they came, and the outcomes of pulses by column."""
+    """Events since the last request to the adviser: samples, and the outcomes of pulses by column."""
 
     samples: bytes = b""
     outcomes: dict[str, list[Any]] = field(default_factory=dict)
@@ -65,7 +65,7 @@ class News:
 
 @dataclass
 class Turn:
-    """One boundary: what is asked, and what came of it."""
+    """One boundary between pieces: the request to the adviser and its result."""
 
     scheduled: int
     questions: int = 0
@@ -76,7 +76,7 @@ class Turn:
 
 @dataclass
 class AdaptiveStatus:
-    """What is known of the test, for pages and for its document."""
+    """State of the test, for pages and its document."""
 
     target: dict[str, float]
     reach: dict[str, Any] | None
@@ -166,12 +166,12 @@ class Follower(Watcher):
             self.begin(self._carry_out(turn, turn.advice))
 
     def _left_s(self, now_s: float) -> float:
-        """From a time on the test's clock until the rig decides what follows what is laid, s."""
+        """Return the time from `now_s` on the test's clock until the rig needs the next segment, s."""
         assert self._newest is not None
         return self._newest.boundary_s - AHEAD / self.plan.pulse_rate_hz - now_s
 
     def _now_s(self) -> float:
-        """The time on the test's clock."""
+        """Return the time on the test's clock, s."""
         assert self._newest is not None
         return self._newest.elapsed_s + self.clock.monotonic_s() - self._received_s
 
@@ -253,13 +253,13 @@ class Follower(Watcher):
         self.publish()
 
     def _spent(self) -> str:
-        """Which bound leaves no room for another piece."""
+        """Return which bound leaves no room for another piece."""
         assert self._newest is not None and self.plan.adaptive is not None
         left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
         return "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"
 
     def _played_so_far(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
-        """Width of each pulse that is laid, and the segments."""
+        """Return the width of each scheduled pulse, and the segments."""
         rate_hz = self.plan.pulse_rate_hz
         sources: Any = {"plan": iter(self._fixed), "extension": iter(self._added)}
         widths: list[float] = []

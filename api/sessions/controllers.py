@@ -32,7 +32,7 @@ MOST_TRIALS = 200
 
 
 class PlanIn(Body):
-    """What a controller may play, trial by trial."""
+    """Plan of a controller's trials."""
 
     current_ma: CurrentMa
     max_pulse_width_us: WidthUs
@@ -47,7 +47,7 @@ class KeyFor(PlanIn):
 
 
 def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
-    """The plan, as it is kept with the key. Raises ApiError: 422 wider than the participant's limits."""
+    """Return the plan to store with the key. Raises ApiError: 422 wider than the participant's limits."""
     for name in ("current_ma", "max_pulse_width_us"):
         value, limit = getattr(plan, name), participant.profile.get(name)
         if limit is None or not value <= limit:
@@ -89,7 +89,7 @@ async def start(
 async def _within_plan(
     runner: Runner, store: Store, principal: Principal, body: TestIn, participant: Participant
 ) -> TestIn:
-    """The test with the plan's limits, where the plan allows it."""
+    """Return the test narrowed to the plan's limits; refuse one beyond the plan."""
     plan = principal.plan or {}
     begun = (Test.requested_by == principal.name, Test.state != "refused")  # what the rig refused was no trial
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
@@ -126,7 +126,7 @@ def _refuse_kind(principal: Principal, body: TestIn) -> None:
 
 
 def _model_sent(runner: Runner, body: TestIn, sent: Tags) -> str:
-    """The tag, of those that were sent, of the model that is served now: the approved one, or what was tracked from it.
+    """Return the sent tag that matches the model served now: the approved one, or its tracked version.
 
     A key plays at the rate of the approved model: a person who made the key chose no other.
 
@@ -172,7 +172,7 @@ KEY_SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
 
 
 def refuse_maker_without(maker: Principal) -> None:
-    """403 to whoever lacks a scope that a key holds: it may do nothing that its maker may not."""
+    """Raise 403 where the maker lacks a scope of the key: a key never has more rights than its maker."""
     lacking = [str(scope) for scope in KEY_SCOPES if not maker.may(scope)]
     if lacking:
         held_by_key = ", ".join(KEY_SCOPES)
@@ -230,7 +230,7 @@ def keys_of(auth: Auth, participant: str) -> list[dict[str, Any]]:
 
 
 def has_key(auth: Auth, participant: str) -> bool:
-    """Whether a controller has a key to a participant that opens something now."""
+    """Return whether a valid controller key exists for a participant."""
     return any(row["state"] == "valid" for row in keys_of(auth, participant))
 
 

@@ -138,7 +138,7 @@ class JointTests(Watched):
     # ---- today's ---------------------------------------------------------------------------------------------
 
     def targets(self, participant: str, shared: Layout) -> list[dict[str, Any]]:
-        """The angles to hold, and which of them were held today."""
+        """List the angles to hold, and which of them are done today."""
         targets = []
         rows = [row for row in self.today(participant) if row.kind == HELD]
         for target in shared.targets_rad:
@@ -147,7 +147,7 @@ class JointTests(Watched):
         return targets
 
     def today(self, participant: str) -> list[Test]:
-        """Guided tests of today that ended well, newest first."""
+        """List today's completed guided tests, newest first."""
         conditions = (
             Test.participant == participant, Test.kind.in_(KINDS), Test.state == "completed",
             Test.recording_id.is_not(None), Test.requested_utc >= self.clock.start_of_day_utc(),
@@ -155,7 +155,7 @@ class JointTests(Watched):
         return self.versions.store.all(Test, *conditions, order=Test.requested_utc.desc())
 
     async def overview(self, plan: messages.TestPlan, preview_s: float) -> dict[str, Any]:
-        """What is open of today's guided tests, and what they cost beside the paper's test.
+        """Return today's open guided tests, and their dose relative to the paper's test.
 
         `plan`: any plan of the participant, with its limits.
         """
@@ -177,7 +177,7 @@ class JointTests(Watched):
 
 
 def target_of(row: Test) -> float:
-    """The angle of a held test, rad; NaN where it has none."""
+    """Return the angle of a held test, rad; NaN where it has none."""
     target = (row.plan.get("angle") or {}).get("target_rad")
     return math.nan if target is None else float(target)
 

@@ -129,7 +129,7 @@ def _rounded(angle_rad: float, low: float, high: float) -> float:
 
 
 def hold_segments(curve: Curve, largest_us: float, stair_s: float, rate_hz: float) -> list[Segment]:
-    """A short staircase with rest around it."""
+    """Return a short staircase with rest around it."""
     top = curve.torque(largest_us)
     return [
         _still("rest", QUIET_S, rate_hz),
@@ -291,13 +291,13 @@ class Coverage:
 
     @property
     def share(self) -> float:
-        """Share of the needed cells that were seen, 0 to 1."""
+        """Share of the needed cells that are covered, 0 to 1."""
         needed = [cell for cell in product(range(len(ROWS)), range(self.columns)) if self.needed(*cell)]
         return sum(self.covered(*cell) for cell in needed) / len(needed)
 
     @property
     def enough(self) -> bool:
-        """Whether a test may end: at most a tenth is missing."""
+        """Return whether a test may end: at most a tenth is missing."""
         return self.share >= ENOUGH - 1e-9
 
     def missing(self) -> list[dict[str, Any]]:

@@ -85,18 +85,18 @@ class Kind:
         """Watch no test any more."""
 
     async def close(self) -> None:
-        """Let everything go."""
+        """Release all resources."""
 
     def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:  # noqa: ARG002
-        """What is kept of a test that has ended, by the name it has in the summary."""
+        """Return the summary fields of a test that has ended."""
         return {}
 
     def fit_options(self, row: Test) -> dict[str, Any]:  # noqa: ARG002
-        """How the recording is fitted."""
+        """Return the options of the recording's fit."""
         return {}
 
     def document(self, row: Test) -> dict[str, Any] | None:  # noqa: ARG002
-        """How a test of this kind stands or what became of it."""
+        """Return the state or the result of a test of this kind."""
         return None
 
 
@@ -112,7 +112,7 @@ class Kinds:
         return self._by_name.get(name, self.all[0])
 
     def documents(self, row: Test) -> dict[str, Any]:
-        """What is told of each kind alone; null for the kinds that a test is none of."""
+        """Return the part of each kind's own document; null for the other kinds."""
         kind = self[row.kind]
         return dict.fromkeys(self.parts) | ({kind.part: kind.document(row)} if kind.part else {})
 
@@ -125,7 +125,7 @@ class Watcher:
     """
 
     watching_state, failed_state = "watching", "alone"
-    """States: while all goes well, and after it did not."""
+    """States while watching, and after an error."""
     log = logging.getLogger("stimrig.sessions")
 
     def __init__(self, plan: TestPlan, status: Any, rig: RigClient, clock: Clock, publish: Callable[[], None]) -> None:
@@ -149,7 +149,7 @@ class Watcher:
         raise NotImplementedError
 
     def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
-        """Do it beside the samples, of which none may be missed."""
+        """Run it in the background, so that no sample is missed."""
         return self._tasks.begin(self._guarded(work))
 
     async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
@@ -169,7 +169,7 @@ class Watcher:
             self.publish()
 
     def problem(self, why: str) -> str:
-        """What is told where it is watched no more."""
+        """Return the problem text for a test that is no longer watched."""
         raise NotImplementedError
 
     def document(self) -> dict[str, Any]:
@@ -193,13 +193,13 @@ class Watched(Kind):
         self._task: asyncio.Task[None] | None = None
 
     def watch(self, watcher: Watcher) -> None:
-        """Watch this test from now on."""
+        """Watch this test."""
         self.unwatch()
         self.watcher, self._task = watcher, asyncio.create_task(watcher.run(self.rig.path))
 
     @property
     def watching(self) -> bool:
-        """Whether a test is being watched."""
+        """Return whether a test is being watched."""
         return self._task is not None and not self._task.done()
 
     def publish(self) -> None:
@@ -255,7 +255,7 @@ class Watched(Kind):
 
 
 def begun(row: Test) -> bool:
-    """Whether a test was ever played."""
+    """Return whether any part of a test was played."""
     return row.state not in ("requested", "refused")
 
 

@@ -177,7 +177,7 @@ class Lifecycle:
         return True
 
     async def _record_of(self, row: Test) -> tuple[Recording, str | None]:
-        """What is identified: the test's recording, or that joined to the one of the model it was made to judge."""
+        """Return the recording to identify: the test's, or the one joined to the recording of the model under test."""
         if row.model_id is not None:  # the service was restarted after its first version
             first = await asyncio.to_thread(self.versions.get, row.model_id)
             return await asyncio.to_thread(self.store.get, Recording, first.recording_id), first.parent_id
@@ -189,7 +189,7 @@ class Lifecycle:
         return await together.join(self.analyses, [model.recording_id, recording.id], row.participant), model.id
 
     def warnings(self, recording_id: str) -> list[str]:
-        """What was found doubtful about a recording, in sentences: by the rig, or when its first model was made."""
+        """Return the warnings about a recording, from the rig or from the fit of its first model."""
         with self.store.read() as session:
             return together.warnings(session, recording_id)
 

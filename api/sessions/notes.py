@@ -31,7 +31,7 @@ class Notes:
         return self.store.all(Note, Note.participant == participant, order=Note.at_utc.desc())
 
     def test_notes(self, test_id: str) -> list[Note]:
-        """The notes of one test by their time in it; those on the whole of it first."""
+        """List the notes of one test by time; those on the whole test first."""
         notes = self.store.all(Note, Note.test_id == test_id, order=Note.at_utc)
         return sorted(notes, key=lambda note: -1.0 if note.at_s is None else note.at_s)
 
@@ -102,7 +102,7 @@ class Notes:
 
 
 def duration_s(test: Test) -> float:
-    """How long a test lasted; how long it is planned to last while it runs."""
+    """Return a test's duration, s; while it runs, the planned one."""
     played = test.summary.get("duration_s")
     planned = (test.plan.get("preview") or {}).get("duration_s")
     duration = float(played if played is not None else planned or 0.0)

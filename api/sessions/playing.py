@@ -29,7 +29,7 @@ LOOK_AGAIN_S = 0.25
 
 @dataclass
 class Current:
-    """The test the rig is busy with, or that is being identified."""
+    """The test that the rig plays or that is being identified."""
 
     test_id: str
     participant: str
@@ -39,7 +39,7 @@ class Current:
     started: bool = False
     """The rig has said that it plays."""
     ending: bool = False
-    """Its end has been heard."""
+    """The rig has reported its end."""
     tokens: list[str] = field(default_factory=list)
     """Hashes of the tokens by whose right it is played."""
     until_utc: str | None = None
@@ -52,25 +52,25 @@ class Current:
     """Those of the participant that have withdrawn it."""
     state_lock: asyncio.Lock = field(default_factory=asyncio.Lock)
     missed: int = 0
-    """How often in a row the rig, asked for its state, did not name it."""
+    """Number of consecutive rig states that did not name it."""
     let_go: asyncio.Event = field(default_factory=asyncio.Event)
     """The rig is free of it."""
 
     @property
     def holder(self) -> dict[str, str]:
-        """Who holds the rig, as problems and the rig's document tell it."""
+        """Return the holder of the rig, for problems and the rig's document."""
         return {"test_id": self.test_id, "participant": self.participant, "by": self.by}
 
 
 class Playing:
-    """That test, if there is one."""
+    """Return the current test's row, if there is one."""
 
     def __init__(self, store: Store, clock: Clock, rig: RigClient) -> None:
         self.store, self.clock, self.rig = store, clock, rig
         self.current: Current | None = None
 
     def plays(self, test_id: str | None) -> bool:
-        """Whether the rig plays this test now."""
+        """Return whether the rig plays this test."""
         current = self.current
         return current is not None and current.test_id == test_id and current.started and not current.ending
 
@@ -143,7 +143,7 @@ class Playing:
             log.warning("stop after a failed start: %s", error)
 
     def is_over(self, current: Current) -> bool:
-        """Whether the right to it has ended by itself."""
+        """Return whether the right to play it has expired."""
         return current.until_utc is not None and current.until_utc <= self.clock.utc()
 
     def until_utc(self, tokens: list[str]) -> str | None:
@@ -164,7 +164,7 @@ def may_play(token: Token | None) -> bool:
 
 
 def other_than(asker: str, ran_by: str | None) -> str | None:
-    """Who ran a test, where that was not who asked for it."""
+    """Return who ran a test, where that is not the requester."""
     return ran_by if ran_by and accounts.folded_name(ran_by) != accounts.folded_name(asker) else None
 
 
@@ -179,7 +179,7 @@ def refuse_archived(participant: Participant) -> None:
 
 
 def right_ended() -> ApiError:
-    """409: by whose right it was asked for may do so no more."""
+    """Return the 409 for a requester whose right has ended."""
     detail = (
         "A controller's key ends with its day or its maker's token, and a right when it is revoked. Nothing was sent."
     )
@@ -187,7 +187,7 @@ def right_ended() -> ApiError:
 
 
 def busy(current: Current) -> ApiError:
-    """409, naming the holder."""
+    """Return the 409 that names the holder of the rig."""
     holder_name = current.by
     detail = (
         f"{current.test_id} for participant {current.participant}, started by {holder_name}, uses the rig. "

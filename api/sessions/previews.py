@@ -52,7 +52,7 @@ class Previews:
         self._previews: dict[str, Preview] = {}
 
     def add(self, body: TestIn, planned: Planned, answer: dict[str, Any], row: Participant) -> str:
-        """Keep a preview; its hash."""
+        """Store a preview and return its hash."""
         now_s, now_unix_s = self.clock.monotonic_s(), self.clock.unix_s()
         preview = Preview(body, planned, answer, dict(row.profile), site_of(row), now_s, now_unix_s)
         plan_hash = preview.hash
@@ -63,7 +63,7 @@ class Previews:
         return plan_hash
 
     def find(self, participant: str, plan_hash: str) -> Preview:
-        """A preview that may be started, or was. Raises ApiError (410): unknown, another participant's, or too old."""
+        """Return a preview. Raises ApiError (410): unknown, another participant's, or too old to start."""
         preview = self._previews.get(plan_hash)
         if preview is None or preview.body.participant != participant:
             raise _gone("It is not known, or the service was restarted since.")

@@ -53,7 +53,7 @@ def calibration(profile: Profile, now_utc: str) -> Literal["none", "valid", "exp
 
 
 def changed(profile: Profile, changes: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
-    """The profile with some limits changed, and why the calibration does not hold with it: empty where nothing is lost.
+    """Return the changed profile, and why the calibration is void with it; empty where it stays valid.
 
     What a calibration found stays where no limit is wider than it was; it goes where one is, and where the comfort
     maximum falls below the motor threshold.
@@ -77,7 +77,7 @@ def _above(name: str, value: float, was: float) -> str:
 
 
 def jumps(profile: Profile, new: Profile) -> list[str]:
-    """What rises by more than a quarter, in words: a limit, or the charge of a pulse, to which two small rises add.
+    """Describe what rises by more than a quarter: a limit, or the charge of a pulse, to which two small rises add.
 
     First limits rise from nothing.
     """
@@ -104,7 +104,7 @@ def _rise(words: str, was: float, now: float, unit: str) -> str:
 
 
 def highest(limits: Mapping[str, Bound], name: str) -> tuple[float, str]:
-    """The most that this rig takes of a limit, and whose bound that is."""
+    """Return the highest value that this rig accepts for a limit, and the owner of that bound."""
     bound = limits.get(LIMITS[name].bound)
     if bound is None or bound.hi is None:
         return LIMITS[name].highest, "any rig's"
@@ -154,7 +154,7 @@ TOLERANCE_RAD = 0.09
 
 
 def rising_range(range_rad: tuple[float, float]) -> tuple[float, float]:
-    """A range as it was sent. Raises ValueError where it is no range, or too narrow to move in."""
+    """Check a range as sent. Raises ValueError: it is no range, or too narrow to move in."""
     low, high = range_rad
     if not (high - low >= NARROWEST_RAD - 1e-9):
         narrowest = f"{math.degrees(NARROWEST_RAD):.0f}° ({NARROWEST_RAD:.2f} rad)"
@@ -163,18 +163,18 @@ def rising_range(range_rad: tuple[float, float]) -> tuple[float, float]:
 
 
 def range_of(profile: Profile) -> tuple[float, float] | None:
-    """The participant's range, rad; None where there is none."""
+    """Return the participant's range, rad, or None."""
     range_rad = profile.get(RANGE)
     return None if range_rad is None else (float(range_rad[0]), float(range_rad[1]))
 
 
 def range_outdated(profile: Profile, set_at_utc: str | None) -> bool:
-    """Whether the range was said under another calibration of the angle sensor than that of `set_at_utc`."""
+    """Return whether the range was set under another calibration of the angle sensor than that of `set_at_utc`."""
     return range_of(profile) is not None and profile.get(SET_AT) != set_at_utc
 
 
 def range_within(inner: Sequence[float], outer: Sequence[float] | None) -> bool:
-    """Whether a range lies in another one; a hair beyond it does, for degrees that were rounded."""
+    """Return whether a range lies within another, with a tolerance for rounded degrees."""
     return outer is None or (outer[0] - 1e-6 <= inner[0] and inner[1] <= outer[1] + 1e-6)
 
 

@@ -111,7 +111,7 @@ class ProfileIn(Body):
         return value
 
     def sent(self) -> dict[str, Any]:
-        """The limits that were sent, as a profile keeps them."""
+        """Return the sent limits in the form of a profile."""
         sent = self.model_dump(exclude_unset=True)
         if (range_rad := sent.get(profiles.RANGE)) is not None:
             sent[profiles.RANGE] = list(range_rad)
@@ -381,7 +381,7 @@ class TokenIn(Body):
 
 
 def limits_of(body: TestIn, participant_profile: dict[str, Any] | None) -> dict[str, Any]:
-    """The limits of a test, as fields of a `TestPlan`.
+    """Return the limits of a test, as fields of a `TestPlan`.
 
     The participant's profile stays whole (thresholds, day, rest), so that the rig judges the calibration that a person
     made; what the request narrows is added to it.

@@ -44,7 +44,7 @@ class RigClient:
         self.path, self.clock = path, clock
         self.patience_s = 5.0
         self.latches: dict[str, tuple[str, str]] = {}
-        """When and why the rig was stopped, by the id that a re-arm names."""
+        """Time and reason of the stop, by the latch id that a re-arm names."""
         self._status: messages.Status | None = None
         self.connected = False
         self.listeners: list[Callable[[AnyEvent], None]] = []
@@ -58,7 +58,7 @@ class RigClient:
 
     @property
     def status(self) -> messages.Status | None:
-        """The newest state."""
+        """Return the newest state."""
         return self._status
 
     @status.setter
@@ -75,7 +75,7 @@ class RigClient:
             self._task = asyncio.create_task(self._stay_connected(self.path), name="rig client")
 
     async def close(self) -> None:
-        """Let the rig go."""
+        """Close the connection."""
         if self._task is not None:
             self._task.cancel()
             with contextlib.suppress(asyncio.CancelledError):
@@ -83,7 +83,7 @@ class RigClient:
 
     @property
     def age_s(self) -> float | None:
-        """Seconds since the rig last spoke; None: never."""
+        """Seconds since the last message of the rig; None: never."""
         return None if self._heard_s is None else self.clock.monotonic_s() - self._heard_s
 
     async def request(self, message: Any, timeout_s: float | None = None) -> messages.Reply:
@@ -109,7 +109,7 @@ class RigClient:
             self._waiting.pop(message.id, None)
 
     async def ask(self, message: Any, timeout_s: float | None = None) -> dict[str, Any]:
-        """Ask the rig; its body, or its refusal raised as an `ApiError`."""
+        """Send a request and return the body of the reply. Raises ApiError: the rig refused."""
         reply = await self.request(message, timeout_s)
         if not reply.ok:
             problem = reply.problem
@@ -220,7 +220,7 @@ class RigClient:
             future.set_result(reply)
 
     def _receive_state(self, request: Any, reply: messages.Reply) -> None:
-        """Keep a state as it is read: who asked for it may come to it after a later one."""
+        """Store a state when it is read: its requester may resume after a later one has arrived."""
         if isinstance(request, requests.StatusRequest) and reply.ok:
             with contextlib.suppress(ValidationError):  # `ask_for` says it
                 self.status = messages.Status.model_validate(reply.body)
@@ -235,7 +235,7 @@ async def _open(path: Path, stops: bool) -> tuple[asyncio.StreamReader, asyncio.
 
 
 def tell_all(listeners: list[Callable[[Any], None]], news: Any) -> None:
-    """Tell each listener; an error in one is logged and keeps the news from nobody else, nor breaks the link."""
+    """Call each listener; an error in one is logged and affects neither the others nor the link."""
     for listener in list(listeners):
         try:
             listener(news)

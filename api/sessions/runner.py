@@ -57,7 +57,7 @@ EMERGENCY = "Use the stimulator's own emergency switch now."
 
 
 def same(confirmed: dict[str, Any], preview: dict[str, Any]) -> bool:
-    """Whether the rig would play what was shown; the torque it is estimated to give may be known better by now."""
+    """Return whether the rig would play the previewed plan; the estimated torque may differ."""
     return {**confirmed, **preview, "torque_time_nms": None} == {**confirmed, "torque_time_nms": None}
 
 
@@ -72,7 +72,7 @@ class Runner(Playing):
         self.versions, self.pool, self.trials, self.limits_lock = versions, pool, trials, limits_lock
         self.previews = Previews(clock)
         self.start_lock = asyncio.Lock()
-        """Of several starts one is prepared at a time."""
+        """Serialises the preparation of starts."""
         self.hub, self.counted = Hub(clock), StopCounter()
         self.adaptive = AdaptiveTests(clock, rig, versions, adviser, self.hub.send)
         self.joint = JointTests(clock, rig, versions, self.hub.send)
@@ -344,7 +344,7 @@ class Runner(Playing):
         return evidence
 
     async def enough(self, row: Test, by: str) -> messages.Extended:
-        """End a running test that may be ended early well: enough is known, was seen, or was borne.
+        """End a running test early as complete, where its kind allows that.
 
         Raises ApiError: 409 it does not run, or is ending; 422 it has a fixed plan.
         """
@@ -391,7 +391,7 @@ class Runner(Playing):
         self._look_for_end(status, MISSED_POLLS, f"the rig is {status.state} and no longer plays this test")
 
     def _look_for_end(self, status: messages.Status, max_missed: int, why: str) -> None:
-        """Take the current test's end as missed where so many states running did not name it.
+        """Treat the current test's end as missed after `max_missed` consecutive states that do not name it.
 
         A start under way learns by itself what became of it.
         """
@@ -480,7 +480,7 @@ class Runner(Playing):
     # ---- what clients see -----------------------------------------------------------------------------------
 
     def announce(self, test_id: str) -> None:
-        """Tell the listeners of the live channel how the test stands; in the order in which it is called."""
+        """Publish the test's state on the live channel, in call order."""
         read = asyncio.get_running_loop().run_in_executor(self._telling, self._read_document, test_id)
         read.add_done_callback(self._publish_document)
 
@@ -509,7 +509,7 @@ class Runner(Playing):
         return [self.document(row, fits) for row in rows]
 
     async def close(self) -> None:
-        """Leave what runs to the next start of the service."""
+        """Stop following; the next start of the service resumes."""
         await self._tasks.close()
         for kind in self.kinds.all:
             await kind.close()
@@ -518,6 +518,6 @@ class Runner(Playing):
 
 
 def not_what_was_seen() -> ApiError:
-    """409: a person said yes to something else."""
+    """Return the 409 for a plan that differs from the previewed one."""
     detail = "The rig would now play something else: it was set up anew. Nothing was started. Go back and check."
     return ApiError(409, "changed-meanwhile", "This page is out of date", detail)

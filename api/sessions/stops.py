@@ -23,7 +23,7 @@ CAPACITY = 200
 
 @dataclass(frozen=True)
 class StopResult:
-    """One press of the button on a page, and its answer."""
+    """A stop requested from a page, and its answer."""
 
     by: str
     reason: str
@@ -43,7 +43,7 @@ class StopLog:
         self._results: dict[str, StopResult] = {}
 
     def add(self, result: StopResult) -> str:
-        """Keep an answer; its key."""
+        """Store an answer and return its key."""
         while len(self._results) >= CAPACITY:
             self._results.pop(next(iter(self._results)))
         key = secrets.token_urlsafe(16)
@@ -51,7 +51,7 @@ class StopLog:
         return key
 
     def get(self, key: str) -> StopResult:
-        """An answer by its key; 404 where it is kept no longer."""
+        """Return an answer by its key. Raises ApiError: 404 no longer stored."""
         result = self._results.get(key)
         if result is None:
             detail = (
@@ -79,13 +79,13 @@ class StopRights:
         self._key, self.clock = key, clock
 
     def give(self, name: str, test_id: str | None) -> str:
-        """A right for the page of `name`, which shows this test or none."""
+        """Issue a signed stop right for the page of `name`, which shows this test or none."""
         claims = [name, test_id, round(self.clock.unix_s())]
         words = json.dumps(claims, separators=(",", ":"), ensure_ascii=False).encode()
         return f"{_text(words)}.{_text(self._sign(words))}"
 
     def holder(self, text: str | None, running: Collection[str | None] = ()) -> str | None:
-        """Whose page it was given to; None where it is no right, or none any more."""
+        """Return the user that the right was issued to; None where it is invalid or has expired."""
         if not text or len(text) > LONGEST or not text.isascii():
             return None
         words, _, mark = text.partition(".")

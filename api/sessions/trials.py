@@ -78,7 +78,7 @@ class Trials(Kind):
 
     @contextmanager
     def ending(self) -> Iterator[None]:
-        """Around the end of a test: who fetches a tracked model meanwhile waits, for it may be a trial."""
+        """Mark the end of a test: a fetch of a tracked model waits meanwhile, since the test may be a trial."""
         self._ending += 1
         self._settled.clear()
         try:
@@ -97,7 +97,7 @@ class Trials(Kind):
             log.warning("a trial is still being followed; the version before it is served")
 
     async def follow(self, test_id: str, last_sample_unix_s: float | None = None) -> Tracked | None:
-        """Follow a trial that has ended: what was written down, None where it is noted already and moves nothing."""
+        """Follow a trial that has ended and return its row; None where it is stored already."""
         with self.ending():
             async with self._turn:
                 trial = await asyncio.to_thread(self.tracked.open_trial, test_id)
@@ -110,7 +110,7 @@ class Trials(Kind):
         return row
 
     async def _examine(self, trial: Trial) -> dict[str, Any]:
-        """What the worker found, or why it found nothing: no trial is lost by that."""
+        """Return the worker's result, or the reason for none: no trial is lost."""
         recording: Recording | None = await asyncio.to_thread(self.store.get, Recording, trial.test.recording_id or "")
         if recording is None or trial.problem:
             return {"reason": trial.problem or "It has no recording."}
@@ -130,7 +130,7 @@ class Trials(Kind):
             return {"reason": error.detail or error.title}
 
     def _between(self, trial: Trial, recording: Recording) -> list[str]:
-        """What the muscle did since what is known of it, oldest first; nothing for a model without effects.
+        """List the recordings since the last known state, oldest first; empty for a model without effects.
 
         Where nothing was followed yet, it begins with the approved model's test.
         """
@@ -152,7 +152,7 @@ class Trials(Kind):
     # ---- the service's own day ---------------------------------------------------------------------------------
 
     def resume(self) -> None:
-        """Follow what a restart left open, and warm the worker where a model may be tracked."""
+        """Follow the trials that a restart left open, and warm the worker where a model may be tracked."""
         self._tasks.begin(self._resume())
 
     async def _resume(self) -> None:
@@ -165,7 +165,7 @@ class Trials(Kind):
             await self._warm(approval.participant)
 
     def _unfollowed(self) -> list[tuple[Approval, list[str]]]:
-        """Approvals that hold and allow tracking, each with its trials that are not noted, oldest first."""
+        """List the valid approvals that allow tracking, each with its unfollowed trials, oldest first."""
         approvals = self.store.all(Approval, Approval.approved, Approval.expires_utc > self.clock.utc())
         holding = [self.tracked.allowing(code) for code in dict.fromkeys(row.participant for row in approvals)]
         return [(approval, self._open_trials(approval)) for approval in holding if approval is not None]
@@ -180,6 +180,6 @@ class Trials(Kind):
         return [test.id for test in played if test.plan.get("approval_id") == approval.id and test.id not in noted]
 
     async def close(self) -> None:
-        """Let everything go; what is open is followed at the next start."""
+        """Release all resources; open trials are followed at the next start."""
         await self._tasks.close()
         await self.tracker.close()

@@ -70,7 +70,7 @@ def export(
 
 
 def settings_of(data: Path | None) -> Settings:
-    """The service's settings, perhaps with another data folder."""
+    """Return the service's settings, with another data folder where one is given."""
     return Settings(**set_options(data_dir=data))
 
 

@@ -45,7 +45,7 @@ def effects(
 
 
 def _own_text(path: Path, wanted: str | None, name: str) -> str:
-    """The text of an effect's file.
+    """Return the text of an effect's file.
 
     Raises InputError: the model has no such free effect, or the name is none or taken.
     """

@@ -23,7 +23,7 @@ def recover(
 
 
 def sealed(journal: Path, folder: Path | None, as_json: bool = True) -> str:
-    """Seal it in a process of its own; return what that says. Raises InputError, LaunchError: it cannot."""
+    """Seal it in a separate process and return its answer. Raises InputError, LaunchError: it cannot be sealed."""
     options = [*(["-o", str(folder)] if folder else []), *(["--json"] if as_json else [])]
     command = [sys.executable, "-m", "stimrig.rig.recover", *options, "--", str(journal)]
     ended = subprocess.run(command, capture_output=True, text=True)
