@@ -1,1 +1,1 @@
-"""Who may do what: tokens, passwords, sessions."""
+"""Users, tokens, passwords and sessions."""

@@ -28,7 +28,7 @@ from stimrig.api.store.tables import Confirmation, KnownPlace, Token, User
 CONFIRMED_S = 120.0
 """How long a password given once more is good for one approval."""
 MOST_PLACES = 20
-"""So many places of a person are remembered."""
+"""Number of places remembered for a user."""
 
 
 class People:
@@ -39,7 +39,7 @@ class People:
         self.passwords = Passwords()
 
     async def add(self, name: str, password: str, scopes: list[Scope], by: str) -> User:
-        """A new person. Raises ApiError: 409 the name is taken."""
+        """Add a user. Raises ApiError: 409 the name is taken."""
         return await asyncio.to_thread(self._add, name, await self.passwords.hash(password), scopes, by)
 
     def _add(self, name: str, hashed: str, scopes: list[Scope], by: str) -> User:
@@ -91,11 +91,11 @@ class People:
                 session.delete(old)
 
     def any(self) -> bool:
-        """Whether there is anybody who could sign in with a password."""
+        """Return whether any user exists."""
         return bool(self.store.all(User, limit=1))
 
     async def confirm(self, principal: Principal, password: str) -> None:
-        """The password once more: good for one approval within two minutes.
+        """Confirm with the password, which allows one approval within two minutes.
 
         Raises ApiError: 401 wrong password; 409 signed in with a token; 429 too many tries.
         """
@@ -109,7 +109,7 @@ class People:
         await asyncio.to_thread(self._confirm, session_hash)
 
     async def _right(self, session_hash: str, name: str, secret: str, token_hash: str | None = None) -> bool:
-        """Whether a person's password, or the token of this hash, is right that is given once more in a session."""
+        """Check a user's password, or the token of this hash, given again in a session."""
         row: User | None = None if token_hash else await asyncio.to_thread(self.store.get, User, name)
         with self.passwords.room(known=True) as lane:
             self.guesses.confirmation(session_hash)
@@ -122,7 +122,7 @@ class People:
         return right
 
     async def unlock(self, principal: Principal, secret: str) -> None:
-        """Go on in a locked session, by its person's password or by the token that it was opened with.
+        """Unlock a session by its user's password, or by the token that opened it.
 
         Raises ApiError: 401 it is not the right one; 429 too many tries.
         """
@@ -143,7 +143,7 @@ class People:
             session.merge(Confirmation(session_hash=session_hash, at_unix_s=self.clock.unix_s()))
 
     async def refuse_unconfirmed(self, principal: Principal) -> None:
-        """Refuse an approval of a person who has not given the password again.
+        """Refuse an approval by a user who has not confirmed with the password.
 
         Raises ApiError: 403 the password is asked for.
         """
@@ -156,7 +156,7 @@ class People:
             raise ApiError(403, "confirm-password", "Please confirm with your password", detail)
 
     async def is_confirmed(self, session_hash: str | None) -> bool:
-        """Whether the password need not be asked for: a token's holder has none, or it was given and not used yet."""
+        """Return whether an approval needs no password: a token has none, or it was given and not used yet."""
         if session_hash is None:
             return True
         row: Confirmation | None = await asyncio.to_thread(self.store.get, Confirmation, session_hash)
@@ -174,7 +174,7 @@ class People:
             return self._is_valid(row)
 
     async def change_password(self, name: str, password: str, principal: Principal, tags: Tags | None) -> str | None:
-        """A new password. The person's sessions end; the one that made the change goes on under a new cookie, if any.
+        """Change a password and end the user's sessions; return the new cookie of the session that made the change.
 
         Raises ApiError: 404 nobody of that name; 412 the account was changed since it was shown.
         """
@@ -202,7 +202,7 @@ class People:
             locking.write(session, row, self.clock.utc(), by, "remove user", row.name)
 
     def documents(self) -> list[dict[str, Any]]:
-        """All users, without their hashes."""
+        """List all users, without their hashes."""
         documents = []
         for row in self.store.all(User, order=User.name):
             token = self.store.get(Token, row.token_hash)
@@ -211,7 +211,7 @@ class People:
         return documents
 
     def close(self) -> None:
-        """Let the threads go."""
+        """Shut the threads down."""
         self.passwords.close()
 
     def _store_password(self, name: str, hashed: str) -> None:
@@ -233,11 +233,11 @@ def known_user(session: Session, name: str) -> User:
 
 
 MOST_STRANGERS, MOST_KNOWN = 8, 64
-"""So many wait at most; each takes some 0.1 s and 64 MB."""
+"""Checks that may wait; each takes about 0.1 s and 64 MB."""
 
 
 class Lane:
-    """One check at a time, and so many that wait."""
+    """A queue of password checks: one thread and a bounded number of waiting checks."""
 
     def __init__(self, name: str, capacity: int) -> None:
         self.threads, self.capacity, self.inside = ThreadPoolExecutor(1, name), capacity, 0
@@ -252,7 +252,7 @@ class Passwords:
     def __init__(self) -> None:
         self.hasher = PasswordHasher()  # argon2id, RFC 9106's parameters for little memory
         self.nobody = self.hasher.hash(secrets.token_hex(16))
-        """Of a password that nobody knows."""
+        """Hash of a random password, checked for unknown names."""
         self._strangers, self._known = Lane("passwords", MOST_STRANGERS), Lane("known-passwords", MOST_KNOWN)
 
     @contextmanager
@@ -270,7 +270,7 @@ class Passwords:
             lane.inside -= 1
 
     async def verify(self, lane: Lane, hashed: str | None, password: str) -> bool:
-        """Whether the password is right; as long a work where there is nobody of that name."""
+        """Check a password; takes as long for an unknown name."""
 
         def check() -> bool:
             try:
@@ -281,12 +281,12 @@ class Passwords:
         return await asyncio.get_running_loop().run_in_executor(lane.threads, check)
 
     async def hash(self, password: str) -> str:
-        """What is kept of a password."""
+        """Hash a password for storage."""
         with self.room(known=True) as lane:
             return await asyncio.get_running_loop().run_in_executor(lane.threads, self.hasher.hash, password)
 
     def close(self) -> None:
-        """Let the threads go."""
+        """Shut the threads down."""
         for lane in (self._strangers, self._known):
             lane.threads.shutdown(wait=False, cancel_futures=True)
 
@@ -294,7 +294,7 @@ class Passwords:
 # Names: with spaces and umlauts, one way to write each, and no two that look the same.
 LONGEST = 80
 NAME_MARKS = " ._@'’,()-"
-"""What a name may hold beside letters, their marks and digits."""
+"""Characters allowed in a name besides letters, their marks and digits."""
 UNSEEN = frozenset("\u034f\u115f\u1160\u17b4\u17b5\u3164\uffa0")
 """Letters and marks that nobody sees; Unicode calls them ignorable."""
 ALPHABETS = frozenset({"LATIN", "CYRILLIC", "GREEK", "ARMENIAN", "CHEROKEE"})

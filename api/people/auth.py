@@ -1,4 +1,4 @@
-"""Who may do what: bearer tokens with scopes, and a cookie session for the page's plain forms."""
+"""Authentication: bearer tokens with scopes, and cookie sessions of browsers."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from stimrig.api.store.tables import Confirmation, PageSession, Token
 LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
 MOST_SEEN = 1000
-"""So many tokens and sessions are remembered for a stop while the database is gone."""
+"""Credentials remembered for a stop while the database is unreachable."""
 
 
 ROLES = {
@@ -35,12 +35,12 @@ ROLES = {
     "reader": [Scope.READ_LIVE, Scope.READ_MODEL],
     "administrator": [Scope.ADMINISTER],
 }
-"""What a person may do, by what people call them."""
+"""Scopes of each role of a user."""
 
 
 @dataclass(frozen=True)
 class Principal:
-    """Who is asking."""
+    """The authenticated holder of a token or session."""
 
     name: str  # the token's name; goes into the audit trail
     scopes: frozenset[str]  # what the token may do; ``administer`` includes everything
@@ -54,12 +54,12 @@ class Principal:
     token_hash: str = ""  # the token's
 
     def may(self, scope: Scope) -> bool:
-        """Whether the scope is held."""
+        """Return whether the scope is held."""
         return scope in self.scopes or Scope.ADMINISTER in self.scopes
 
     @property
     def role(self) -> str:
-        """What a person calls these scopes."""
+        """Name of the role with these scopes."""
         if self.may(Scope.ADMINISTER):
             return "administrator"
         if self.may(Scope.APPROVE_MODEL):
@@ -102,7 +102,7 @@ class Auth:
             return self.revoke_within(session, token_id, by)
 
     def revoke_within(self, session: Session, token_id: str, by: str) -> bool:
-        """The same in a transaction that does more."""
+        """Revoke a token within the caller's transaction."""
         rows = [row for row in session.scalars(select(Token)) if row.hash[:16] == token_id]
         for row in rows:
             row.revoked = True
@@ -162,9 +162,9 @@ class Auth:
         )  # fmt: skip
 
     def fallen(self, token: Token) -> bool:
-        """Whether who made this key could not make it now: has been removed, or lacks a scope since.
+        """Return whether the key's creator no longer holds the required scopes.
 
-        Or the token that made it has been revoked or has expired.
+        Also true once the creator was removed, or the creating token was revoked or expired.
         """
         if token.made_by is None:
             return False
@@ -250,13 +250,13 @@ class Auth:
         return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
 
     async def authenticate(self, connection: HTTPConnection, **how: bool) -> Principal:
-        """`identify`, in threads of its own: whatever else waits for the database, it does not keep this from it."""
+        """Run `identify` in its own threads, so that other work on the database cannot delay it."""
         return await asyncio.get_running_loop().run_in_executor(
             self._threads, partial(self.identify, connection, **how)
         )
 
     async def authenticate_within(self, connection: HTTPConnection, patience_s: float, **how: bool) -> Principal:
-        """`ask`, given up after a while; what the database says later is no matter. Raises TimeoutError, too."""
+        """Run `authenticate` with a timeout. Raises also TimeoutError."""
         task = asyncio.ensure_future(self.authenticate(connection, **how))
         task.add_done_callback(lambda done: done.cancelled() or done.exception())
         async with asyncio.timeout(patience_s):
@@ -265,10 +265,10 @@ class Auth:
     def identify(
         self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False, bound: bool = False
     ) -> Principal:
-        """Who stands behind a request or a WebSocket.
+        """Return the principal of a request or a WebSocket.
 
-        A controller's key, which is bound to a participant, is refused (403) unless whoever asks looks after that
-        (`bound`): `stimrig.api.web.guards`, and stop.
+        A controller's key, which is bound to a participant, is refused (403) unless the caller checks the participant
+        itself (`bound`): `stimrig.api.web.guards`, and stop.
         """
         try:
             principal = self._identify(connection, forgive_age, forgive_lock)
@@ -293,11 +293,11 @@ class Auth:
             self._last_names.pop(self._credential(connection), None)
 
     def last_known_name(self, connection: HTTPConnection) -> str | None:
-        """Who was behind this token or session when the database was last asked: good for a stop, and nothing else."""
+        """Return the name last authenticated with this credential; it authorises a stop only."""
         return self._last_names.get(self._credential(connection))
 
     def last_known_name_on_page(self, connection: HTTPConnection) -> str | None:
-        """`seen`, for a page's session only: a controller's key opens no page, so no page gives it a right."""
+        """Return `last_known_name` of a browser's session; None for a bearer token, which opens no page."""
         return None if connection.headers.get("authorization") else self.last_known_name(connection)
 
     def _identify(self, connection: HTTPConnection, forgive_age: bool, forgive_lock: bool) -> Principal:
@@ -335,11 +335,11 @@ def outside(participant: str | None) -> ApiError:
 
 
 FLUSH_S = 15.0
-"""How often the times of the last actions are written down; so much of them is lost with a process that is killed."""
+"""Interval at which times of last actions are stored; a killed process loses at most that much."""
 
 
 class IdleLock:
-    """Which sessions are locked: one that nobody touches is, and asks for the password again, and for nothing else.
+    """Locks idle sessions, which then need the password again.
 
     Only a person's actions count, as `stimrig.api.web.guards` tells them from what scripts ask for by themselves. Times
     of actions are kept in memory and written down now and then, so that no page waits for the disk; a lock holds over a
@@ -356,7 +356,7 @@ class IdleLock:
         self._lock = threading.Lock()
 
     def locked(self, row: PageSession) -> bool:
-        """Whether this session has to be unlocked first."""
+        """Return whether this session is locked."""
         if row.locked_unix_s is not None:
             return True
         return bool(self.after_s) and self.clock.unix_s() - self._last(row) > self.after_s
@@ -369,12 +369,12 @@ class IdleLock:
         return max(row.acted_unix_s or row.created_unix_s, self._acted.get(row.hash, 0.0))
 
     def acted(self, session_hash: str) -> None:
-        """A person has just done something in this session, which is not locked."""
+        """Record a person's action in a session that is not locked."""
         with self._lock:
             self._acted[session_hash] = self.clock.unix_s()
 
     def watches(self, session_hash: str) -> None:
-        """A live view of a running test holds the lock off, but not the one that a person asked for."""
+        """Record that a live view of a running test is open, which delays the idle lock but not a manual one."""
         if session_hash not in self._locked_by_hand:
             self.acted(session_hash)
 

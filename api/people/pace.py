@@ -46,12 +46,12 @@ class Pace:
         self._swept_s = -SWEEP_S
 
     def wait_s(self, key: str) -> float:
-        """How long the next try has to wait."""
+        """Return how long the next try has to wait, s."""
         count = self._counts.get(self._slot(key))
         return 0.0 if count is None else max(0.0, count.until_s - self.clock.monotonic_s())
 
     def count(self, key: str) -> None:
-        """A try."""
+        """Count a try."""
         now = self.clock.monotonic_s()
         count = self._counts.setdefault(self._slot(key), Count())
         if now - count.last_s > FORGOTTEN_S:
@@ -62,13 +62,13 @@ class Pace:
             count.until_s = now + min(LONGEST_WAIT_S, 2.0 ** min(over, 20))
 
     def give_back(self, key: str) -> None:
-        """The try proved right: it counts no more; the wrong ones before it still do."""
+        """Uncount a try that proved right; wrong ones before it still count."""
         count = self._counts.get(self._slot(key))
         if count is not None:
             count.tries, count.until_s = max(0, count.tries - 1), 0.0
 
     def forget(self, key: str) -> None:
-        """Nothing of this key counts any more."""
+        """Forget all tries of a key."""
         self._counts.pop(key, None)
 
     def __len__(self) -> int:
@@ -87,7 +87,7 @@ class Pace:
 
 
 class Guesses:
-    """Which paces a guess is held to.
+    """Limits the rate of guesses of passwords and tokens.
 
     A person who has signed in from a place before is counted there apart from everybody else: what strangers try under
     that name, or from other places, doesn't matter there. A stranger's try counts for name and place together, for the
@@ -159,7 +159,7 @@ def refuse(wait_s: float) -> None:
 
 
 def place_of(address: str) -> str:
-    """Where a try comes from: an IPv4 address, or the part of an IPv6 address that one customer gets."""
+    """Return the origin of a try: the IPv4 address, or the /64 network of an IPv6 address."""
     try:
         parsed = ipaddress.ip_address(address)
     except ValueError:

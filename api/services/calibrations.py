@@ -25,7 +25,7 @@ from stimrig.rig import messages, requests
 
 
 def _write_begin(context: Context, by: str, code: str, values: dict[str, Any], tags: Tags) -> str:
-    """The intent; the calibration's id."""
+    """Write the intent to the audit trail and return the calibration's id."""
     with context.store.write() as session:
         version, now = locking.check(session, participants.within(session, code), tags), context.clock.utc()
         stamp = now[:19].replace("-", "").replace(":", "")
@@ -35,7 +35,7 @@ def _write_begin(context: Context, by: str, code: str, values: dict[str, Any], t
 
 
 def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
-    """How the calibration goes: what was asked for, and the participant's own current and torque where it was not.
+    """Return the calibration's settings; current and torque default to the participant's own.
 
     Raises ApiError: 422 neither the request nor the participant says one of them.
     """
@@ -51,10 +51,10 @@ async def begin(
     context: Context, code: str, body: CalibrationIn, by: str, tags: Tags, confirm: str = "",
     interactive: bool = False,
 ) -> dict[str, Any]:  # fmt: skip
-    """Open a calibration: where it stands. A person, with `ask`, is asked before a current far above the usual one.
+    """Open a calibration and return its state; `interactive`: confirm a current far above the usual one first.
 
-    What is not asked for is the participant's own, so never wider. It is bound to the limits that it is begun with: the
-    participant's version ends its id, and so is kept by the rig, which may outlive this service.
+    The calibration is bound to the limits it begins with. Its id ends in the participant's version, which the rig keeps
+    even if this service restarts.
     """
     async with context.limits_lock:
         row = await asyncio.to_thread(participants.find, context, code)
@@ -84,7 +84,7 @@ def confirm_current(row: Participant, values: dict[str, Any], confirm: str) -> N
 
 
 async def step(context: Context, code: str, body: StepIn, tags: Tags) -> dict[str, Any]:
-    """Play one train: where the calibration stands."""
+    """Play one train and return the calibration's state."""
     async with context.limits_lock:  # of two presses on the same sight one plays
         check_train(await sound(context, code), tags)
         await context.rig.ask(requests.CalibrateStepRequest(**body.model_dump()))
@@ -92,7 +92,7 @@ async def step(context: Context, code: str, body: StepIn, tags: Tags) -> dict[st
 
 
 async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags) -> dict[str, Any]:
-    """Mark the last train's width as a threshold: where the calibration stands."""
+    """Mark the last train's width as a threshold and return the calibration's state."""
     async with context.limits_lock:  # no train comes between looking and marking
         calibration = await sound(context, code)
         check_train(calibration, tags)
@@ -131,14 +131,14 @@ def another_train() -> ApiError:
 
 
 async def _waiting(context: Context, code: str) -> messages.Calibrated | None:
-    """A calibration of this participant that is closed, and was not stored."""
+    """Return a finished calibration of this participant that is not stored yet."""
     status = await context.rig.fresh_status()
     waits = status.calibrated
     return waits if waits is not None and waits.participant == code and status.calibration is None else None
 
 
 async def standing(context: Context, code: str) -> dict[str, Any]:
-    """Where the participant's calibration stands. Raises ApiError: 404 none is open for this participant."""
+    """Return the state of the participant's calibration. Raises ApiError: 404 none is open for this participant."""
     status: messages.Status = await context.rig.fresh_status()
     calibration = status.calibration
     if calibration is None or calibration.participant != code:
@@ -160,7 +160,7 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
 
 
 def outdated(context: Context, code: str, calibration: messages.CalibrationStatus) -> str:
-    """Why a calibration that is open goes no further: the participant's limits are no longer those of its beginning."""
+    """Say why an open calibration cannot go on: the participant's limits changed since it began; else empty."""
     with context.store.read() as session:
         row = participants.within(session, code)
         return _outdated_words(row) if _changed(session, row, calibration.calibration_id) else ""
@@ -175,7 +175,7 @@ def _outdated_words(row: Participant) -> str:
 
 
 def _changed(session: Session, row: Participant, calibration_id: str) -> bool:
-    """Whether limits, site or archive are others than when this calibration was begun."""
+    """Return whether limits, site or archive changed since this calibration began."""
     begun = re.fullmatch(r"C\w+-[0-9a-f]{6}-(\d{1,18})", calibration_id, re.ASCII)
     if begun is None or not locking.is_known(session, int(begun[1])):
         return True  # it began on other data than this service has
@@ -183,7 +183,7 @@ def _changed(session: Session, row: Participant, calibration_id: str) -> bool:
 
 
 async def sound(context: Context, code: str) -> dict[str, Any]:
-    """Where the calibration stands, as long as it may go on.
+    """Return the calibration's state if it may go on.
 
     Raises ApiError: 404 none is open for this participant; 409 the participant's limits were changed since it was
     begun.
@@ -202,8 +202,10 @@ def outdated_error(detail: str) -> ApiError:
 def _store(
     context: Context, code: str, result: messages.CalibrationResult, by: str, identity: str
 ) -> dict[str, Any] | None:  # fmt: skip
-    """What was found is the profile, if nothing of that was changed since; what a calibration does not look for (the
-    rest between tests) stays. Storing it again changes nothing."""
+    """Store the calibrated profile unless the limits changed since it began; return the profile.
+
+    Fields that a calibration does not measure (the rest between tests) stay. Storing it again changes nothing.
+    """
     new_profile = result.profile.model_dump() if result.profile else None
     detail = {"calibration": identity, "recordings": result.recordings}
     with context.store.write() as session:

@@ -43,7 +43,7 @@ def sensor(context: Context) -> AngleStatus:
 
 
 async def overview_of(context: Context, row: Participant) -> dict[str, Any]:
-    """What is open of today's guided tests, and the sensor; nothing of tests where there is no sensor or no range."""
+    """Return the sensor and today's open guided tests; no tests without a sensor or a range of angles."""
     status = context.rig.status
     sensor_state = (status.angle if status is not None else AngleStatus()).model_dump()
     if not sensor_state["present"] or profiles.range_of(row.profile) is None:

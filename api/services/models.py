@@ -1,4 +1,4 @@
-"""Models: approval, and trials foretold within the limits of participant and rig."""
+"""Models: approval, and pulse widths for a reference within the limits of participant and rig."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ async def invert(
     context: Context, model_id: str, reference: dict[str, Any], width_us: float | None = None,
     rise_us: float | None = None, whole: bool = True,
 ) -> dict[str, Any]:  # fmt: skip
-    """What a worker makes of a reference, within the limits of participant and rig.
+    """Invert a model for a reference torque, within the limits of participant and rig.
 
     `reference`: the torque to follow, as the verb `invert` takes it; `width_us`, `rise_us`: further limits.
     """
@@ -54,7 +54,7 @@ async def invert(
 
 
 def segments(pulse_width_us: list[float]) -> list[dict[str, Any]]:
-    """A trial of these widths between two rests, for `POST /v1/tests`."""
+    """Return a trial of these widths between two rests, for `POST /v1/tests`."""
     rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": REST_S}}
     return [rest, {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": pulse_width_us}}, rest]
 

@@ -25,7 +25,7 @@ from stimrig.rig.messages import Status
 
 
 def create(context: Context, body: ParticipantIn, by: str) -> Participant:
-    """A new participant; 409 where the code is taken, 422 where this rig would refuse its limits."""
+    """Add a participant; 409 where the code is taken, 422 where this rig would refuse its limits."""
     now = context.clock.utc()
     profile = body.profile.model_dump(exclude_none=True)
     if "profile" in body.model_fields_set:
@@ -44,12 +44,12 @@ def create(context: Context, body: ParticipantIn, by: str) -> Participant:
 
 
 def find(context: Context, code: str) -> Participant:
-    """A participant by its code; 404 where there is none."""
+    """Return a participant by its code; 404 where there is none."""
     return require_found(context.store.get(Participant, code), "participant", code, "POST /v1/participants makes one.")
 
 
 def within(session: Session, code: str) -> Participant:
-    """The same in a transaction that changes it."""
+    """Return a participant within the caller's transaction; 404 where there is none."""
     return require_found(session.get(Participant, code), "participant", code)
 
 
@@ -63,10 +63,10 @@ def change_profile(
     confirm: str = "",
     interactive: bool = False,
 ) -> Participant:
-    """Change limits of a participant: those that are asked for; the rest stays.
+    """Change the given limits of a participant; the others stay.
 
     Raises ApiError: 404 no such participant; 412 changed meanwhile; 422 beyond what the rig takes, or the first ones
-    are not whole; 409 the calibration would be lost, or with `ask` a limit jumps, and that was not confirmed.
+    are not whole; 409 the calibration would be lost, or with `interactive` a limit jumps, and that was not confirmed.
     """
     with context.store.write() as session:
         row = within(session, code)
@@ -91,7 +91,7 @@ def confirm_profile(
     confirm: str,
     interactive: bool,
 ) -> None:
-    """Ask before limits that void the calibration; a person, with `ask`, also before a jump."""
+    """Require confirmation of limits that void the calibration; with `interactive` also of a jump."""
     warnings = profiles.jumps(before, profile) if interactive else []
     if voids:
         required = context.rig.status is None or context.rig.status.require_calibration is not False
@@ -129,20 +129,20 @@ def check_limits(context: Context, profile: dict[str, Any], limits: dict[str, An
 
 
 def add_calibration_time(context: Context, limits: dict[str, Any]) -> dict[str, Any]:
-    """What is asked for; a range of joint angles holds as long as the angle sensor's calibration of now."""
+    """Add the time of the sensor's calibration to a range of angles, which is void after the next calibration."""
     if limits.get(profiles.RANGE) is None:
         return limits
     return {**limits, profiles.SET_AT: calibrated_utc(context.rig.status)}
 
 
 def calibrated_utc(status: Status | None) -> str | None:
-    """When the rig's angle sensor was calibrated; None: by nobody."""
+    """Return when the rig's angle sensor was calibrated; None: never."""
     calibration = status.angle.calibration if status else None
     return calibration.set_at_utc if calibration else None
 
 
 def effect_on_open_work(context: Context, code: str) -> str:
-    """What a change of this participant's limits means for what goes on; empty where nothing does."""
+    """Say what changed limits mean for the participant's running test or open calibration; empty without one."""
     current, status = context.runner.current, context.rig.status
     if current is not None and current.participant == code:
         return (
@@ -158,14 +158,14 @@ def effect_on_open_work(context: Context, code: str) -> str:
 
 
 def loses_calibration(row: Participant, body: MuscleIn) -> bool:
-    """Whether a calibration is lost: it was found at another site than the new one."""
+    """Return whether a new site voids the calibration."""
     is_calibrated = any(row.profile.get(name) is not None for name in profiles.CALIBRATION_FIELDS)
     pairs = zip(site_of(row), site_in(body), strict=True)
     return is_calibrated and any(before is not None and before != after for before, after in pairs)
 
 
 def site_in(body: MuscleIn) -> Site:
-    """The site that is asked for."""
+    """Return the site of a request."""
     return body.side, body.muscle, body.placement
 
 
@@ -173,10 +173,10 @@ def site_in(body: MuscleIn) -> Site:
 def change_site(
     context: Context, code: str, body: MuscleIn, by: str, tags: Tags, confirm: str = "", interactive: bool = False
 ) -> Participant:
-    """Say another site. What a calibration found at the one before does not hold for it, nor do models and keys.
+    """Change the stimulated site, which voids the calibration, models and keys of the site before.
 
     Raises ApiError: 404 no such participant; 412 changed meanwhile; 409 a test or calibration of it is under way, or
-    the calibration would be lost, or with `ask` the approved model, and that was not confirmed.
+    the calibration would be lost, or with `interactive` the approved model, and that was not confirmed.
     """
     refuse_busy(context, code)
     now, has_model = context.clock.utc(), interactive and context.versions.approved(code) is not None
@@ -258,7 +258,7 @@ def matching(store: Store, q: str = "", archived: bool | None = None) -> list[tu
 
 
 def participant_counts(store: Store) -> dict[str, int]:
-    """How many participants there are, and how many of them are archived."""
+    """Count all participants and the archived ones."""
     query = select(func.count(), func.count(Participant.archived_utc)).select_from(Participant)
     with store.read() as session:
         total, archived = session.execute(query).one()
@@ -266,7 +266,7 @@ def participant_counts(store: Store) -> dict[str, int]:
 
 
 def list_rows(store: Store, versions: Versions, participants: list[Participant]) -> list[Listed]:
-    """What the list says of each; no plans of tests and no models are read for it."""
+    """Return the list's row of each participant, without reading plans of tests or models."""
     codes = [row.code for row in participants]
     tests = _newest_rows(store, Test, Test.requested_utc, codes, Test.state, Test.requested_utc)
     models = _newest_rows(store, Model, Model.created_utc, codes, Model.fit)

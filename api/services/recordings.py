@@ -23,7 +23,7 @@ from stimrig.identify.records import HDF5_MAGIC, PARQUET_MAGIC
 
 
 def find(context: Context, recording_id: str) -> tuple[Recording, Path]:
-    """A recording and its file. Raises ApiError: 404 no such recording; 410 its file is gone."""
+    """Return a recording and its file. Raises ApiError: 404 no such recording; 410 its file is gone."""
     row = context.store.get(Recording, recording_id)
     require_found(row, "recording", recording_id, "A test's document names its recording.")
     path = Path(row.path)
@@ -67,9 +67,9 @@ async def take_in(
 
 
 def _other_owner(context: Context, code: str, principal: Principal, stated_owner: str, data: bytes, of: str) -> str:
-    """The other participant whose recording a person has decided to take in; empty: it is nobody else's.
+    """Return the other participant that the recording belongs to, as confirmed with `of`; empty: none.
 
-    Refuses what the file, or this database, says is another participant's, where nobody has decided that.
+    Raises ApiError: 409 the file or the database names another participant, and that is not confirmed.
     """
     same = Recording.file_sha256 == hashlib.sha256(data).hexdigest()
     owner = stated_owner or next(
@@ -89,7 +89,7 @@ def _other_owner(context: Context, code: str, principal: Principal, stated_owner
 
 
 async def _rename_columns(context: Context, path: Path, columns: Sequence[str], data: bytes) -> tuple[list[str], bytes]:
-    """What was assumed, and the bytes that are kept: the upload's own, or the table of ours that was made of it."""
+    """Return what was assumed, and the bytes to keep: the upload, or the CSV table converted from it."""
     if not columns:
         return [], data
     out = path.with_suffix(uploads.PLAIN)
@@ -110,7 +110,7 @@ async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str
 
 @contextlib.contextmanager
 def _about_the_upload(path: Path) -> Iterator[None]:
-    """Every reason why there is no model is about the upload, and tells nothing of this machine."""
+    """Reword errors so that they are about the upload and reveal no path of this machine."""
     try:
         yield
     except ApiError as error:

@@ -15,7 +15,7 @@ from stimrig.rig.requests import RearmRequest
 
 
 def rig_state(context: Context) -> dict[str, Any]:
-    """What is known of the rig, and how old it is."""
+    """Return the rig's last status and its age."""
     status = context.rig.status
     current = context.runner.current
     return {

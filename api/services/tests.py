@@ -14,12 +14,12 @@ from stimrig.api.store.tables import Test
 
 
 def find(context: Context, test_id: str) -> Test:
-    """A test by its id; 404 where there is none."""
+    """Return a test. Raises ApiError: 404 there is none of this id."""
     return require_found(context.store.get(Test, test_id), "test", test_id, LISTED)
 
 
 def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tags: Tags) -> Test:
-    """Note who ran a test at the rig. Raises ApiError: 404 no such test; 412 it was said meanwhile."""
+    """Note who ran a test at the rig. Raises ApiError: 404 no such test; 412 it was changed since."""
     with context.store.write() as session:
         row = require_found(session.get(Test, test_id), "test", test_id, LISTED)
         locking.check(session, row, tags)

@@ -77,12 +77,12 @@ def _mentions(value: Any, names: set[str]) -> bool:
 
 
 def left_of(entries: list[AuditEntry]) -> str:
-    """Digest of what stays of entries whose content is taken away."""
+    """Return the digest of the fields that blanked entries keep."""
     return digest(canonical([[entry.seq, entry.at_utc, entry.who, entry.action, entry.hash] for entry in entries]))
 
 
 def vouched(entries: list[AuditEntry]) -> set[int]:
-    """Numbers of the entries that a later, sound one says it has left as they are now."""
+    """Return the numbers of blanked entries that a later, valid entry vouches for."""
     numbers: set[int] = set()
     for entry in entries:
         if entry.action == ERASE and entry.hash == entry_hash(entry.as_dict()):
@@ -97,7 +97,7 @@ def vouched(entries: list[AuditEntry]) -> set[int]:
 
 
 def blank(entry: AuditEntry) -> int | None:
-    """By which entry it was blanked; None: it has its content."""
+    """Return the number of the entry that blanked this one; None: it has its content."""
     return entry.detail["erased"] if entry.subject == ERASED and list(entry.detail) == ["erased"] else None
 
 

@@ -61,7 +61,7 @@ class Store:
             yield session
 
     def get(self, table: type[Any], key: Any) -> Any:
-        """One row by its key, or None."""
+        """Return a row by its key, or None."""
         with self.read() as session:
             return session.get(table, key)
 
@@ -101,7 +101,7 @@ class Store:
         return row.value
 
     def close(self) -> None:
-        """Let the connections go."""
+        """Close the connections."""
         self.engine.dispose()
 
 
@@ -118,7 +118,7 @@ def why_not_opened(error: Exception, safe_url: str) -> str:
 
 CONNECT_S, POOL_S = 3, 5
 OTHER_WRITER_MS = 10_000
-"""How long one waits for another writer."""
+"""Timeout for another writer's lock."""
 SERVER_SETTINGS = {
     "lock_timeout": OTHER_WRITER_MS,
     "statement_timeout": 30_000,

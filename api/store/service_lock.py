@@ -67,7 +67,7 @@ class ServiceLock:
         self.write_holder(self._address)
 
     def write_holder(self, address: str) -> None:
-        """Write down who holds it, for whoever comes second."""
+        """Write this process into the lock files, for the message of a second start."""
         self._address = address
         words = {"pid": os.getpid(), "host": socket.gethostname(), "since_utc": self._since_utc, "address": address}
         for file in self._files.values():
@@ -97,7 +97,7 @@ class ServiceLock:
             log.warning("whether the lock is still held cannot be seen: %s", error)
 
     def release(self) -> None:
-        """Let go."""
+        """Release all locks."""
         while self._files:
             self._files.popitem()[1].close()
         if self._database is not None:

@@ -1,7 +1,7 @@
-"""What a route asks of whoever comes: a scope, of a session's form its CSRF token, of a decision its version.
+"""Dependencies that authorise a request: scopes, the CSRF token of a session, `If-Match`, and the right to stop.
 
-Also what a controller's key opens: the routes in `OPEN` for its participant, and nothing else. `Auth.identify` refuses
-a bound key to whoever does not ask here, so a new route is closed to it. What a trial may be: `api.sessions.trials`.
+A controller's key opens the routes in `OPEN` for its participant only. `Auth.identify` refuses a bound key unless it is
+called from here, so a new route is closed to keys. `api.sessions.trials` limits the trials that a key may play.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from stimrig.api.store.tables import Model, Participant, Recording, Test
 from stimrig.api.web.middleware import SAFE_METHODS, STOP, entity_tags, wants_html
 
 POLLED = ("/rig/", "/v1/jobs/")
-"""What pages ask for again and again by themselves."""
+"""Paths that scripts of pages poll."""
 BEARER = HTTPBearer(scheme_name="token", description="a token, or a controller's key", auto_error=False)
 SESSION = APIKeyCookie(
     name="stimrig_session", scheme_name="session", auto_error=False,
@@ -64,7 +64,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
 
 
 async def identified(request: Request) -> Principal:
-    """Who asks; where it is a person's own doing, the session is not idle."""
+    """Authenticate a request; a person's own action restarts the idle time of the session."""
     context = request.app.state.context
     auth, principal = context.auth, await context.auth.authenticate(request, bound=True)
     if principal.participant is not None:
@@ -93,7 +93,7 @@ def _page_version(store: Store, request: Request) -> int:
 
 
 def is_action(request: Request) -> bool:
-    """Whether a person did something, as far as a request tells: what scripts read by themselves is nobody's action."""
+    """Return whether a request is a person's action; what scripts poll is not."""
     if request.method not in SAFE_METHODS:
         return True
     by_script = request.headers.get("sec-fetch-dest") == "empty"
@@ -177,7 +177,7 @@ def _opens(registry: Versions, participant: str, method: str, path: str) -> bool
 
 
 def _approved(registry: Versions, participant: str, model_id: str) -> bool:
-    """Whether a person allows this version today: the approved one, or one tracked from it. Raises ApiError (409)."""
+    """Return whether a version is approved today, or tracked from the approved one. Raises ApiError (409)."""
     approval = registry.approved(participant)
     if approval is None:
         raise unapproved(participant)
@@ -200,13 +200,13 @@ def set_cookie(context: Any, answer: Response, cookie: str) -> None:
 
 
 def local(target: str) -> str:
-    """An address on this host, or the first page."""
+    """Return the address if it is on this host, else that of the first page."""
     plain = target.startswith("/") and not target.startswith("//") and target.isprintable() and "\\" not in target
     return target if plain else "/"
 
 
 MOST_TAGS = 20
-"""Of `If-Match`: the others are not read."""
+"""Tags of `If-Match` that are read; further ones are ignored."""
 
 
 def if_match(document: str, needed: bool = True) -> Any:
@@ -246,7 +246,7 @@ Right = Annotated[object, Security(RIGHT)]
 
 @dataclass(frozen=True)
 class Press:
-    """A stop that is allowed: who pressed it, and why; a controller's key is told of no other participant."""
+    """An authorised stop. With `by_key` the answer names no other participant."""
 
     by: str
     reason: str
@@ -277,7 +277,10 @@ async def anyone_who_may_stop(request: Request, _token: Token, _session: Session
 
 
 async def _signed_in(request: Request, reason: str) -> Press:
-    """Who is signed in; where the database does not say so at once, who was when it last did. Raises ApiError."""
+    """Return the press of a signed-in user; without the database, of the last user known for the credential.
+
+    Raises ApiError: nobody is signed in, or nobody is known.
+    """
     auth = request.app.state.context.auth
     try:
         principal = await auth.authenticate_within(request, PATIENCE_S, forgive_age=True, bound=True)

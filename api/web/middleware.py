@@ -104,7 +104,7 @@ def entity_tags(field: str) -> list[str]:
 
 
 def wants_html(request: HTTPConnection) -> bool:
-    """Whether a browser's navigation or form asked, not a program."""
+    """Return whether a browser's navigation or form sent the request."""
     return "text/html" in request.headers.get("accept", "")
 
 
@@ -232,7 +232,7 @@ async def _refuse_form() -> Message:
 
 
 def sound(body: bytes) -> Any:
-    """What JSON says; None where it says nothing. Refused where it would be read in two ways, or no route takes it.
+    """Return the parsed JSON; None for an empty or invalid body, which the route refuses with the field's name.
 
     Raises HTTPException: 400, with what is wrong in one line.
     """

@@ -50,7 +50,7 @@ async def show(request: Request, context: Ctx, _principal: Tester, code: str) ->
         "step_us": f"{low_us:g} to {high_us:g} µs",
     }
     return page(
-        request, "calibration.html", participant=row, found=standing, waits=waits, marks=MARKS,
+        request, "calibration.html", participant=row, calibration=standing, waits=waits, marks=MARKS,
         last=last(row.profile), texts=texts, help=help_texts,
     )  # fmt: skip
 

@@ -18,12 +18,12 @@ from stimrig.api.web.pages.render import identify_viewer, page, problem_page
 
 router = APIRouter(include_in_schema=False)
 FIRST_ROWS = 50
-"""So many participants are on the first page; a search, or one click, finds the others."""
+"""Participants listed on the first page before *all* is chosen."""
 
 
 @dataclass(frozen=True)
 class Search:
-    """What the list is asked for: a part of the code, the archive, all of them."""
+    """Filter of the list: a part of the code, the archive, all rows."""
 
     q: str = ""
     archived: bool = False

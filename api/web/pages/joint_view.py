@@ -35,7 +35,7 @@ async def show(request: Request, context: Ctx, _principal: Tester, code: str) ->
         problem = error
         overview = {"sensor": joint.sensor(context).model_dump(), "range_rad": None, **joint.NOTHING_OPEN}
     gathered = await asyncio.to_thread(_gather, context, row, overview)
-    return page(request, "joint.html", participant=row, found=overview, problem=problem, **gathered)
+    return page(request, "joint.html", participant=row, overview=overview, problem=problem, **gathered)
 
 
 def _gather(context: Context, row: Participant, overview: dict[str, Any]) -> dict[str, Any]:

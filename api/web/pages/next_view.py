@@ -33,7 +33,7 @@ RIG_ADVICE = {
     "latched": REARM, "uncertain": REARM, "unreachable": SILENT, "silent": SILENT,
     "disconnected": "A device is not connected. See above what to check.",
 }  # fmt: skip
-"""What to do about a rig that plays nothing."""
+"""Advice on a rig that plays nothing, by its state."""
 BEFORE = {
     "poor": "The last model is not usable.",
     "rejected": "The last model was rejected.",
@@ -126,7 +126,7 @@ def _under_way(now: Situation) -> Step | None:
 
 
 def _playing(now: Situation) -> str:
-    """What their open test does, as far as it is known."""
+    """Describe the open test's progress."""
     if now.state == "identifying":
         return "The test is done. The model is being made; it takes a few seconds."
     if now.rig in ("unreachable", "silent"):
@@ -156,7 +156,7 @@ def _model_waits(now: Situation) -> Step | None:
 
 
 def _rig_stands(now: Situation) -> Step | None:
-    """What keeps the rig from playing anything, a controller's trials, too."""
+    """Wait for the rig, or re-arm it, while it plays nothing."""
     words = RIG_ADVICE.get(now.rig)
     has = f"{_has_model(now)} " if now.served_until else ""
     kind: Kind = "rearm" if now.rig in ("latched", "uncertain") else "wait"
@@ -212,14 +212,14 @@ def _test_waits(now: Situation) -> Step:
 
 
 def _before(now: Situation) -> str:
-    """What came of the last test where it gave no model to approve; with a space at its end, or empty."""
+    """Describe the last test if it gave no model to approve; ends with a space, or empty."""
     if now.of != "joint" and now.model is not None and now.model.verdict == "not usable":
         return f"{BEFORE['poor']} "
     return f"{BEFORE['rejected']} " if now.of != "joint" and now.rejected else _ended(now)
 
 
 def _ended(now: Situation) -> str:
-    """How the newest test ended where it gave nothing; with a space at its end, or empty."""
+    """Describe how the newest test ended if it gave nothing; ends with a space, or empty."""
     words = (TRIAL_BEFORE if now.of == "trial" else BEFORE).get(now.state)
     return f"{words} " if words else ""
 
@@ -292,6 +292,6 @@ def _kind_of(test: Test | None, models: list[dict[str, Any]]) -> Literal["test",
 
 
 def _counts(version: dict[str, Any]) -> bool:
-    """Whether a version counts: not a rejected one, nor one in last time's structure where the plain one is better."""
+    """Return whether a version counts: not rejected, nor with a carried structure where the plain one is better."""
     offered = version["carried_from_id"] is None or (version["carried"] or {}).get("offered") != "plain"
     return version["decision"] == "approved" or (version["decision"] is None and offered)

@@ -31,7 +31,7 @@ NEWEST = 30
 
 
 def rows_shown(request: Request) -> int | None:
-    """How many rows of a long table are asked for; None: all."""
+    """Return the requested number of rows of a long table; None: all."""
     return None if request.query_params.get("all") else NEWEST
 
 
@@ -60,10 +60,10 @@ def zone(context: Context) -> str:
 
 
 async def identify_viewer(request: Request) -> None:
-    """Find out who looks at a page that anybody may see, for its bar.
+    """Identify the viewer of a public page, for its bar.
 
-    Nobody, where the database does not answer at once: what a stop did is said all the same, and the stop button is
-    there for who was signed in when the database last answered.
+    Without an answer of the database the page has no viewer, and its stop button has the right of the last user known
+    for the session.
     """
     if getattr(request.state, "principal", None) is not None:
         return
@@ -79,7 +79,7 @@ async def identify_viewer(request: Request) -> None:
 
 
 def stop_right(request: Request, principal: Principal | None) -> str | None:
-    """What the page's stop button is good for; the answer to a stop keeps the right that was used, and no longer."""
+    """Return the right of the page's stop button; the answer to a stop keeps the right that was used."""
     if principal is None:
         return getattr(request.state, "stop_right", None)
     return _right_of(request.app.state.context, principal.name)
@@ -91,7 +91,7 @@ def _right_of(context: Context, name: str) -> str:
 
 
 def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
-    """What every page has at its top."""
+    """Return the values of the bar at the top of every page."""
     return {
         "rig": context.rig.status,
         "connected": context.rig.connected,
@@ -175,7 +175,7 @@ def torque_now(context: Context) -> tuple[float | None, float | None]:
 
 
 def rig_now(context: Context, principal: Principal | None) -> dict[str, Any]:
-    """What the rig does now. Without a sign-in: the state only, nothing about a participant."""
+    """Return the rig's state. Without a sign-in: the state only, nothing about a participant."""
     state = state_of(context)
     if state in ("arming", "running") and plays_passive(context):
         state = PASSIVE
@@ -211,7 +211,7 @@ def notice_key(context: Context, state: str) -> str:
 
 
 def what_to_check(reason: str) -> str:
-    """What a person should check before pressing *Reconnect*."""
+    """Return what to check before pressing *Reconnect*."""
     if reason.startswith(("load cell", "load_cell")):
         return "Check the cable and the power of the load cell. Then press Reconnect."
     if reason.startswith("stimulator"):

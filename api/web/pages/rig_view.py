@@ -1,4 +1,4 @@
-"""What scripts on every page ask for: the rig's state; and the page that tells what a stop did."""
+"""The rig's state, which scripts on every page poll, and the page of a stop's result."""
 
 from __future__ import annotations
 
@@ -40,4 +40,4 @@ async def stopped(request: Request, context: Ctx, key: str) -> Response:
     await identify_viewer(request)
     if isinstance(stop.answer, ApiError):
         return page(request, "problem.html", stop.answer.status, problem=stop.answer, back=None)
-    return page(request, "stop.html", told=stop, evidence=stop.answer)
+    return page(request, "stop.html", stop=stop, evidence=stop.answer)

@@ -1,4 +1,4 @@
-"""What is looked at: a test."""
+"""The page of a test."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ async def test(request: Request, context: Ctx, _principal: LiveReader, test_id: 
 
 
 def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
-    """What the test was started with: its current, the torque that stops it, and the widest pulse."""
+    """Return the limits of the test: its current, the torque that stops it, and the widest pulse."""
     profile = row.plan.get("profile") or {}
     rig = status.limits.get("torque_nm") if status else None
     torque_nm = [profile.get("max_torque_nm"), row.plan.get("max_torque_nm"), rig.hi if rig else None]
@@ -71,7 +71,7 @@ async def draw_ended(context: Context, row: Test) -> dict[str, Any]:
 
 
 async def measured(context: Context, model_id: str) -> Markup | None:
-    """What was measured, with the model's free run; None where it cannot be had."""
+    """Draw the measured torque with the model's free run; None without curves."""
     row = await asyncio.to_thread(context.versions.get, model_id)
     measurements = await measurement(context, row)
     if measurements["curves"] is None:
