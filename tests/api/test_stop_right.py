@@ -107,7 +107,7 @@ def test_a_page_has_its_stop_button_while_the_database_does_not_answer(
     browser, stranger = person(service), service.client(token=None, headers=HTML)
     browser.get("/")
     running(service, participant)
-    monkeypatch.setattr(service.context.auth, "ask", database)
+    monkeypatch.setattr(service.context.auth, "authenticate", database)
     shown = browser.get("/nowhere")
     assert shown.status_code == 404
     assert CONFIRMED in press(service, right_on(shown.text)).text
@@ -125,7 +125,7 @@ def test_no_page_gives_a_right_to_a_key_or_to_who_was_told_no_since(
     assert removed.get("/").status_code == 200
     remove(removed, client, service)
     assert 'action="/v1/stop"' not in removed.get("/nowhere").text
-    monkeypatch.setattr(service.context.auth, "ask", gone)
+    monkeypatch.setattr(service.context.auth, "authenticate", gone)
     for stranger in (by_key, as_cookie, removed):
         assert 'action="/v1/stop"' not in stranger.get("/nowhere").text
 
