@@ -98,7 +98,7 @@ def begun(path: Path) -> float | None:
         with path.open("rb") as file:
             if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                 return None
-        from stimrig.identify.records.recording import attributes  # here: a table does not wait for h5py
+        from stimrig.identify.records.recording import attributes  # imported here: a table needs no h5py
 
         return datetime.fromisoformat(attributes(path, ["created_utc"])["created_utc"]).timestamp()
     except (identify.IdentifyError, OSError, ValueError, OverflowError):
@@ -163,7 +163,7 @@ def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, A
     progress(0.1, "looking through the recordings")
     for path in sorted(Path(folder).glob("**/*.h5")):
         if path.name.startswith(PREFIX):
-            continue  # what somebody sent in is no recording of this rig, whatever test it names
+            continue  # an upload is no recording of this rig, whatever test it names
         try:
             fields = attributes(path, ["test_id", "recording_id", "outcome", "reason"])
         except identify.IdentifyError:

@@ -23,7 +23,7 @@ def whole_file(path: Path) -> Iterator[IO[bytes]]:
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):  # not every file system brings a folder's list of files to the disk
+    with contextlib.suppress(OSError):  # not every file system can sync a directory
         to_disk(path.parent)
 
 

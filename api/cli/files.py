@@ -187,7 +187,7 @@ def story_of(record: Any, explained: Any, structure: Sequence[str]) -> dict[str,
         with_experiment(record, explained.left, final_structure),
     )
     improvement, left_open = explained.improvement.to_dict(), only_open(vars(explained.left)) or {}
-    # of what is left open the last diagnosis speaks
+    # the last diagnosis describes what is left open
     improvement["refused"] = [row for row in improvement["refused"] if row["effect"] != left_open.get("effect")]
     narrative = story(step_versions(improvement), before["comparison"], after["comparison"], *diagnoses)
     words = in_words(structure)

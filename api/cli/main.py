@@ -101,8 +101,8 @@ def _options(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run a verb and leave with its exit code."""
-    # The libraries make half a million objects that all stay: to go through them again and again, and once more at the
-    # end, takes longer than a fit.
+    # The libraries allocate half a million permanent objects; collecting garbage among them, repeatedly and at exit,
+    # takes longer than a fit.
     gc.set_threshold(50_000)
     computes = COMPUTES.intersection(sys.argv[1:2] if arguments is None else arguments[:1])
     signal.signal(signal.SIGINT, _interrupt if computes else signal.default_int_handler)
@@ -128,7 +128,7 @@ def run(arguments: list[str] | None = None) -> int:
             raise KeyboardInterrupt
         return code if isinstance(code, int) else 0
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the reader has gone; nothing to say to nobody
+        os.dup2(os.open(os.devnull, os.O_WRONLY), 1)  # the reader has closed the pipe
         return 0
     except (Exception, KeyboardInterrupt) as error:
         if isinstance(error, KeyboardInterrupt | typer.Abort) or interrupted.is_set():  # a library may have changed it

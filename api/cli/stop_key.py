@@ -54,7 +54,7 @@ def in_foreground(descriptor: int) -> bool:
     """Tell whether it is a terminal whose keys are for this program."""
     try:
         return os.isatty(descriptor) and os.tcgetpgrp(descriptor) == os.getpgrp()
-    except OSError:  # not the controlling terminal: nobody takes turns on it
+    except OSError:  # not the controlling terminal: it has no foreground process group
         return True
 
 
@@ -70,7 +70,7 @@ def at_rig(path: Path, stray: Callable[[], bool] = lambda: True) -> Callable[[],
 
     async def stop() -> str:
         rig = RigClient(path, Clock())
-        with contextlib.suppress(Exception):  # one that does not say what it does is stopped
+        with contextlib.suppress(Exception):  # a rig without a readable state is stopped
             if stray() and (await rig.ask(StatusRequest(), STATUS_S)).get("state") in IDLE:
                 return NOTHING
         try:
@@ -87,7 +87,7 @@ def at_service(url: str, token: str, stray: Callable[[], bool] = lambda: True) -
 
     def stop() -> str:
         with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}) as client:
-            with contextlib.suppress(Exception):  # nothing in a look may prevent a stop
+            with contextlib.suppress(Exception):  # an error of this query must not prevent a stop
                 if stray() and _rests(client.get("/v1/rig", timeout=STATUS_S).raise_for_status().json()):
                     return NOTHING
             try:

@@ -133,7 +133,7 @@ class Analyses:
             return known
         call = self.running.get(key)
         if call is not None and call.background and not background and call.progress < HALF_DONE:
-            self.pool.cancel(call)  # somebody waits now: on a busy machine low priority could take minutes
+            self.pool.cancel(call)  # a request waits now; at low priority a busy machine could take minutes
             call = None
         if call is None:
             call = self.running[key] = self.pool.submit(verb or kind, background=background, data=path, **arguments)

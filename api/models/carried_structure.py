@@ -58,7 +58,7 @@ async def carry(analyses: Analyses, plain: Model, path: str, on_call: OnCall | N
         return plain
     try:
         carried = await analyses.run("carry", on_call, data=path, model_json=stored_model.text(earlier), **how)
-    except (ApiError, OSError, ValueError) as error:  # all that a call can end with
+    except (ApiError, OSError, ValueError) as error:  # every error of a worker's call
         carried = {"json": None, "found": _not_carried(error)}
     return await asyncio.to_thread(_store, analyses.versions, carried, plain, earlier)
 
@@ -120,7 +120,7 @@ def carried_context(versions: Versions, row: Model, diagnosis: dict[str, Any] | 
     if carried is None or carried["why"] == "plain-before":
         return None
     is_plain, earlier = row.carried_from_id is None, versions.get(carried["from_model_id"])
-    wanted = set() if diagnosis is None else asked_for(diagnosis)  # what it only names, it does not ask for
+    wanted = set() if diagnosis is None else asked_for(diagnosis)  # effects that are only named are not requested
     missing = [entry for entry in (diagnosis or {}).get("missing", []) if entry["effect"] in wanted]
     known = [effect["effect"] for effect in carried["effects"]]
     reappearing = {entry["effect"] for entry in missing} & {*carried["no_longer_needed"], *carried["undecided"]}

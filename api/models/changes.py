@@ -186,7 +186,7 @@ def dose_words(charge_uc: float | None) -> str:
 
 def uncertain_words(value: float | None, uncertainty: float | None, name: Name, sign: bool = False) -> str:
     """Format a value with twice its uncertainty, without the unit; a difference has its sign."""
-    if uncertainty and name.digits is None:  # as many digits as are known
+    if uncertainty and name.digits is None:  # digits follow the uncertainty
         name = replace(name, digits=max(0, _digits(BEYOND * uncertainty * name.factor) - 1))
     words = value_words(value, name, unit=False)
     if sign and value is not None and not words.startswith("−"):

@@ -306,7 +306,7 @@ class Versions:
             people = {row.code: row for row in of}
             for decision in session.scalars(query.execution_options(yield_per=AT_ONCE)):
                 if len(newest) == len(people):
-                    break  # years of decisions are not read for today's
+                    break  # avoids reading years of decisions
                 if not decision.approved:
                     rejected.add(decision.model_id)
                 elif decision.model_id not in rejected and holds_at(decision.site, people[decision.participant]):
@@ -334,7 +334,7 @@ class Versions:
         try:
             served = self.served(participant)
         except ApiError as error:
-            if error.detail not in self._damaged:  # told once, not at every look
+            if error.detail not in self._damaged:  # logged once, not on every read
                 self._damaged.add(error.detail)
                 log.warning("%s Without it no torque-time is estimated.", error.detail)
             return None

@@ -85,7 +85,8 @@ async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs
     """
     paths = [await asyncio.to_thread(analyses.path, part) for part in parts]
     settings = analyses.settings
-    export = settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"  # all that a worker may write to
+    # the only folder that a worker may write to
+    export = settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"
     path = settings.recordings_dir / export.name
     try:
         joined = await analyses.run("join", urgent=True, parts=paths, out=str(export), needs=list(needs))

@@ -146,7 +146,7 @@ class TrackedVersions:
             The row; None where the trial had been noted.
         """
         approval, step = trial.approval, result.get("step")
-        with self.store.write() as session:  # no approval slips in between looking and writing
+        with self.store.write() as session:  # no approval can be made between the check and the write
             if session.get(Tracked, trial.test.id) is not None:
                 return None
             holding = self.versions.approved(approval.participant)

@@ -160,7 +160,7 @@ class Trend:
         sessions.sort(key=lambda session: session.at_utc)
         by_test = {test_id: session for session in sessions for test_id in session.test_ids}
         by_day = {local_day(session.at_utc): session for session in sessions}
-        for note in notes:  # what is noted on a day without a session is left out
+        for note in notes:  # notes on days without a session are left out
             if (owner := by_test.get(note.test_id or "") or by_day.get(local_day(note.at_utc))) is not None:
                 owner.notes.append(note)
         return sessions, {row.id: row for row in models}
@@ -184,7 +184,8 @@ def _session(
     if approval is not None:
         candidates = [row for row in rows if row.id == approval.model_id]
     model = max(candidates, key=lambda row: (row.recorded_utc, row.created_utc))
-    own_tests = [test for test in tests if test.id == model.test_id] or tests  # a joined recording is of all its tests
+    # a joined recording belongs to all of its tests
+    own_tests = [test for test in tests if test.id == model.test_id] or tests
     charges = [test.charge_uc for test in tests if test.charge_uc is not None]
     return Session(
         key, model.recorded_utc, model, len(rows), approval, own_tests[-1].current_ma if own_tests else None,

@@ -133,7 +133,7 @@ class Follower(Watcher):
         self._tasks.begin(self._release(self._turn.scheduled))
 
     async def _release(self, scheduled: int) -> None:
-        with contextlib.suppress(ApiError):  # then it plays on once the rig's patience is over
+        with contextlib.suppress(ApiError):  # without this request the test continues after the rig's timeout
             await self.rig.ask(ExtendRequest(test_id=self.plan.test_id, key=self.key, after=scheduled, segments=[]))
 
     def document(self) -> dict[str, Any]:
@@ -144,7 +144,7 @@ class Follower(Watcher):
         measured_nm_s = 0.0 if self._newest is None else self._newest.torque_time_nms
         return {**limits, "torque_time_nm_s": measured_nm_s, **asdict(self.status)}
 
-    # ---- what the rig says ----------------------------------------------------------------------------------
+    # ---- events of the rig ----------------------------------------------------------------------------------
 
     def hear(self, event: LiveEvent) -> None:
         """As `Watcher`."""
@@ -157,7 +157,7 @@ class Follower(Watcher):
         left_s = self._left_s(event.elapsed_s)
         idle = self._deciding is None or self._deciding.done()
         turn = self._turn
-        early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # on a busy machine at once
+        early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # earlier on a busy machine
         least_s = LEAST_S + 2.0 / self.plan.pulse_rate_hz
         if idle and not turn.sent and event.elapsed_s >= least_s and left_s <= (early_s, LATE_S, -1.0)[turn.questions]:
             turn.questions = 2 if left_s <= LATE_S else 1
@@ -178,7 +178,7 @@ class Follower(Watcher):
     # ---- deciding ------------------------------------------------------------------------------------------
 
     async def _decide(self, turn: Turn) -> None:
-        # the newest event of all that were heard until now: news of pulses and what is laid belong together
+        # the newest event: outcomes of pulses and scheduled segments must be of the same event
         event, received_s, news, self._new = self._newest, self._received_s, self._new, News()
         assert event is not None
         widths, segments = self._played_so_far(event)
@@ -198,7 +198,7 @@ class Follower(Watcher):
 
     def _note(self, document: dict[str, Any], event: LiveEvent, received_s: float) -> Advice:
         status, known = self.status, document["knowledge"]
-        # a misfit is told as the problem, and its bands mean nothing; at the end those stay on which it was decided
+        # a misfit is reported as the problem, its bands are meaningless; the bands of the final decision stay
         fits = document["kind"] != "misfit" and not self.status.ended
         if fits:
             status.words = document["words"]
@@ -235,15 +235,15 @@ class Follower(Watcher):
         request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.scheduled, segments=chosen)
         if ended:
             request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
-            # at once: what comes while the rig answers is neither asked about, nor told as what the end was decided on
+            # before the request: samples that arrive during it are not part of this decision
             self.status.state, self.status.ended = "ending", self.status.ended or ended
         self._added += (widths := [segment.settings["pulse_width_us"] for segment in chosen])
         try:
             await self.rig.ask(request)
-        except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, and then it is asked again
+        except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, then it decides again
             if ended:
                 self.status.state, self.status.ended = before
-            if error.code == "rig-unreachable":  # whether it was laid is not known, nor what plays from now on
+            if error.code == "rig-unreachable":  # unknown whether it was scheduled, and what plays next
                 raise
             del self._added[len(self._added) - len(widths) :]
             self._write(advice, refused=error.detail)
@@ -266,9 +266,8 @@ class Follower(Watcher):
         segments = []
         for segment in event.laid_segments:
             count = round(segment.end_s * rate_hz) - len(widths)
-            source_widths = (
-                next(sources[segment.by], []) if segment.by in sources else []
-            )  # rest, while it waits or ends
+            # other segments are rest: the test waits or ends
+            source_widths = next(sources[segment.by], []) if segment.by in sources else []
             segments.append((segment.name, len(widths), len(widths) + count))
             widths += [*source_widths, *[0.0] * count][:count]
         return widths, segments

@@ -69,13 +69,13 @@ async def start(
     """
     if principal.participant is None:
         return await runner.start(body, principal.name, holder=principal.token_hash, tags=tags)
-    async with lock:  # no two trials share the last one that is left
+    async with lock:  # two requests must not both use the last remaining trial
         try:
             _refuse_kind(principal, body)
             participant: Participant = await asyncio.to_thread(store.get, Participant, principal.participant)
             model = await asyncio.to_thread(_model_sent, runner, body, tags or ())
             body = await _within_plan(runner, store, principal, body, participant)
-            version = (str(participant.version),)  # what the plan and the model were looked at with
+            version = (str(participant.version),)  # the version that plan and model were checked against
             return await runner.start(body, principal.name, holder=principal.token_hash, tags=version, model=model)
         except ChangedError:
             raise trial_overtaken() from None
@@ -91,7 +91,7 @@ async def _within_plan(
 ) -> TestIn:
     """Return the test narrowed to the plan's limits; refuse one beyond the plan."""
     plan = principal.plan or {}
-    begun = (Test.requested_by == principal.name, Test.state != "refused")  # what the rig refused was no trial
+    begun = (Test.requested_by == principal.name, Test.state != "refused")  # tests that the rig refused do not count
     if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
         raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
     limits: dict[str, Any] = {}

@@ -244,13 +244,13 @@ class JointWatcher(Watcher):
         """Without stimulation everything counts in a passive test, and nothing in another one."""
         if self.plan.kind == PASSIVE:
             return True
-        flows = time_s - self._last_s <= NEXT_PULSES / self.plan.pulse_rate_hz  # else its outcome is not known yet
+        flows = time_s - self._last_s <= NEXT_PULSES / self.plan.pulse_rate_hz  # otherwise its outcome is unknown
         return flows and self._since_s is not None and time_s - self._since_s >= SETTLED_S
 
     async def _say_enough(self) -> None:
         try:
             await self.rig.ask(requests.EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
-        except ApiError as error:  # it has ended by itself, or a person was quicker
+        except ApiError as error:  # it has ended already, by itself or by a person
             if error.code != "rig-late":
                 self.status.state, self.status.ended = "watching", ""
                 raise

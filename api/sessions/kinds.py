@@ -31,8 +31,8 @@ class Planned:
     """A plan, and what else is known of it before it is played."""
 
     plan: TestPlan
-    extra: dict[str, Any] = field(default_factory=dict)  # what is kept beside the plan; nothing of a plain test
-    how: dict[str, Any] | None = None  # of an adaptive test: what the adviser is asked with
+    extra: dict[str, Any] = field(default_factory=dict)  # stored with the plan; empty for a plain test
+    how: dict[str, Any] | None = None  # arguments of the adviser, for an adaptive test
 
 
 class Kind:

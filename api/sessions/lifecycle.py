@@ -86,7 +86,7 @@ class Lifecycle:
             row = session.get(Test, test_id)
             assert row is not None
             if fields.get("state") == "running" and row.state != "requested":
-                fields.pop("state")  # the rig was done before we wrote that it had begun
+                fields.pop("state")  # the test ended before its start was written
             for name, value in fields.items():
                 setattr(row, name, value)
             if row.state not in OPEN_STATES and row.finished_utc is None:

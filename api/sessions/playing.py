@@ -107,10 +107,10 @@ class Playing:
             return
         async with current.state_lock:
             version, changes, lost = current.version, list[dict[str, Any]](), self.is_over(current)
-            if not lost:  # by time it is known here, also where the store cannot be read
+            if not lost:  # expiry is known here even where the store cannot be read
                 version, changes, lost = await asyncio.to_thread(self.find_changes, current)
             ended = lost and not current.over
-            if version is None:  # its intent was not written yet; if it is by now, it rests on what is there now
+            if version is None:  # its intent was not written yet; one written since then uses the current version
                 version = current.version
             if version == current.version and not ended:
                 return

@@ -374,7 +374,7 @@ class TokenIn(Body):
         Annotated[
             str,
             StringConstraints(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]+)?Z$"),
-            AfterValidator(lambda label: utc_label(unix_of(label))),  # as our clock writes them: they are compared
+            AfterValidator(lambda label: utc_label(unix_of(label))),  # the clock's format: labels are compared as text
         ]
         | None
     ) = None
@@ -438,7 +438,7 @@ def limits_of(body: TestIn, participant_profile: dict[str, Any] | None) -> dict[
 
 
 def _wider(name: str, value: float, limit: float) -> str | None:
-    if value <= limit:  # a number that compares with nothing is wider
+    if value <= limit:  # NaN compares false, so it counts as wider
         return None
     unit = LIMITS[name].unit
     return f"{name} {value:g} {unit} is above the participant's {limit:g} {unit} by {value - limit:g}"

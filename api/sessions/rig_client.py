@@ -145,9 +145,9 @@ class RigClient:
                     return reply
                 finally:
                     writer.close()
-        except ValueError as error:  # no answer at all, another's words, or a line without an end
+        except ValueError as error:  # no reply, not the protocol, or a line without an end
             raise no_rig("It closed the connection, or sent something that is no answer.") from error
-        except OSError as error:  # a time that ran out is one, too
+        except OSError as error:  # TimeoutError is an OSError
             raise no_rig(str(error) or "It did not answer in time.") from error
 
     async def _stay_connected(self, path: Path) -> None:
@@ -157,7 +157,7 @@ class RigClient:
                 await self._listen(reader)
             except (OSError, ValueError, asyncio.IncompleteReadError) as error:
                 log.debug("rig link: %s", error)
-            except Exception:  # whatever it was, a service that never connects again hears of no test's end
+            except Exception:  # without a reconnect the service would miss the end of every test
                 log.exception("the rig's link failed")
             finally:
                 self._lose_link()
@@ -194,11 +194,11 @@ class RigClient:
             before = self.status.state if self.status else None
             try:
                 status = await self.fresh_status()
-                if status.state != before:  # a change that no event told
+                if status.state != before:  # a change without an event
                     tell_all(self.listeners, messages.StateEvent(status=status))
                 tell_all(self.poll_listeners, status)
             except ApiError:
-                continue  # its age tells
+                continue  # the age of the state shows it
             except Exception:
                 log.exception("the rig's state could not be taken")
 
@@ -222,7 +222,7 @@ class RigClient:
     def _receive_state(self, request: Any, reply: messages.Reply) -> None:
         """Store a state when it is read: its requester may resume after a later one has arrived."""
         if isinstance(request, requests.StatusRequest) and reply.ok:
-            with contextlib.suppress(ValidationError):  # `ask_for` says it
+            with contextlib.suppress(ValidationError):  # `ask_for` reports it
                 self.status = messages.Status.model_validate(reply.body)
 
 

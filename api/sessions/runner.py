@@ -127,7 +127,7 @@ class Runner(Playing):
         tokens = await asyncio.to_thread(self.tokens_of, holder)
         await self.let_end()
         self.refuse_second()
-        # what an adaptive test can reach is computed now, and not while others wait, and then remembered
+        # computes and caches the reach of an adaptive test before the lock, so that other starts do not wait
         if body.kind == ADAPTIVE and preview is None:
             await self._planned(body, await self._participant(body))
         async with self.start_lock:
@@ -152,7 +152,8 @@ class Runner(Playing):
         self, body: TestIn, participant: Participant, by: str, seen_preview: Preview | None, tokens: list[str],
         tags: Tags | None, model: str,
     ) -> Test:  # fmt: skip
-        await asyncio.to_thread(self._check, body.participant, tags)  # then the preview may differ for no other reason
+        # rules out a changed participant before the previews are compared
+        await asyncio.to_thread(self._check, body.participant, tags)
         if seen_preview is None:
             planned = await self._planned(body, participant)
         else:
@@ -184,7 +185,7 @@ class Runner(Playing):
             raise
         try:
             return await asyncio.to_thread(self.lifecycle.update, row.id, state="running")
-        except Exception:  # who asked is told that it failed: then nothing of it plays on
+        except Exception:  # the requester gets an error, so the test must not keep playing
             await self.stop_quietly(f"start of {plan.test_id} could not be written down")
             raise
 
@@ -199,12 +200,12 @@ class Runner(Playing):
                     raise right_ended()
                 if current.changes or version != current.version:
                     raise locking.ChangedError(version or 0, current.changes or changes)
-                # from here to the command nothing waits
+                # no await between here and the command
                 self._refuse_overtaken(request_received_s.get(self.clock.monotonic_s()))
                 key = self.kinds[plan.kind].begin(planned)
                 await self.rig.ask(requests.StartRequest(plan=plan, key=key), timeout_s=ANSWER_S)
         except ApiError as error:
-            if error.code == "rig-unreachable":  # it may have heard us all the same
+            if error.code == "rig-unreachable":  # the rig may have received the command
                 await self.stop_quietly(f"start of {plan.test_id} was not answered")
             await asyncio.to_thread(
                 self.lifecycle.update, plan.test_id, state="refused", reason=error.detail or error.title
@@ -213,7 +214,7 @@ class Runner(Playing):
             if error.code == "rig-busy" and status is not None:
                 error.extra["holder"] = {"test_id": status.test_id, "participant": status.participant}
             raise
-        except Exception as error:  # whatever it was: no test stays open that never began
+        except Exception as error:  # any error: a test that never began must not stay open
             await self.stop_quietly(f"start of {plan.test_id} failed")
             await asyncio.to_thread(self.lifecycle.fail, plan.test_id, error)
             raise
@@ -366,10 +367,11 @@ class Runner(Playing):
                 time.sleep(wait_s)
             log.error("%s is not in the audit trail; the rig's journal has it", action)
 
-        noted = asyncio.get_running_loop().run_in_executor(self._notes, write)  # threads that nothing else can fill
+        # an executor of its own, which other work cannot exhaust
+        noted = asyncio.get_running_loop().run_in_executor(self._notes, write)
         await asyncio.wait({noted}, timeout=NOTE_S)
 
-    # ---- what the rig says ----------------------------------------------------------------------------------
+    # ---- events of the rig ----------------------------------------------------------------------------------
 
     def _on_event(self, event: AnyEvent) -> None:
         if isinstance(event, messages.LiveEvent):
@@ -393,7 +395,7 @@ class Runner(Playing):
     def _look_for_end(self, status: messages.Status, max_missed: int, why: str) -> None:
         """Treat the current test's end as missed after `max_missed` consecutive states that do not name it.
 
-        A start under way learns by itself what became of it.
+        A start in progress handles its own outcome.
         """
         current = self.current
         if current is None or not current.started or current.ending:
@@ -477,7 +479,7 @@ class Runner(Playing):
         else:
             await self._finish(await self.lifecycle.missed_end(test_id, why))
 
-    # ---- what clients see -----------------------------------------------------------------------------------
+    # ---- documents -------------------------------------------------------------------------------------------
 
     def announce(self, test_id: str) -> None:
         """Publish the test's state on the live channel, in call order."""

@@ -23,7 +23,7 @@ class StopCounter:
             buckets=STOP_BUCKETS_S, registry=self.registry,
         )  # fmt: skip
         for outcome in STOP_ENDS:
-            self._stops.labels(outcome)  # 0 is told, too
+            self._stops.labels(outcome)  # exports 0 as well
 
     def stopped(self, outcome: str, took_s: float) -> None:
         """A stop has ended; `outcome` of `STOP_ENDS`."""

@@ -29,7 +29,7 @@ class StopResult:
     reason: str
     at_utc: str
     test_id: str | None
-    right: str | None  # the page's right to stop: the page with the answer carries it on
+    right: str | None  # the page's right to stop, passed on to the page with the answer
     answer: StopEvidence | ApiError  # the rig's evidence, or why the stop is not confirmed
 
 

@@ -149,7 +149,7 @@ class Trials(Kind):
         here = [row for row in recordings if row.test_id in tests and not differ(place_of(tests[row.test_id]), place)]
         return [row.path for row in (here if trial.state else [since, *here])]
 
-    # ---- the service's own day ---------------------------------------------------------------------------------
+    # ---- start and shutdown ------------------------------------------------------------------------------------
 
     def resume(self) -> None:
         """Follow the trials that a restart left open, and warm the worker where a model may be tracked."""
@@ -160,7 +160,7 @@ class Trials(Kind):
             try:
                 for test_id in open_trials:
                     await self.follow(test_id)
-            except ApiError as error:  # a damaged model: the other participants' trials are followed all the same
+            except ApiError as error:  # a damaged model must not block the other participants' trials
                 log.warning("trials with %s are not followed: %s", approval.model_id, error)
             await self._warm(approval.participant)
 

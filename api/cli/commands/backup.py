@@ -42,7 +42,7 @@ def backup(
     try:
         to.mkdir(parents=True, exist_ok=True)
         partial.mkdir(mode=0o700)
-        # the database first: the files that it names are there by then, and are copied after it
+        # the database first: every file that it names exists by then and is copied afterwards
         sums = {} if database is None else {DATABASE: copy_database(database, partial / DATABASE)}
         sums |= copy_files(partial, rig_data or settings.data_dir, settings.data_dir)
         damaged = [] if database is None else damaged_recordings(partial / DATABASE, sums)
@@ -88,7 +88,7 @@ def copy_files(target: Path, rig_data: Path, api_data: Path) -> dict[str, str]:
         del sums[name]
     latch = rig_data / "latch.json"
     content = latch.read_bytes() if latch.is_file() else b'{"state": "latched"}'
-    if b'"latched"' in content:  # of any other state the rig comes up uncertain, which says more
+    if b'"latched"' in content:  # from any other state the rig starts as uncertain, which is stricter
         content = json.dumps({"state": "latched", "reason": f"the data were restored from {target.stem}"}).encode()
     return sums | {"rig/latch.json": write(target / "rig/latch.json", content)}
 

@@ -96,7 +96,7 @@ def test(
     else:
         result = on_own_services(rig, data, emulate, code, request)
     recording = result.pop("recording")
-    if output is not None:  # first: what was measured is not lost, whatever comes after
+    if output is not None:  # first, so that a later error cannot lose the recording
         with writing(output) as place:
             place.write_bytes(recording)
     if decide:
