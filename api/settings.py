@@ -15,7 +15,7 @@ from stimrig.api.errors import SettingsError
 
 PREFIX = "STIMRIG_"
 SECRET = ("_KEY", "_TOKEN")
-"""How the names of settings end whose values are not shown."""
+"""Suffixes of settings whose values are not shown."""
 
 
 class Settings(BaseSettings):
@@ -84,17 +84,17 @@ class Settings(BaseSettings):
 
     @property
     def exports_dir(self) -> Path:
-        """Where a file lies while it is handed out; emptied at each start."""
+        """Folder of files being handed out; emptied at each start."""
         return self.data_dir / "exports"
 
     @property
     def recordings_dir(self) -> Path:
-        """Where sealed and uploaded recordings lie."""
+        """Folder of sealed and uploaded recordings."""
         return self.data_dir / "recordings"
 
     @property
     def logs_dir(self) -> Path:
-        """Where each process writes its log."""
+        """Folder of the processes' logs."""
         return self.data_dir / "logs"
 
 
@@ -108,7 +108,7 @@ def refusal(error: ValidationError) -> str:
 
 
 def loopback(host: str) -> bool:
-    """Whether an address can be reached from this machine only."""
+    """Return whether an address is reachable from this machine only."""
     try:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -12,7 +12,7 @@ from stimrig.api.charts.figure import Axis, Curve, Figure, Shade, Value
 from stimrig.api.charts.model_charts import broken_at_pauses, segment_marks
 
 AROUND_S = 1.0
-"""Of the record on each side of the place that is shown close up."""
+"""Length of the record on each side of the place shown close up, s."""
 
 
 def story_figures(told: dict[str, Any], before: dict[str, Any], after: dict[str, Any], at: str = "") -> Figures:

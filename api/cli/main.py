@@ -141,7 +141,7 @@ def run(arguments: list[str] | None = None) -> int:
 
 
 def _keep_compiled() -> None:
-    """Where the installation is another user's, what numba compiles lies in this user's cache, for workers, too."""
+    """Use this user's cache for numba, also in workers, where the installation belongs to another user."""
     if "NUMBA_CACHE_DIR" in os.environ or os.access(PACKAGE, os.W_OK):
         return
     with contextlib.suppress(OSError, RuntimeError):  # no home: `stimrig doctor` tells what follows

@@ -204,7 +204,7 @@ class Services:
 
     @property
     def url(self) -> str:
-        """Where the service answers."""
+        """The address of the service."""
         return str(self.api.ready["url"])
 
     def start(self) -> None:

@@ -49,7 +49,7 @@ class ApprovedModel:
 
 
 class Client(Connection):
-    """What a program does with a running service. Each method is one request, or says otherwise; nothing is retried.
+    """Client of a running service. Each method sends one request unless stated otherwise; nothing is retried.
 
     An answer's fields are read as `test.state` or `test["state"]`; `to_dict()` gives it as it was sent. `request`,
     `get` and `post` reach every other route of docs/api.md. Each method raises ServiceError: `Unreachable` without an
@@ -70,7 +70,7 @@ class Client(Connection):
         return [kind.read(row) for row in self.get(f"/v1{path}", **more)]
 
     def health(self) -> HealthOut:
-        """Whether the service and its rig answer; needs no token."""
+        """Return whether the service and its rig answer; needs no token."""
         return HealthOut.read(self.get("/health"))
 
     def rig(self) -> RigOut:
@@ -311,7 +311,7 @@ class Client(Connection):
         return self._request_as(models.ComparisonOut, "GET", f"/models/{model_id}/comparison", params=params)
 
     def diagnosis(self, model_id: str, progress: Progress = QUIET) -> models.DiagnosisOut:
-        """What is missing in the model. `progress` as in `add_effects`."""
+        """Diagnose what the model lacks. `progress` as in `add_effects`."""
         return self._long(models.DiagnosisOut, "GET", f"/models/{model_id}/diagnosis", progress)
 
     def add_effects(

@@ -1,4 +1,4 @@
-"""What the model of a new recording begins with: the structure of the participant's last approved model.
+"""Fits a new recording with the structure of the participant's last approved model.
 
 It is fitted beside the plain structure, and the better of the two is offered. A participant without an approved model
 begins with the effects that the site has set.

@@ -130,7 +130,7 @@ def changed(before: State, now: State) -> list[dict[str, Any]]:
 
 @dataclass(frozen=True)
 class Name:
-    """How a figure is called, the unit it is shown in, and the factor from the stored unit to that one.
+    """Display name and unit of a figure, and the factor from the stored unit to that unit.
 
     `digits` after the point; None: three significant ones. `in_percent`: whether a change of it is told in per cent.
     """

@@ -1,4 +1,4 @@
-"""How a model was improved: where it failed at first, what was added, how the error fell, and why that ended."""
+"""Story of a model's improvement: where it failed first, what was added, how the error fell, and why it ended."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ log = logging.getLogger("stimrig.tracking")
 MOST_EARLIER = 20
 """Approvals before this one from which it is learnt how fast a person changes."""
 OF_STEP = ("now", "coming", "moved", "effects", "disturbed_s")
-"""What of a step is served with the model."""
+"""Fields of a step that are served with the model."""
 SUPERSEDED = "Another model was approved, or this approval ended, before the trial was followed."
 
 
@@ -33,29 +33,29 @@ class Trial:
 
     test: Test
     approval: Approval
-    """The one under which it was begun."""
+    """The approval under which the trial was begun."""
     number: int
-    """Of the approval's trials, from 1."""
+    """Number among the approval's trials, from 1."""
     earlier: list[list[dict[str, Any]]]
     """The levels of the trials under earlier approvals of this person, oldest first: how fast they change."""
     missed: int
-    """Trials that were not followed since the last one that was."""
+    """Number of trials not followed since the last followed one."""
     since: str
     """Id of the recording that `state` was found from; without one, of the approved model's."""
     state: dict[str, Any] | None = None
-    """What is known from the last trial that was followed; None: there is none."""
+    """State after the last followed trial; None: there is none."""
     model_json: str = ""
     """The approved MODEL.json."""
     bounds: Bounds = field(default_factory=dict)
-    """What a person allowed."""
+    """Bounds that the approval allows."""
     alarms: Bounds = field(default_factory=dict)
-    """Beyond what they are asked."""
+    """Bounds beyond which a new test is requested."""
     problem: str = ""
-    """Why the approved model cannot be followed; empty where it can."""
+    """Reason why the approved model cannot be followed; empty where it can."""
 
 
 class TrackedVersions:
-    """What was tracked under each approval."""
+    """The tracked versions of all approvals."""
 
     def __init__(self, store: Store, clock: Clock, versions: Versions) -> None:
         self.store, self.clock, self.versions = store, clock, versions

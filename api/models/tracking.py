@@ -1,4 +1,4 @@
-"""How far a tracked model may move from the approved one, what is asked beyond that, and what trials found."""
+"""Limits of a tracked model around the approved one, the request for a new test beyond them, and words on trials."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ class Limits(BaseModel):
 
     @property
     def allows(self) -> bool:
-        """Whether anything may be tracked."""
+        """Return whether anything may be tracked."""
         return any(percent > 0.0 for percent in self.model_dump().values())
 
     def bounds(self, threshold_us: float | None) -> Bounds:
-        """What the quantities may be.
+        """Return the bounds of the quantities.
 
         `threshold_us`: the threshold of the approved curve, µs; without one the threshold is not tracked.
         """
@@ -107,7 +107,7 @@ def _beyond(name: str, value: float, low: float, high: float) -> str:
 
 
 def not_followed(number: int) -> str:
-    """Why a person has to be asked after two trials running that could not be followed."""
+    """Return why a new test is needed after two consecutive trials that could not be followed."""
     return (
         f"Trials {number - 1} and {number} could not be followed; their table says why. Whether the model still holds "
         f"is not known. {NEW_TEST}"
@@ -127,7 +127,7 @@ CHANGES = {
     "threshold_shift_us": ("threshold", "lower", "higher"),
     "time_scale": ("muscle", "faster", "slower"),
 }
-"""What changes with a quantity, and the words for less and for more of it."""
+"""What a quantity describes, and the words for less and for more of it."""
 NARROW = {"gain": 0.05, "threshold_shift_us": 5.0, "time_scale": 0.1}
 """The muscle is called unchanged where each band holds the middle and leaves it by no more than this."""
 

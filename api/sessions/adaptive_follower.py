@@ -35,9 +35,9 @@ LATE_S = 0.35
 SEND_S = 0.06
 """The early answer is sent if the late one is not there."""
 LEAST_S = 2.0
-"""A shorter record tells nothing. Besides a pulse whose samples are under way, and one that is cut off as not whole."""
+"""A shorter record is not informative. Excludes a pulse whose samples are under way, and an incomplete one."""
 SHORTEST_PIECE_S = 1.0
-"""Of the pieces that are chosen."""
+"""Shortest chosen piece, s."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ from stimrig.api.store.tables import Participant, Test, Token
 LONGEST_S = 300.0
 HALTED = "The rig is stopped. A person looks at participant and rig and re-arms it."
 NEUTRAL = {"rig-busy": "The rig is in use. Wait until it is free.", "rig-latched": HALTED, "rig-uncertain": HALTED}
-"""What a key is told instead of words that may name another participant."""
+"""Messages to a key, in place of texts that may name another participant."""
 SAME_RATE = 1e-3
 """Share by which a pulse rate may differ from the model's: what writing and reading a number leaves."""
 MOST_TRIALS = 200
@@ -168,7 +168,7 @@ def beyond(why: str) -> ApiError:
 
 
 KEY_SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
-"""Of these only what `stimrig.api.web.guards` opens."""
+"""The scopes of a key; `stimrig.api.web.guards` restricts which calls they open."""
 
 
 def refuse_maker_without(maker: Principal) -> None:

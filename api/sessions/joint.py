@@ -67,7 +67,7 @@ class JointTests(Watched):
     async def _layout(
         self, plan: messages.TestPlan, range_rad: tuple[float, float], longest_s: float | None, preview_s: float
     ) -> Layout:
-        """What the three tests are, as long as the paper's torque-time allows."""
+        """Lay out the three tests within the paper's torque-time."""
         paper = plan.model_copy(update={"kind": "pre-session", "segments": None})
         preview = await self.rig.ask(requests.PreviewRequest(plan=paper, recruitment=None), timeout_s=preview_s)
         table = await asyncio.to_thread(self.versions.recruitment, plan.participant)

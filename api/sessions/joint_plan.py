@@ -28,9 +28,9 @@ RANGES_RAD = (math.radians(60), math.radians(90))
 """From the first on there are four angles to hold, from the second on five."""
 
 PLANNED_SHARE = 0.85
-"""Of the paper's torque-time: of 60 simulated arms the strongest elsewhere took 1.15 times what was planned."""
+"""Share of the paper's torque-time: the worst of 60 simulated arms took 1.15 times the planned dose."""
 HELD_SHARE = 0.45
-"""Of what is planned, for all held tests together; the moving one has what is left."""
+"""Share of the planned dose for all held tests together; the moving test has the rest."""
 STAIRS = (0.25, 0.5, 0.75)
 """Steps of a held test, as shares of the torque at the widest pulse."""
 LONGEST_STAIR_S = 1.0
@@ -48,7 +48,7 @@ STILL_S = {PASSIVE: 8.0, MOVING: 5.0}
 SEEN_S = {PASSIVE: 0.2, MOVING: 0.1}
 """Time in a cell of angle and velocity after which it counts as seen."""
 UNKNOWN_MOTOR_SHARE = 0.3
-"""Where a muscle begins to pull, as a share of the widest pulse, where neither model nor calibration say."""
+"""Assumed motor threshold as a share of the widest pulse, without a model or a calibration."""
 
 Segment = dict[str, Any]
 
@@ -96,7 +96,7 @@ def curve_of(table: Mapping[str, Sequence[float]] | None, largest_us: float, mot
 
 
 def _rises(table: Mapping[str, Sequence[float]], largest_us: float) -> bool:
-    """Whether a model's curve can be planned with: it pulls the joint at the widest pulse."""
+    """Return whether a model's curve is usable for planning: it gives torque at the widest pulse."""
     curve = Curve(tuple(table["pulse_width_us"]), tuple(table["torque_nm"]), True)
     return len(curve.torque_nm) > 1 and curve.torque(largest_us) > 0.0
 
@@ -200,7 +200,7 @@ class Layout:
 
     @property
     def share(self) -> float:
-        """Of the paper's torque-time."""
+        """Share of the paper's torque-time."""
         return self.doses["total"] / self.doses["paper"] if self.doses["paper"] > 0 else 0.0
 
 
@@ -230,7 +230,7 @@ SLOW_RAD_S, FAST_RAD_S = 0.15, 0.7
 """A movement slower than the first is none; from the second on it is a fast one (40°/s)."""
 VELOCITY_EDGES_RAD_S = (-FAST_RAD_S, -SLOW_RAD_S, SLOW_RAD_S, FAST_RAD_S)
 ROWS = (("extension", "fast"), ("extension", "slow"), None, ("flexion", "slow"), ("flexion", "fast"))
-"""What each row of velocities is: direction and speed; None: nearly still."""
+"""Direction and speed of each row of velocities; None: nearly still."""
 MISSING_ORDER = (("flexion", "slow"), ("extension", "slow"), ("flexion", "fast"), ("extension", "fast"))
 """As it is to be done."""
 BIN_RAD = math.radians(15)
@@ -244,7 +244,7 @@ ENOUGH = 0.9
 
 
 class Coverage:
-    """How long the joint was in each cell of angle and velocity: fast and slow in both directions, and nearly still.
+    """Time of the joint in each cell of angle and velocity: fast and slow in both directions, and nearly still.
 
     A cell is seen once the joint was in it for long enough. Nearly still is not needed, nor fast at the ends of the
     range, where a movement turns round. The columns of angle are of about 15°, from 3 to 8 of them.

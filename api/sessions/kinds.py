@@ -20,7 +20,7 @@ from stimrig.api.store.tables import Test
 from stimrig.rig.messages import AnglePlan, FinishedEvent, LiveEvent, TestPlan
 
 SERVICE = "stimrig"
-"""Who says enough where the service does."""
+"""Requester of an early end by the service."""
 AT_STOPPING_TORQUE_S = 12.0
 """The largest torque-time, where nobody says: so many seconds at the torque that stops the test."""
 Send = Callable[[dict[str, Any]], None]
@@ -41,9 +41,9 @@ class Kind:
     names: tuple[str, ...] = ()
     """As requests call them."""
     part = ""
-    """What a test's document, its summary and the live messages call what is told of this kind alone."""
+    """Name of this kind's own part in a test's document, its summary and the live messages."""
     fitted = True
-    """Whether a test gives a model by itself."""
+    """True where a single test gives a model."""
 
     def __init__(self, rig: RigClient) -> None:
         self.rig = rig
@@ -71,7 +71,7 @@ class Kind:
         return range_rad
 
     def stored_fields(self, body: TestIn, pulses: int) -> dict[str, Any]:  # noqa: ARG002
-        """What more is kept of a test with so many pulses. Raises ApiError (422) where both do not go together."""
+        """Return further fields to store of a test with this many pulses. Raises ApiError (422): they do not match."""
         return {}
 
     def begin(self, planned: Planned) -> str:  # noqa: ARG002
@@ -184,7 +184,7 @@ class Watched(Kind):
     """
 
     ends: ClassVar[Mapping[str, str]] = {}
-    """Why a test ended, by the rig's reason, where it is told by another name."""
+    """Reasons for the end of a test, by the rig's reason, where they have another name."""
 
     def __init__(self, clock: Clock, rig: RigClient, versions: Versions, send: Send) -> None:
         super().__init__(rig)
@@ -238,7 +238,7 @@ class Watched(Kind):
         return {self.part: {**standing, "torque_time_nm_s": measured, "state": "ended", "ended": ended}}
 
     def end_of(self, row: Test, event: FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
-        """Why it ended, where more than the rig's reason says it."""
+        """Return why it ended, where the rig's reason is not enough."""
         return ""
 
     def document(self, row: Test) -> dict[str, Any] | None:
@@ -250,7 +250,7 @@ class Watched(Kind):
         return watcher.document() if watcher is not None else self.unwatched(row)
 
     def unwatched(self, row: Test) -> dict[str, Any]:
-        """Of a test that this service does not watch: it never began, or the service was restarted meanwhile."""
+        """Return the document of a test that is not watched: it never began, or the service was restarted."""
         raise NotImplementedError
 
 

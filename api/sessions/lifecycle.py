@@ -1,4 +1,4 @@
-"""What becomes of a test: its row, its recording, its model; and what is found of one whose end nobody heard."""
+"""Lifecycle of a test: its row, recording and model; recovers a test whose end was missed."""
 
 from __future__ import annotations
 

@@ -136,5 +136,5 @@ class Hub:
 
     @property
     def listeners(self) -> int:
-        """How many pages listen."""
+        """Number of connected pages."""
         return len(self._queues)

@@ -35,7 +35,7 @@ class Current:
     participant: str
     by: str
     kind: str = ""
-    """Of the test."""
+    """Id of the test."""
     started: bool = False
     """The rig has said that it plays."""
     ending: bool = False

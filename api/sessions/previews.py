@@ -16,7 +16,7 @@ from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store.tables import Participant
 
 VALID_S = 300.0
-"""How long a shown plan may be started."""
+"""Validity of a preview, s."""
 CAPACITY = 20
 """Previews that are kept; the oldest goes first."""
 
@@ -33,7 +33,7 @@ class Preview:
     made_s: float
     made_unix_s: float
     test_id: str | None = None
-    """Of the test that was started from it: a second request leads to the same one."""
+    """Id of the test started from it: a second request returns the same test."""
     starting: asyncio.Lock = field(default_factory=asyncio.Lock)
 
     @property

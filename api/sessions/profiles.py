@@ -1,4 +1,4 @@
-"""What a participant's limits become when a person changes some: what they keep, what they void, what must be asked."""
+"""Changes of a participant's limits: what stays, what becomes void, what needs a confirmation."""
 
 from __future__ import annotations
 
@@ -150,7 +150,7 @@ SET_AT = "angle_set_at_utc"
 LEAST_RAD, MOST_RAD = -math.pi, math.pi
 NARROWEST_RAD = math.radians(10)
 TOLERANCE_RAD = 0.09
-"""How near to its angle a held joint must be (5°)."""
+"""Tolerance of a held joint's angle (5°)."""
 
 
 def rising_range(range_rad: tuple[float, float]) -> tuple[float, float]:

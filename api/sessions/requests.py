@@ -92,7 +92,7 @@ class FirstProfileIn(Body):
 
 
 FIRST_PROFILE = FirstProfileIn(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0)
-"""What a participant has who was made without limits, until a person sets them or calibrates."""
+"""Limits of a new participant until a person sets them or calibrates."""
 
 
 class ProfileIn(Body):

@@ -245,7 +245,7 @@ class Runner(Playing):
         return await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:
-        """What is open of today's guided tests of a joint. Raises ApiError where the rig cannot be asked."""
+        """Return today's open guided tests of a joint. Raises ApiError: the rig does not answer."""
         body = TestIn(participant=participant.code)
         limits = limits_of(body, participant.profile)
         plan = messages.TestPlan(test_id=self._new_id(), participant=participant.code, **limits)
