@@ -15,7 +15,7 @@ from stimrig.api.clinical_words import segment_words
 from stimrig.identify.records.record import HELD_OUT
 
 SHOWN_BEYOND = 1.5
-"""Length of the unplayed plan that is drawn, as a share of what was played."""
+"""The unplayed plan is drawn up to this multiple of the played time, plus 2 s."""
 PAUSE, PAUSE_S = 20.0, 2.0
 """A pause lasts more than so many of the usual steps in time, and more than so many seconds: no line crosses it."""
 LETTER = 0.007

@@ -35,7 +35,7 @@ LATE_S = 0.35
 SEND_S = 0.06
 """The early answer is sent if the late one is not there."""
 LEAST_S = 2.0
-"""A shorter record is not informative. Excludes a pulse whose samples are under way, and an incomplete one."""
+"""A shorter record is not informative. To it come one pulse whose samples are in transit and one incomplete pulse."""
 SHORTEST_PIECE_S = 1.0
 """Shortest chosen piece, s."""
 
