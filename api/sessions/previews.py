@@ -5,7 +5,9 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import json
+import secrets
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 from stimrig.api.clock import Clock
@@ -17,8 +19,8 @@ from stimrig.api.store.tables import Participant
 
 VALID_S = 300.0
 """Validity of a preview, s."""
-CAPACITY = 20
-"""Previews that are kept; the oldest goes first."""
+CAPACITY, CAPACITY_OF_ONE = 60, 5
+"""Previews that are kept of all participants, and of each; the oldest goes first."""
 
 
 @dataclass
@@ -35,12 +37,14 @@ class Preview:
     test_id: str | None = None
     """Id of the test started from it: a second request returns the same test."""
     starting: asyncio.Lock = field(default_factory=asyncio.Lock)
+    nonce: str = field(default_factory=lambda: secrets.token_hex(16))
+    """Each preview has a hash of its own: one that was started or is too old stays so, whoever previews that plan."""
 
-    @property
+    @cached_property
     def hash(self) -> str:
-        """Of everything that is shown and played; not of the test's id."""
+        """Of everything that is shown and played, without the test's id, and of the nonce."""
         plan = self.planned.plan.model_dump(mode="json", exclude={"test_id"})
-        text = json.dumps([self.body.model_dump(mode="json"), plan, self.answer], sort_keys=True)
+        text = json.dumps([self.nonce, self.body.model_dump(mode="json"), plan, self.answer], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -55,18 +59,17 @@ class Previews:
         """Store a preview and return its hash."""
         now_s, now_unix_s = self.clock.monotonic_s(), self.clock.unix_s()
         preview = Preview(body, planned, answer, dict(row.profile), site_of(row), now_s, now_unix_s)
-        plan_hash = preview.hash
-        self._previews.pop(plan_hash, None)
-        self._previews[plan_hash] = preview
-        for old in list(self._previews)[:-CAPACITY]:
+        self._previews[preview.hash] = preview
+        of_one = [old for old, kept in self._previews.items() if kept.body.participant == body.participant]
+        for old in of_one[:-CAPACITY_OF_ONE] or list(self._previews)[:-CAPACITY]:
             del self._previews[old]
-        return plan_hash
+        return preview.hash
 
     def find(self, participant: str, plan_hash: str) -> Preview:
         """Return a preview. Raises ApiError (410): unknown, another participant's, or too old to start."""
         preview = self._previews.get(plan_hash)
         if preview is None or preview.body.participant != participant:
-            raise _gone("It is not known, or the service was restarted since.")
+            raise _gone("Newer previews took its place, or the service was restarted since.")
         # both clocks: one stands still while the machine sleeps, the other may be set
         ages_s = self.clock.monotonic_s() - preview.made_s, self.clock.unix_s() - preview.made_unix_s
         if preview.test_id is None and not all(0 <= age_s <= VALID_S for age_s in ages_s):

@@ -9,7 +9,7 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api.sessions.previews import CAPACITY, VALID_S
+from stimrig.api.sessions.previews import CAPACITY_OF_ONE, VALID_S
 from stimrig.api.store.tables import Participant
 from stimrig.rig import messages as m
 from tests.api.conftest import Service, SetClock, run_test, wait_done
@@ -53,6 +53,7 @@ def test_it_starts_once_however_often_it_is_pressed(tab: httpx.Client, client: h
         (test_id,) = {answer.json()["id"] for answer in pool.map(lambda _: start(tab, shown), range(5))}
     assert service.rig.starts == 1
     wait_done(client, test_id)
+    assert tab.get(WHERE).status_code == 200, "somebody else only looks at the same plan"
     assert start(tab, shown).json()["id"] == test_id and service.rig.starts == 1, "Back, and once more"
 
 
@@ -78,9 +79,9 @@ def test_a_plan_is_of_one_participant_and_complete(tab: httpx.Client, client: ht
     assert "all else is as it was previewed" in refused["detail"]
     assert tab.post("/v1/tests", json=asked).status_code == 403, "a start carries the session's CSRF token"
     assert service.rig.starts == 0
-    for _ in range(CAPACITY + 1):
+    for _ in range(CAPACITY_OF_ONE + 1):
         client.post("/v1/preview", json={"participant": "P018"})
-    assert client.post("/v1/tests", json=asked).status_code == 202, "the same preview is kept once"
+    assert client.post("/v1/tests", json=asked).status_code == 202, "previews of others take no place of it"
 
 
 @pytest.mark.parametrize(("what", "body"), [("profile", {"current_ma": 10}), ("muscle", {"side": "right"})])

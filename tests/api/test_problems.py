@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import httpx
 import pytest
@@ -168,3 +169,8 @@ def test_upload_too_large_or_empty(client: httpx.Client, service: Service, parti
     problem(client.post(f"/v1/participants/{participant}/recordings", content=b"x" * 2000), 413)
     problem(client.post(f"/v1/participants/{participant}/recordings", content=b""), 422)
     assert list((service.data / "recordings").rglob("upload-*")) == []
+
+
+def test_unforeseen_error_is_a_problem_too(client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(service.context.versions, "get", Mock(side_effect=RuntimeError("secret detail")))
+    assert "secret detail" not in str(problem(client.get("/v1/models/M1"), 500))
