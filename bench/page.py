@@ -41,7 +41,7 @@ def opened(browser: Any, service: Service) -> Any:
     with service.client() as http:
         http.post("/v1/users", json={"name": NAME, "password": PASSWORD})
     with service.client(None) as http:
-        http.post("/sign-in", data={"name": NAME, "password": PASSWORD})
+        http.post("/v1/sessions", data={"name": NAME, "password": PASSWORD})
         cookies = [{"name": key, "value": value, "url": service.url} for key, value in http.cookies.items()]
     context = browser.new_context(viewport={"width": 1366, "height": 900})
     context.add_cookies(cookies)

@@ -47,6 +47,14 @@ def test_the_page_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, cl
     assert "by administrator, valid until" in rows(page)["Calibration"] and "not calibrated" not in page
 
 
+def test_start_sends_limits_that_were_typed_and_leads_on(tab: httpx.Client, client: httpx.Client) -> None:
+    html = tab.get(PAGE).text
+    assert re.search(rf'<button class="stimulate" data-next="{WHERE}"', html)
+    assert press(tab, PAGE, f"PUT /v1{PAGE}/profile", html=html, current_ma="19,5").status_code == 200
+    assert client.get("/v1" + PAGE).json()["profile"]["current_ma"] == 19.5
+    assert rows(tab.get(WHERE).text)["Current of every pulse"] == "19.5 mA"
+
+
 def test_it_starts_once_however_often_it_is_pressed(tab: httpx.Client, client: httpx.Client, service: Service) -> None:
     shown = tab.get(WHERE).text
     with concurrent.futures.ThreadPoolExecutor(5) as pool:
