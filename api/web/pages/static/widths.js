@@ -19,6 +19,7 @@
     form.requestSubmit();
   }, true);
   file.addEventListener("change", () => { read = null; });
+  form.addEventListener("reset", (event) => event.preventDefault()); // `act` would empty it: its file is named, and sent again for other colours
 
   form.addEventListener("answered", async ({ detail: answer }) => {
     result.hidden = !answer?.ok;
