@@ -87,6 +87,19 @@ def test_back_to_a_page_that_was_loaded_before_the_start_shows_what_flows(tab: A
     says(tab, "Stimulating")
 
 
+def test_the_page_before_a_test_stays_once_it_is_started(tab: Any, service: Service, done: dict[str, Any]) -> None:
+    """It is refused from then on; to load it again would keep the test's page from opening."""
+    service.rig.speed = SLOW
+    tab.goto(service.url + "/participants/E1/start")
+    says(tab, "No stimulation ready")
+    tab.evaluate("window.stays = true")
+    with service.client() as http:
+        http.post("/v1/tests", json={"participant": "E1"})
+        now = soon(lambda: (now := http.get("/rig/now").json())["flow"] == "Stimulating" and now)
+    expected(tab.locator("#rig-notice")).to_have_attribute("data-key", now["notice"])
+    assert tab.evaluate("window.stays") is True
+
+
 def test_a_page_that_the_browser_had_kept_is_loaded_anew(tab: Any, service: Service) -> None:
     says(tab, "ready")
     with tab.expect_navigation():

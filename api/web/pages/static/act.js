@@ -119,8 +119,10 @@ const act = (() => {
 
   async function renew(ids) { // these elements, as the page has them now
     const answer = await fetch(here(), { cache: "no-store", headers: { Accept: "text/html" } });
-    if (!answer.ok || answer.redirected) { location.assign(answer.redirected ? answer.url : here()); return; }
     const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+    // A refusal that has them will do: the page before a test is refused once it is started, and must not keep the test's own page from opening.
+    const found = answer.ok || ids.every((id) => page.getElementById(id));
+    if (!found || answer.redirected) { location.assign(answer.redirected ? answer.url : here()); return; }
     for (const id of ids) if (page.getElementById(id)) document.getElementById(id)?.replaceWith(page.getElementById(id));
     const last = focused && document.getElementById(focused); // a button that was disabled, or replaced, has lost the focus
     if (last && !last.disabled && ids.some((id) => document.getElementById(id)?.contains(last)) && document.activeElement === document.body) last.focus({ preventScroll: true });
