@@ -169,7 +169,7 @@ const act = (() => {
   }
 
   function overtaken({ title, detail, changes = [] }, { again }) {
-    const rows = changes.map((each) => ({ what: each.action, before: each.old, now: each.new, who: `${each.who}, ${new Date(each.at_utc).toLocaleTimeString()}` }));
+    const rows = changes.map((each) => ({ what: each.action, before: each.old, now: each.new, who: [each.who, new Date(each.at_utc).toLocaleTimeString()].filter(Boolean).join(", ") }));
     const button = again === "reload" ? words.show_anew : again || words.all_the_same;
     return { title, warnings: [words.changed, ...(rows.length ? [] : [detail])], rows, button };
   }

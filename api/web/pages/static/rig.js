@@ -12,7 +12,7 @@
   const begun = clock();
   let heard = said.dataset.at, lost = "", stopped = "", late = 0; // when the page last heard of the service; why what it shows is old
   let known = null, asked = null, last = null, busy = false, fetching = "", notice = document.getElementById("rig-notice");
-  let shown = { latch: document.getElementById("rearm")?.dataset.ifMatch, since: -READ_MS };
+  let shown = remembered(), focused = false; // the stop whose re-arm this tab showed last, and since when if another was shown before
 
   const say = (name, text) => { for (const box of boxes(name)) if (box.textContent !== text) box.textContent = text; };
   const figure = (value, digits) => value.toLocaleString(document.documentElement.lang, { minimumFractionDigits: digits, maximumFractionDigits: digits, useGrouping: false }).replace("-", "−");
@@ -112,21 +112,25 @@
     if (!notice || notice.dataset.key === key || fetching === key) return;
     fetching = key;
     try {
-      const focused = notice.contains(document.activeElement);
+      focused = notice.contains(document.activeElement);
       await act.renew(["rig-notice"]);
-      notice = document.getElementById("rig-notice");
-      hold(focused);
     } catch { /* the next answer asks again */ }
     fetching = "";
   }
 
-  function hold(focused) { // another stop came under the hand that was about to re-arm: it is read first
-    const form = document.getElementById("rearm"), button = form?.querySelector("button");
-    if (form && form.dataset.ifMatch !== shown.latch) shown = { latch: form.dataset.ifMatch, since: shown.latch ? performance.now() : shown.since };
-    const left_ms = READ_MS - (performance.now() - shown.since);
-    if (!form || left_ms <= 0) return;
+  function remembered() { try { return JSON.parse(sessionStorage.getItem("rearm")) || {}; } catch { return {}; } }
+
+  function hold() { // another stop came under the hand that was about to re-arm, here or as the page was loaded anew: it is read first
+    const form = document.getElementById("rearm"), button = form?.querySelector("button"), latch = form?.dataset.ifMatch;
+    if (!form) return;
+    if (latch !== shown.latch) {
+      shown = { latch, since: shown.latch ? Date.now() : 0 };
+      try { sessionStorage.setItem("rearm", JSON.stringify(shown)); } catch { /* not kept */ }
+    }
+    const left_ms = Math.min(READ_MS, READ_MS - (Date.now() - shown.since)), back = focused;
+    if (left_ms <= 0) return;
     button.disabled = true;
-    setTimeout(() => { button.disabled = false; if (focused && document.activeElement === document.body) button.focus(); }, left_ms);
+    setTimeout(() => { button.disabled = false; if (back && document.activeElement === document.body) button.focus(); }, left_ms);
   }
 
   function look() {
@@ -135,6 +139,12 @@
   }
   const now = () => { show(); if (!document.hidden) ask(); };
   setInterval(look, 250);
+  hold();
+  addEventListener("renewed", ({ detail }) => { // at once, before anything can be pressed
+    if (!detail.includes("rig-notice")) return;
+    notice = document.getElementById("rig-notice");
+    hold();
+  });
   said.lastElementChild.addEventListener("click", () => location.reload());
   addEventListener("submit", (event) => {
     if (event.target.id !== "stop-form") return;
