@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from stimrig.api.store.tables import Participant, Recording, Test
+if TYPE_CHECKING:  # reports are written where no database is installed
+    from stimrig.api.store.tables import Participant, Recording, Test
 
 Site = tuple[str | None, str | None, str | None]
 """Side, muscle and electrode placement; None: unknown. Models, approvals and keys belong to one site."""
