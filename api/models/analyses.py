@@ -140,20 +140,21 @@ class Analyses:
         if on_call is not None:
             on_call(call)
         try:
-            document = await asyncio.shield(call.result)
-            await asyncio.to_thread(self._store_result, *key, document)
+            result = await asyncio.shield(call.result)
+            return await asyncio.to_thread(self._store_result, *key, result)
         finally:
             if call.result.done() and self.running.get(key) is call:
                 del self.running[key]
-        return document
 
-    def _store_result(self, model_id: str, kind: str, result: dict[str, Any]) -> None:
+    def _store_result(self, model_id: str, kind: str, result: dict[str, Any]) -> dict[str, Any]:
+        """Store a diagnosis apart from the models of its search; return the analysis as it is read again."""
         parts = {kind: {name: part for name, part in result.items() if name != IMPROVEMENT}}
         if IMPROVEMENT in result:
             parts[f"{IMPROVEMENT} of {kind}"] = result[IMPROVEMENT]
         with self.store.write() as session:
             for name, document in parts.items():
                 session.merge(Analysis(model_id=model_id, kind=name, document=document, created_utc=self.clock.utc()))
+        return parts[kind]
 
     async def run(self, verb: str, on_call: OnCall | None = None, **arguments: Any) -> dict[str, Any]:
         """Have a worker do a verb; it goes on if the caller is cancelled."""
