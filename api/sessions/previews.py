@@ -19,7 +19,7 @@ from stimrig.api.store.tables import Participant
 
 VALID_S = 300.0
 """Validity of a preview, s."""
-CAPACITY, CAPACITY_OF_ONE = 60, 5
+CAPACITY, CAPACITY_OF_ONE = 60, 20
 """Previews that are kept of all participants, and of each; the oldest goes first."""
 
 
