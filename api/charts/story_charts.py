@@ -15,19 +15,19 @@ AROUND_S = 1.0
 """Length of the record on each side of the place shown close up, s."""
 
 
-def story_figures(told: dict[str, Any], before: dict[str, Any], after: dict[str, Any], at: str = "") -> Figures:
+def story_figures(story: dict[str, Any], before: dict[str, Any], after: dict[str, Any], at: str = "") -> Figures:
     """Return the figures of the story.
 
-    `told`: as `stimrig.api.models.story` gives it. `before`, `after`: ``curves`` and ``comparison`` of the first model
+    `story`: as `stimrig.api.models.story` gives it. `before`, `after`: ``curves`` and ``comparison`` of the first model
     and of the last one; the same where nothing was added. `at`: as `Figures` takes it.
     """
-    places, rows = told["places"], told["rows"]
+    places, rows = story["places"], story["rows"]
     figures = {"story-torque": side_by_side(before, after, places)}
     if places:
         figures["story-place"] = side_by_side(before, after, places[:1], close=True)
     if len(rows) > 1:
         figures["falling"] = falling(rows)
-    return Figures(figures, at, captions(told))
+    return Figures(figures, at, captions(story))
 
 
 def side_by_side(

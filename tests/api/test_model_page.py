@@ -41,7 +41,7 @@ def model(service: Service) -> str:
 
 def in_state(service: Service, model: str, state: str, diagnosis: dict[str, Any] | None) -> str:
     shown = make_poor(service, model) if state == "not usable" else model
-    service.context.analyses._keep(shown, "diagnosis", {"library": {}, **diagnosis} if diagnosis else None)
+    service.context.analyses._store_result(shown, "diagnosis", {"library": {}, **diagnosis} if diagnosis else None)
     return shown
 
 

@@ -328,7 +328,7 @@ def test_what_is_left_to_add_is_said_by_the_diagnosis_that_named_it(
     assert explanation.remaining(found, ["fatigue_of_mine"], {}) is found
 
     soon(lambda: service.context.analyses.known(model, "diagnosis"))
-    service.context.analyses._keep(model, "diagnosis", found)
+    service.context.analyses._store_result(model, "diagnosis", found)
     searched: list[Any] = []
     submit = service.context.pool.submit
 
@@ -348,7 +348,7 @@ def test_a_free_effect_that_is_forced_and_asked_for_has_the_form_that_was_found(
 ) -> None:
     found = soon(lambda: service.context.analyses.known(model, "diagnosis"))
     free = {"effect": "fatigue", "form": "fitness", "name": "Fatigue", "words": "", "parameters": {}}
-    service.context.analyses._keep(model, "diagnosis", {**found, "missing": [], "free": [free], "add": ["fatigue"]})
+    service.context.analyses._store_result(model, "diagnosis", {**found, "missing": [], "free": [free], "add": ["fatigue"]})
     submit, asked = service.context.pool.submit, []
     monkeypatch.setattr(
         service.context.pool,

@@ -106,7 +106,7 @@ def story_html(
 
     Parameters
     ----------
-    told : dict
+    story : dict
         As `stimrig.api.models.story.story` gives it.
     before, after : dict
         Curves and comparison of the first model and of the last one.

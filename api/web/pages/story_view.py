@@ -28,7 +28,7 @@ async def show_story(request: Request, context: Ctx, _principal: ModelReader, ro
     parts: dict[str, Any] = {"story": {"title": ""}, "problem": None}
     try:
         known = await _known(context, row)
-        parts |= {"story": known["told"], "figures": story_figures(**known, at=f"/models/{row.id}/story/figures/{{}}")}
+        parts |= {"story": known["story"], "figures": story_figures(**known, at=f"/models/{row.id}/story/figures/{{}}")}
     except ApiError as error:
         parts["problem"] = error
     version = await asyncio.to_thread(context.versions.document, row)
@@ -65,7 +65,7 @@ async def _known(context: Context, row: Model) -> dict[str, Any]:
         first, last = (context.analyses.known_diagnosis(version) for version in (path[0], row))
         return story(rows, before["comparison"], after["comparison"], first, last)
 
-    return {"told": await asyncio.to_thread(read_story), "before": before, "after": after}
+    return {"story": await asyncio.to_thread(read_story), "before": before, "after": after}
 
 
 async def _measured(context: Context, row: Model) -> dict[str, Any]:
