@@ -81,7 +81,7 @@ class StrictFile:
             if (kind.length or 0) > LONGEST_TEXT:
                 raise self.bad("texts without an end", path)
             found = []
-            for index in range(dataset.size):  # many may point to one long text, which is then read once and refused
+            for index in range(len(dataset)):  # many may point to one long text, which is then read once and refused
                 text = dataset[index]
                 if len(text) > LONGEST_TEXT:
                     raise self.bad("a text without an end", path)
@@ -118,19 +118,19 @@ class StrictFile:
                 raise self.bad("data that are not plainly in this file (virtual or external)", path)
             if here.shape is None or len(here.shape) != 1:
                 raise self.bad("not of one dimension", path)
-            if here.size > most:
-                raise self.bad(f"{here.size} values are declared, at most {most} are read", path)
+            if len(here) > most:
+                raise self.bad(f"{len(here)} values are declared, at most {most} are read", path)
             self._check_written(here, path)
         return here
 
     def _check_written(self, dataset: h5py.Dataset, path: str) -> None:
         """Refuse values that are declared and were never written: libhdf5 gives the fill value for them."""
         if dataset.chunks is None:
-            if dataset.id.get_storage_size() < dataset.size * dataset.dtype.itemsize:
+            if dataset.id.get_storage_size() < len(dataset) * dataset.dtype.itemsize:
                 raise self.bad("values are declared and were never written", path)
             return
         (length,) = dataset.chunks
-        full, count = length * dataset.dtype.itemsize, -(-dataset.size // length)
+        full, count = length * dataset.dtype.itemsize, -(-len(dataset) // length)
         if full > LARGEST_CHUNK_BYTES or count > MOST_CHUNKS:
             raise self.bad(f"{count} chunks of {full} bytes: too many, or too large", path)
         written = [dataset.id.get_chunk_info(index).size for index in range(dataset.id.get_num_chunks())]
