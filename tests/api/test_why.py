@@ -348,7 +348,8 @@ def test_a_free_effect_that_is_forced_and_asked_for_has_the_form_that_was_found(
 ) -> None:
     found = soon(lambda: service.context.analyses.known(model, "diagnosis"))
     free = {"effect": "fatigue", "form": "fitness", "name": "Fatigue", "words": "", "parameters": {}}
-    service.context.analyses._store_result(model, "diagnosis", {**found, "missing": [], "free": [free], "add": ["fatigue"]})
+    forced = {**found, "missing": [], "free": [free], "add": ["fatigue"]}
+    service.context.analyses._store_result(model, "diagnosis", forced)
     submit, asked = service.context.pool.submit, []
     monkeypatch.setattr(
         service.context.pool,
