@@ -205,7 +205,9 @@ def rig_now(context: Context, principal: Principal | None) -> dict[str, Any]:
 
 
 def notice_key(context: Context, state: str) -> str:
-    """A key that changes when the notice changes."""
+    """Return a key that changes when the notice changes; it is empty in states without a notice (notice.html)."""
+    if state not in ("unreachable", "silent", "latched", "uncertain", "disconnected"):
+        return ""
     latched = f"{status.latch} {status.reason}" if (status := context.rig.status) else ""
     return hashlib.sha256(f"{state} {latched}".encode()).hexdigest()[:12]
 
