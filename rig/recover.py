@@ -10,6 +10,7 @@ import argparse
 import contextlib
 import fcntl
 import json
+import os
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -74,14 +75,13 @@ def _nobody_writes(path: Path) -> Iterator[None]:
     """Lock the journal, and its data folder if it lies in one. Raises BusyError if a rig uses them."""
     locks = [path]
     if path.suffix == ".journal" and path.parent.name == "journals":
-        locks.append(path.parent.parent / "rig.lock")
+        locks.append(path.parent)
     with contextlib.ExitStack() as stack:
-        for lock in locks:
-            if not lock.is_file():
-                continue
+        for lock in filter(Path.exists, locks):
             try:
-                file = stack.enter_context(lock.open("rb"))
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+                fd = os.open(lock, os.O_RDONLY | os.O_CLOEXEC)
+                stack.callback(os.close, fd)
+                fcntl.flock(fd, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
                 raise BusyError(
                     f"journal {path}: a running rig uses it and will seal it; stop that rig first"

@@ -7,7 +7,6 @@ import fcntl
 import os
 import tempfile
 from pathlib import Path
-from typing import IO
 
 from stimrig.rig.errors import BusyError
 
@@ -18,19 +17,22 @@ class Files:
     def make_folder(self, path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
-    def lock(self, folder: Path) -> IO[str]:
-        file = (folder / "rig.lock").open("a+")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            file.seek(0)
-            holder = file.read().strip() or "unknown"
-            file.close()
-            raise BusyError(f"data_dir {folder}: another rig (process {holder}) uses it; stop that rig first") from None
-        file.truncate(0)
-        file.write(str(os.getpid()))
-        file.flush()
-        return file
+    def lock(self, folder: Path) -> contextlib.ExitStack:
+        # not a file of its own: whoever removed that would let a second rig in
+        journals, holder = folder / "journals", folder / "rig.lock"
+        self.make_folder(journals)
+        with contextlib.ExitStack() as held:
+            fd = os.open(journals, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            held.callback(os.close, fd)
+            try:
+                fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError:
+                pid = holder.read_text().strip() if holder.is_file() else "unknown"
+                raise BusyError(
+                    f"data_dir {folder}: another rig (process {pid}) uses it; stop that rig first"
+                ) from None
+            holder.write_text(str(os.getpid()))
+            return held.pop_all()
 
     def create(self, path: Path) -> LogFile:
         return LogFile(path)

@@ -208,7 +208,7 @@ def test_recover_refuses_what_a_living_rig_has(tmp_path: Path, capsys: pytest.Ca
     assert recover.main([str(rig.path)]) == 2
     assert "a running rig uses it" in capsys.readouterr().err
     rig.journal.close()
-    (tmp_path / "journals").mkdir()
+    (tmp_path / "journals").mkdir(exist_ok=True)
     path = rig.path.rename(tmp_path / "journals" / "t.journal")
     with Files().lock(tmp_path):
         assert recover.main([str(path)]) == 2
@@ -265,7 +265,7 @@ def test_a_second_rig_whose_lock_was_removed_does_not_touch_a_journal_that_is_wr
     disk: Any = live.machine.disk
     live.start(live.plan("one", hold_s=1.0))
     live.wait_pulses(PULSES)
-    disk._locked = False  # somebody removed rig.lock
+    disk._locked = False  # somebody moved the journals' folder away and back as a copy
     with pytest.raises(BusyError, match="another rig writes it"):
         make(disk=disk, clock=live.clock)
     live.wait("ready")

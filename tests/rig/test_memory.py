@@ -57,8 +57,10 @@ def test_what_is_asked_for_first_is_written_first_however_slow_the_disk_is(tmp_p
 
 def test_one_rig_a_folder(tmp_path: Path):
     held = Files().lock(tmp_path)
-    with pytest.raises(BusyError, match="another rig"):
-        Files().lock(tmp_path)
+    for _ in range(2):
+        with pytest.raises(BusyError, match="another rig"):
+            Files().lock(tmp_path)
+        (tmp_path / "rig.lock").unlink(missing_ok=True)  # by hand: that lets no second rig in
     held.close()
     Files().lock(tmp_path).close()
 
