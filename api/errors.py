@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
@@ -69,35 +65,6 @@ def forbidden(detail: str) -> ApiError:
 def not_answering() -> ApiError:
     """503: the database is unavailable, or locked for too long."""
     return ApiError(503, "database", "The database does not answer", "Nothing was changed. Try again in a minute.")
-
-
-@dataclass(frozen=True)
-class Change:
-    """One line of a confirmation: what changes, from what to what; `before` is empty where nothing was there."""
-
-    what: str
-    now: str
-    before: str = ""
-
-
-def require_confirmation(
-    sent: str, title: str, button: str, changes: Sequence[Change], warnings: Sequence[str], code: str = "confirm"
-) -> None:
-    """Ask before what deserves a second look: 409, unless `sent` is the token of this very question.
-
-    The problem's `confirm` holds `title`, `button`, `rows`, `warnings` and `token`, which is sent back as
-    `?confirm=TOKEN`.
-    """
-    question: dict[str, Any] = {
-        "title": title,
-        "button": button,
-        "rows": [asdict(change) for change in changes],
-        "warnings": list(warnings),
-    }
-    token = hashlib.sha256(json.dumps(question, sort_keys=True).encode()).hexdigest()[:16]
-    if sent != token:
-        detail = f"{' '.join(warnings)} To do it all the same, send it again with ?confirm={token}."
-        raise ApiError(409, code, title, detail, confirm={**question, "token": token})
 
 
 class SettingsError(Exception):

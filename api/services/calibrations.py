@@ -12,9 +12,10 @@ from typing import Any
 from sqlalchemy import select
 from sqlalchemy.orm import Session
 
-from stimrig.api.errors import ApiError, Change, require_confirmation
+from stimrig.api.errors import ApiError
 from stimrig.api.services import participants
 from stimrig.api.services.context import Context
+from stimrig.api.services.decisions import Change, Decision
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
@@ -47,11 +48,8 @@ def settings(body: CalibrationIn, profile: dict[str, Any]) -> dict[str, Any]:
     return values
 
 
-async def begin(
-    context: Context, code: str, body: CalibrationIn, by: str, tags: Tags, confirm: str = "",
-    interactive: bool = False,
-) -> dict[str, Any]:  # fmt: skip
-    """Open a calibration and return its state; `interactive`: confirm a current far above the usual one first.
+async def begin(context: Context, code: str, body: CalibrationIn, decision: Decision) -> dict[str, Any]:
+    """Open a calibration and return its state; on a page a current far above the usual one is confirmed first.
 
     The calibration is bound to the limits it begins with. Its id ends in the participant's version, which the rig keeps
     even if this service restarts.
@@ -61,9 +59,10 @@ async def begin(
         refuse_archived(row)
         context.runner.refuse_second()
         values = settings(body, row.profile)
-        if interactive:
-            confirm_current(row, values, confirm)
-        identity = await asyncio.to_thread(_write_begin, context, by, code, values, tags)
+        if decision.on_page:
+            confirm_current(row, values, decision)
+        by = decision.by
+        identity = await asyncio.to_thread(_write_begin, context, by, code, values, decision.tags)
         last = messages.Profile.model_validate(row.profile) if body.large_steps else None
         await context.rig.ask(
             requests.CalibrateStartRequest(calibration_id=identity, participant=code, by=by, last=last, **values)
@@ -71,7 +70,7 @@ async def begin(
         return await standing(context, code)
 
 
-def confirm_current(row: Participant, values: dict[str, Any], confirm: str) -> None:
+def confirm_current(row: Participant, values: dict[str, Any], decision: Decision) -> None:
     """Ask before a calibration with a current far above the participant's."""
     if warnings := profiles.jumps(row.profile, {**row.profile, "current_ma": values["current_ma"]}):
         current = f"{values['current_ma']:g} mA"
@@ -80,7 +79,7 @@ def confirm_current(row: Participant, values: dict[str, Any], confirm: str) -> N
             Change("Fine step", f"{values['step_us']:g} µs"),
         ]
         title, button = f"Calibrate {row.code} with {current}?", f"Yes, calibrate with {current}"
-        require_confirmation(confirm, title, button, changes, warnings)
+        decision.require_confirmation(row.version, title, button, changes, warnings)
 
 
 async def step(context: Context, code: str, body: StepIn, tags: Tags) -> dict[str, Any]:

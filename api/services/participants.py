@@ -12,10 +12,11 @@ from typing import Any
 from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
-from stimrig.api.errors import ApiError, Change, require_confirmation, require_found
+from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models.places import Site, in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.services.context import Context, under_limits_lock
+from stimrig.api.services.decisions import Change, Decision
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.requests import MuscleIn, ParticipantIn
 from stimrig.api.store import Store, locking
@@ -54,45 +55,32 @@ def within(session: Session, code: str) -> Participant:
 
 
 @under_limits_lock
-def change_profile(
-    context: Context,
-    code: str,
-    limits: dict[str, Any],
-    by: str,
-    tags: Tags,
-    confirm: str = "",
-    interactive: bool = False,
-) -> Participant:
+def change_profile(context: Context, code: str, limits: dict[str, Any], decision: Decision) -> Participant:
     """Change the given limits of a participant; the others stay.
 
     Raises ApiError: 404 no such participant; 412 changed meanwhile; 422 beyond what the rig takes, or the first ones
-    are not whole; 409 the calibration would be lost, or with `interactive` a limit jumps, and that was not confirmed.
+    are not whole; 409 the calibration would be lost, or on a page a limit jumps, and that was not confirmed.
     """
     with context.store.write() as session:
         row = within(session, code)
-        locking.check(session, row, tags)
+        locking.check(session, row, decision.tags)
         before = row.profile
         check_limits(context, before, limits)
         profile, voids = profiles.changed(before, add_calibration_time(context, limits))
-        confirm_profile(context, code, before, profile, voids, confirm, interactive)
+        confirm_profile(context, row, profile, voids, decision)
         if profile != before:
             row.profile = profile
             now = context.clock.utc()
-            locking.write(session, row, now, by, "set profile", code, profile=profile, voids=voids)
+            locking.write(session, row, now, decision.by, "set profile", code, profile=profile, voids=voids)
     return row
 
 
 def confirm_profile(
-    context: Context,
-    code: str,
-    before: dict[str, Any],
-    profile: dict[str, Any],
-    voids: str,
-    confirm: str,
-    interactive: bool,
-) -> None:
-    """Require confirmation of limits that void the calibration; with `interactive` also of a jump."""
-    warnings = profiles.jumps(before, profile) if interactive else []
+    context: Context, row: Participant, profile: dict[str, Any], voids: str, decision: Decision
+) -> None:  # fmt: skip
+    """Require confirmation of limits that void the calibration; on a page also of a jump."""
+    before = row.profile
+    warnings = profiles.jumps(before, profile) if decision.on_page else []
     if voids:
         required = context.rig.status is None or context.rig.status.require_calibration is not False
         then = " Until the participant is calibrated anew, no test starts." if required else ""
@@ -113,7 +101,7 @@ def confirm_profile(
         was = profiles.range_words(was_rad) if was_rad else ""
         changes.append(Change("Joint angles", profiles.range_words(range_rad), was))
     refusal = "voids-calibration" if voids else "confirm"
-    require_confirmation(confirm, f"Set these limits for {code}?", button, changes, warnings, refusal)
+    decision.require_confirmation(row.version, f"Set these limits for {row.code}?", button, changes, warnings, refusal)
 
 
 def check_limits(context: Context, profile: dict[str, Any], limits: dict[str, Any]) -> None:
@@ -170,35 +158,35 @@ def site_in(body: MuscleIn) -> Site:
 
 
 @under_limits_lock
-def change_site(
-    context: Context, code: str, body: MuscleIn, by: str, tags: Tags, confirm: str = "", interactive: bool = False
-) -> Participant:
+def change_site(context: Context, code: str, body: MuscleIn, decision: Decision) -> Participant:
     """Change the stimulated site, which voids the calibration, models and keys of the site before.
 
     Raises ApiError: 404 no such participant; 412 changed meanwhile; 409 a test or calibration of it is under way, or
-    the calibration would be lost, or with `interactive` the approved model, and that was not confirmed.
+    the calibration would be lost, or on a page the approved model, and that was not confirmed.
     """
     refuse_busy(context, code)
-    now, has_model = context.clock.utc(), interactive and context.versions.approved(code) is not None
+    now, has_model = context.clock.utc(), decision.on_page and context.versions.approved(code) is not None
     with context.store.write() as session:
         row = within(session, code)
-        locking.check(session, row, tags)
+        locking.check(session, row, decision.tags)
         lost, here = loses_calibration(row, body), site_of(row)
         before, after = in_words(here), in_words(site_in(body))
         warnings = []
         if lost:
             warnings.append(f"The calibration is lost with it: its thresholds were found at {before}.")
-        if interactive and here != site_in(body) and has_model:
+        if here != site_in(body) and has_model:
             warnings.append(f"The approved model and its keys are of {before}. Here there is none.")
         if warnings:
             title, refusal = f"Change side and muscle of {code}?", "voids-calibration" if lost else "confirm"
             changes = [Change("Side and muscle", after, before)]
-            require_confirmation(confirm, title, f"Yes, it is {after}", changes, warnings, refusal)
+            decision.require_confirmation(row.version, title, f"Yes, it is {after}", changes, warnings, refusal)
         if here != site_in(body):
             if lost:
                 row.profile = {**row.profile, **dict.fromkeys(profiles.CALIBRATION_FIELDS)}
             row.side, row.muscle, row.placement = site_in(body)
-            locking.write(session, row, now, by, "set muscle", code, **body.model_dump(), voids_calibration=lost)
+            locking.write(
+                session, row, now, decision.by, "set muscle", code, **body.model_dump(), voids_calibration=lost
+            )
     return row
 
 

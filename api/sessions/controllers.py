@@ -13,6 +13,7 @@ from sqlalchemy import select
 from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Auth, Principal, Scope, outside
+from stimrig.api.sessions.playing import Requester
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
@@ -68,7 +69,7 @@ async def start(
     as `Runner.start`.
     """
     if principal.participant is None:
-        return await runner.start(body, principal.name, holder=principal.token_hash, tags=tags)
+        return await runner.start(body, Requester(principal.name, principal.token_hash, tags))
     async with lock:  # two requests must not both use the last remaining trial
         try:
             _refuse_kind(principal, body)
@@ -76,7 +77,7 @@ async def start(
             model = await asyncio.to_thread(_model_sent, runner, body, tags or ())
             body = await _within_plan(runner, store, principal, body, participant)
             version = (str(participant.version),)  # the version that plan and model were checked against
-            return await runner.start(body, principal.name, holder=principal.token_hash, tags=version, model=model)
+            return await runner.start(body, Requester(principal.name, principal.token_hash, version, model))
         except ChangedError:
             raise trial_overtaken() from None
         except ApiError as error:

@@ -15,6 +15,7 @@ from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store import Store, locking
+from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Participant, Token
 from stimrig.rig.requests import StopRequest, WithdrawRequest
 
@@ -25,6 +26,19 @@ RIGHTS = (*locking.MODELS, "set muscle", "archive")
 """Changes with which a right ends that a controller plays by."""
 LOOK_AGAIN_S = 0.25
 """Interval at which it is checked whether a test may still be played: a right may end by time."""
+
+
+@dataclass(frozen=True)
+class Requester:
+    """Who asks for a test, and what they decided it on."""
+
+    name: str
+    token: str = ""
+    """Hash of the token by whose right it is begun."""
+    tags: Tags | None = None
+    """Versions of the participant."""
+    model: str = ""
+    """Tag of the model that a controller's trial was planned with."""
 
 
 @dataclass

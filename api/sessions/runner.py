@@ -28,7 +28,15 @@ from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Lifecycle
 from stimrig.api.sessions.live import Hub
-from stimrig.api.sessions.playing import Current, Playing, may_play, other_than, refuse_archived, right_ended
+from stimrig.api.sessions.playing import (
+    Current,
+    Playing,
+    Requester,
+    may_play,
+    other_than,
+    refuse_archived,
+    right_ended,
+)
 from stimrig.api.sessions.previews import Preview, Previews, refuse_changed
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import AnyEvent, RigClient
@@ -90,41 +98,22 @@ class Runner(Playing):
 
     # ---- start and stop -------------------------------------------------------------------------------------
 
-    async def start(self, body: TestIn, by: str, holder: str = "", tags: Tags | None = None, model: str = "") -> Test:
-        """Begin a test.
+    async def start(self, body: TestIn, requester: Requester) -> Test:
+        """Begin a test; with `plan_hash` the previewed one. Started from it twice, the first test is returned.
 
-        Parameters
-        ----------
-        body : TestIn
-            The test; with `plan_hash` the previewed one. Started from it twice, the first test is returned.
-        by : str
-            Who answers for it.
-        holder : str
-            Hash of the token by whose right it is begun.
-        tags : tuple of str
-            Versions of the participant that it is begun on.
-        model : str
-            Tag of the model that a controller's trial was planned with.
-
-        Raises
-        ------
-        ApiError
-            404 no such participant; 412 it was changed; 409 another test runs, the holder named; 409 it would not be
-            what was seen, or a stop came since it was asked for; 410 no such preview; 503 that was too long ago; what
-            the rig refuses.
+        Raises ApiError: 404 no such participant; 412 it was changed; 409 another test runs, the holder named; 409 it
+        would not be what was seen, or a stop came since it was asked for; 410 no such preview; 503 that was too long
+        ago; what the rig refuses.
         """
         if body.plan_hash is None:
-            return await self._begin(body, by, holder, tags, model)
+            return await self._begin(body, requester)
         preview = self.previews.find(body.participant, body.plan_hash)
         async with preview.starting:
             if preview.test_id is None:
-                return await self._begin(preview.body, by, holder, tags, model, preview)
+                return await self._begin(preview.body, requester, preview)
         return await asyncio.to_thread(self.store.get, Test, preview.test_id)
 
-    async def _begin(
-        self, body: TestIn, by: str, holder: str, tags: Tags | None, model: str, preview: Preview | None = None
-    ) -> Test:
-        tokens = await asyncio.to_thread(self.tokens_of, holder)
+    async def _begin(self, body: TestIn, requester: Requester, preview: Preview | None = None) -> Test:
         await self.let_end()
         self.refuse_second()
         # computes and caches the reach of an adaptive test before the lock, so that other starts do not wait
@@ -133,7 +122,7 @@ class Runner(Playing):
         async with self.start_lock:
             self.refuse_second()
             participant = await self._participant(body)
-            return await self._start(body, participant, by, preview, tokens, tags, model)
+            return await self._start(body, participant, requester, preview)
 
     def _check(self, code: str, tags: Tags | None) -> None:
         with self.store.read() as session:
@@ -149,11 +138,10 @@ class Runner(Playing):
         return participant
 
     async def _start(
-        self, body: TestIn, participant: Participant, by: str, seen_preview: Preview | None, tokens: list[str],
-        tags: Tags | None, model: str,
-    ) -> Test:  # fmt: skip
+        self, body: TestIn, participant: Participant, requester: Requester, seen_preview: Preview | None
+    ) -> Test:
         # rules out a changed participant before the previews are compared
-        await asyncio.to_thread(self._check, body.participant, tags)
+        await asyncio.to_thread(self._check, body.participant, requester.tags)
         if seen_preview is None:
             planned = await self._planned(body, participant)
         else:
@@ -162,9 +150,10 @@ class Runner(Playing):
                 seen_preview.planned, plan=seen_preview.planned.plan.model_copy(update={"test_id": self._new_id()})
             )
         plan = planned.plan
+        tokens = await asyncio.to_thread(self.tokens_of, requester.token)
         until_utc = await asyncio.to_thread(self.until_utc, tokens)
         current = self.current = Current(
-            plan.test_id, plan.participant, by, plan.kind, tokens=tokens, until_utc=until_utc
+            plan.test_id, plan.participant, requester.name, plan.kind, tokens=tokens, until_utc=until_utc
         )
         current_test.set(plan.test_id)
         self.pool.cancel_background()
@@ -172,7 +161,7 @@ class Runner(Playing):
             preview = await self._previewed(plan)
             if seen_preview is not None and not same(seen_preview.answer, preview):
                 raise not_what_was_seen()
-            row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant, tags, model)
+            row = await asyncio.to_thread(self._write_intent, planned, preview, current, body, participant, requester)
             self.hub.begin(plan.test_id)
             await self._command(planned, current)
             current.started = True
@@ -273,9 +262,9 @@ class Runner(Playing):
 
     def _write_intent(
         self, planned: Planned, preview: dict[str, Any], current: Current, body: TestIn, participant: Participant,
-        tags: Tags | None, model: str,
+        requester: Requester,
     ) -> Test:  # fmt: skip
-        now, plan, by = self.clock.utc(), planned.plan, current.by
+        now, plan, by = self.clock.utc(), planned.plan, requester.name
         stored_plan: dict[str, Any] = {
             **plan.model_dump(),
             "preview": preview,
@@ -289,7 +278,7 @@ class Runner(Playing):
         with self.store.write() as session:
             person = session.get(Participant, plan.participant)
             assert person is not None
-            version = locking.check(session, person, tags)
+            version = locking.check(session, person, requester.tags)
             if any(not may_play(session.get(Token, each)) for each in current.tokens):
                 raise right_ended()
             row = Test(
@@ -298,7 +287,7 @@ class Runner(Playing):
                 requested_utc=now, ran_by=other_than(by, body.ran_by),
             )  # fmt: skip
             entry = {"participant": plan.participant, "kind": plan.kind, "shown": dose, "version": version}
-            entry |= {"model": model} if model else {}
+            entry |= {"model": requester.model} if requester.model else {}
             locking.write(session, row, now, by, "start test", plan.test_id, **entry)
             session.add(row)
             current.version = version

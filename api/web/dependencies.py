@@ -10,6 +10,7 @@ from starlette.requests import HTTPConnection
 
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.services.context import Context
+from stimrig.api.services.decisions import Decision
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model
 from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, if_match, require
@@ -27,9 +28,6 @@ async def from_request(request: Request) -> Context:
 
 
 Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
-Interactive = Annotated[
-    bool, Query(alias="ask", description="a person decides: ask before what deserves a second look (409, `confirm`)")
-]
 Ctx = Annotated[Context, Depends(from_request)]
 Anyone = Annotated[Principal, Depends(anyone_signed_in)]
 EvenLocked = Annotated[Principal, Depends(anyone_even_locked)]
@@ -49,6 +47,14 @@ TestVersion = Annotated[Tags, if_match("/v1/tests/{test_id}")]
 UserVersion = Annotated[Tags, if_match("/v1/users")]
 LatchVersion = Annotated[Tags, if_match("/v1/rig")]
 AngleVersion = Annotated[Tags, if_match("/v1/rig/angle")]
+
+
+async def _decision(principal: Tester, tags: ParticipantVersion, confirm: Confirm = "") -> Decision:
+    return Decision(principal.name, tags, confirm, on_page=principal.csrf is not None)
+
+
+ParticipantDecision = Annotated[Decision, Depends(_decision)]
+"""Of who may test; one who is signed in is asked before what deserves a second look (409, `confirm`)."""
 
 
 async def _version(context: Ctx, model_id: str) -> Model:

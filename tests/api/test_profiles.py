@@ -162,6 +162,20 @@ def test_a_calibration_is_lost_knowingly_alone(client: httpx.Client, tight: dict
     assert [profile[name] for name in profiles.CALIBRATION_FIELDS] == [None] * 4 and profile | asked == profile
 
 
+def test_a_confirmation_is_one_persons_and_of_one_version(
+    service: Service, client: httpx.Client, tight: dict[str, float]
+) -> None:
+    def asked(by: httpx.Client, token: str) -> httpx.Response:
+        return by.put(f"{P}/profile", params={"confirm": token}, json={"current_ma": 12.5})
+
+    calibrate(client)
+    token = problem(asked(client, ""), 409)["confirm"]["token"]
+    assert asked(service.client(service.token("lab", "run-test")), token).status_code == 409
+    assert client.put(f"{P}/muscle", json={"side": "left"}).status_code == 200
+    token = problem(asked(client, token), 409)["confirm"]["token"]
+    assert asked(client, token).status_code == 200
+
+
 def test_a_calibration_takes_the_participants_own_limits(
     client: httpx.Client, service: Service, tight: dict[str, float]
 ) -> None:

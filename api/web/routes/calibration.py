@@ -8,15 +8,7 @@ from fastapi import APIRouter, Response
 
 from stimrig.api.services import calibrations
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
-from stimrig.api.web.dependencies import (
-    PROBLEM,
-    CalibrationVersion,
-    Confirm,
-    Ctx,
-    Interactive,
-    ParticipantVersion,
-    Tester,
-)
+from stimrig.api.web.dependencies import PROBLEM, CalibrationVersion, Ctx, ParticipantDecision, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import CalibratedOut, CalibrationOut
 
@@ -25,14 +17,11 @@ router = APIRouter(prefix="/v1/participants/{code}/calibration", tags=["calibrat
 
 @router.post("", status_code=201, **describe_answer(CalibrationOut, 201, "open; nothing was sent yet"))
 async def begin_calibration(
-    context: Ctx, principal: Tester, code: str, tags: ParticipantVersion, response: Response,
-    body: CalibrationIn | None = None, confirm: Confirm = "", interactive: Interactive = False,
-) -> dict[str, Any]:  # fmt: skip
+    context: Ctx, code: str, decision: ParticipantDecision, response: Response, body: CalibrationIn | None = None
+) -> dict[str, Any]:
     """Open a guided calibration: nothing is sent until a step is asked for."""
-    calibration = await calibrations.begin(
-        context, code, body or CalibrationIn.model_validate({}), principal.name, tags, confirm, interactive
-    )
-    return tagged(response, calibration)
+    body = body or CalibrationIn.model_validate({})
+    return tagged(response, await calibrations.begin(context, code, body, decision))
 
 
 @router.get("", **describe_answer(CalibrationOut))

@@ -13,7 +13,7 @@ from fastapi import APIRouter, Query, Response
 from stimrig.api.services import notes, participants
 from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
 from stimrig.api.store.tables import Participant
-from stimrig.api.web.dependencies import PROBLEM, Confirm, Ctx, Interactive, ParticipantVersion, Tester
+from stimrig.api.web.dependencies import PROBLEM, Ctx, ParticipantDecision, ParticipantVersion, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 
@@ -53,42 +53,28 @@ def tagged(response: Response, row: Participant) -> dict[str, Any]:
 
 @router.put("/{code}/profile", **describe_answer(ChangedOut))
 async def set_profile(
-    context: Ctx,
-    principal: Tester,
-    code: str,
-    tags: ParticipantVersion,
-    body: ProfileIn,
-    response: Response,
-    confirm: Confirm = "",
-    interactive: Interactive = False,
+    context: Ctx, code: str, decision: ParticipantDecision, body: ProfileIn, response: Response
 ) -> dict[str, Any]:
     """Change limits: those that are sent; the others keep their values, and so does what a calibration found.
 
-    A limit wider than at the calibration voids it: 409, until it is confirmed. `meanwhile` says what it means for a
+    A limit wider than at the calibration voids it: 409, until it is confirmed. Who is signed in also confirms a limit
+    that rises by more than a quarter. `meanwhile` says what it means for a
     test that runs, or a calibration that is open.
     """
-    row = await participants.change_profile(context, code, body.sent(), principal.name, tags, confirm, interactive)
+    row = await participants.change_profile(context, code, body.sent(), decision)
     return {**tagged(response, row), "meanwhile": participants.effect_on_open_work(context, code)}
 
 
 @router.put("/{code}/muscle", **describe_answer(ParticipantOut))
 async def set_muscle(
-    context: Ctx,
-    principal: Tester,
-    code: str,
-    tags: ParticipantVersion,
-    body: MuscleIn,
-    response: Response,
-    confirm: Confirm = "",
-    interactive: Interactive = False,
+    context: Ctx, code: str, decision: ParticipantDecision, body: MuscleIn, response: Response
 ) -> dict[str, Any]:
     """Say the site. Another one than before voids the calibration: 409, until it is confirmed.
 
     A model belongs to the site at which it was measured: at another one there is no approved model, and no key of a
     controller, until it has its own. Tests keep the site that they were begun with.
     """
-    row = await participants.change_site(context, code, body, principal.name, tags, confirm, interactive)
-    return tagged(response, row)
+    return tagged(response, await participants.change_site(context, code, body, decision))
 
 
 @router.post("/{code}/archive", **describe_answer(ParticipantOut))
