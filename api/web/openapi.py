@@ -13,7 +13,9 @@ from stimrig.api.web.responses.base import Problem
 from stimrig.api.web.responses.models import TrackedOut
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
-EMBEDDED = ("model", "effects")
+EXTENDED = ("Comparison", "Diagnosis", "Improvement")
+"""Answers that hold to a published schema, and say more."""
+EMBEDDED = ("model", "effects", *map(str.lower, EXTENDED))
 DESCRIPTION = """
 Programs send `Authorization: Bearer <token>`; browsers have a session's cookie. Each operation names its scope.
 
@@ -81,6 +83,8 @@ def _complete(document: dict[str, Any]) -> None:
         components.pop(name, None)
     for name in EMBEDDED:
         components.update(schemas.components(name))
+    for name in EXTENDED:
+        components[f"{name}Out"]["allOf"] = [{"$ref": f"#/components/schemas/{name}Json"}]
     components["ModelJson"]["properties"]["tracking"] = {"$ref": "#/components/schemas/TrackedOut"}
     for methods in document["paths"].values():
         for operation in methods.values():

@@ -10,6 +10,7 @@ from typing import Any
 
 import h5py
 import httpx
+import jsonschema_rs
 import pytest
 
 from bench.muscles import hidden_records
@@ -413,23 +414,23 @@ def test_a_model_on_another_recording(client: httpx.Client, pages: httpx.Client,
 
 def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path) -> None:
     """identify's own answers carry what page and routes build on."""
+    from stimrig.api import schemas
     from stimrig.api.jobs import verbs
     from stimrig.api.jobs.curves import comparison
     from stimrig.api.jobs.verbs import fit
-    from stimrig.api.web.responses.models import ComparisonOut, DiagnosisOut
 
     path = str(tmp_path / "record.csv")
     hidden_records.write_csv(hidden_records.generate("asymmetric_relaxation", "middle", 8, rate_hz=100), path)
     told: list[float] = []
     with few_effects.only("asymmetric_relaxation", "fatigue", "recruitment_hysteresis", "potentiation"):
         found = verbs.diagnosis(path, lambda share, _text="": told.append(share))
-    DiagnosisOut.model_validate(found)
+    assert list(jsonschema_rs.validator_for(schemas.load("diagnosis")).iter_errors(found)) == []
     assert told == sorted(told) and told[-1] <= 1 and len(told) >= 4
     assert (found["structure"], found["verdict"]) == ([], "effect_missing")
     assert [entry["effect"] for entry in found["missing"]] == ["asymmetric_relaxation"]
     model = fit(path, lambda *_: None)
     compared = comparison(path, lambda *_: None, model["json"])
-    ComparisonOut.model_validate(compared)
+    assert list(jsonschema_rs.validator_for(schemas.load("comparison")).iter_errors(compared)) == []
     assert 1000 < len(compared["series"]["time_s"]) <= 2400
     view = explanation.view(found, compared)
     assert [entry["effect"] for entry in view["missing"]] == ["asymmetric_relaxation"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field, JsonValue
+from pydantic import Field
 
 from stimrig.api.models.tracking import Limits
 from stimrig.api.web.responses.base import Document, Problem, SegmentOut
@@ -73,61 +73,8 @@ class VersionOut(Document):
     created_utc: str
 
 
-class Place(Document):
-    """A stretch that holds much of the error."""
-
-    segment: str
-    start_s: float
-    end_s: float
-    pulse_width_us: list[float]
-    direction: Literal["rising", "falling", "held"] | None
-    share_of_excess: float
-    text: str = ""
-
-
-class Part(Document):
-    """The error's part in a class of samples."""
-
-    label: str
-    rms_nm: float | None
-    share_of_excess: float
-
-
-REPETITION = "what repeats in the recording, and how much of that the model explains; null: from an older version"
-
-
 class ComparisonOut(Document):
-    """Measurement against the model's free run."""
-
-    fit_percent: float | None
-    ceiling_percent: float | None = Field(
-        description="that the true system would reach on this noise; a fit follows a little of it, and may be above"
-    )
-    rms_nm: float | None
-    noise_sd_nm: float | None
-    repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
-    by: dict[Literal["segment", "level", "direction", "time", "frequency"], list[Part]] | None = Field(
-        None, description="the error split up"
-    )
-    where: list[Place] = Field([])
-    series: dict[str, list[JsonValue] | float | str | None] = Field(
-        default={}, description="curves for drawing, thinned, by name, and `noise_band_nm`, N·m"
-    )
-    plain: list[str] = Field([], description="in sentences")
-
-
-class MissingOut(Document):
-    """An effect that the recording asks for."""
-
-    effect: str
-    probability: float | None
-    rms_before_nm: float | None
-    rms_after_nm: float | None
-    held_out_rms_before_nm: float | None
-    held_out_rms_after_nm: float | None
-    confused_with: list[str]
-    next_experiment: str
-    parameters: dict[str, ParameterOut]
+    """Measurement against the model's free run: the schema `comparison`."""
 
 
 class ExperimentOut(Document):
@@ -142,43 +89,15 @@ class ExperimentOut(Document):
     pulse_rate_hz: float = Field(40.0, description="of the recording, which its own is joined to")
 
 
-class FiguresOut(Document):
-    """How well a model fits."""
-
-    fit_percent: float | None = Field(None, description="best-fit, %")
-    held_out_fit_percent: float | None = Field(None, description="best-fit of held-out pulses, %")
-    rms_nm: float | None = Field(None, description="N·m")
-    held_out_rms_nm: float | None = Field(None, description="N·m")
-    repetition: dict[str, float | str | None] | None = Field(None, description=REPETITION)
-    unforeseen_nm: float | None = Field(None, description="of held-out pulses, left out of predictions, N·m")
-
-
-class StepOut(FiguresOut):
-    """A step of improving."""
-
-    added: str | None = Field(description="the effect that came; null: the structure it began with")
-
-
 class DiagnosisOut(Document):
-    """What is missing in a model's structure."""
+    """What is missing in a model's structure: the schema `diagnosis`, and the next experiment."""
 
-    structure: list[str] | None = Field(
-        None, description="effects of the structure criticised, `id` or `id:form`; null: made when it was always plain"
-    )
-    verdict: Literal["effect_missing", "nothing_missing", "unexplained_structure"]
-    noise_sd_nm: float | None = None
-    base: FiguresOut | None = None
-    missing: list[MissingOut]
-    where: list[Place]
     experiment: ExperimentOut | None = None
 
 
 class ImprovementOut(Document):
-    """Effects added one by one."""
+    """Effects added one by one: the schema `improvement`, and the versions."""
 
-    verdict: str
-    noise_sd_nm: float | None = None
-    steps: list[StepOut]
     versions: list[VersionOut] = Field(description="the versions of these steps, the first one included")
 
 
@@ -355,52 +274,51 @@ Levels = Annotated[
 ]
 
 
-class TrackedOut(Document):
-    """What a model that is asked for with `tracked` was moved by; missing in one that nothing has moved yet."""
+class StepOut(Document):
+    """What a trial said of the muscle."""
 
-    approved_model_id: str
-    trial: int = Field(description="the trial that it was tracked to; 0: none")
-    test_id: str | None
-    at_utc: str
-    moved: list[str] | None = Field(description="the quantities by which the model was moved")
-    now: Levels | None = Field(description="in that trial")
-    coming: Levels | None = Field(description="expected in the next one: what the model holds")
-    effects: dict[str, dict[str, float]] | None = Field(description="as in a trial")
-    disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches to learn nothing from, s")
-    limits: Limits | None
-    outcome: str | None
-    ask: str | None = Field(description="null, or why a person has to look: then end")
-
-
-class TrialOut(Document):
-    """A trial."""
-
-    number: int = Field(description="since the approval, from 1")
-    test_id: str
-    recording_id: str | None
     at_utc: str = Field(description="when it was followed")
-    outcome: Literal["followed", "little", "odd", "no-torque", "contradicts", "not-followed"] = Field(
-        description="`little`: it tells little; `odd`: it is far from what was expected, and moves little; "
-        "`contradicts`: gain, threshold and time scale do not explain it; `no-torque`: the pulses gave next to no "
-        "torque, as with a loose electrode or cable; `not-followed`: `reason` says why"
-    )
-    reason: str
-    ask: str | None = Field(description="why a new test was needed after it, in a sentence")
-    error_percent: float | None = Field(description="of the torque against `reference_torque_nm`, % of its rms")
-    delay_s: float | None = Field(description="from its last sample to the model being served")
     now: Levels | None = Field(description="in this trial")
     coming: Levels | None = Field(description="expected in the next one")
     effects: dict[str, dict[str, float]] | None = Field(
         description="by effect id, its slow state from 0 (rested) to 1: `now` at this trial's end, `coming` at the "
         "next one's begin; empty if the model has no such effect"
     )
+    disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches that do not fit, s")
+    ask: str | None = Field(description="null, or why a new test is needed, in a sentence: a controller ends then")
+
+
+class TrackedOut(StepOut):
+    """What a model that is asked for with `tracked` was moved by; missing in one that nothing has moved yet."""
+
+    approved_model_id: str
+    trial: int = Field(description="the trial that it was tracked to; 0: none")
+    test_id: str | None
+    moved: list[str] | None = Field(description="the quantities by which the model was moved")
+    limits: Limits | None
+    outcome: str | None
+
+
+class TrialOut(StepOut):
+    """A trial."""
+
+    number: int = Field(description="since the approval, from 1")
+    test_id: str
+    recording_id: str | None
+    outcome: Literal["followed", "little", "odd", "no-torque", "contradicts", "not-followed"] = Field(
+        description="`little`: it tells little; `odd`: it is far from what was expected, and moves little; "
+        "`contradicts`: gain, threshold and time scale do not explain it; `no-torque`: the pulses gave next to no "
+        "torque, as with a loose electrode or cable; `not-followed`: `reason` says why"
+    )
+    reason: str
+    error_percent: float | None = Field(description="of the torque against `reference_torque_nm`, % of its rms")
+    delay_s: float | None = Field(description="from its last sample to the model being served")
     error_nm: float | None = Field(description="what no gain, threshold or time scale explains, N·m")
     expected_error_nm: float | None = Field(description="the same on the approved model's own recording, N·m")
     distance: float | None = Field(
         description="of what it said from what was expected, squared, in standard deviations; null: the model learnt "
         "nothing from it"
     )
-    disturbed_s: list[list[float]] | None = Field(description="begin and end of stretches that do not fit, s")
 
 
 class TrackingOut(Document):

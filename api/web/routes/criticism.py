@@ -20,7 +20,7 @@ LATER: dict[int | str, dict[str, Any]] = {202: {"model": JobOut, "description": 
 Wait = Annotated[bool, Query(description="false: answer 202 at once, with the job's address")]
 
 
-@router.get("/models/{model_id}/comparison", response_model=ComparisonOut)
+@router.get("/models/{model_id}/comparison", **describe_answer(ComparisonOut))
 async def comparison(
     context: Ctx,
     _principal: ModelReader,
