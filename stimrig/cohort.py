@@ -1,4 +1,4 @@
-"""`stimrig cohort`: one verb over many recordings, two runs compared, figures (docs/cohorts.md).
+"""`stimrig cohort`: one verb over many recordings (docs/cohorts.md).
 
 `options` are those of the command line: `select`, `method`, `effects`, `scheduler`, `workers`, `memory`, `limit`, …
 """
@@ -11,7 +11,7 @@ from typing import Any
 
 from stimrig.verbs import Report
 
-__all__ = ["changed", "diagnose", "figures", "fit", "improve"]
+__all__ = ["diagnose", "fit", "improve"]
 
 
 def _run(verb: str, data: Sequence[str | Path], output: str | Path, options: dict[str, Any]) -> Report:
@@ -68,36 +68,3 @@ def improve(data: Sequence[str | Path], output: str | Path, **options: Any) -> R
         Those of the command line.
     """
     return _run("improve", data, output, options)
-
-
-def changed(old: str | Path, new: str | Path) -> Report:
-    """Whose results differ between two runs, and why.
-
-    Parameters
-    ----------
-    old : path
-        Results of the earlier run.
-    new : path
-        Results of the later one.
-    """
-    from stimrig.api.cli.commands.cohort import require_extra
-
-    require_extra()
-    from stimrig.api.cohort.changed import compare_runs
-
-    return Report("cohort changed", compare_runs(Path(old), Path(new)))
-
-
-def figures(results: str | Path, html: str | Path) -> Report:
-    """Draw a cohort into an HTML file: effects by prevalence, parameters over sessions, errors by reason.
-
-    Parameters
-    ----------
-    results : path
-        The Parquet file of a run.
-    html : path
-        File to write.
-    """
-    from stimrig.api.cli.commands.cohort import draw
-
-    return Report("cohort figures", draw(Path(results), Path(html)))

@@ -16,7 +16,7 @@ IN_FULL = ("fatigue", "plain", "electromechanical_delay", "sealed", "rig_plain")
 VERBS = (
     "", "fit", "predict", "compare", "diagnose", "improve", "invert", "export", "recover", "audit", "audit verify",
     "audit export", "effects", "schema", "table1", "test", "doctor", "demo", "serve", "emulate",
-    "cohort", "cohort fit", "cohort diagnose", "cohort improve", "cohort changed", "cohort figures",
+    "cohort", "cohort fit", "cohort diagnose", "cohort improve",
 )  # fmt: skip
 REFUSED = (
     "fly", "fit", "fit none.csv", "fit plain.csv --effects no_such_effect", "fit plain.csv --effects fatigue:none",
@@ -33,8 +33,7 @@ REFUSED = (
     "table1 --trials 0", "test --protocol none", "test --rig none.toml", "cohort fit",
     "cohort fit nowhere -o r.parquet",
     "cohort fit cohort -o r.parquet --select day", "cohort fit cohort -o r.parquet --workers 0",
-    "cohort changed plain.csv plain.csv", "cohort figures plain.csv -o f.html", "serve --port 99999",
-    "emulate --patient none", "emulate --fault none",
+    "serve --port 99999", "emulate --patient none", "emulate --fault none",
 )  # fmt: skip
 DONE = (
     "--version", "effects", "effects --json", "table1 --trials 2", "table1 --trials 1 --json",
@@ -46,8 +45,6 @@ DONE = (
     "cohort fit cohort -o fit.parquet --workers 1 --json", "cohort fit cohort -o fit.parquet --workers 1",
     "cohort fit cohort -o tired.parquet --workers 1 --effects fatigue",
     "cohort diagnose cohort -o diagnosed.parquet --workers 1 --json --select participant=='P001'",
-    "cohort changed fit.parquet tired.parquet", "cohort changed fit.parquet tired.parquet --json",
-    "cohort figures fit.parquet -o figures.html --json",
 )  # fmt: skip
 
 

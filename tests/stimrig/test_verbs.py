@@ -112,9 +112,6 @@ def recovers(_at: Path, new: Path) -> None:
 def cohort_fits(at: Path, new: Path) -> None:
     found = stimrig.cohort.fit([at / "record.csv"], new / "results.parquet", workers=1)
     assert (found["ok"], found["errors"]) == (1, 0), found
-    assert stimrig.cohort.changed(new / "results.parquet", new / "results.parquet")["unchanged"] == 1
-    assert stimrig.cohort.figures(new / "results.parquet", new / "cohort.html")["records"] == 1
-    assert "<html" in (new / "cohort.html").read_text()
 
 
 def exports(at: Path, new: Path) -> None:
@@ -143,7 +140,7 @@ REST: dict[str, Callable[[Path, Path], Any]] = {
     "effects": lambda *_: [row["equation"] and row["source"] for row in stimrig.effects()],
     "schema": lambda *_: stimrig.schema("invert")["properties"]["pulse_width_us"],
 }
-ELSEWHERE = ("cohort changed", "cohort figures", "test", "cohort diagnose", "cohort improve")
+ELSEWHERE = ("test", "cohort diagnose", "cohort improve")
 """Run by another one of these tests, or as the others of a cohort by `tests/api/cohort`."""
 
 

@@ -1,4 +1,4 @@
-"""`stimrig cohort`: one verb over many recordings, two runs compared, figures over a cohort.
+"""`stimrig cohort`: one verb over many recordings.
 
 Its packages are an extra (`pip install stimrig[cohort]`): loaded where they are used, so that the verb can say so.
 """
@@ -15,13 +15,10 @@ import typer
 
 from stimrig.api.cli.commands.fit import METHOD
 from stimrig.api.cli.errors import INTERRUPTED, CommandError, InputError
-from stimrig.api.cli.files import write
 from stimrig.api.cli.options import Json, names
-from stimrig.api.cli.terminal import say, say_json, table
+from stimrig.api.cli.terminal import say, say_json
 
 NEEDED = ("dask", "distributed", "fsspec", "pyarrow")
-MAX_LISTED = 40
-"""Changed records that are shown; --json gives all."""
 
 Addresses = Annotated[
     list[str],
@@ -52,11 +49,9 @@ RUNS = {
 
 def register(app: typer.Typer) -> None:
     """Add the verb and its verbs."""
-    verbs = typer.Typer(no_args_is_help=True, help="Fit or diagnose many recordings, compare two runs, draw a cohort.")
+    verbs = typer.Typer(no_args_is_help=True, help="Fit, diagnose or improve many recordings.")
     for verb, help_text in RUNS.items():
         verbs.command(verb, help=help_text)(_run_of(verb))
-    for command in (changed, figures):
-        verbs.command(command.__name__)(command)
     app.add_typer(verbs, name="cohort")
 
 
@@ -127,45 +122,6 @@ def refuse_undone(done: int, failed: int, where: str) -> None:
         raise CommandError(f"{nothing}no record was selected.")
 
 
-def changed(
-    old: Annotated[Path, typer.Argument(metavar="OLD.parquet", show_default=False)],
-    new: Annotated[Path, typer.Argument(metavar="NEW.parquet", show_default=False)],
-    as_json: Json = False,
-) -> None:
-    """Whose results differ between two runs, and why: what a new release is judged by before it is used on people."""
-    require_extra()
-    from stimrig.api.cohort.changed import compare_runs
-
-    report = compare_runs(old, new)
-    say_json(report) if as_json else say(*changed_lines(report))
-
-
-def figures(
-    results: Annotated[Path, typer.Argument(metavar="RESULTS.parquet", show_default=False)],
-    html: Annotated[Path, typer.Option("-o", "--html", help="file to write: works offline, in any browser")],
-    as_json: Json = False,
-) -> None:
-    """Draw a cohort: effects by prevalence, parameters over sessions, repeatability, errors by reason."""
-    report = draw(results, html)
-    summary = f"{report['records']} records, {report['ok']} with a result, {report['participants']} participants"
-    say_json(report) if as_json else say(summary, f"written to {html}")
-
-
-def draw(results: Path, html: Path) -> dict[str, Any]:
-    """Draw a cohort into a file; return the keys of `--json`. Raises InputError."""
-    require_extra()
-    from stimrig.api.cohort.figures import page, read_cohort
-
-    cohort = read_cohort(results)
-    write(html, page(cohort, results.name))
-    counted, total, effects = cohort.prevalence()
-    return {
-        "output": str(html), "records": cohort.ok + cohort.errors.total(), "ok": cohort.ok,
-        "errors": dict(cohort.errors), "participants": len(cohort.participants), "verdicts": dict(cohort.verdicts),
-        "counted": counted, "of": total, "effects": dict(effects), "repeatability": cohort.repeatability(),
-    }  # fmt: skip
-
-
 def require_extra() -> None:
     """Raise InputError if a package of the extra is missing."""
     missing = [name for name in NEEDED if importlib.util.find_spec(name) is None]
@@ -190,28 +146,3 @@ def skipped_lines(report: dict[str, Any], verb: str) -> list[str]:
     left_out, copies = report["left_out"], report["copies"]
     lines = [f"left out       {left_out} that --select does not mean"] if left_out else []
     return lines + ([f"copies         {copies} files with the content of another: {verb} once"] if copies else [])
-
-
-def changed_lines(report: dict[str, Any]) -> list[str]:
-    """Describe a comparison of two runs."""
-    old, new, limits = report["old"], report["new"], report["tolerances"]
-    lines = [
-        f"{old['verb']}: stimrig {old['software']} ({old['file']}) → stimrig {new['software']} ({new['file']})",
-        *([f"made with other options: {report['other_options']}"] if report["other_options"] else []),
-        f"{report['compared']} records in both: {report['unchanged']} unchanged, {report['changed']} changed",
-        *(f"  {count:6d}  {kind}" for kind, count in report["counts"].items()),
-        f"unchanged: a probability within {limits['probability']:g}, a parameter within {limits['parameter_sd']:g} sd "
-        f"(without one {100 * limits['parameter_without_sd_relative']:g} %), held-out rms within "
-        f"{100 * limits['held_out_rms_relative']:g} %",
-    ]
-    for run_name in ("old", "new"):
-        if records := report[f"only_in_{run_name}"]:
-            more = f" and {len(records) - 10} more" if len(records) > 10 else ""
-            lines.append(f"only in {run_name}: {len(records)} ({', '.join(records[:10])}{more})")
-    rows = [
-        (row["record"], row["participant"] or "–", row["day"] or "–", "; ".join(row["why"]))
-        for row in report["records"][:MAX_LISTED]
-    ]
-    lines += ["", *table(("record", "participant", "day", "why"), rows)] if rows else []
-    hidden = len(report["records"]) - len(rows)
-    return [*lines, *([f"and {hidden} records more (--json gives all)"] if hidden else [])]
