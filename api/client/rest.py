@@ -231,10 +231,6 @@ class Client(Connection):
         """Sessions of a participant, oldest first: figures with their uncertainty, and what changed."""
         return self._request_as(models.TrendOut, "GET", f"/participants/{participant}/trend")
 
-    def trend_csv(self, participant: str) -> bytes:
-        """The same as a CSV file."""
-        return self.request("GET", f"/v1/participants/{participant}/trend.csv").content
-
     def version(self, model_id: str) -> VersionOut:
         """One model version."""
         return self._request_as(VersionOut, "GET", f"/models/{model_id}")

@@ -326,11 +326,3 @@ def test_explain_tells_how_the_error_falls_and_agrees_with_the_other_verbs(tired
 
 def _without_ids(improved: dict) -> list[dict]:
     return [{key: value for key, value in step.items() if key != "model_id"} for step in improved["steps"]]
-
-
-def test_what_diagnose_writes_is_what_the_page_shows_and_small(tired: Path, tmp_path: Path) -> None:
-    report = tmp_path / "diagnosis.html"
-    said = stimrig("diagnose", tired / "record.csv", "--html", report)
-    text = report.read_text()
-    assert 'id="missing-fatigue"' in text and 'id="effect-fatigue"' in text
-    assert said.split(" (probability")[0] in text and len(text) < 1_000_000

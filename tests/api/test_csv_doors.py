@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +15,6 @@ from stimrig import identify
 from stimrig.api import record_files
 from stimrig.api.cli import main
 from stimrig.api.models import inverted
-from stimrig.api.web.routes import trend
 from stimrig.identify.records import cells
 from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.record import Record, Source
@@ -61,19 +59,6 @@ def test_a_recording(tmp_path: Path) -> None:
     given, back = identify.read(tmp_path / "in.csv"), identify.read(tmp_path / "out.csv")
     assert back.segment_names == given.segment_names
     assert np.array_equal(back.torque_nm, given.torque_nm)
-
-
-def test_a_trend() -> None:
-    for text in HOSTILE:
-        note = {"at_utc": text, "by": text, "kind": text, "text": text}
-        figure = {"unit": text, "value": -1.5, "sd": None}
-        session: dict[str, Any] = {
-            "at_utc": "2026-01-05T09:00:00Z", "approved": True, "effects": [text], "figures": {text: figure},
-            "notes": [note], **dict.fromkeys(("model_id", "recording_id", "approved_by", "approved_utc"), text),
-            **dict.fromkeys(("verdict", "method", "versions"), text),
-        }  # fmt: skip
-        head, row = csv.reader(trend.table([session]).splitlines())
-        assert not any(map(runs, head)) and {cell for cell in row if runs(cell)} == {"-1.5"}
 
 
 def test_an_export(tmp_path: Path) -> None:

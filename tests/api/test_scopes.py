@@ -58,7 +58,6 @@ GET    /v1/participants/x/model                            read-model     404
 GET    /v1/participants/x/models                           read-model     404
 GET    /v1/participants/x/tracking                         read-model     404
 GET    /v1/participants/x/trend                            read-model     404
-GET    /v1/participants/x/trend.csv                        read-model     404
 GET    /v1/recordings/x                                    read-model     404
 GET    /v1/recordings/x/csv                                read-model     404
 GET    /v1/effects                                         read-model     200
@@ -66,9 +65,7 @@ GET    /v1/jobs/x                                          read-model     404
 GET    /models/x                                           read-model     404
 GET    /models/x/report                                    read-model     404
 GET    /models/x/figures/x                                 read-model     404
-GET    /models/x/story                                     read-model     404
 GET    /models/x/story.html                                read-model     404
-GET    /models/x/story/figures/x                           read-model     404
 GET    /compare/figures/x                                  read-model     422
 GET    /participants/x/trend                               read-model     404
 GET    /compare                                            read-model     422

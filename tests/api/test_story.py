@@ -1,4 +1,4 @@
-"""The story of a model on its page: where it failed, what was added, how the error fell, and why that ended."""
+"""The story of a model as a file: where it failed, what was added, how the error fell, and why that ended."""
 
 from __future__ import annotations
 
@@ -15,27 +15,18 @@ def model(client: httpx.Client, participant: str) -> str:
     return run_test(client, participant)["model_id"]
 
 
-def test_story_begins_with_what_is_missing_and_ends_with_the_falling_error(
+def test_the_story_begins_with_what_is_missing_and_ends_with_the_error(
     service: Service, client: httpx.Client, model: str
 ) -> None:
     client.get(f"/v1/models/{model}/diagnosis")
     with signed_in(service) as page:
-        first = page.get(f"/models/{model}/story").text
+        first = page.get(f"/models/{model}/story.html").text
         assert "What is missing" in first and "The held-out error is" in first and "To decide between" in first
         last = client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"]
         client.get(f"/v1/models/{last}/diagnosis")
-        told = page.get(f"/models/{last}/story").text
-        assert (
-            "The held-out error did not fall" in told
-            and "What was missing" in told
-            and told.count('class="still"') == 3
-        )
-        file = page.get(f"/models/{last}/story.html")
-        assert file.headers["content-disposition"] == "attachment" and "The held-out error did not fall" in file.text
-        for kind, start in (("svg", b"<svg"), ("pdf", b"%PDF"), ("png", b"\x89PNG")):
-            assert page.get(f"/models/{last}/story/figures/falling.{kind}").content.startswith(start)
-        for name in ("falling.exe", "nothing.svg"):
-            assert page.get(f"/models/{last}/story/figures/{name}").status_code == 404
+        told = page.get(f"/models/{last}/story.html")
+        assert told.headers["content-disposition"] == "attachment" and told.text.count('class="still"') == 3
+        assert "The held-out error did not fall" in told.text and "What was missing" in told.text
 
 
 def test_the_improvement_that_a_diagnosis_found_is_not_searched_again(

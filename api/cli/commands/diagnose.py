@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from stimrig import identify
-from stimrig.api.cli.files import load_structure, short, write
-from stimrig.api.cli.options import ColumnMap, HeldModel, Html, Json, SeveralData
+from stimrig.api.cli.files import load_structure
+from stimrig.api.cli.options import ColumnMap, HeldModel, Json, SeveralData
 from stimrig.api.cli.reports import repetition_lines
 from stimrig.api.cli.terminal import number, percent, say, say_json
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.structure import in_words, worded
 
 
-def diagnose(
-    data: SeveralData, model_json: HeldModel = None, html: Html = None, columns: ColumnMap = None, as_json: Json = False
-) -> None:
+def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap = None, as_json: Json = False) -> None:
     """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
 
     Takes 5 to 30 s, longer where structure is left or with several recordings. DATA decides: a model given with --model
@@ -24,25 +21,12 @@ def diagnose(
     """
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
-        if html is None:
-            diagnosis = identify.diagnose(record, model, progress)
-        else:
-            diagnosis, improved = identify.diagnose_and_improve(record, progress, model)
-            write(html, _report(record, diagnosis, improved, structure, short(data)))
+        diagnosis = identify.diagnose(record, model, progress)
     document = {"structure": structure, **diagnosis.to_dict()}
     if as_json:
         say_json(document)
         return
-    say(*diagnosis_lines(document), *([] if html is None else ["", f"report         {html}"]))
-
-
-def _report(record: Any, diagnosis: Any, improved: Any, structure: Sequence[str], name: str) -> str:
-    from stimrig.api.jobs.curves import rounded, segments_of
-    from stimrig.api.jobs.verbs import finding_of
-    from stimrig.api.web.pages.report_file import diagnosis_html
-
-    comparison = rounded(identify.compare(improved.models[0], record).to_dict())
-    return diagnosis_html(finding_of(record, diagnosis, improved, structure), comparison, segments_of(record), name)
+    say(*diagnosis_lines(document))
 
 
 def diagnosis_lines(diagnosis: dict[str, Any]) -> list[str]:
