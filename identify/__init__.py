@@ -54,7 +54,7 @@ _PLACES = {
 }
 _MODULES = {"effects", "methods"}
 
-__all__ = [*_PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
+__all__ = [*_PLACES]  # type: ignore
 
 
 def __getattr__(name: str) -> Any:

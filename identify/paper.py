@@ -36,7 +36,7 @@ def torque(width_us: np.ndarray, sample_rate_hz: float) -> np.ndarray:
     from scipy.signal import cont2discrete, lfilter
 
     transfer = ([1.0], [TIME_CONSTANT_S**2, 2 * DAMPING * TIME_CONSTANT_S, 1.0])
-    b, a = cont2discrete(transfer, 1.0 / sample_rate_hz, method="zoh")[:2]  # pyright: ignore
+    b, a = cont2discrete(transfer, 1.0 / sample_rate_hz, method="zoh")[:2]  # type: ignore
     each = round(sample_rate_hz / PULSE_RATE_HZ)
     return np.asarray(lfilter(np.ravel(b), np.ravel(a), np.repeat(recruitment(width_us), each)))
 

@@ -90,7 +90,7 @@ class Task(Generic[T]):
         assert self.done.is_set(), f"{self.name} has not ended"
         if self.error is not None:
             raise self.error
-        return self._result  # pyright: ignore[reportReturnType]
+        return self._result  # type: ignore
 
 
 @types.coroutine

@@ -40,7 +40,12 @@ class Mover:
 
     holds = True
     """Whether somebody holds the forearm, so that the load cell between the two carries the torque."""
-    at: Callable[[float], Motion]
+
+    _at: Callable[[float], Motion]
+
+    def at(self, time_s: float) -> Motion:
+        """The motion at a time."""
+        return self._at(time_s)
 
     def advance(self, time_s: float, drive: Drive) -> Motion:  # noqa: ARG002
         """The motion at `time_s`, which never runs backwards; only a mover that does not hold asks the drive."""
@@ -86,7 +91,7 @@ class Held(Mover):
         if angle_deg is None and start.velocity_rad_s:  # it cannot stop on the spot
             target_rad += math.copysign(0.02, start.velocity_rad_s)
         lasts_s = lasting_s(start.angle_rad, target_rad, peak_rad_s)
-        self.at = Quintic(begin.time_s, lasts_s, start, Motion(target_rad)).at
+        self._at = Quintic(begin.time_s, lasts_s, start, Motion(target_rad)).at
 
 
 class Robot(Mover):
@@ -115,7 +120,7 @@ class Robot(Mover):
                 for end_rad in ends_rad:
                     yield Leg(end_rad, rad_s, rest_s)
 
-        self.at = Servo(
+        self._at = Servo(
             begin,
             Path(begin.time_s, begin.motion.angle_rad, legs()).at,
             within("bandwidth_hz", bandwidth_hz, 0.2, 30.0),
@@ -160,7 +165,7 @@ class Hand(Mover):
             since_s = time_s - begin.time_s
             return path.at(time_s) + sum(a * math.sin(w * since_s + phase) for a, w, phase in waves)
 
-        self.at = Servo(begin, reference_rad, HAND_HZ).at
+        self._at = Servo(begin, reference_rad, HAND_HZ).at
 
 
 def _uneven_legs(

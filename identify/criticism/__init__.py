@@ -245,7 +245,7 @@ def _frequency_rows(
     power = np.abs(np.fft.rfft(values)) ** 2 / values.size**2
     power[1:] *= 2.0
     frequency = np.fft.rfftfreq(values.size, 1.0 / rate)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for low, high in pairwise(OCTAVES_HZ):
         inside = (frequency >= low) & (frequency < high)
         if not inside.any() or low >= rate / 2:

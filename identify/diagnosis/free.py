@@ -211,7 +211,7 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
     def judged(number: int) -> tuple[Fitted, LeftOut]:
         """Without the problem: it holds functions, which cannot be sent between processes."""
         fitted = trusted(likely[number].fitted)
-        return replace(fitted, problem=None), leave_out(fitted)
+        return replace(fitted, problem=None), leave_out(fitted)  # type: ignore
 
     able: dict[int, Chain] = {}
     for done, (number, (fitted, left_out)) in enumerate(side_by_side(judged, len(likely)), start=1):

@@ -255,7 +255,9 @@ def scan(
         """Without the problem: it holds functions, which cannot be sent between processes."""
         effect = listed[number]
         found = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)), least)
-        return found and (found.form.name, replace(found.fitted, problem=None), found.gain, found.forms)
+        if found is None:
+            return None
+        return found.form.name, replace(found.fitted, problem=None), found.gain, found.forms  # type: ignore
 
     found: list[Candidate] = []
     for done, (number, result) in enumerate(side_by_side(tried, len(listed)), start=1):

@@ -101,7 +101,7 @@ def text_of(effect: Effect, form: Form, found: Mapping[str, tuple[float, float]]
     if not np.isfinite([*found.values()]).all():
         raise BadRequest("a value that is no number", place=effect.id, fix="Fit the record again.")
     rows = "".join(f"                {_row(one, *found[one.name])},\n" for one in form.parameters)
-    law = ", ".join(f'"{key}": FreeLaw.{FreeLaw(value).name}' for key, value in form.law.items())  # type: ignore[arg-type]
+    law = ", ".join(f'"{key}": FreeLaw.{FreeLaw(value).name}' for key, value in form.law.items())  # type: ignore
     held = ", ".join(f"FreeLaw.{key.name}: {value}" for key, value in form.held.items())
     more = [f"law={{{law}}}"] * bool(law) + [f"held={{{held}}}"] * bool(held)
     lines = ["from stimrig.effects import Effect, Form, FreeLaw, Parameter" if law else HEAD]

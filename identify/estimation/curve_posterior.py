@@ -137,7 +137,7 @@ class CurvePosterior:
                 z = np.r_[near[kind].z[: 3 + self.n], z[3 + self.n :]]
             elif found:
                 moved = self.prior.roots[kind - 1] @ z[3 : 3 + self.n]
-                own = solve_triangular(self.prior.roots[kind], moved, lower=True)
+                own = np.asarray(solve_triangular(self.prior.roots[kind], moved, lower=True))
                 # What is rough in one kind may be all but impossible in another: its share is left out.
                 z = np.r_[z[:3], own if own @ own < self.n else np.zeros(self.n), z[3 + self.n :]]
             found.append(self.mode(z, kind))
@@ -164,14 +164,14 @@ class CurvePosterior:
         slopes[: self.n, : 3 + self.n] = size[:, None] * by_z
         slopes[self.n :, self.others] = np.eye(self.data.mean.size)
         root = _solve(slopes.T @ self.data.gram @ slopes + self.precision, np.zeros(mode.z.size), 1e-9)[1]
-        return solve_triangular(root, normal.T, lower=True, trans=1).T @ slopes.T
+        return np.asarray(solve_triangular(root, normal.T, lower=True, trans=1)).T @ slopes.T
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
     """Solution of a damped positive definite system, and its lower root."""
     damped = matrix.copy()
     damped[np.diag_indices_from(damped)] *= 1.0 + damping
-    root, failed = lapack.dpotrf(damped, lower=1, clean=1)  # pyright: ignore[reportAttributeAccessIssue]
+    root, failed = lapack.dpotrf(damped, lower=1, clean=1)  # type: ignore
     if failed:
         raise np.linalg.LinAlgError("the information is not positive definite")
-    return lapack.dpotrs(root, right, lower=1)[0], root  # pyright: ignore[reportAttributeAccessIssue]
+    return lapack.dpotrs(root, right, lower=1)[0], root  # type: ignore

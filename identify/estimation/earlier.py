@@ -67,7 +67,7 @@ def _marks(model: Model) -> tuple[float, ...] | None:
     if marks is None:
         return None
     gain, low, middle, high = marks
-    t, z = model.linear.core  # pyright: ignore[reportAttributeAccessIssue]
+    t, z = model.linear.core  # type: ignore
     return float(np.log(gain)), middle, float(np.log(max(high - low, 1.0))), float(np.log(t)), float(np.log(z))
 
 
@@ -78,7 +78,7 @@ def _curve_marks(model: Model) -> tuple[float, float, float, float] | None:
     if not rising[-1] > 0.0:
         return None
     at = [float(u[np.argmax(rising >= share * rising[-1])]) for share in (0.1, 0.5, 0.9)]
-    return float(rising[-1]), *at  # type: ignore[return-value]
+    return float(rising[-1]), *at  # type: ignore
 
 
 @dataclass(frozen=True)

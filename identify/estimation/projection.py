@@ -39,7 +39,7 @@ class Projection:
     roughness: np.ndarray  # penalty on the coefficients, shape (P, P)
     rows: np.ndarray  # rows that are fitted, bool, shape (K,)
     delay_s: float | None = None  # a fixed delay; None to estimate it
-    rests: tuple[np.ndarray, np.ndarray] = ()  # type: ignore[assignment]
+    rests: tuple[np.ndarray, np.ndarray] = ()  # type: ignore
     """Zero of each part as its rests show it, and its sd, N·m, where they are known already (`rest_levels`)."""
     stretches: list[slice] = field(init=False)
 

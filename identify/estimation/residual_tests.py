@@ -109,7 +109,8 @@ def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
     for name in names:
         # Towards smaller values: away from the bounds, and from the kink of `share` at 1.
         nudge = -NUDGE * max(1.0 - getattr(noise, name), NUDGE) if name in ("ar1", "keep") else -NUDGE
-        moved = replace(noise, **{name: max(getattr(noise, name) + nudge, 0.0)})
+        changed: dict[str, Any] = {name: max(getattr(noise, name) + nudge, 0.0)}
+        moved = replace(noise, **changed)
         change = (_log_spectrum(moved) - _log_spectrum(noise)) / nudge
         rows.append(np.fft.irfft(change)[1 : lags + 1])
     return np.array(rows).reshape(len(rows), lags)

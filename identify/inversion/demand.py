@@ -81,7 +81,7 @@ class _Programme:
 
     def solve(self) -> np.ndarray:
         """v, shape (K,)."""
-        v = cho_solve_banded((cholesky_banded(self.P, lower=True), True), -self.q)
+        v = np.asarray(cho_solve_banded((cholesky_banded(self.P, lower=True), True), -self.q))
         if np.all(self.constrained(v) <= self.limit):
             return v
         slack = np.maximum(self.limit - self.constrained(v), 0.1)
@@ -93,7 +93,7 @@ class _Programme:
             if gap < CLOSE and np.max(np.abs(outside)) < CLOSE and np.max(np.abs(gradient)) < 100 * CLOSE:
                 break
             grams = [T.gram(w, self.bands) for (T, *_), w in zip(self.sides, dual / slack, strict=True)]
-            at = gradient, outside, slack, dual, cholesky_banded(self.P + np.sum(grams, axis=0), lower=True)
+            at = gradient, outside, slack, dual, np.asarray(cholesky_banded(self.P + np.sum(grams, axis=0), lower=True))
             _, ds, dz = self._step(*at, slack * dual)
             length = min(_longest(slack, ds), _longest(dual, dz))
             ahead = float(np.mean((slack + length * ds) * (dual + length * dz)))
@@ -112,7 +112,7 @@ class _Programme:
         product: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Newton's step of v, slack and dual that takes `product` off slack times dual; `factor` is of its matrix."""
-        dv = cho_solve_banded((factor, True), -gradient - self.back((dual * outside - product) / slack))
+        dv = np.asarray(cho_solve_banded((factor, True), -gradient - self.back((dual * outside - product) / slack)))
         ds = -outside - self.constrained(dv)
         return dv, ds, (-product - dual * ds) / slack
 

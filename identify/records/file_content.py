@@ -41,14 +41,14 @@ class FileContent:
     def noting(self, *notes: str, **changes: object) -> FileContent:
         """The same with changes, and with more to say."""
         source = replace(self.source, notes=(*self.source.notes, *(note for note in notes if note)))
-        return replace(self, source=source, **changes)  # pyright: ignore[reportArgumentType]
+        return replace(self, source=source, **changes)  # type: ignore
 
     def record(self, **more: object) -> Record:
         """The columns as a record, as they are; `more` is what else `Record.from_arrays` takes."""
         low_us = float(np.min(self.columns["pulse_width_us"], initial=np.inf))
         source = self.noting(f"the lowest width, {low_us:.4g} µs, is taken as rest" if low_us > 0 else "").source
         known = {"segment_names": self.names, "pulse_rate_hz": self.pulse_rate_hz, "source": source}
-        return Record.from_arrays(**self.columns, **known, **more)  # pyright: ignore[reportArgumentType]
+        return Record.from_arrays(**self.columns, **known, **more)  # type: ignore
 
 
 def file_source(content: bytes, path: Path, known: Mapping[str, Column], *written: str) -> Source:

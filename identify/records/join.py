@@ -316,7 +316,7 @@ def _block_means(piece: _Piece, each: int, rate_hz: float) -> Record:
     kept = record.segment[pick]
     used, segment = np.unique(kept, return_inverse=True)
     names = tuple(record.segment_names[index] for index in used)
-    return replace(record, segment=segment, segment_names=names, **changes)  # pyright: ignore[reportArgumentType]
+    return replace(record, segment=segment, segment_names=names, **changes)  # type: ignore
 
 
 def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
@@ -356,7 +356,7 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
         pulse_rate_hz=rate_hz,
         source=sources[0] if len(sources) == 1 else joined_source(sources),
         parts=tuple(parts),
-        **columns,  # pyright: ignore[reportArgumentType]
+        **columns,  # type: ignore
     )
 
 

@@ -327,7 +327,7 @@ class _StagePass:
             for column, value in chosen.form.held.items():
                 laws[:, column] = value
             for one, value in zip(chosen.parameters, self.grown(values).T, strict=True):
-                laws[:, chosen.form.law[one.name]] += value  # pyright: ignore[reportCallIssue, reportArgumentType]
+                laws[:, chosen.form.law[one.name]] += value  # type: ignore
         return laws
 
     def respond(
@@ -343,7 +343,7 @@ class _StagePass:
         ]
         if len(responses) == 1:
             return responses[0]
-        return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore[return-value]
+        return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore
 
     def scale(
         self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray, present: int

@@ -163,4 +163,4 @@ class Setup:
 
     def with_(self, **changes: object) -> Setup:
         """The set-up with some fields changed (derived arrays are computed again)."""
-        return replace(self, **changes)  # type: ignore[arg-type]
+        return replace(self, **changes)  # type: ignore

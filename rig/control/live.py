@@ -15,7 +15,7 @@ from stimrig.rig.acquire.run import TestRun
 from stimrig.rig.gate import Done
 from stimrig.rig.messages import LaidSegment, LiveEvent, PulseOutcomes
 
-IDLE = {"test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "dropped_pulses": 0}
+IDLE: dict[str, Any] = {"test_id": None, "segment": None, "elapsed_s": 0.0, "duration_s": 0.0, "dropped_pulses": 0}
 
 
 def live_event(
