@@ -25,10 +25,9 @@ from stimrig.api.models.trend import Trend
 from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock
 from stimrig.api.people.pace import Guesses
-from stimrig.api.sessions.notes import Notes
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.runner import Runner
-from stimrig.api.sessions.stops import StopLog, StopRights
+from stimrig.api.sessions.stops import StopRights, Stops
 from stimrig.api.sessions.trials import Trials
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, uploads
@@ -75,15 +74,10 @@ class Context:
         """Trials of controllers' keys are counted and begun one after the other."""
         # processes of their own: they remember a test or a trial, and nothing else keeps them busy
         adviser, tracker = Pool(1, worker), Pool(1, worker)
-        trials = Trials(rig, store, clock, self.tracked, tracker)
-        self.runner = Runner(
-            store, clock, rig, pool, self.versions, self.analyses, adviser, trials, settings.recordings_dir,
-            self.limits_lock,
-        )  # fmt: skip
+        self.stops, self.stop_rights = Stops(store, clock, rig), StopRights(store.secret("stop-right"), clock)
+        trials = Trials(rig, self.tracked, tracker)
+        self.runner = Runner(self.analyses, rig, self.stops, trials, adviser, self.limits_lock)
         self.trend, self.jobs = Trend(store), Jobs(pool)
-        self.notes, self.stops = Notes(store, clock), StopLog()
-        stop_key = store.secret("stop-right")
-        self.stop_rights = StopRights(stop_key, clock)
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self) -> None:
@@ -101,7 +95,7 @@ class Context:
 
     async def close(self) -> None:
         """Let everything go."""
-        for part in (self.runner, self.jobs, self.pool, self.rig):
+        for part in (self.runner, self.stops, self.jobs, self.pool, self.rig):
             await part.close()
         for task in self._tasks:
             task.cancel()

@@ -1,4 +1,4 @@
-"""Tests: finding one, and who ran it."""
+"""Tests: finding them, and who ran one."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from stimrig.api.store import locking
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Test
 
+LISTED = "GET /v1/tests lists them."
+
 
 def find(context: Context, test_id: str) -> Test:
     """Return a test. Raises ApiError: 404 there is none of this id."""
@@ -23,12 +25,10 @@ def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tag
     with context.store.write() as session:
         row = require_found(session.get(Test, test_id), "test", test_id, LISTED)
         locking.check(session, row, tags)
-        row.ran_by, now = other_than(row.requested_by, name), context.clock.utc()
-        locking.write(session, row, now, by, locking.RAN_BY, test_id, ran_by=row.ran_by or row.requested_by)
+        row.ran_by = other_than(row.requested_by, name)
+        ran_by = row.ran_by or row.requested_by
+        locking.write(session, row, context.clock.utc(), by, locking.RAN_BY, test_id, ran_by=ran_by)
     return row
-
-
-LISTED = "GET /v1/tests lists them."
 
 
 def newest(context: Context, limit: int, participant: str | None = None) -> list[dict[str, Any]]:

@@ -1,69 +1,59 @@
-"""Lifecycle of a test: its row, recording and model; recovers a test whose end was missed."""
+"""Lifecycle of a test: its row, its recording, its model and its document; recovers a test whose end was missed."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
 from collections.abc import Callable, Mapping
-from pathlib import Path
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import Job
-from stimrig.api.jobs.pool import Pool
 from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.models import carried_structure, together
 from stimrig.api.models.analyses import Analyses
-from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.kinds import Kinds
+from stimrig.api.sessions.live import Hub
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.store import Store, audit
+from stimrig.api.store import audit
 from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
 from stimrig.rig.messages import LABEL_TITLES, FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
-NOT_SHOWN = ("plan", "summary", "version")
+HIDDEN = ("plan", "summary", "version")
 """Columns of a test that clients do not see as they are."""
 
 
 class Lifecycle:
-    """Takes over what a test leaves behind.
+    """Stores what a test leaves behind, has it identified, and tells clients and open pages how it stands."""
 
-    `on_progress`: called with a test's id whenever its identification has got further.
-    """
-
-    def __init__(
-        self, store: Store, clock: Clock, rig: RigClient, pool: Pool, versions: Versions,
-        analyses: Analyses, kinds: Kinds, recordings_dir: Path,
-        on_progress: Callable[[str], None],
-    ) -> None:  # fmt: skip
-        self.store, self.clock, self.rig, self.pool, self.versions = store, clock, rig, pool, versions
-        self.analyses, self.recordings_dir, self.on_progress = analyses, recordings_dir, on_progress
-        self.kinds = kinds
+    def __init__(self, analyses: Analyses, rig: RigClient, kinds: Kinds, hub: Hub) -> None:
+        self.analyses, self.rig, self.kinds, self.hub = analyses, rig, kinds, hub
+        self.store, self.clock, self.versions = analyses.store, analyses.clock, analyses.versions
         self.jobs: dict[str, Job] = {}
+        self._reader = ThreadPoolExecutor(1, "documents-of-tests")  # one thread: documents are read in call order
         self._tasks = Tasks(log)
 
-    def document(
-        self, row: Test, position: tuple[float, float, str | None] | None, fits: Mapping[str, Any] | None = None
-    ) -> dict[str, Any]:
-        """A test as clients see it: what became of it so far; while it runs also where it is, as the rig tells it.
+    # ---- documents -------------------------------------------------------------------------------------------
 
-        `fits`: documents of models by their ids, where many tests are told of at once.
-        """
+    def document(self, row: Test, fits: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Return a test as clients see it. `fits`: documents of models by id, where many tests are read at once."""
         planned = {key: value for key, value in row.plan.get("preview", {}).items() if key != "pulse_width_us"}
-        running = row.state in ("requested", "running")
-        lasted_s = row.summary.get("duration_s", 0.0)
-        there = (position or (0.0, planned.get("duration_s", 0.0), None)) if running else (lasted_s, lasted_s, None)
-        elapsed_s, duration_s, segment = there
         job, rig = self.jobs.get(row.id), self.rig.status
-        sealing = running and rig is not None and rig.test_id == row.id and rig.state == "sealing"
-        if fits is None and row.model_id:
-            fits = {row.model_id: self.versions.document(self.versions.get(row.model_id))}
+        state, segment = row.state, None
+        elapsed_s = duration_s = row.summary.get("duration_s", 0.0)
+        if state in ("requested", "running"):
+            start = (0.0, planned.get("duration_s", 0.0), None)
+            elapsed_s, duration_s, segment = self.hub.position(row.id) or start
+            if rig is not None and rig.test_id == row.id and rig.state == "sealing":
+                state = "sealing"
+        if fits is None:
+            fits = {row.model_id: self.versions.document(self.versions.get(row.model_id))} if row.model_id else {}
         return {
-            **{name: value for name, value in row.as_dict().items() if name not in NOT_SHOWN},
-            "state": "sealing" if sealing else row.state,
-            "done": row.state not in OPEN_STATES,
+            **{name: value for name, value in row.as_dict().items() if name not in HIDDEN},
+            "state": state,
+            "done": state not in OPEN_STATES,
             "segment": segment,
             "elapsed_s": elapsed_s,
             "duration_s": duration_s,
@@ -77,11 +67,34 @@ class Lifecycle:
             "model_url": f"/v1/models/{row.model_id}" if row.model_id else None,
             "summary": {name: value for name, value in row.summary.items() if name not in self.kinds.parts},
             **self.kinds.documents(row),
-            "fit": (fits or {}).get(row.model_id or ""),
+            "fit": fits.get(row.model_id or ""),
         }
 
-    def update(self, test_id: str, **fields: Any) -> Test:
-        """Change a test's row."""
+    def documents(
+        self, participant: str, models: list[dict[str, Any]], limit: int | None = None
+    ) -> list[dict[str, Any]]:
+        """Return a participant's tests, newest first. `models`: documents of all of the participant's models."""
+        fits, of_participant = {model["id"]: model for model in models}, Test.participant == participant
+        rows = self.store.all(Test, of_participant, order=Test.requested_utc.desc(), limit=limit)
+        return [self.document(row, fits) for row in rows]
+
+    def announce(self, test_id: str) -> None:
+        """Publish how a test stands to open pages."""
+        self._tasks.begin(self._announce(test_id))
+
+    async def _announce(self, test_id: str) -> None:
+        def read() -> dict[str, Any] | None:
+            row = self.store.get(Test, test_id)
+            return None if row is None else self.document(row)
+
+        document = await asyncio.get_running_loop().run_in_executor(self._reader, read)
+        if document is not None:
+            self.hub.send({"type": "test", "test": document})
+
+    # ---- the row -----------------------------------------------------------------------------------------------
+
+    def update(self, test_id: str, *, summary: Mapping[str, Any] | None = None, **fields: Any) -> Test:
+        """Change fields of a test's row; `summary` is added to the one that it has."""
         with self.store.write() as session:
             row = session.get(Test, test_id)
             assert row is not None
@@ -89,6 +102,7 @@ class Lifecycle:
                 fields.pop("state")  # the test ended before its start was written
             for name, value in fields.items():
                 setattr(row, name, value)
+            row.summary = {**row.summary, **(summary or {})}
             if row.state not in OPEN_STATES and row.finished_utc is None:
                 row.finished_utc = self.clock.utc()
         if "state" in fields:
@@ -96,13 +110,13 @@ class Lifecycle:
         return row
 
     def fail(self, test_id: str, error: Exception) -> None:
-        """End a test that is still open: something unexpected went wrong with it."""
+        """End a test that is still open, for an unexpected error."""
         row = self.store.get(Test, test_id)
         if row is not None and row.state in OPEN_STATES:
             self.update(test_id, state="failed", reason=" ".join(str(error).split()) or type(error).__name__)
 
     def take_recording(self, event: FinishedEvent) -> Test | None:
-        """Write down how a test ended and where its recording lies; None where that is done."""
+        """Store how a test ended and where its recording is; None where that is done."""
         with self.store.write() as session:
             row = session.get(Test, event.test_id)
             if row is None or row.recording_id is not None:
@@ -126,6 +140,27 @@ class Lifecycle:
         log.info("the rig: test %s", event.outcome, extra={"test_id": row.id})
         return row
 
+    def warnings(self, recording_id: str) -> list[str]:
+        """Return the warnings about a recording, from the rig or from the fit of its first model."""
+        with self.store.read() as session:
+            return together.warnings(session, recording_id)
+
+    async def missed_end(self, test_id: str, why: str) -> FinishedEvent:
+        """Return the end of a test as the rig remembers it, or as its recording says."""
+        status = self.rig.status
+        if status is not None and status.finished is not None and status.finished.test_id == test_id:
+            return status.finished
+        event = FinishedEvent(test_id=test_id, outcome="fault", reason=why, last_sample_unix_s=None)
+        folder = str(self.analyses.settings.recordings_dir)
+        try:
+            answer = await self.analyses.run("find_recording", urgent=True, folder=folder, test_id=test_id)
+            return event.model_copy(update=answer.get("found") or {})
+        except ApiError as error:
+            log.warning("looking for the recording of %s: %s", test_id, error)
+            return event
+
+    # ---- identification ----------------------------------------------------------------------------------------
+
     async def identify(self, test_id: str, last_sample_unix_s: float | None = None) -> None:
         """Identify a test's recording in a worker and store the model."""
         row: Test = await asyncio.to_thread(self.store.get, Test, test_id)
@@ -133,12 +168,12 @@ class Lifecycle:
         def follow(job: Job) -> None:
             self.jobs[test_id] = job
 
-        how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.on_progress(test_id)}
+        how: dict[str, Any] = {"urgent": True, "on_progress": lambda _job: self.announce(test_id)}
         step = "joining the recordings"
         try:
-            recording, parent = await self._record_of(row)
+            recording, parent = await self._recording_of(row)
             step = "identification"
-            model = await self._first_version(row, recording, parent, follow, dict(how))
+            model = await self._first_version(row, recording, parent, follow, how)
             model = await carried_structure.carry(self.analyses, model, recording.path, follow, **how)
         except ApiError as error:
             reason = f"{step}: {error.detail or error.title}"
@@ -146,62 +181,47 @@ class Lifecycle:
             return
         finally:
             self.jobs.pop(test_id, None)
-        summary = dict((await asyncio.to_thread(self.store.get, Test, test_id)).summary)
-        if last_sample_unix_s is not None:
-            summary["last_sample_to_model_s"] = round(self.clock.unix_s() - last_sample_unix_s, 3)
+        late_s = None if last_sample_unix_s is None else round(self.clock.unix_s() - last_sample_unix_s, 3)
+        summary = {} if late_s is None else {"last_sample_to_model_s": late_s}
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)
         self._tasks.begin(self.analyses.diagnose_ahead(model))
 
-    async def _first_version(
-        self, row: Test, recording: Recording, parent: str | None, follow: Callable[[Job], None], how: dict[str, Any]
-    ) -> Model:
-        """The first version of a test's recording, named by the test at once: it is there whatever comes after it."""
-        if row.model_id is not None:
-            return await asyncio.to_thread(self.versions.get, row.model_id)
-        how |= await asyncio.to_thread(self.kinds[row.kind].fit_options, row)
-        fit, warning = await carried_structure.fit(self.analyses, row.participant, recording.path, follow, **how)
-        by = f"test {row.id}"
-        model = await asyncio.to_thread(self.versions.add, fit["json"], row.participant, recording.id, by, parent)
-        summary = dict(row.summary)
-        if warning:
-            summary["warnings"] = [*(summary.get("warnings") or []), warning]
-        await asyncio.to_thread(self.update, row.id, model_id=model.id, summary=summary)
-        return model
-
-    def keep_plain(self, test_id: str) -> bool:
-        """End the fit of the last session's structure after a test; whether one was under way."""
-        job = self.jobs.get(test_id)
-        if job is None or job.kind != "carry":
-            return False
-        self.pool.cancel(job)
-        return True
-
-    async def _record_of(self, row: Test) -> tuple[Recording, str | None]:
-        """Return the recording to identify: the test's, or the one joined to the recording of the model under test."""
+    async def _recording_of(self, row: Test) -> tuple[Recording, str | None]:
+        """Return the recording to identify, the test's or a joined one, and the model that it is joined to."""
         if row.model_id is not None:  # the service was restarted after its first version
             first = await asyncio.to_thread(self.versions.get, row.model_id)
             return await asyncio.to_thread(self.store.get, Recording, first.recording_id), first.parent_id
         recording: Recording = await asyncio.to_thread(self.store.get, Recording, row.recording_id)
-        joins = row.plan.get("joins")
-        if joins is None:
+        if (joins := row.plan.get("joins")) is None:
             return recording, None
         model = await asyncio.to_thread(self.versions.get, joins)
         return await together.join(self.analyses, [model.recording_id, recording.id], row.participant), model.id
 
-    def warnings(self, recording_id: str) -> list[str]:
-        """Return the warnings about a recording, from the rig or from the fit of its first model."""
-        with self.store.read() as session:
-            return together.warnings(session, recording_id)
+    async def _first_version(
+        self, row: Test, recording: Recording, parent: str | None, follow: Callable[[Job], None], how: dict[str, Any]
+    ) -> Model:
+        """Fit the first version of a test's recording; the test names it at once, whatever comes after it."""
+        if row.model_id is not None:
+            return await asyncio.to_thread(self.versions.get, row.model_id)
+        options = await asyncio.to_thread(self.kinds[row.kind].fit_options, row)
+        fit, warning = await carried_structure.fit(
+            self.analyses, row.participant, recording.path, follow, **how, **options
+        )
+        by = f"test {row.id}"
+        model = await asyncio.to_thread(self.versions.add, fit["json"], row.participant, recording.id, by, parent)
+        summary = {"warnings": [*(row.summary.get("warnings") or []), warning]} if warning else {}
+        await asyncio.to_thread(self.update, row.id, model_id=model.id, summary=summary)
+        return model
 
-    async def missed_end(self, test_id: str, why: str) -> FinishedEvent:
-        """The end of a test as the rig remembers it, or as its recording tells."""
-        status = self.rig.status
-        if status is not None and status.finished is not None and status.finished.test_id == test_id:
-            return status.finished
-        event = FinishedEvent(test_id=test_id, outcome="fault", reason=why, last_sample_unix_s=None)
-        job = self.pool.submit("find_recording", urgent=True, folder=str(self.recordings_dir), test_id=test_id)
-        try:
-            return event.model_copy(update=(await job.result).get("found") or {})
-        except ApiError as error:
-            log.warning("looking for the recording of %s: %s", test_id, error)
-            return event
+    def keep_plain(self, test_id: str) -> bool:
+        """End the fit of the last session's structure after a test; return whether one was under way."""
+        job = self.jobs.get(test_id)
+        if job is None or job.kind != "carry":
+            return False
+        self.analyses.pool.cancel(job)
+        return True
+
+    async def close(self) -> None:
+        """End what goes on in the background."""
+        await self._tasks.close()
+        await asyncio.to_thread(self._reader.shutdown)

@@ -12,15 +12,12 @@ from stimrig.api.clock import Clock
 from stimrig.rig.messages import LiveEvent, LiveState
 
 QUEUE_LENGTH = 200
+BIN_S = 0.01
+ANGLE_OLD_S = 0.5
+"""An older angle is not shown as that of now."""
 SERIES = ("time_s", "torque_min_nm", "torque_max_nm", "pulse_time_s", "pulse_width_us")
 ANGLES = ("angle_time_s", "angle_rad", "velocity_rad_s")
 """Of a rig with an angle sensor: one of each for each frame."""
-
-ANGLE_OLD_S = 0.5
-"""An older angle is not shown as that of now."""
-
-
-BIN_S = 0.01
 
 
 class LiveOut(LiveState):
@@ -57,59 +54,53 @@ def frame_of(event: LiveEvent) -> LiveOut:
 
 
 class Hub:
-    """Keeps the current test's drawn history, so that a page opened late sees all of it, and the newest torque."""
+    """Passes messages to open pages; keeps the newest torque and angle, and the current test's curves for late pages.
+
+    `newest`: the newest frame of the current test.
+    """
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock
         self._torque: tuple[float, float] | None = None
         self._angle: tuple[float, float] | None = None
-        self.test_id: str | None = None
-        self.history: dict[str, list[float]] = {name: [] for name in (*SERIES, *ANGLES)}
-        self.newest: LiveOut | None = None
         self._queues: set[asyncio.Queue[dict[str, Any]]] = set()
+        self.begin(None)
 
-    def begin(self, test_id: str) -> None:
-        """A new test: forget the last one's curves."""
-        self.test_id, self.newest = test_id, None
-        self.history = {name: [] for name in (*SERIES, *ANGLES)}
+    def begin(self, test_id: str | None) -> None:
+        """Begin a new test: the last one's curves are forgotten."""
+        self.test_id = test_id
+        self.newest: LiveOut | None = None
+        self.history: dict[str, list[float]] = {name: [] for name in (*SERIES, *ANGLES)}
 
     def live(self, event: LiveEvent) -> None:
-        """Take what is new, keep it, pass it on."""
-        frame = frame_of(event)
+        """Keep an event of the rig and pass it on."""
+        frame, now_s = frame_of(event), self.clock.monotonic_s()
         if frame.torque_max_nm:
-            middle_nm = (frame.torque_min_nm[-1] + frame.torque_max_nm[-1]) / 2
-            self._torque = middle_nm, self.clock.monotonic_s() - event.torque_age_s
+            self._torque = (frame.torque_min_nm[-1] + frame.torque_max_nm[-1]) / 2, now_s - event.torque_age_s
         if event.angle_rad is not None:
-            self._angle = event.angle_rad, self.clock.monotonic_s()
+            self._angle = event.angle_rad, now_s
         if event.test_id == self.test_id and event.test_id is not None:
             self.newest = frame
             for name in SERIES:
                 self.history[name].extend(getattr(frame, name))
-            self._keep_angle(frame)
+            if frame.angle_rad is not None and frame.velocity_rad_s is not None:
+                for name, value in zip(ANGLES, (frame.elapsed_s, frame.angle_rad, frame.velocity_rad_s), strict=True):
+                    self.history[name].append(value)
         self.send({"type": "live", **frame.model_dump(exclude={"event"})})
 
-    def _keep_angle(self, event: LiveOut) -> None:
-        if event.angle_rad is not None and event.velocity_rad_s is not None:
-            values = event.elapsed_s, event.angle_rad, event.velocity_rad_s
-            for name, value in zip(ANGLES, values, strict=True):
-                self.history[name].append(value)
-
     def torque(self) -> tuple[float | None, float | None]:
-        """The newest torque, N·m, and its age, s; None for both where none ever came."""
-        if self._torque is None:
-            return None, None
-        torque_nm, measured_s = self._torque
-        return torque_nm, self.clock.monotonic_s() - measured_s
+        """Return the newest torque, N·m, and its age, s; None for both where none ever came."""
+        return (None, None) if self._torque is None else (self._torque[0], self.clock.monotonic_s() - self._torque[1])
 
     def angle(self) -> float | None:
-        """The joint's angle of now, rad; None where none came lately."""
+        """Return the joint's angle now, rad; None where none came lately."""
         if self._angle is None or not (self.clock.monotonic_s() - self._angle[1] <= ANGLE_OLD_S):
             return None
         return self._angle[0]
 
-    def position(self, test_id: str) -> tuple[float, float, str | None] | None:
-        """Elapsed and total seconds, and the segment, of the running test."""
-        if self.test_id != test_id or self.newest is None:
+    def position(self, test_id: str | None) -> tuple[float, float, str | None] | None:
+        """Return elapsed and total seconds, and the segment, of the running test."""
+        if self.newest is None or self.test_id != test_id:
             return None
         return self.newest.elapsed_s, self.newest.duration_s, self.newest.segment
 
@@ -121,20 +112,19 @@ class Hub:
             queue.put_nowait(message)
 
     def open(self) -> asyncio.Queue[dict[str, Any]]:
-        """A page's queue, with the history so far as its first message."""
+        """Return the queue of a page, with the history so far as its first message."""
         queue: asyncio.Queue[dict[str, Any]] = asyncio.Queue(QUEUE_LENGTH)
-        position = self.position(self.test_id) if self.test_id else None
-        duration_s = position[1] if position else 0.0
+        duration_s = self.newest.duration_s if self.newest else 0.0
         history = {name: list(values) for name, values in self.history.items()}
         queue.put_nowait({"type": "history", "test_id": self.test_id, "duration_s": duration_s, **history})
         self._queues.add(queue)
         return queue
 
     def close(self, queue: asyncio.Queue[dict[str, Any]]) -> None:
-        """A page has gone."""
+        """Forget a page that has gone."""
         self._queues.discard(queue)
 
     @property
     def listeners(self) -> int:
-        """Number of connected pages."""
+        """Return the number of connected pages."""
         return len(self._queues)

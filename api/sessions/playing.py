@@ -152,7 +152,7 @@ class Playing:
     async def stop_quietly(self, reason: str) -> None:
         """Stop the rig; whether it could is only noted."""
         try:
-            await self.rig.request(StopRequest(reason=reason, by="service"))
+            await self.rig.ask(StopRequest(reason=reason, by="service"))
         except ApiError as error:
             log.warning("stop after a failed start: %s", error)
 

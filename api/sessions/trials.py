@@ -1,4 +1,4 @@
-"""After each trial of a controller: the muscle is followed, in a worker of its own, and what was found is kept.
+"""After each trial of a controller: the muscle is followed in a worker of its own, and the result is kept.
 
 A trial's test is over before it is followed: nothing that is played waits for it. Trials are followed one after the
 other, in the order in which they ended.
@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.pool import Pool
 from stimrig.api.jobs.tasks import Tasks
@@ -21,14 +20,13 @@ from stimrig.api.models.tracked import TrackedVersions, Trial
 from stimrig.api.sessions.kinds import Kind
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.store import Store
 from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
 
 log = logging.getLogger("stimrig.tracking")
 SEQUENCE = "sequence"
 """A test of this kind is a controller's trial."""
 PATIENCE_S = 2.0
-"""So long who fetches a tracked model waits for a trial that has just ended."""
+"""So long a request for a tracked model waits for a trial that has just ended."""
 MOST_BETWEEN = 20
 """So many recordings between two trials that were followed are passed through the effects."""
 ELSEWHERE = "It was played at another side, muscle or current than the approved model's test."
@@ -39,19 +37,17 @@ class Trials(Kind):
 
     names, fitted = (SEQUENCE,), False
 
-    def __init__(self, rig: RigClient, store: Store, clock: Clock, tracked: TrackedVersions, tracker: Pool) -> None:
+    def __init__(self, rig: RigClient, tracked: TrackedVersions, tracker: Pool) -> None:
         super().__init__(rig)
-        self.store, self.clock, self.tracked, self.tracker = store, clock, tracked, tracker
+        self.store, self.clock, self.tracked, self.tracker = tracked.store, tracked.clock, tracked, tracker
         self._turn = asyncio.Lock()
         self._ending = 0
         self._settled = asyncio.Event()
         self._settled.set()
         self._tasks = Tasks(log)
 
-    # ---- before a trial ----------------------------------------------------------------------------------------
-
     def stored_fields(self, body: TestIn, pulses: int) -> dict[str, Any]:
-        """Its approval, and what the controller wants: a value for each pulse, else ApiError (422)."""
+        """Return its approval and the reference torque, one value for each pulse. Raises ApiError (422): it is not."""
         reference = body.reference_torque_nm
         if reference is not None and len(reference) != pulses:
             detail = f"reference_torque_nm: {len(reference)} values, but the whole test has {pulses} pulses."
@@ -73,8 +69,6 @@ class Trials(Kind):
             await self.tracker.submit("track_warm", model_json=text).result
         except ApiError as error:
             log.warning("the worker of trials could not be warmed: %s", error)
-
-    # ---- after it ----------------------------------------------------------------------------------------------
 
     @contextmanager
     def ending(self) -> Iterator[None]:
@@ -117,13 +111,12 @@ class Trials(Kind):
         if await asyncio.to_thread(self.tracked.elsewhere, trial.approval, [place_of(trial.test)]):
             return {"reason": ELSEWHERE}
         try:
-            job = self.tracker.submit(
+            return await self.tracker.submit(
                 "track", data=recording.path, model_json=trial.model_json, bounds=trial.bounds,
                 state=trial.state, missed=trial.missed, earlier=trial.earlier,
                 reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
                 between=await asyncio.to_thread(self._between, trial, recording),
-            )  # fmt: skip
-            return await job.result
+            ).result  # fmt: skip
         except ApiError as error:
             if error.code == "worker-died":
                 self.warm(trial.test.participant)
@@ -149,14 +142,12 @@ class Trials(Kind):
         here = [row for row in recordings if row.test_id in tests and not differ(place_of(tests[row.test_id]), place)]
         return [row.path for row in (here if trial.state else [since, *here])]
 
-    # ---- start and shutdown ------------------------------------------------------------------------------------
-
     def resume(self) -> None:
         """Follow the trials that a restart left open, and warm the worker where a model may be tracked."""
         self._tasks.begin(self._resume())
 
     async def _resume(self) -> None:
-        for approval, open_trials in await asyncio.to_thread(self._unfollowed):
+        for approval, open_trials in await asyncio.to_thread(self._open_trials):
             try:
                 for test_id in open_trials:
                     await self.follow(test_id)
@@ -164,20 +155,16 @@ class Trials(Kind):
                 log.warning("trials with %s are not followed: %s", approval.model_id, error)
             await self._warm(approval.participant)
 
-    def _unfollowed(self) -> list[tuple[Approval, list[str]]]:
-        """List the valid approvals that allow tracking, each with its unfollowed trials, oldest first."""
-        approvals = self.store.all(Approval, Approval.approved, Approval.expires_utc > self.clock.utc())
-        holding = [self.tracked.allowing(code) for code in dict.fromkeys(row.participant for row in approvals)]
-        return [(approval, self._open_trials(approval)) for approval in holding if approval is not None]
-
-    def _open_trials(self, approval: Approval) -> list[str]:
-        conditions = (
-            Test.participant == approval.participant, Test.kind == SEQUENCE, Test.state == "completed",
-            Test.requested_utc >= self.clock.start_of_day_utc(),
-        )  # fmt: skip
-        played = self.store.all(Test, *conditions, order=Test.requested_utc)
-        noted = {row.test_id for row in self.tracked.rows(approval.id)}
-        return [test.id for test in played if test.plan.get("approval_id") == approval.id and test.id not in noted]
+    def _open_trials(self) -> list[tuple[Approval, list[str]]]:
+        """List the valid approvals that allow tracking, each with its trials of today, oldest first."""
+        codes = self.store.all(Approval.participant, Approval.approved, Approval.expires_utc > self.clock.utc())
+        today = Test.kind == SEQUENCE, Test.state == "completed", Test.requested_utc >= self.clock.start_of_day_utc()
+        played = self.store.all(Test, *today, order=Test.requested_utc)
+        approvals = [approval for code in sorted(set(codes)) if (approval := self.tracked.allowing(code))]
+        return [
+            (approval, [test.id for test in played if test.plan.get("approval_id") == approval.id])
+            for approval in approvals
+        ]
 
     async def close(self) -> None:
         """Release all resources; open trials are followed at the next start."""

@@ -29,7 +29,7 @@ class Figures:
         """Give one family after the other."""
         for part in (_tests, _rig, _pulses, _store, _jobs, _operation):
             yield from part(self.context)
-        yield from self.context.runner.counted.collect()
+        yield from self.context.stops.registry.collect()
 
 
 def gauges(rows: Iterable[tuple[str, str, float]]) -> Iterator[Metric]:

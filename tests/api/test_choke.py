@@ -334,6 +334,9 @@ def test_a_stop_whose_answer_is_no_answer_names_the_emergency_switch(client: htt
             assert told["detail"].startswith("Use the stimulator's own emergency switch now."), answers
             assert "validation error" not in told["detail"]
         assert "stop failed" in str(client.get("/v1/audit").json()), "it is in the audit trail, too"
+        figures = client.get("/metrics").text
+        assert 'stimrig_stops_total{outcome="failed"} 5.0' in figures
+        assert "stimrig_stop_confirmation_seconds_count 0.0" in figures, "a stop without an answer has no time"
     finally:
         context.rig.path = path
         service.rig_thread.loop.call_soon_threadsafe(server.close)

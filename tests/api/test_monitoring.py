@@ -7,7 +7,6 @@ from pathlib import Path
 import httpx
 from prometheus_client.parser import text_string_to_metric_families
 
-from stimrig.api.sessions.stop_counter import StopCounter
 from tests.api.conftest import Service, run_test
 
 
@@ -40,10 +39,3 @@ def test_every_figure_stands_in_the_docs_and_tells_nothing_of_anybody(
     page = (Path(__file__).parents[2] / "docs" / "operation.md").read_text("utf-8")
     families = [one.name for one in text_string_to_metric_families(text)]
     assert [name for name in families if f"`{name}" not in page] == []
-
-
-def test_a_stop_that_was_not_answered_has_no_time() -> None:
-    counter = StopCounter()
-    counter.stopped("failed", 8.0)
-    values = {sample.name: sample.value for family in counter.collect() for sample in family.samples}
-    assert values["stimrig_stop_confirmation_seconds_count"] == 0

@@ -12,7 +12,7 @@ from stimrig.api.charts import trend_charts
 from stimrig.api.errors import ApiError
 from stimrig.api.local_time import clock
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
-from stimrig.api.services import participants
+from stimrig.api.services import notes, participants
 from stimrig.api.sessions import controllers
 from stimrig.api.store.tables import Recording
 from stimrig.api.web.dependencies import Context, Ctx, Tester
@@ -39,7 +39,7 @@ async def participant(request: Request, context: Ctx, principal: Tester, code: s
         tests = context.runner.documents(code, models, limit and limit + 1)
         return {
             "participant": row,
-            "notes": context.notes.participant_notes(code),
+            "notes": notes.of_participant(context.store, code),
             "calibrated": starting.calibrated(context, row),
             "step": next_view.step(context, row, principal),
             "meanwhile": participants.effect_on_open_work(context, code),

@@ -12,6 +12,7 @@ from stimrig.api.charts.drawing import svg
 from stimrig.api.clock import local_day
 from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.places import site_of, site_of_recording
+from stimrig.api.services import notes
 from stimrig.api.store.tables import Note, Participant, Recording, Test
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
 from stimrig.api.web.pages.model_view import draw_model, facts, measurement, versions_of
@@ -79,7 +80,7 @@ def session_of(context: Context, recording: Recording) -> dict[str, Any]:
 
 def _notes(context: Context, recording: Recording, test: Test | None) -> list[Note]:
     """List the test's notes by their time in it, then those on the day as a whole."""
-    valid = [note for note in context.notes.participant_notes(recording.participant) if note.struck_utc is None]
+    valid = [note for note in notes.of_participant(context.store, recording.participant) if note.struck_utc is None]
     of_test = [note for note in valid if test is not None and note.test_id == test.id]
     today = local_day(test.requested_utc if test else recording.created_utc)
     general = [note for note in valid if note.test_id is None and local_day(note.at_utc) == today]

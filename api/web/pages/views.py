@@ -14,7 +14,7 @@ from stimrig.api.charts.drawing import svg
 from stimrig.api.clinical_words import missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
-from stimrig.api.services import tests
+from stimrig.api.services import notes, tests
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import Context, Ctx, LiveReader
 from stimrig.api.web.pages.model_view import draw_model, measurement
@@ -40,9 +40,9 @@ async def test(request: Request, context: Ctx, _principal: LiveReader, test_id: 
     picture: dict[str, Any] = (
         await draw_ended(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
     )
-    notes = await asyncio.to_thread(context.notes.test_notes, test_id)
+    noted = await asyncio.to_thread(notes.of_test, context.store, test_id)
     missing = missing_words(((joint or {}).get("coverage") or {}).get("missing"))
-    return page(request, "test.html", test=document, data=data, limits=bounds, notes=notes, missing=missing, **picture)
+    return page(request, "test.html", test=document, data=data, limits=bounds, notes=noted, missing=missing, **picture)
 
 
 def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:

@@ -100,7 +100,7 @@ notes_router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"],
 def list_notes(context: Ctx, _principal: Tester, code: str) -> list[dict[str, Any]]:
     """A participant's notes, newest first, the struck ones among them."""
     participants.find(context, code)
-    return [note.as_dict() for note in context.notes.participant_notes(code)]
+    return [note.as_dict() for note in notes.of_participant(context.store, code)]
 
 
 @notes_router.post("", status_code=201, **describe_answer(NoteOut, 201, "written"))
@@ -112,4 +112,4 @@ async def write_note(context: Ctx, principal: Tester, code: str, body: NoteIn) -
 @notes_router.post("/{note_id}/strike", **describe_answer(NoteOut))
 def strike_note(context: Ctx, principal: Tester, code: str, note_id: str) -> dict[str, Any]:
     """Mark a note as wrong: it stays readable, with who struck it."""
-    return context.notes.strike(code, note_id, principal.name).as_dict()
+    return notes.strike(context, code, note_id, principal.name).as_dict()

@@ -55,7 +55,8 @@ async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
     """
     if wants_html(request):
         return await stop_on_page(request, context, press)
-    evidence = await context.runner.stop(press.reason, press.by)
+    current = context.runner.current
+    evidence = await context.stops.stop(press.reason, press.by, current.test_id if current else "rig")
     rig = {} if press.by_key else {"rig": services.rig_state(context)}
     return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), **rig})
 
@@ -65,7 +66,7 @@ async def stop_on_page(request: Request, context: Context, press: Press) -> Resp
     current = context.runner.current
     answer: StopEvidence | ApiError
     try:
-        answer = await context.runner.stop(press.reason, press.by)
+        answer = await context.stops.stop(press.reason, press.by, current.test_id if current else "rig")
     except ApiError as error:
         answer = error
     right, test_id = getattr(request.state, "stop_right", None), current.test_id if current else None
