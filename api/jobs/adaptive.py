@@ -5,6 +5,7 @@ That test stays in this process between two jobs: a job brings only the samples 
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -16,19 +17,11 @@ import numpy as np
 from stimrig import identify
 from stimrig.api.record_files import Progress
 from stimrig.identify.json_text import json_value
+from stimrig.identify.records.live import SAMPLE, Segments, live_record
 
 NEW_PERSON_SHARE = 1 / 3
 """Of the torque that stops a test: the guess of a new person's torque at the largest width."""
 DIGITS = 4
-BINS = 5
-"""Means for each pulse interval, where a load cell gives at least twice as many samples: the delay of a sample's way to
-the host, some milliseconds that only a sealed recording corrects, is then within the one sample that the fit allows."""
-SAMPLE = np.dtype(
-    [("host_time_s", "<f8"), ("stamp_s", "<f8"), ("torque_nm", "<f8"), ("counter", "<i8"), ("sync", "u1")]
-)
-"""As `stimrig.rig.messages.TORQUE_ROW`."""
-Segments = Sequence[tuple[str, int, int]]
-"""Name, first pulse and end of each."""
 
 
 def adaptive_outlook(
@@ -53,7 +46,7 @@ def adaptive_outlook(
     opening = decide(None, (), limits)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
     outlook = reach(limits, NEW_PERSON_SHARE * max_torque_nm)
-    return json_value({"opening_us": widths, "reach": asdict(outlook), "known": limits.earlier is not None})
+    return json_value({"opening_us": widths, "reach": {**asdict(outlook), "known": limits.earlier is not None}})
 
 
 def warm() -> None:
@@ -133,30 +126,23 @@ class Running:
     ) -> dict[str, Any]:
         """Return the decision, and where the curves are known least.
 
-        Parameters
-        ----------
-        samples, outcomes
-            Samples that are new, and what became of pulses since, as the rig sends both.
-        zero_s
-            Begin of the test on the clock of the samples, s.
-        laid_us, segments
-            Widths of all pulses that are laid, µs, and their segments.
-        torque_time_nm_s, measured_s
-            Torque-time that was measured, N·m·s, and until when, s.
+        `samples`, `outcomes`: those that are new, as the rig sends both; `zero_s`: begin of the test on the clock of
+        the samples; `laid_us`, `segments`: widths of all pulses that are laid, and their segments; `torque_time_nm_s`,
+        `measured_s`: what was measured, and until when.
         """
         from stimrig.identify.experiments.adaptive import Asked, decide
 
         self.samples += samples
         for name, column in outcomes.items():
             self.outcomes.setdefault(name, []).extend(column)
-        rows = np.frombuffer(self.samples, SAMPLE)
-        record = record_of(rows, zero_s, self.outcomes, laid_us, segments, self.pulse_rate_hz)
+        rows, rate_hz = np.frombuffer(self.samples, SAMPLE), self.pulse_rate_hz
+        record = live_record(rows, zero_s, self.outcomes, laid_us, segments, rate_hz)
         played_us = np.array(laid_us, float)
         played_us[self.outcomes["index"]] = self.outcomes["pulse_width_us"]
-        committed_nm_s = self._expected_nm_s(laid_us[round(measured_s * self.pulse_rate_hz) :])
-        left_s = max(0.0, self.playable_s - len(laid_us) / self.pulse_rate_hz)
+        committed_nm_s = self._expected_nm_s(laid_us[round(measured_s * rate_hz) :])
+        left_s = max(0.0, self.playable_s - len(laid_us) / rate_hz)
         left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
-        limits = Asked(self.target, left_s, left_nm_s, self.largest_us, self.pulse_rate_hz, self.earlier)
+        limits = Asked(self.target, left_s, left_nm_s, self.largest_us, rate_hz, self.earlier)
         decision = decide(record, played_us, limits, self.decision)
         self.decision = decision if decision.short is not None else self.decision
         document = decision.to_dict()
@@ -180,94 +166,9 @@ class Running:
         return float(np.sum(shares)) * knowledge.plateau_nm / self.pulse_rate_hz
 
 
-def rounded(value: Any) -> Any:
-    """Round all numbers in a document to what a page shows."""
-    if isinstance(value, dict):
-        return {key: rounded(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [rounded(item) for item in value]
-    return round(value, DIGITS) if isinstance(value, float) else value
-
-
-def record_of(
-    samples: Any, zero_s: float, outcomes: Mapping[str, Any], laid_us: list[float], segments: Segments, rate_hz: float
-) -> Any:
-    """Return the record of what was measured since the first pulse, for `decide`; None where there is nothing yet.
-
-    Pulses are those that were felt, by the same rules as in a sealed recording.
-    """
-    from stimrig.identify.records.pulse_times import in_force, locate_pulses
-    from stimrig.identify.records.record import Record
-
-    if samples.size < 2:
-        return None
-    time_s = sample_times(samples["host_time_s"] - zero_s, samples["counter"])
-    whole_s = min(np.floor(time_s[-1] * rate_hz), len(laid_us)) / rate_hz  # of an interval's begin a mean is noisy
-    inside = np.isfinite(samples["torque_nm"]) & (time_s >= 0) & (time_s < whole_s - 1e-9)
-    if not inside.any():
-        return None
-    time_s, torque, sync = time_s[inside], samples["torque_nm"][inside], samples["sync"][inside]
-    pulse_count = int(time_s[-1] * rate_hz) + 1
-    pulses, doubted = locate_pulses(_sent(outcomes, laid_us[:pulse_count], rate_hz), time_s, sync)
-    even_s, torque = means(time_s, torque, BINS * rate_hz)
-    width_us, late_s = in_force(pulses, even_s, rate_hz)
-    code = np.searchsorted([start for _, start, _ in segments], even_s * rate_hz + 1e-9, side="right") - 1
-    return Record.from_arrays(
-        even_s, width_us, torque, code, segment_names=[name for name, _, _ in segments], late_s=late_s,
-        doubted=np.interp(even_s, time_s, doubted) > 0, pulses=pulses, pulse_rate_hz=rate_hz,
-    )  # fmt: skip
-
-
-def _sent(outcomes: Mapping[str, Any], laid_us: list[float], rate_hz: float) -> Any:
-    """Return what is known of each pulse; one whose outcome is not known yet is on its way."""
-    from stimrig.identify.records.pulse_times import ON_ITS_WAY, RESTS, Sent
-
-    widths_us = np.array(laid_us, float)
-    written_s, acknowledged_s = np.full(widths_us.size, np.nan), np.full(widths_us.size, np.nan)
-    status = np.where(widths_us > 0, ON_ITS_WAY, RESTS)
-    index = np.array(outcomes["index"], int)
-    is_laid = index < widths_us.size
-    columns = {"pulse_width_us": widths_us, "written_time_s": written_s, "acknowledged_time_s": acknowledged_s}
-    for name, column in {**columns, "status": status}.items():
-        column[index[is_laid]] = np.array(outcomes[name], float)[is_laid]
-    return Sent(np.arange(widths_us.size) / rate_hz, widths_us, written_s, acknowledged_s, status, 1.0 / rate_hz)
-
-
-def means(time_s: Any, torque_nm: Any, rate_hz: float) -> tuple[Any, Any]:
-    """Average over even bins, each at its middle; return the samples where there are not two for each bin."""
-    if time_s.size < 2 * rate_hz * (time_s[-1] - time_s[0]):
-        return time_s, torque_nm
-    number = np.floor(time_s * rate_hz + 1e-9).astype(int)
-    count = np.bincount(number)
-    filled = np.flatnonzero(count)
-    return (filled + 0.5) / rate_hz, (np.bincount(number, torque_nm)[filled] / count[filled])
-
-
-def sample_times(host_s: Any, counter: Any) -> Any:
-    """Estimate when the samples were taken: evenly by the cell's counter, on the line below all arrivals.
-
-    Samples arrive late and never early, after a pause of the computer all of it at once: so no arrival lies below the
-    line. Of such lines it is the highest one in the record's middle, an edge of the arrivals' lower convex hull.
-    """
-    number = np.array(counter, float)
-    if number.min() < 0:  # the cell has none
-        number = np.arange(host_s.size, dtype=float)
-    number -= number[0]
-    hull: list[Any] = []
-    latest = np.r_[np.diff(host_s) > 0, True]  # of those that came at once
-    for point in np.column_stack([number, host_s])[latest].tolist():
-        while len(hull) > 1 and _turn(hull[-2], hull[-1], point) <= 0:
-            hull.pop()
-        hull.append(point)
-    corners = np.array(hull)
-    after = int(np.clip(np.searchsorted(corners[:, 0], number.mean()), 1, len(corners) - 1))
-    (start, start_s), (end, end_s) = corners[after - 1], corners[after]
-    return start_s + (end_s - start_s) / (end - start) * (number - start)
-
-
-def _turn(first: Any, second: Any, third: Any) -> float:
-    """Return a value above 0 where the way from the first point to the third turns upwards at the second."""
-    return (second[0] - first[0]) * (third[1] - first[1]) - (second[1] - first[1]) * (third[0] - first[0])
+def rounded(document: dict[str, Any]) -> dict[str, Any]:
+    """Round all numbers of a document to what a page shows."""
+    return json.loads(json.dumps(json_value(document)), parse_float=lambda text: round(float(text), DIGITS))
 
 
 _running: list[Running] = []

@@ -9,7 +9,6 @@ from typing import Annotated, Any
 from pydantic import AfterValidator, Field, FiniteFloat, StrictBool, StringConstraints
 
 from stimrig.api.errors import ApiError, invalid
-from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import together
 from stimrig.api.services.context import Context
 from stimrig.api.sessions import profiles
@@ -18,7 +17,7 @@ from stimrig.api.sessions.requests import Body
 from stimrig.api.store import locking
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Participant
-from stimrig.rig.messages import AngleCalibration, AngleStatus, Status
+from stimrig.rig.messages import AngleStatus, Status
 from stimrig.rig.requests import AnglePoseRequest
 
 NOTHING_OPEN: dict[str, Any] = {
@@ -34,6 +33,27 @@ class PoseIn(Body):
     first: StrictBool = Field(False, description="begin anew with this one: a first pose that waits is forgotten")
 
 
+def _once(recordings: list[str]) -> list[str]:
+    if len(set(recordings)) != len(recordings):
+        raise ValueError("a recording is named twice")
+    return recordings
+
+
+RecordingId = Annotated[str, StringConstraints(min_length=1, max_length=80)]
+EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}(:[a-z0-9_|]{1,100})?$")]
+
+
+class TogetherIn(Body):
+    """Recordings of one participant that are to be fitted as one."""
+
+    recordings: Annotated[
+        list[RecordingId], Field(min_length=1, max_length=together.MAX_RECORDINGS), AfterValidator(_once)
+    ]
+    effects: Annotated[list[EffectId], Field(max_length=20)] = Field(
+        default=list(together.JOINT_EFFECTS), description="of the model; needs the joint's angle in each recording"
+    )
+
+
 def sensor(context: Context) -> AngleStatus:
     """The rig's angle sensor; 409 where it has none."""
     status = context.rig.status
@@ -44,17 +64,10 @@ def sensor(context: Context) -> AngleStatus:
 
 async def overview_of(context: Context, row: Participant) -> dict[str, Any]:
     """Return the sensor and today's open guided tests; no tests without a sensor or a range of angles."""
-    status = context.rig.status
-    sensor_state = (status.angle if status is not None else AngleStatus()).model_dump()
-    if not sensor_state["present"] or profiles.range_of(row.profile) is None:
-        return {"sensor": sensor_state, "range_rad": row.profile.get(profiles.RANGE), **NOTHING_OPEN}
-    return {"sensor": sensor_state, **await context.runner.joint_overview(row)}
-
-
-def pose_version(context: Context) -> int:
-    """Return the version of the sensor's calibration."""
-    with context.store.read() as session:
-        return locking.pose_version(session)
+    angle = context.rig.status.angle if context.rig.status else AngleStatus()
+    range_rad = row.profile.get(profiles.RANGE)
+    opened = await context.runner.joint_overview(row) if angle.present and range_rad else NOTHING_OPEN
+    return {"sensor": angle.model_dump(), "range_rad": range_rad, **opened}
 
 
 async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags) -> tuple[Status, int]:
@@ -72,62 +85,23 @@ async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags) -> tupl
         raise invalid(f"angle_rad: {words}", errors=[{"field": "angle_rad", "detail": words}])
     pose = {"angle_rad": round(body.angle_rad, 4)}
 
-    def write_intent() -> int:
+    def write(action: str, detail: dict[str, Any]) -> int:
         with context.store.write() as session:
-            locking.check_poses(session, tags)
-            return locking.write_pose(session, context.clock.utc(), by, locking.POSES[0], **pose)
-
-    def write_calibration(done: AngleCalibration) -> int:
-        with context.store.write() as session:
-            return locking.write_pose(
-                session, context.clock.utc(), by, locking.POSES[1], **done.model_dump(exclude={"by"})
-            )
+            if action == locking.POSES[0]:
+                locking.check_poses(session, tags)
+            return locking.write_pose(session, context.clock.utc(), by, action, **detail)
 
     async with context.limits_lock:  # no other pose comes between looking and taking it
         before = context.rig.status.angle.calibration if context.rig.status else None
-        version = await asyncio.to_thread(write_intent)
+        version = await asyncio.to_thread(write, locking.POSES[0], pose)
         try:
             request = AnglePoseRequest(angle_rad=body.angle_rad, by=by, first=body.first)
             status = await context.rig.ask_for(Status, request)
         except ApiError as error:
-            await asyncio.to_thread(
-                context.store.note, context.clock, by, "pose not taken", "rig", **pose, why=error.detail
-            )
+            note = {**pose, "why": error.detail}
+            await asyncio.to_thread(context.store.note, context.clock, by, "pose not taken", "rig", **note)
             raise
         context.rig.status = status
         if (done := status.angle.calibration) is not None and done != before:
-            version = await asyncio.to_thread(write_calibration, done)
+            version = await asyncio.to_thread(write, locking.POSES[1], done.model_dump(exclude={"by"}))
     return status, version
-
-
-def _once(recordings: list[str]) -> list[str]:
-    if len(set(recordings)) != len(recordings):
-        raise ValueError("a recording is named twice")
-    return recordings
-
-
-RecordingId = Annotated[str, StringConstraints(min_length=1, max_length=80)]
-
-
-EffectId = Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{1,64}(:[a-z0-9_|]{1,100})?$")]
-
-
-class TogetherIn(Body):
-    """Recordings of one participant that are to be fitted as one."""
-
-    recordings: Annotated[
-        list[RecordingId], Field(min_length=1, max_length=together.MAX_RECORDINGS), AfterValidator(_once)
-    ]
-    effects: Annotated[list[EffectId], Field(max_length=20)] = Field(
-        default=list(together.JOINT_EFFECTS), description="of the model; needs the joint's angle in each recording"
-    )
-
-
-def begin_fit(context: Context, code: str, body: TogetherIn, by: str) -> Job:
-    """Fit them while the person looks on."""
-
-    async def work(job: Job) -> str:
-        model = await together.fit(context.analyses, code, body.recordings, body.effects, by, job.follow)
-        return f"/v1/models/{model.id}"
-
-    return context.jobs.start(FIT_TOGETHER, code, work)

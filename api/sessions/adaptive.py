@@ -7,11 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
-from collections import OrderedDict
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
-from typing import Any, ClassVar
+from collections.abc import Iterator, Sequence
+from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
@@ -20,7 +17,7 @@ from stimrig.api.models import stored_model
 from stimrig.api.models.places import Place, differ, place_of, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.adaptive_follower import AdaptiveStatus, Follower
-from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Send, Watched, begun
+from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, Planned, Send, Watched
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.store.tables import Participant, Test
@@ -30,8 +27,6 @@ from stimrig.rig.requests import PreviewRequest
 
 ADAPTIVE = "adaptive"
 """Kind of test."""
-MOST_OUTLOOKS = 20
-"""Outlooks that are remembered: the question before a test and its start need the same one."""
 MOST_MODELS = 10
 """Sessions from which is learnt how much a person changes between two."""
 DURATION_S = 50.0
@@ -48,15 +43,14 @@ class AdaptiveTests(Watched):
     """All of them. `adviser`: says what a test can reach, and what to play next."""
 
     names, part = (ADAPTIVE,), "adaptive"
-    ends: ClassVar[Mapping[str, str]] = {"torque_time": "torque-time", "plan": "fixed-rest"}
+    status_type, watching, alone = AdaptiveStatus, "choosing", "fixed"
+    left_alone = "The fixed plan plays on"
 
     def __init__(self, clock: Clock, rig: RigClient, versions: Versions, adviser: Pool, send: Send) -> None:
         super().__init__(clock, rig, versions, send)
         self.adviser = adviser
-        self._outlooks: OrderedDict[str, dict[str, Any]] = OrderedDict()
+        self._last: tuple[Any, dict[str, Any]] = None, {}
         self._outlook_lock = asyncio.Lock()
-
-    # ---- before ----------------------------------------------------------------------------------------------
 
     async def planned(self, body: TestIn, plan: TestPlan, preview_s: float) -> Planned:
         """The plan with its bounds and its fixed plan.
@@ -64,10 +58,9 @@ class AdaptiveTests(Watched):
         Raises ApiError: 422: the target cannot be reached, and nobody said that the test is to be played anyway; what
         the rig refuses. 500: the worker died.
         """
-        given_s, given_nm_s = body.max_duration_s, body.max_torque_time_nm_s
         bounds = AdaptivePlan(
-            max_duration_s=DURATION_S if given_s is None else given_s,
-            max_torque_time_nms=AT_STOPPING_TORQUE_S * plan.stopping_torque_nm if given_nm_s is None else given_nm_s,
+            max_duration_s=body.max_duration_s or DURATION_S,
+            max_torque_time_nms=body.max_torque_time_nm_s or AT_STOPPING_TORQUE_S * plan.stopping_torque_nm,
             patience_s=PATIENCE_S,
         )
         how = {
@@ -79,26 +72,25 @@ class AdaptiveTests(Watched):
         outlook = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
         default = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None), timeout_s=preview_s)
         segments = fixed_plan(outlook["opening_us"], default, plan.pulse_rate_hz, bounds)
-        if not outlook["reach"]["reachable"] and not body.anyway:
-            raise out_of_reach(outlook["reach"])
+        reach = outlook["reach"]
+        if not reach["reachable"] and not body.anyway:
+            words = f"{reach['words']} Nothing was started. Allow more torque-time or time, ask for less, or send "
+            raise out_of_reach(f'{words}"anyway": true to play it all the same.', reach=reach)
         plan = plan.model_copy(update={"segments": segments, "adaptive": bounds})
-        reach = {**outlook["reach"], "known": outlook["known"]}
         return Planned(plan, {"target": how["target"], "reach": reach, "bounds": bounds.model_dump()}, how)
 
     async def _outlook(self, wanted: dict[str, Any]) -> dict[str, Any]:
-        """Estimate what the test can reach. Serialised: a starting test waits for at most one estimate."""
-        name = hashlib.sha256(repr(wanted).encode()).hexdigest()
-        if name in self._outlooks:
-            return self._outlooks[name]
+        """Estimate what the test can reach; the last estimate is kept, for the start after a preview.
+
+        One after the other: a starting test waits for at most one estimate.
+        """
         async with self._outlook_lock:
-            if name not in self._outlooks:
-                if self.watching:
+            if self._last[0] != wanted:
+                if self.is_watching:
                     detail = "What a test can reach is computed once the one that runs has ended."
                     raise ApiError(409, "rig-busy", "Another test is running", detail)
-                self._outlooks[name] = await self.adviser.submit("adaptive_outlook", **wanted).result
-                while len(self._outlooks) > MOST_OUTLOOKS:
-                    self._outlooks.popitem(last=False)
-            return self._outlooks[name]
+                self._last = wanted, await self.adviser.submit("adaptive_outlook", **wanted).result
+            return self._last[1]
 
     def _known(self, plan: TestPlan) -> list[str]:
         """List the participant's models at the place of a plan, oldest first."""
@@ -112,35 +104,27 @@ class AdaptiveTests(Watched):
         """
         rows = self.versions.all_approved_ones(participant)
         of_rows = self.versions.store.all(Test, Test.recording_id.in_([row.recording_id for row in rows]))
-        tests = {test.recording_id: test for test in of_rows}
+        elsewhere = {test.recording_id for test in of_rows if differ(place_of(test), place)}
         texts = []
-        pairs = [(row, tests.get(row.recording_id)) for row in rows]
-        here = [row for row, test in pairs if test is None or not differ(place_of(test), place)]
-        for row in here[-MOST_MODELS:]:
+        for row in [row for row in rows if row.recording_id not in elsewhere][-MOST_MODELS:]:
             with contextlib.suppress(ApiError):
                 texts.append(stored_model.text(row))
         return texts
 
-    # ---- while it plays, and after it ------------------------------------------------------------------------
-
     def begin(self, planned: Planned) -> str:
-        """As `Kind`."""
-        assert planned.how is not None
-        follower = Follower(
-            planned.plan, planned.how, planned.extra["reach"], self.rig, self.adviser, self.clock, self.publish
-        )
+        follower = Follower(planned, self, self.adviser)
         self.watch(follower)
         return follower.key
 
     async def close(self) -> None:
-        """As `Kind`."""
         await super().close()
         await self.adviser.close()
 
-    def end_of(self, row: Test, event: FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
-        """Where another piece of the fixed plan would have been too long, the time has ended it."""
-        by_time = rigs == "limit" and standing["max_duration_s"] - event.summary["duration_s"] < PIECE_S
-        return "time" if by_time else ""
+    def ended(self, row: Test, event: FinishedEvent, by: str) -> str:
+        """As `Watched`. Where another piece of the fixed plan would have been too long, the time has ended it."""
+        if by == "limit" and row.plan["adaptive"]["max_duration_s"] - event.summary["duration_s"] < PIECE_S:
+            return "time"
+        return {"torque_time": "torque-time", "plan": "fixed-rest"}.get(by, by)
 
     def fit_options(self, row: Test) -> dict[str, Any]:
         """A short recording needs to know what a curve looks like, or looked like last time.
@@ -149,21 +133,17 @@ class AdaptiveTests(Watched):
         bound.
         """
         ended = (row.summary.get("adaptive") or {}).get("ended")
-        planned = [segment["name"] for segment in (row.plan.get("preview") or {}).get("segments") or []]
-        if ended == "fixed-rest" and HELD_OUT in planned:
+        if ended == "fixed-rest" and HELD_OUT in [segment["name"] for segment in row.plan["preview"]["segments"]]:
             return {}
         return {"recruitment": "near-sigmoid", "models": self._models(row.participant, place_of(row))}
 
-    def unwatched(self, row: Test) -> dict[str, Any]:
-        """As `Watched`."""
-        bounds = row.plan.get("adaptive") or {}
-        why = "The fixed plan plays on: the service was restarted during the test." if begun(row) else ""
-        return {
-            "max_duration_s": bounds.get("max_duration_s"),
-            "max_torque_time_nm_s": bounds.get("max_torque_time_nms"),
-            "torque_time_nm_s": None,
-            **asdict(AdaptiveStatus(row.plan.get("target") or {}, row.plan.get("reach"), state="fixed", problem=why)),
+    def document(self, row: Test) -> dict[str, Any]:
+        plan = row.plan
+        bounds = {
+            "max_duration_s": plan["adaptive"]["max_duration_s"],
+            "max_torque_time_nm_s": plan["adaptive"]["max_torque_time_nms"],
         }
+        return {"target": plan["target"], "reach": plan["reach"], **bounds, **super().document(row)}
 
 
 def fixed_plan(
@@ -174,20 +154,19 @@ def fixed_plan(
     `opening_us`: the opening's widths, one for each pulse, µs; `default`: the rig's preview of the default test. Raises
     ApiError: 422: there is no room for the opening.
     """
-    opening = [*opening_us, *[0.0] * round(TAIL_S * rate_hz)]
-    room = round((bounds.max_duration_s - SAFE_END_S) * rate_hz) - len(opening)
-    if not opening_us or room < 0:
-        detail = (
-            f"A test of at most {bounds.max_duration_s:g} s and {bounds.max_torque_time_nms:g} N·m·s has no room for a "
-            "first look at the muscle. Nothing was started. Allow more."
-        )
-        raise ApiError(422, "out-of-reach", "The target cannot be reached", detail)
-    segments = [_segment("opening", opening)]
-    for name, widths in _pieces(default, rate_hz):
+    pieces = [("opening", [*opening_us, *[0.0] * round(TAIL_S * rate_hz)]), *_pieces(default, rate_hz)]
+    room = round((bounds.max_duration_s - SAFE_END_S) * rate_hz)
+    segments = []
+    for name, widths in pieces:
         room -= len(widths)
         if room < 0:
             break
-        segments.append(_segment(name, widths))
+        settings = {"pulse_width_us": widths, "jumps": True}
+        segments.append(SegmentPlan(name=name, sequence="widths", settings=settings))
+    if not opening_us or not segments:
+        allowed = f"{bounds.max_duration_s:g} s and {bounds.max_torque_time_nms:g} N·m·s"
+        words = f"A test of at most {allowed} has no room for a first look at the muscle."
+        raise out_of_reach(f"{words} Nothing was started. Allow more.")
     return segments
 
 
@@ -201,14 +180,6 @@ def _pieces(default: dict[str, Any], rate_hz: float) -> Iterator[tuple[str, list
                 yield segment["name"], widths[start : min(start + piece, end)]
 
 
-def _segment(name: str, widths: list[float]) -> SegmentPlan:
-    return SegmentPlan(name=name, sequence="widths", settings={"pulse_width_us": widths, "jumps": True})
-
-
-def out_of_reach(reach: dict[str, Any]) -> ApiError:
+def out_of_reach(detail: str, **more: Any) -> ApiError:
     """422: said before the first pulse, with what can be reached."""
-    detail = (
-        f'{reach["words"]} Nothing was started. Allow more torque-time or time, ask for less, or send "anyway": true '
-        "to play it all the same."
-    )
-    return ApiError(422, "out-of-reach", "The target cannot be reached", detail, reach=reach)
+    return ApiError(422, "out-of-reach", "The target cannot be reached", detail, **more)

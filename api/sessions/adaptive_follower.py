@@ -13,20 +13,14 @@ import contextlib
 import logging
 import secrets
 from base64 import b64decode
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any
 
-from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.pool import Pool
-from stimrig.api.sessions.kinds import SERVICE, Watcher
-from stimrig.api.sessions.rig_client import RigClient
-from stimrig.rig.messages import AHEAD, SAFE_END_S, LiveEvent, SegmentPlan, TestPlan
+from stimrig.api.sessions.kinds import SERVICE, Planned, Watched, Watcher, WatchStatus
+from stimrig.rig.messages import AHEAD, SAFE_END_S, LiveEvent, SegmentPlan
 from stimrig.rig.requests import EnoughRequest, ExtendRequest
-
-log = logging.getLogger("stimrig.adaptive")
 
 EARLY_S = 0.75
 """Before the rig decides on a boundary: the first question."""
@@ -40,13 +34,14 @@ SHORTEST_PIECE_S = 1.0
 """Shortest chosen piece, s."""
 
 
-@dataclass(frozen=True)
-class Advice:
-    """The adviser's decision, when its newest sample was received (monotonic, s), and its number."""
+@dataclass
+class AdaptiveStatus(WatchStatus):
+    """State of the test: choosing; fixed (the fixed plan plays on, `problem` says why); ending."""
 
-    document: dict[str, Any]
-    received_s: float
-    number: int
+    words: str = ""
+    knowledge: dict[str, Any] | None = None
+    least_known: dict[str, Any] | None = None
+    decisions: list[dict[str, Any]] = field(default_factory=list)
 
 
 @dataclass
@@ -64,122 +59,87 @@ class News:
 
 
 @dataclass
+class Advice:
+    """The adviser's decision, when its newest sample was received (monotonic, s), and its line of the document."""
+
+    document: dict[str, Any]
+    received_s: float
+    row: dict[str, Any]
+
+
+@dataclass
 class Turn:
     """One boundary between pieces: the request to the adviser and its result."""
 
-    scheduled: int
+    after: int
+    """Pulses that are laid before it."""
     questions: int = 0
     """1: with early samples; 2: with the newest ones."""
     advice: Advice | None = None
     sent: bool = False
 
 
-@dataclass
-class AdaptiveStatus:
-    """State of the test, for pages and its document."""
-
-    target: dict[str, float]
-    reach: dict[str, Any] | None
-    state: str = "choosing"
-    """choosing; fixed: the fixed plan plays on, `problem` says why; ending."""
-    words: str = ""
-    problem: str = ""
-    knowledge: dict[str, Any] | None = None
-    least_known: dict[str, Any] | None = None
-    ended: str = ""
-    decisions: list[dict[str, Any]] = field(default_factory=list)
-
-
 class Follower(Watcher):
-    """One test from its first sample to its end.
+    """One test from its first sample to its end. Each segment of its plan holds its widths."""
 
-    `plan`: each of its segments holds its widths; `how`: for the adviser: target, bounds, largest width, pulse rate,
-    the participant's models; `reach`: what was said of the target before the test.
-    """
+    log = logging.getLogger("stimrig.adaptive")
+    status: AdaptiveStatus
 
-    watching_state, failed_state = "choosing", "fixed"
-    log = log
-
-    def __init__(
-        self, plan: TestPlan, how: dict[str, Any], reach: dict[str, Any], rig: RigClient, adviser: Pool,
-        clock: Clock, publish: Callable[[], None],
-    ) -> None:  # fmt: skip
-        super().__init__(plan, AdaptiveStatus(how["target"], reach), rig, clock, publish)
-        self.how, self.adviser = how, adviser
+    def __init__(self, planned: Planned, kind: Watched, adviser: Pool) -> None:
+        super().__init__(planned.plan, kind)
+        self.how, self.adviser = planned.how, adviser
         self.key = secrets.token_urlsafe(24)
-        self._fixed = [segment.settings["pulse_width_us"] for segment in plan.segments or []]
+        self._fixed = [segment.settings["pulse_width_us"] for segment in self.plan.segments or []]
         self._added: list[list[float]] = []
-        self._new = News()
+        self._news = News()
         self._newest: LiveEvent | None = None
         self._received_s = 0.0
         self._took_s = 0.0
         self._turn = Turn(-1)
         self._deciding: asyncio.Task[None] | None = None
 
-    async def _listen(self, path: Path | None) -> None:
+    async def _listen(self) -> None:
         self._deciding = self.begin(self._begin())
-        await super()._listen(path)
+        await super()._listen()
 
     async def _begin(self) -> None:
         await self.adviser.submit("adaptive_begin", **self.how).result
 
-    def problem(self, why: str) -> str:
-        """As `Watcher`."""
-        return f"The fixed plan plays on: {why}"
-
     def give_up(self, why: str) -> None:
         """As `Watcher`; the fixed plan plays on at once, without rest for somebody who would choose."""
         super().give_up(why)
-        self._tasks.begin(self._release(self._turn.scheduled))
+        self._tasks.begin(self._release(self._turn.after))
 
-    async def _release(self, scheduled: int) -> None:
+    async def _release(self, after: int) -> None:
         with contextlib.suppress(ApiError):  # without this request the test continues after the rig's timeout
-            await self.rig.ask(ExtendRequest(test_id=self.plan.test_id, key=self.key, after=scheduled, segments=[]))
-
-    def document(self) -> dict[str, Any]:
-        """As `Watcher`."""
-        bounds = self.plan.adaptive
-        assert bounds is not None
-        limits = {"max_duration_s": bounds.max_duration_s, "max_torque_time_nm_s": bounds.max_torque_time_nms}
-        measured_nm_s = 0.0 if self._newest is None else self._newest.torque_time_nms
-        return {**limits, "torque_time_nm_s": measured_nm_s, **asdict(self.status)}
-
-    # ---- events of the rig ----------------------------------------------------------------------------------
+            await self.rig.ask(ExtendRequest(test_id=self.plan.test_id, key=self.key, after=after, segments=[]))
 
     def hear(self, event: LiveEvent) -> None:
-        """As `Watcher`."""
         self._newest, self._received_s = event, self.clock.monotonic_s()
-        self._new.add(event)
-        if event.laid != self._turn.scheduled:
+        self.status.torque_time_nm_s = event.torque_time_nms
+        self._news.add(event)
+        if event.laid != self._turn.after:
             self._turn = Turn(event.laid)
-        if event.ended_by or self.status.state != "choosing":
+        turn, left_s = self._turn, self._left_s(event)
+        if event.ended_by or self.status.state != self.kind.watching or turn.sent:
             return
-        left_s = self._left_s(event.elapsed_s)
         idle = self._deciding is None or self._deciding.done()
-        turn = self._turn
         early_s = max(EARLY_S, 1.5 * self._took_s + SEND_S)  # earlier on a busy machine
         least_s = LEAST_S + 2.0 / self.plan.pulse_rate_hz
-        if idle and not turn.sent and event.elapsed_s >= least_s and left_s <= (early_s, LATE_S, -1.0)[turn.questions]:
+        if idle and event.elapsed_s >= least_s and left_s <= (early_s, LATE_S, -1.0)[turn.questions]:
             turn.questions = 2 if left_s <= LATE_S else 1
             self._deciding = self.begin(self._decide(turn))
-        elif turn.advice is not None and not turn.sent and left_s <= SEND_S:  # the late one is not there
+        elif turn.advice is not None and left_s <= SEND_S:  # the late one is not there
             self.begin(self._carry_out(turn, turn.advice))
 
-    def _left_s(self, now_s: float) -> float:
-        """Return the time from `now_s` on the test's clock until the rig needs the next segment, s."""
-        assert self._newest is not None
-        return self._newest.boundary_s - AHEAD / self.plan.pulse_rate_hz - now_s
-
-    def _now_s(self) -> float:
-        """Return the time on the test's clock, s."""
-        assert self._newest is not None
-        return self._newest.elapsed_s + self.clock.monotonic_s() - self._received_s
-
-    # ---- deciding ------------------------------------------------------------------------------------------
+    def _left_s(self, event: LiveEvent) -> float:
+        """Return the time from now until the rig needs the next segment, s; `event`: the newest one."""
+        now_s = event.elapsed_s + self.clock.monotonic_s() - self._received_s
+        return event.boundary_s - AHEAD / self.plan.pulse_rate_hz - now_s
 
     async def _decide(self, turn: Turn) -> None:
         # the newest event: outcomes of pulses and scheduled segments must be of the same event
-        event, received_s, news, self._new = self._newest, self._received_s, self._new, News()
+        event, received_s, news, self._news = self._newest, self._received_s, self._news, News()
         assert event is not None
         widths, segments = self._played_so_far(event)
         job = self.adviser.submit(
@@ -188,69 +148,65 @@ class Follower(Watcher):
         )  # fmt: skip
         document = await job.result
         self._took_s = self.clock.monotonic_s() - received_s
-        advice = self._note(document, event, received_s)
-        if turn is not self._turn or turn.sent:
-            self._write(advice, late=True)
+        late = turn is not self._turn or turn.sent
+        advice = Advice(document, received_s, self._note(document, event, late))
+        if late:
             return
         turn.advice = advice
-        if turn.questions == 2 or self._left_s(self._now_s()) <= SEND_S:
+        assert self._newest is not None
+        if turn.questions == 2 or self._left_s(self._newest) <= SEND_S:
             await self._carry_out(turn, advice)
 
-    def _note(self, document: dict[str, Any], event: LiveEvent, received_s: float) -> Advice:
+    def _note(self, document: dict[str, Any], event: LiveEvent, late: bool) -> dict[str, Any]:
+        """Add the decision's line to the document and return it. It has all its keys: pages read it in threads."""
         status, known = self.status, document["knowledge"]
         # a misfit is reported as the problem, its bands are meaningless; the bands of the final decision stay
-        fits = document["kind"] != "misfit" and not self.status.ended
-        if fits:
+        if document["kind"] != "misfit" and not status.ended:
             status.words = document["words"]
+            if known is not None:
+                status.knowledge, status.least_known = known, document["least_known"]
         row = {
             "at_s": round(event.elapsed_s, 3), "kind": document["kind"], "words": document["words"],
             "segments": [segment["name"] for segment in document["segments"]],
             "expected_torque_time_nm_s": document["expected_torque_time_nm_s"],
-            "answer_ms": round(1e3 * self._took_s, 1),
+            "answer_ms": round(1e3 * self._took_s, 1), "late": late, "refused": None, "sample_to_plan_ms": None,
+            **{name: known and round(known[name], 3) for name in ("curve_percent", "step_percent")},
         }  # fmt: skip
-        if known is not None:
-            if fits:
-                status.knowledge, status.least_known = known, document["least_known"]
-            row |= {name: round(known[name], 3) for name in ("curve_percent", "step_percent")}
         status.decisions.append(row)
-        self.publish()
-        return Advice(document, received_s, len(status.decisions) - 1)
-
-    def _write(self, advice: Advice, **more: Any) -> None:
-        """More of a decision. Its line is replaced: a page's thread may be copying the old one."""
-        rows = self.status.decisions
-        rows[advice.number] = rows[advice.number] | more
+        self.kind.publish()
+        return row
 
     async def _carry_out(self, turn: Turn, advice: Advice) -> None:
         if turn.sent:  # the newest advice came between
             return
         turn.sent = True
-        kind, test_id = advice.document["kind"], self.plan.test_id
+        status, kind, test_id = self.status, advice.document["kind"], self.plan.test_id
         if kind == "misfit":
             self.give_up(advice.document["words"])
             return
-        before = self.status.state, self.status.ended
         chosen = [SegmentPlan(**segment) for segment in advice.document["segments"]]
-        ended = {"enough": "known-enough", "spent": self._spent()}.get(kind, "")
-        request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.scheduled, segments=chosen)
-        if ended:
+        before = status.state, status.ended
+        if kind == "next":
+            request: Any = ExtendRequest(test_id=test_id, key=self.key, after=turn.after, segments=chosen)
+        else:
             request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
             # before the request: samples that arrive during it are not part of this decision
-            self.status.state, self.status.ended = "ending", self.status.ended or ended
+            ended = "known-enough" if kind == "enough" else self._spent()
+            status.state, status.ended = "ending", status.ended or ended
         self._added += (widths := [segment.settings["pulse_width_us"] for segment in chosen])
         try:
             await self.rig.ask(request)
         except ApiError as error:  # too late, or a limit: the fixed plan's next piece plays, then it decides again
-            if ended:
-                self.status.state, self.status.ended = before
+            if kind != "next":
+                status.state, status.ended = before
             if error.code == "rig-unreachable":  # unknown whether it was scheduled, and what plays next
                 raise
             del self._added[len(self._added) - len(widths) :]
-            self._write(advice, refused=error.detail)
-            log.info("not laid: %s", error.detail, extra={"test_id": test_id})
+            advice.row["refused"] = error.detail
+            self.log.info("not laid: %s", error.detail, extra={"test_id": test_id})
             return
-        self._write(advice, sample_to_plan_ms=round(1e3 * (self.clock.monotonic_s() - advice.received_s), 1))
-        self.publish()
+        advice.row["sample_to_plan_ms"] = round(1e3 * (self.clock.monotonic_s() - advice.received_s), 1)
+        self.kind.publish()
 
     def _spent(self) -> str:
         """Return which bound leaves no room for another piece."""

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import secrets
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
-from stimrig.api.errors import ApiError
+from stimrig.api.errors import ApiError, invalid
 from stimrig.api.sessions import joint_plan, profiles
 from stimrig.api.sessions.joint_plan import HELD, KINDS, MOVING, PASSIVE, Coverage, Layout
-from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, SERVICE, Planned, Watched, Watcher, begun
+from stimrig.api.sessions.kinds import AT_STOPPING_TORQUE_S, SERVICE, Planned, Watched, Watcher, WatchStatus
 from stimrig.api.sessions.requests import AngleIn, TestIn
 from stimrig.api.store.tables import Test
 from stimrig.rig import messages, requests
@@ -28,11 +26,20 @@ TELL_S = 0.2
 """Pages hear this often how much was seen."""
 
 
+@dataclass
+class JointStatus(WatchStatus):
+    """State of a guided test: watching; alone (nobody counts any more, `problem` says why); ending."""
+
+    angle_rad: float | None = None
+    velocity_rad_s: float | None = None
+    coverage: dict[str, Any] | None = None
+
+
 class JointTests(Watched):
     """All of them."""
 
-    names, part, fitted = KINDS, "joint", False
-    ends: ClassVar[Mapping[str, str]] = {"torque_time": "torque-time", "plan": "time", "limit": "time"}
+    names, part, fitted, status_type = KINDS, "joint", False, JointStatus
+    left_alone = "What is seen is not counted any more. The test goes on to its longest time"
 
     # ---- before ----------------------------------------------------------------------------------------------
 
@@ -42,111 +49,94 @@ class JointTests(Watched):
         Raises ApiError: 409 the rig has no angle sensor, or no angle is left to hold; 422 the participant has no range
         of angles, or one that is too small, or the target is not in it; what the rig refuses.
         """
-        range_rad = self.range_of(plan)
         angle_in, longest_s = body.angle or AngleIn(), body.max_duration_s
-        shared = await self._layout(plan, range_rad, longest_s, preview_s)
-        angle = messages.AnglePlan(range_rad=range_rad, tolerance_rad=angle_in.tolerance_rad)
-        document = {
-            "kind": plan.kind, "doses": shared.doses, "known": shared.known, "longest_s": None, "target_rad": None,
-            "tolerance_rad": angle_in.tolerance_rad,
-        }  # fmt: skip
+        angle = messages.AnglePlan(range_rad=self.range_of(plan), tolerance_rad=angle_in.tolerance_rad)
+        shared = await self._layout(plan, longest_s, preview_s)
+        bounds, segments = None, shared.held if plan.kind == HELD else shared.moving
         if plan.kind == HELD:
-            target = await asyncio.to_thread(self._target, plan, angle_in, shared)
-            angle.target_rad = document["target_rad"] = target
-            segments, bounds = shared.hold_segments, None
+            angle.target_rad = await asyncio.to_thread(self._target, plan, angle_in, shared)
         else:
-            angle.still_s = joint_plan.STILL_S[plan.kind] if angle_in.still_s is None else angle_in.still_s
-            bounds = self._bounds(body, plan, shared)
+            angle.still_s = angle_in.still_s or joint_plan.STILL_S[plan.kind]
+            expected = shared.doses["paper"] if shared.known else AT_STOPPING_TORQUE_S * plan.stopping_torque_nm
+            bounds = messages.AdaptivePlan(
+                max_duration_s=longest_s or joint_plan.LONGEST_S[plan.kind],
+                max_torque_time_nms=body.max_torque_time_nm_s or expected,
+            )
+        if plan.kind == PASSIVE and bounds is not None:
             quiet_s = bounds.max_duration_s - messages.SAFE_END_S
-            segments = shared.moving if plan.kind == MOVING else joint_plan.passive(quiet_s, plan.pulse_rate_hz)
-            document["longest_s"] = bounds.max_duration_s
+            segments = [joint_plan.still("passive", quiet_s, plan.pulse_rate_hz)]
         chosen = [messages.SegmentPlan(**segment) for segment in segments]
         plan = plan.model_copy(update={"segments": chosen, "angle": angle, "adaptive": bounds})
+        document = {
+            "kind": plan.kind, "doses": shared.doses, "known": shared.known,
+            "longest_s": bounds and bounds.max_duration_s, **angle.model_dump(),
+        }  # fmt: skip
         return Planned(plan, {"joint": document})
 
-    async def _layout(
-        self, plan: messages.TestPlan, range_rad: tuple[float, float], longest_s: float | None, preview_s: float
-    ) -> Layout:
-        """Lay out the three tests within the paper's torque-time."""
+    async def _layout(self, plan: messages.TestPlan, longest_s: float | None, preview_s: float) -> Layout:
+        """Lay out the three tests within the paper's torque-time; `plan`: any of the participant, with its limits."""
         paper = plan.model_copy(update={"kind": "pre-session", "segments": None})
         preview = await self.rig.ask(requests.PreviewRequest(plan=paper, recruitment=None), timeout_s=preview_s)
         table = await asyncio.to_thread(self.versions.recruitment, plan.participant)
         curve = joint_plan.curve_of(table, plan.largest_us, plan.profile.motor_pulse_width_us)
-        moving_s = (joint_plan.MOVING_S if longest_s is None else longest_s) - messages.SAFE_END_S
-        return joint_plan.layout(
-            range_rad, curve, plan.largest_us, preview["pulse_width_us"], plan.pulse_rate_hz, moving_s
-        )
-
-    def _bounds(self, body: TestIn, plan: messages.TestPlan, shared: Layout) -> messages.AdaptivePlan:
-        longest_s = {PASSIVE: joint_plan.PASSIVE_S, MOVING: joint_plan.MOVING_S}[plan.kind]
-        expected = shared.doses["paper"] if shared.known else AT_STOPPING_TORQUE_S * plan.stopping_torque_nm
-        largest_nm_s = body.max_torque_time_nm_s or expected
-        return messages.AdaptivePlan(max_duration_s=body.max_duration_s or longest_s, max_torque_time_nms=largest_nm_s)
+        moving_s = (longest_s or joint_plan.LONGEST_S[MOVING]) - messages.SAFE_END_S
+        range_rad, rate_hz = plan.profile.angle_range_rad, plan.pulse_rate_hz
+        assert range_rad is not None
+        return joint_plan.layout(range_rad, curve, plan.largest_us, preview["pulse_width_us"], rate_hz, moving_s)
 
     def _target(self, plan: messages.TestPlan, angle_in: AngleIn, shared: Layout) -> float:
         """Return the angle to hold: the requested one, or the next that is open."""
-        range_rad = plan.profile.angle_range_rad
-        assert range_rad is not None
+        range_rad, target_rad = plan.profile.angle_range_rad or (0.0, 0.0), angle_in.target_rad
         words = profiles.range_words(range_rad)
-        if angle_in.target_rad is not None:
-            if not (range_rad[0] <= angle_in.target_rad <= range_rad[1]):
-                detail = f"angle.target_rad {angle_in.target_rad:g} is not within the range {words}."
-                raise ApiError(422, "invalid-input", "The angle is not in the participant's range", detail)
-            return angle_in.target_rad
+        if target_rad is not None:
+            if not (range_rad[0] <= target_rad <= range_rad[1]):
+                raise invalid(f"angle.target_rad {target_rad:g} is not within the range {words}.")
+            return target_rad
         if not shared.targets_rad:
             smallest = math.degrees(joint_plan.LEAST_RANGE_RAD)
             detail = f"The range {words} is smaller than {smallest:.0f}°. Send angle.target_rad."
             raise ApiError(422, "small-range", "The range is too small", detail)
-        open_ones = [row["angle_rad"] for row in self.targets(plan.participant, shared) if not row["done"]]
-        if not open_ones:
+        targets = self._targets(self._today(plan.participant), shared)
+        if (next_rad := next((row["angle_rad"] for row in targets if not row["done"]), None)) is None:
             detail = "Every angle of the list was held today. Send angle.target_rad to hold one again."
             raise ApiError(409, "all-held", "No angle is left", detail)
-        return open_ones[0]
+        return next_rad
 
     # ---- while it plays, and after it ------------------------------------------------------------------------
 
     def begin(self, planned: Planned) -> str:
-        """As `Kind`."""
-        plan = planned.plan
-        if plan.adaptive is None or plan.angle is None:
+        if planned.plan.adaptive is None:
             return ""
-        coverage = Coverage(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
-        self.watch(JointWatcher(plan, JointStatus(coverage), self.rig, self.clock, self.publish))
+        self.watch(JointWatcher(planned.plan, self))
         return secrets.token_urlsafe(24)
 
-    def end_of(self, row: Test, event: messages.FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
-        """A held test has no other end than its outcome; a moving one's levels are as many as its share allows."""
+    def ended(self, row: Test, event: messages.FinishedEvent, by: str) -> str:
+        """As `Watched`. A moving test's levels are as many as its share allows."""
         if row.kind == HELD:
             return event.outcome
-        return "torque-time" if row.kind == MOVING and rigs == "plan" else ""
+        plan = "torque-time" if row.kind == MOVING else "time"
+        return {"torque_time": "torque-time", "plan": plan, "limit": "time"}.get(by, by)
 
     def outcome(self, row: Test, event: messages.FinishedEvent) -> dict[str, Any]:
-        """As `Kind`."""
         return {"joint": {**super().outcome(row, event)["joint"], "angle_rad": None, "velocity_rad_s": None}}
 
-    def document(self, row: Test) -> dict[str, Any] | None:
-        """As `Kind`."""
-        return {**(super().document(row) or {}), **(row.plan.get("joint") or {}), **(row.plan.get("angle") or {})}
+    def document(self, row: Test) -> dict[str, Any]:
+        return {**super().document(row), **row.plan["joint"]}
 
-    def unwatched(self, row: Test) -> dict[str, Any]:
-        """As `Watched`."""
-        lost = begun(row) and row.kind != HELD
-        why = "What is seen is not counted any more: the service was restarted during the test." if lost else ""
-        state = {"state": "alone" if lost else "watching", "problem": why, "ended": ""}
-        return dict.fromkeys(JointStatus.__dataclass_fields__) | state
+    def needs_watching(self, row: Test) -> bool:
+        return row.kind != HELD
 
     # ---- today's ---------------------------------------------------------------------------------------------
 
-    def targets(self, participant: str, shared: Layout) -> list[dict[str, Any]]:
-        """List the angles to hold, and which of them are done today."""
+    def _targets(self, rows: list[Test], shared: Layout) -> list[dict[str, Any]]:
+        """List the angles to hold, each with the newest test of `rows` that held it."""
         targets = []
-        rows = [row for row in self.today(participant) if row.kind == HELD]
         for target in shared.targets_rad:
-            near = [row for row in rows if abs(target_of(row) - target) <= SAME_ANGLE_RAD]
-            targets.append({"angle_rad": target, "done": bool(near), "test_id": near[0].id if near else None})
+            near = [row.id for row in rows if row.kind == HELD and abs(target_of(row) - target) <= SAME_ANGLE_RAD]
+            targets.append({"angle_rad": target, "done": bool(near), "test_id": near[0] if near else None})
         return targets
 
-    def today(self, participant: str) -> list[Test]:
+    def _today(self, participant: str) -> list[Test]:
         """List today's completed guided tests, newest first."""
         conditions = (
             Test.participant == participant, Test.kind.in_(KINDS), Test.state == "completed",
@@ -159,17 +149,13 @@ class JointTests(Watched):
 
         `plan`: any plan of the participant, with its limits.
         """
-        range_rad = plan.profile.angle_range_rad
-        assert range_rad is not None
-        shared = await self._layout(plan, range_rad, None, preview_s)
-        rows = await asyncio.to_thread(self.today, plan.participant)
-        targets = await asyncio.to_thread(self.targets, plan.participant, shared)
-        newest = {kind: next((row.id for row in rows if row.kind == kind), None) for kind in (PASSIVE, MOVING)}
+        shared = await self._layout(plan, None, preview_s)
+        rows = await asyncio.to_thread(self._today, plan.participant)
+        targets = self._targets(rows, shared)
         return {
-            "range_rad": list(range_rad),
             "targets": targets,
             "next_rad": next((row["angle_rad"] for row in targets if not row["done"]), None),
-            "tests": newest,
+            "tests": {kind: next((row.id for row in rows if row.kind == kind), None) for kind in (PASSIVE, MOVING)},
             "doses": shared.doses,
             "known": shared.known,
             "share_of_paper": shared.share,
@@ -182,40 +168,22 @@ def target_of(row: Test) -> float:
     return math.nan if target is None else float(target)
 
 
-@dataclass
-class JointStatus:
-    """State of a guided test for pages and its document."""
-
-    coverage: Coverage
-    state: str = "watching"
-    """watching; alone: nobody counts any more, `problem` says why; ending."""
-    problem: str = ""
-    ended: str = ""
-    angle_rad: float | None = None
-    velocity_rad_s: float | None = None
-    torque_time_nm_s: float = 0.0
-
-
 class JointWatcher(Watcher):
     """Counts what was seen of angle and velocity in a test in which a joint moves; ends it well when that is enough."""
 
     status: JointStatus
-    log = logging.getLogger("stimrig.joint")
 
-    def __init__(self, *args: Any) -> None:
-        super().__init__(*args)
+    def __init__(self, plan: messages.TestPlan, kind: JointTests) -> None:
+        super().__init__(plan, kind)
+        assert plan.angle is not None
+        self.coverage = Coverage(plan.angle.range_rad, joint_plan.SEEN_S[plan.kind])
         self._since_s: float | None = None
         """Since when pulses follow one another, and the newest one, on the test's clock."""
         self._last_s = 0.0
         self._shown_s = -TELL_S
 
-    def problem(self, why: str) -> str:
-        """As `Watcher`."""
-        return f"What is seen is not counted any more. The test goes on to its longest time: {why}"
-
     def document(self) -> dict[str, Any]:
-        """As `Watcher`."""
-        return {**vars(self.status), "coverage": self.status.coverage.document()}
+        return {**vars(self.status), "coverage": self.coverage.document()}
 
     def hear(self, event: messages.LiveEvent) -> None:
         """As `Watcher`; where the samples are enough, have the rig end the test well."""
@@ -231,14 +199,14 @@ class JointWatcher(Watcher):
             if math.isfinite(angle_rad) and math.isfinite(velocity_rad_s):
                 status.angle_rad, status.velocity_rad_s = angle_rad, velocity_rad_s
                 at_s = host_s - event.zero_s
-                status.coverage.add(at_s, angle_rad, velocity_rad_s, self._counts(at_s))
-        if status.state == "watching" and status.coverage.enough and not event.ended_by:
+                self.coverage.add(at_s, angle_rad, velocity_rad_s, self._counts(at_s))
+        if status.state == self.kind.watching and self.coverage.enough and not event.ended_by:
             status.state, status.ended = "ending", "covered"
             self.begin(self._say_enough())
         now_s = self.clock.monotonic_s()
         if now_s - self._shown_s >= TELL_S or status.state == "ending":
             self._shown_s = now_s
-            self.publish()
+            self.kind.publish()
 
     def _counts(self, time_s: float) -> bool:
         """Without stimulation everything counts in a passive test, and nothing in another one."""
@@ -252,5 +220,5 @@ class JointWatcher(Watcher):
             await self.rig.ask(requests.EnoughRequest(test_id=self.plan.test_id, by=SERVICE, at_once=True))
         except ApiError as error:  # it has ended already, by itself or by a person
             if error.code != "rig-late":
-                self.status.state, self.status.ended = "watching", ""
+                self.status.state, self.status.ended = self.kind.watching, ""
                 raise

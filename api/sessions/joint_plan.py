@@ -9,10 +9,10 @@ the part that is not planned is there for a muscle that is stronger elsewhere.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
+from bisect import bisect_left, bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import groupby, product
 from typing import Any
 
 from stimrig.api.sessions.profiles import TOLERANCE_RAD
@@ -41,7 +41,7 @@ RISE_S = 0.3
 """From one width to the next: no jump that startles."""
 QUIET_S = 1.0
 """Without stimulation, before and after the steps of a held test, and before the first level of a moving one."""
-PASSIVE_S, MOVING_S = 90.0, 60.0
+LONGEST_S = {PASSIVE: 90.0, MOVING: 60.0}
 """The longest passive and moving test, where nobody says."""
 STILL_S = {PASSIVE: 8.0, MOVING: 5.0}
 """So long the joint may stand still before such a test ends: then nobody moves it, or the sensor is stuck."""
@@ -57,59 +57,47 @@ Segment = dict[str, Any]
 class Curve:
     """Steady torque over pulse width, rising: a model's, or a stand-in whose torque at the widest pulse is 1."""
 
-    pulse_width_us: tuple[float, ...]
-    torque_nm: tuple[float, ...]
+    pulse_width_us: Sequence[float]
+    torque_nm: Sequence[float]
     known: bool  # whether it is a model's, in N·m
 
     def torque(self, width_us: float) -> float:
         """Steady torque at a width; 0 without a pulse, level beyond the ends."""
-        widths, torques = self.pulse_width_us, self.torque_nm
+        widths, torques, k = self.pulse_width_us, self.torque_nm, bisect_right(self.pulse_width_us, width_us)
         if not (width_us > 0.0):
             return 0.0
-        if width_us >= widths[-1]:
-            return torques[-1]
-        k = bisect_right(widths, width_us)
-        if k == 0:
-            return torques[0]
+        if k in (0, len(widths)):
+            return torques[min(k, len(widths) - 1)]
         share = (width_us - widths[k - 1]) / (widths[k] - widths[k - 1])
         return torques[k - 1] + share * (torques[k] - torques[k - 1])
 
     def width(self, torque_nm: float, largest_us: float) -> float:
         """The smallest width that gives a torque, in steps of a µs; never above the largest."""
-        low, high = 0, math.floor(largest_us)
-        while low < high:
-            middle = (low + high) // 2
-            low, high = (low, middle) if self.torque(middle) >= torque_nm else (middle + 1, high)
-        return float(low)
+        return float(bisect_left(range(math.floor(largest_us)), torque_nm, key=self.torque))
+
+    def torque_time(self, widths_us: Sequence[float], rate_hz: float) -> float:
+        """Expected torque-time of a plan, N·m·s (with a stand-in: s at the torque of the widest pulse)."""
+        return sum(map(self.torque, widths_us)) / rate_hz
 
 
 def curve_of(table: Mapping[str, Sequence[float]] | None, largest_us: float, motor_us: float | None) -> Curve:
     """The approved model's recruitment curve; where there is none, a straight line from the motor threshold on.
 
-    `table`: `pulse_width_us` and `torque_nm`; `largest_us`: the widest pulse of the tests, µs; `motor_us`: what the
-    calibration found, µs.
+    `table`: `pulse_width_us` and `torque_nm`; one without torque at the widest pulse is not used. `largest_us`: the
+    widest pulse of the tests, µs; `motor_us`: what the calibration found, µs.
     """
-    if table is not None and _rises(table, largest_us):
-        return Curve(tuple(table["pulse_width_us"]), tuple(max(0.0, t) for t in table["torque_nm"]), True)
+    if table is not None:
+        curve = Curve(table["pulse_width_us"], [max(0.0, torque) for torque in table["torque_nm"]], True)
+        if len(curve.torque_nm) > 1 and curve.torque(largest_us) > 0.0:
+            return curve
     begin_us = motor_us if motor_us is not None and 0 < motor_us < largest_us else UNKNOWN_MOTOR_SHARE * largest_us
     return Curve((begin_us, largest_us), (0.0, 1.0), False)
-
-
-def _rises(table: Mapping[str, Sequence[float]], largest_us: float) -> bool:
-    """Return whether a model's curve is usable for planning: it gives torque at the widest pulse."""
-    curve = Curve(tuple(table["pulse_width_us"]), tuple(table["torque_nm"]), True)
-    return len(curve.torque_nm) > 1 and curve.torque(largest_us) > 0.0
-
-
-def torque_time(widths_us: Sequence[float], rate_hz: float, curve: Curve) -> float:
-    """Expected torque-time of a plan, N·m·s (with a stand-in: s at the torque of the widest pulse)."""
-    return sum(map(curve.torque, widths_us)) / rate_hz
 
 
 def targets(range_rad: Sequence[float]) -> list[float]:
     """The angles to hold, rad: 3 to 5, evenly over the range, far enough from its ends that none is left by accident.
 
-    Empty where the range is too small.
+    Each is rounded to a multiple of 5° that lies in the range. Empty where the range is too small.
     """
     low, high = range_rad
     width = high - low
@@ -117,63 +105,50 @@ def targets(range_rad: Sequence[float]) -> list[float]:
         return []
     count = 3 + sum(width >= edge - 1e-9 for edge in RANGES_RAD)
     margin = min(2.0 * TOLERANCE_RAD, width / 6)
-    first, last = low + margin, high - margin
-    return [_rounded(first + (last - first) * k / (count - 1), low + margin, high - margin) for k in range(count)]
+    first, last, angles = low + margin, high - margin, []
+    for k in range(count):
+        angle = first + (last - first) * k / (count - 1)
+        near = round(angle / ROUND_RAD) * ROUND_RAD
+        rounded = (near, near + ROUND_RAD, near - ROUND_RAD, angle)
+        angles.append(next(each for each in rounded if first - 1e-9 <= each <= last + 1e-9))
+    return angles
 
 
-def _rounded(angle_rad: float, low: float, high: float) -> float:
-    """The nearest multiple of 5° that lies in the range; the angle itself where none does."""
-    near = round(angle_rad / ROUND_RAD) * ROUND_RAD
-    inside = [value for value in (near, near + ROUND_RAD, near - ROUND_RAD) if low - 1e-9 <= value <= high + 1e-9]
-    return inside[0] if inside else angle_rad
-
-
-def hold_segments(curve: Curve, largest_us: float, stair_s: float, rate_hz: float) -> list[Segment]:
+def held(curve: Curve, largest_us: float, stair_s: float, rate_hz: float) -> list[Segment]:
     """Return a short staircase with rest around it."""
-    top = curve.torque(largest_us)
-    return [
-        _still("rest", QUIET_S, rate_hz),
-        *_levels("hold", [curve.width(share * top, largest_us) for share in STAIRS], [stair_s] * len(STAIRS), rate_hz),
-        _still("rest", QUIET_S, rate_hz),
-    ]
+    segments, before_us = [still("rest", QUIET_S, rate_hz)], 0.0
+    for number, share in enumerate(STAIRS, start=1):
+        width_us = curve.width(share * curve.torque(largest_us), largest_us)
+        segments.append(_level(f"hold {number}", before_us, width_us, stair_s, rate_hz))
+        before_us = width_us
+    return [*segments, still("rest", QUIET_S, rate_hz)]
 
 
 def moving(curve: Curve, largest_us: float, most_nm_s: float, longest_s: float, rate_hz: float) -> list[Segment]:
     """Steady levels with pauses, until their torque-time or the time is used up."""
-    top, segments = curve.torque(largest_us), [_still("passive", QUIET_S, rate_hz)]
-    widths = [curve.width(share * top, largest_us) for share in LEVELS]
+    segments = [still("passive", QUIET_S, rate_hz)]
     left_nm_s, left_s, number = most_nm_s, longest_s - QUIET_S, 0
     while True:
-        width_us = widths[number % len(widths)]
+        width_us = curve.width(LEVELS[number % len(LEVELS)] * curve.torque(largest_us), largest_us)
         hold_s = min(LEVEL_S, left_nm_s / max(curve.torque(width_us), 1e-9), left_s)
         if hold_s < 2 * RISE_S:
             return segments
         number += 1
-        (level,) = _levels("moving", [width_us], [hold_s], rate_hz, number)
-        spent = torque_time(level["settings"]["pulse_width_us"], rate_hz, curve)
-        segments += [level, _still("passive", PAUSE_S, rate_hz)]
-        left_nm_s, left_s = left_nm_s - spent, left_s - hold_s - PAUSE_S
+        level = _level(f"moving {number}", 0.0, width_us, hold_s, rate_hz)
+        left_nm_s -= curve.torque_time(level["settings"]["pulse_width_us"], rate_hz)
+        left_s -= hold_s + PAUSE_S
+        segments += [level, still("passive", PAUSE_S, rate_hz)]
 
 
-def passive(longest_s: float, rate_hz: float) -> list[Segment]:
+def _level(name: str, before_us: float, width_us: float, hold_s: float, rate_hz: float) -> Segment:
+    """A width that is held, reached from the one before it within the time of a rise."""
+    count, rise = math.floor(hold_s * rate_hz + 1e-6), max(round(RISE_S * rate_hz), 1)
+    widths = [before_us + (width_us - before_us) * min((i + 1) / rise, 1.0) for i in range(count)]
+    return _segment(name, [math.floor(10.0 * width) / 10.0 for width in widths])
+
+
+def still(name: str, seconds: float, rate_hz: float) -> Segment:
     """No pulse at all."""
-    return [_still("passive", longest_s, rate_hz)]
-
-
-def _levels(
-    name: str, widths_us: Sequence[float], each_s: Sequence[float], rate_hz: float, number: int = 1
-) -> list[Segment]:
-    """Steps one after the other, each reached within its own time."""
-    segments, before = [], 0.0
-    for k, (width_us, hold_s) in enumerate(zip(widths_us, each_s, strict=True)):
-        count, rise = math.floor(hold_s * rate_hz + 1e-6), max(round(RISE_S * rate_hz), 1)
-        rising = [before + (width_us - before) * min((i + 1) / rise, 1.0) for i in range(count)]
-        segments.append(_segment(f"{name} {number + k}", [math.floor(10.0 * value) / 10.0 for value in rising]))
-        before = width_us
-    return segments
-
-
-def _still(name: str, seconds: float, rate_hz: float) -> Segment:
     return _segment(name, [0.0] * max(round(seconds * rate_hz), 1))
 
 
@@ -191,7 +166,7 @@ class Layout:
     """The guided tests of a participant."""
 
     targets_rad: list[float]  # angles to hold
-    hold_segments: list[Segment]  # of one held test
+    held: list[Segment]  # of one held test
     moving: list[Segment]
     doses: dict[str, float]
     """Expected torque-time: of the paper's test, one held test, all of them, the moving one, and all together; N·m·s,
@@ -206,22 +181,24 @@ class Layout:
 
 def layout(
     range_rad: Sequence[float], curve: Curve, largest_us: float, paper_us: Sequence[float], rate_hz: float,
-    moving_s: float = MOVING_S,
+    moving_s: float = LONGEST_S[MOVING],
 ) -> Layout:  # fmt: skip
     """Share out `PLANNED_SHARE` of the paper's torque-time among the held tests and the moving one.
 
     `range_rad`: the participant's lowest and highest angle, rad; `paper_us`: every width of the paper's test with these
     limits, µs; `moving_s`: the longest moving test without its safe end, s.
     """
-    angles, paper = targets(range_rad), torque_time(paper_us, rate_hz, curve)
-    full = torque_time(widths_of(hold_segments(curve, largest_us, LONGEST_STAIR_S, rate_hz)), rate_hz, curve)
-    planned = PLANNED_SHARE * paper
+
+    def dose(segments: list[Segment]) -> float:
+        return curve.torque_time(widths_of(segments), rate_hz)
+
+    angles, paper = targets(range_rad), curve.torque_time(paper_us, rate_hz)
+    full, planned = dose(held(curve, largest_us, LONGEST_STAIR_S, rate_hz)), PLANNED_SHARE * paper
     fits = HELD_SHARE * planned / (full * len(angles)) if angles and full > 0 else 0.0
-    stairs = hold_segments(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
-    each = torque_time(widths_of(stairs), rate_hz, curve)
-    levels = moving(curve, largest_us, max(planned - each * len(angles), 0.0), moving_s, rate_hz)
-    doses = {"paper": paper, "held_each": each, "held": each * len(angles)}
-    doses["moving"] = torque_time(widths_of(levels), rate_hz, curve)
+    stairs = held(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
+    doses = {"paper": paper, "held_each": dose(stairs), "held": dose(stairs) * len(angles)}
+    levels = moving(curve, largest_us, max(planned - doses["held"], 0.0), moving_s, rate_hz)
+    doses["moving"] = dose(levels)
     doses["total"] = doses["held"] + doses["moving"]
     return Layout(angles, stairs, levels, doses, curve.known)
 
@@ -231,8 +208,8 @@ SLOW_RAD_S, FAST_RAD_S = 0.15, 0.7
 VELOCITY_EDGES_RAD_S = (-FAST_RAD_S, -SLOW_RAD_S, SLOW_RAD_S, FAST_RAD_S)
 ROWS = (("extension", "fast"), ("extension", "slow"), None, ("flexion", "slow"), ("flexion", "fast"))
 """Direction and speed of each row of velocities; None: nearly still."""
-MISSING_ORDER = (("flexion", "slow"), ("extension", "slow"), ("flexion", "fast"), ("extension", "fast"))
-"""As it is to be done."""
+MISSING_ORDER = (3, 1, 4, 0)
+"""Rows as they are to be done: slow before fast, flexion before extension."""
 BIN_RAD = math.radians(15)
 LEAST_BINS, MOST_BINS = 3, 8
 MARGIN_RAD, MARGIN_SHARE = math.radians(3), 0.05
@@ -240,7 +217,7 @@ MARGIN_RAD, MARGIN_SHARE = math.radians(3), 0.05
 LONGEST_STEP_S = 0.05
 """A longer gap between two samples says nothing of the cells between them."""
 ENOUGH = 0.9
-"""Share of the cells that are asked for."""
+"""Share of the cells that are asked for: at most a tenth is missing when a test ends."""
 
 
 class Coverage:
@@ -297,22 +274,24 @@ class Coverage:
 
     @property
     def enough(self) -> bool:
-        """Return whether a test may end: at most a tenth is missing."""
+        """Return whether a test may end."""
         return self.share >= ENOUGH - 1e-9
 
     def missing(self) -> list[dict[str, Any]]:
-        """Return the stretches of angles that were not seen yet in a direction at a speed: slow before fast."""
+        """Return the stretches of angles that were not seen yet in a direction at a speed."""
+
+        def is_open(cell: tuple[int, int]) -> bool:
+            return self.needed(*cell) and not self.covered(*cell)
+
         stretches = []
-        for kind in MISSING_ORDER:
-            row, edge = ROWS.index(kind), None
-            for column in range(self.columns + 1):
-                is_open = column < self.columns and self.needed(row, column) and not self.covered(row, column)
-                if is_open and edge is None:
-                    edge = self.edges_rad[column]
-                elif not is_open and edge is not None:
-                    stretch = {"from_rad": edge, "to_rad": self.edges_rad[column]}
+        for row in MISSING_ORDER:
+            kind = ROWS[row]
+            assert kind is not None
+            for lacks, cells in groupby(product([row], range(self.columns)), is_open):
+                columns = [column for _, column in cells]
+                if lacks:
+                    stretch = {"from_rad": self.edges_rad[columns[0]], "to_rad": self.edges_rad[columns[-1] + 1]}
                     stretches.append({"direction": kind[0], "speed": kind[1], **stretch})
-                    edge = None
         return stretches
 
     def document(self) -> dict[str, Any]:

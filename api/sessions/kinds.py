@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import Callable, Coroutine, Mapping
-from dataclasses import dataclass, field
-from pathlib import Path
-from typing import Any, ClassVar
+from collections.abc import Callable, Coroutine
+from dataclasses import asdict, dataclass, field
+from typing import Any
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
@@ -32,7 +31,7 @@ class Planned:
 
     plan: TestPlan
     extra: dict[str, Any] = field(default_factory=dict)  # stored with the plan; empty for a plain test
-    how: dict[str, Any] | None = None  # arguments of the adviser, for an adaptive test
+    how: dict[str, Any] = field(default_factory=dict)  # arguments of the adviser, for an adaptive test
 
 
 class Kind:
@@ -95,9 +94,9 @@ class Kind:
         """Return the options of the recording's fit."""
         return {}
 
-    def document(self, row: Test) -> dict[str, Any] | None:  # noqa: ARG002
+    def document(self, row: Test) -> dict[str, Any]:  # noqa: ARG002
         """Return the state or the result of a test of this kind."""
-        return None
+        return {}
 
 
 class Kinds:
@@ -117,30 +116,115 @@ class Kinds:
         return dict.fromkeys(self.parts) | ({kind.part: kind.document(row)} if kind.part else {})
 
 
-class Watcher:
-    """A test from its first sample to its end. Whatever goes wrong in watching leaves it to its plan, status.
+@dataclass
+class WatchStatus:
+    """State of a watched test, for pages and its document."""
 
-    `plan`: as the rig plays it. `status`: what is known of the test, for pages and its document; has `state`, `problem`
-    and `ended`. `publish`: called whenever there is something new for pages.
+    state: str
+    problem: str = ""
+    """Why it is not watched any more."""
+    ended: str = ""
+    torque_time_nm_s: float | None = None
+
+
+class Watched(Kind):
+    """A kind whose running test this service watches, sample by sample; at most one runs.
+
+    `send`: called with a message for the live channel.
     """
 
-    watching_state, failed_state = "watching", "alone"
-    """States while watching, and after an error."""
+    status_type: type[WatchStatus] = WatchStatus
+    watching, alone = "watching", "alone"
+    """States of a test that is watched, and of one that is left to its plan."""
+    left_alone = ""
+    """What it means that it is left to its plan."""
+
+    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, send: Send) -> None:
+        super().__init__(rig)
+        self.clock, self.versions, self.send = clock, versions, send
+        self.watcher: Watcher | None = None
+        self._task: asyncio.Task[None] | None = None
+
+    def watch(self, watcher: Watcher) -> None:
+        """Watch this test."""
+        self.unwatch()
+        self.watcher, self._task = watcher, asyncio.create_task(watcher.run())
+
+    @property
+    def is_watching(self) -> bool:
+        """Return whether a test is being watched."""
+        return self._task is not None and not self._task.done()
+
+    def publish(self) -> None:
+        """Send its state to the pages."""
+        if self.watcher is not None:
+            self.send({"type": self.part, "test_id": self.watcher.plan.test_id, **self.watcher.document()})
+
+    def said_enough(self, test_id: str) -> None:
+        if (watcher := self._watcher_of(test_id)) is not None:
+            watcher.status.state, watcher.status.ended = "ending", watcher.status.ended or "enough"
+            self.publish()
+
+    def unwatch(self) -> None:
+        if self._task is not None:
+            self._task.cancel()
+        self._task, self.watcher = None, None
+
+    async def close(self) -> None:
+        task = self._task
+        self.unwatch()
+        if task is not None:
+            await asyncio.gather(task, return_exceptions=True)
+
+    def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
+        by, status = str(event.summary.get("ended_by") or event.outcome), self._status(row)
+        ended = (by == "enough" and status["ended"]) or self.ended(row, event, by)
+        measured = event.summary.get("torque_time_nms", status["torque_time_nm_s"])
+        return {self.part: {**status, "torque_time_nm_s": measured, "state": "ended", "ended": ended}}
+
+    def ended(self, row: Test, event: FinishedEvent, by: str) -> str:
+        """Return why a test ended, by what ended it on the rig."""
+        raise NotImplementedError
+
+    def document(self, row: Test) -> dict[str, Any]:
+        return row.summary.get(self.part) or self._status(row)
+
+    def _watcher_of(self, test_id: str) -> Watcher | None:
+        return self.watcher if self.watcher is not None and self.watcher.plan.test_id == test_id else None
+
+    def _status(self, row: Test) -> dict[str, Any]:
+        """A test that is not watched never began, needs no watching, or the service was restarted."""
+        if (watcher := self._watcher_of(row.id)) is not None:
+            return watcher.document()
+        status = self.status_type(self.watching)
+        if self.needs_watching(row) and row.state not in ("requested", "refused"):
+            status.state, status.problem = self.alone, f"{self.left_alone}: the service was restarted during the test."
+        return asdict(status)
+
+    def needs_watching(self, row: Test) -> bool:  # noqa: ARG002
+        """Return whether a test of this kind is watched at all."""
+        return True
+
+
+class Watcher:
+    """Follows one test from its first sample to its end. Whatever goes wrong in that leaves the test to its plan."""
+
     log = logging.getLogger("stimrig.sessions")
 
-    def __init__(self, plan: TestPlan, status: Any, rig: RigClient, clock: Clock, publish: Callable[[], None]) -> None:
-        self.plan, self.status, self.rig, self.clock, self.publish = plan, status, rig, clock, publish
+    def __init__(self, plan: TestPlan, kind: Watched) -> None:
+        self.plan, self.kind, self.rig, self.clock = plan, kind, kind.rig, kind.clock
+        self.status: Any = kind.status_type(kind.watching)
         self._tasks = Tasks(self.log)
 
-    async def run(self, path: Path | None) -> None:
+    async def run(self) -> None:
         """Watch it to its end."""
         try:
-            await self._guarded(self._listen(path))
+            await self._guarded(self._listen())
         finally:
             await self._tasks.close()
 
-    async def _listen(self, path: Path | None) -> None:
-        async with contextlib.aclosing(events_of(path, self.plan.test_id)) as events:
+    async def _listen(self) -> None:
+        async with contextlib.aclosing(events_of(self.rig.path, self.plan.test_id)) as events:
             async for event in events:
                 self.hear(event)
 
@@ -163,100 +247,14 @@ class Watcher:
 
     def give_up(self, why: str) -> None:
         """Watch no more."""
-        if self.status.state == self.watching_state:
-            self.status.state, self.status.problem = self.failed_state, self.problem(why)
+        if self.status.state == self.kind.watching:
+            self.status.state, self.status.problem = self.kind.alone, f"{self.kind.left_alone}: {why}"
             self.log.warning("%s", self.status.problem, extra={"test_id": self.plan.test_id})
-            self.publish()
-
-    def problem(self, why: str) -> str:
-        """Return the problem text for a test that is no longer watched."""
-        raise NotImplementedError
+            self.kind.publish()
 
     def document(self) -> dict[str, Any]:
         """As clients see it."""
-        raise NotImplementedError
-
-
-class Watched(Kind):
-    """A kind whose running test this service watches, sample by sample; at most one runs.
-
-    `send`: called with a message for the live channel.
-    """
-
-    ends: ClassVar[Mapping[str, str]] = {}
-    """Reasons for the end of a test, by the rig's reason, where they have another name."""
-
-    def __init__(self, clock: Clock, rig: RigClient, versions: Versions, send: Send) -> None:
-        super().__init__(rig)
-        self.clock, self.versions, self.send = clock, versions, send
-        self.watcher: Watcher | None = None
-        self._task: asyncio.Task[None] | None = None
-
-    def watch(self, watcher: Watcher) -> None:
-        """Watch this test."""
-        self.unwatch()
-        self.watcher, self._task = watcher, asyncio.create_task(watcher.run(self.rig.path))
-
-    @property
-    def watching(self) -> bool:
-        """Return whether a test is being watched."""
-        return self._task is not None and not self._task.done()
-
-    def publish(self) -> None:
-        """Send its state to the pages."""
-        if self.watcher is not None:
-            self.send({"type": self.part, "test_id": self.watcher.plan.test_id, **self.watcher.document()})
-
-    def _watcher_of(self, test_id: str) -> Watcher | None:
-        return self.watcher if self.watcher is not None and self.watcher.plan.test_id == test_id else None
-
-    def said_enough(self, test_id: str) -> None:
-        """As `Kind`."""
-        if (watcher := self._watcher_of(test_id)) is not None:
-            watcher.status.state, watcher.status.ended = "ending", watcher.status.ended or "enough"
-            self.publish()
-
-    def unwatch(self) -> None:
-        """As `Kind`."""
-        if self._task is not None:
-            self._task.cancel()
-        self._task, self.watcher = None, None
-
-    async def close(self) -> None:
-        """As `Kind`."""
-        task = self._task
-        self.unwatch()
-        if task is not None:
-            await asyncio.gather(task, return_exceptions=True)
-
-    def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
-        """As `Kind`."""
-        rigs, standing = str(event.summary.get("ended_by") or event.outcome), self._standing(row)
-        ended = standing["ended"] if rigs == "enough" and standing["ended"] else self.ends.get(rigs, rigs)
-        ended = self.end_of(row, event, rigs, standing) or ended
-        measured = event.summary.get("torque_time_nms", standing["torque_time_nm_s"])
-        return {self.part: {**standing, "torque_time_nm_s": measured, "state": "ended", "ended": ended}}
-
-    def end_of(self, row: Test, event: FinishedEvent, rigs: str, standing: Mapping[str, Any]) -> str:  # noqa: ARG002
-        """Return why it ended, where the rig's reason is not enough."""
-        return ""
-
-    def document(self, row: Test) -> dict[str, Any] | None:
-        """As `Kind`."""
-        return row.summary.get(self.part) or self._standing(row)
-
-    def _standing(self, row: Test) -> dict[str, Any]:
-        watcher = self._watcher_of(row.id)
-        return watcher.document() if watcher is not None else self.unwatched(row)
-
-    def unwatched(self, row: Test) -> dict[str, Any]:
-        """Return the document of a test that is not watched: it never began, or the service was restarted."""
-        raise NotImplementedError
-
-
-def begun(row: Test) -> bool:
-    """Return whether any part of a test was played."""
-    return row.state not in ("requested", "refused")
+        return asdict(self.status)
 
 
 def no_sensor() -> ApiError:

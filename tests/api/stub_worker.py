@@ -255,7 +255,7 @@ def adaptive_outlook(
         )
     reach = {"reachable": within, "curve_percent": 1.9 if within else 6.0, "step_percent": 3.0, "seconds": 9.0,
              "torque_time_nm_s": 20.0, "words": words}  # fmt: skip
-    return {"opening_us": OPENING, "reach": reach, "known": bool(models)}
+    return {"opening_us": OPENING, "reach": {**reach, "known": bool(models)}}
 
 
 def adaptive_begin(progress: Progress, target: dict[str, float], **_: Any) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from math import nan
 
 import pytest
 
-from stimrig.api.jobs import adaptive
 from stimrig.api.sessions.live import frame_of
+from stimrig.identify.records import live
 from stimrig.rig.messages import TORQUE_ROW, LiveEvent, PulseOutcomes
 from stimrig.rig.signals import SAMPLE
 
@@ -29,7 +29,7 @@ def event(rows: list[tuple[float, float]], test_id: str | None = "T1") -> LiveEv
 
 
 def test_a_row_is_a_sample_as_the_rig_holds_it() -> None:
-    assert SAMPLE == adaptive.SAMPLE and TORQUE_ROW.size == SAMPLE.itemsize
+    assert SAMPLE == live.SAMPLE and TORQUE_ROW.size == SAMPLE.itemsize
 
 
 def test_pages_get_the_lowest_and_highest_torque_of_each_bin_and_the_pulses() -> None:

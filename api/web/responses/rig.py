@@ -149,10 +149,10 @@ class DecisionOut(Document):
     segments: list[str] = Field(description="names of what was chosen")
     expected_torque_time_nm_s: float
     answer_ms: float = Field(description="from the question to the answer")
-    curve_percent: float | None = Field(None, description="how well the curve was known, %; missing before a fit")
+    curve_percent: float | None = Field(None, description="how well the curve was known, %; null before a fit")
     step_percent: float | None = Field(None, description="and the step response, %")
     late: bool = Field(False, description="it came too late and fell away")
-    refused: str | None = Field(None, description="why the rig did not lay it; missing where it did")
+    refused: str | None = Field(None, description="why the rig did not lay it; null where it did")
     sample_to_plan_ms: float | None = Field(None, description="from that sample until the rig had laid it")
 
 

@@ -7,9 +7,11 @@ from typing import Any
 
 from fastapi import APIRouter, Response
 
+from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import together
 from stimrig.api.services import joint, participants
 from stimrig.api.services.joint import PoseIn, TogetherIn
+from stimrig.api.store import locking
 from stimrig.api.web.dependencies import PROBLEM, AngleVersion, Ctx, LiveReader, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.models import VersionOut
@@ -23,7 +25,12 @@ router = APIRouter(prefix="/v1", tags=["joint"], responses=PROBLEM)
 @router.get("/rig/angle", **describe_answer(AngleStatus))
 async def angle(context: Ctx, _principal: LiveReader, response: Response) -> dict[str, Any]:
     """The joint's angle now, and the sensor's calibration: both poses, who and when; `present` is false without one."""
-    response.headers["ETag"] = f'"{await asyncio.to_thread(joint.pose_version, context)}"'
+
+    def version() -> int:
+        with context.store.read() as session:
+            return locking.pose_version(session)
+
+    response.headers["ETag"] = f'"{await asyncio.to_thread(version)}"'
     return (await context.rig.fresh_status()).angle.model_dump()
 
 
@@ -48,8 +55,13 @@ async def fit_together(
 ) -> Any:
     """One model of several recordings, joined: isometric ones and those in which the joint was held or moved."""
     await asyncio.to_thread(participants.find, context, code)
+    arguments = context.analyses, code, body.recordings, body.effects, principal.name
     if not wait:
-        return later(joint.begin_fit(context, code, body, principal.name))
-    model = await together.fit(context.analyses, code, body.recordings, body.effects, principal.name)
+
+        async def work(job: Job) -> str:
+            return f"/v1/models/{(await together.fit(*arguments, job.follow)).id}"
+
+        return later(context.jobs.start(FIT_TOGETHER, code, work))
+    model = await together.fit(*arguments)
     response.headers["Location"] = f"/v1/models/{model.id}"
     return await asyncio.to_thread(context.versions.document, model)
