@@ -16,13 +16,6 @@ from stimrig.identify.json_text import json_value
 BINS = 1000
 """Each bin keeps its lowest and its highest torque: no peak is lost."""
 
-NUMBERS = (
-    "torque/time_s", "torque/torque_nm", "pulses/planned_time_s", "pulses/sent_pulse_width_us", "segments/start_s",
-    "segments/end_s",
-)  # fmt: skip
-ANGLES = ("angle/time_s", "angle/angle_rad")
-"""Only of a rig with an angle sensor."""
-
 
 def page_curves(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     """The curves a page draws: measured, predicted, commanded, and the step response."""
@@ -98,71 +91,45 @@ def step_response(document: dict[str, Any], seconds: float = 4.0) -> dict[str, l
 
 
 def recorded(data: str, progress: Progress) -> dict[str, Any]:
-    """Torque over time, rounded; each change of the pulse width that was sent; None where a pulse was dropped.
+    """Return torque over time, rounded, the widths of the pulses that were sent (None: dropped), and the segments.
 
     With an angle sensor also the joint's angle, °.
     """
+    import h5py
+
     progress(0.1, "reading the recording")
-    columns = _columns(Path(data))
-    time_s, torque_nm = columns["torque/time_s"], columns["torque/torque_nm"]
-    known = np.isfinite(torque_nm) & np.isfinite(time_s)
-    time_s, torque_nm = _envelope(time_s[known], torque_nm[known])
-    pulses = _changes(columns["pulses/planned_time_s"], columns["pulses/sent_pulse_width_us"], columns["rate_hz"])
-    rows = zip(columns["segments/name"], columns["segments/start_s"], columns["segments/end_s"], strict=True)
+    with h5py.File(data) as file:
+        tables: Any = {name: {key: table[()] for key, table in group.items()} for name, group in file.items()}
+        names: Any = file["segments/name"]
+        labels, rate_hz = names.asstr()[:], float(np.asarray(file.attrs["pulse_rate_hz"]))
+    pulses, spans, drawn = tables["pulses"], tables["segments"], {}
+    for table, source, name, factor in (
+        ("torque", "torque_nm", "torque_nm", 1.0), ("angle", "angle_rad", "angle_deg", 180 / math.pi),
+    ):  # fmt: skip
+        if tables.get(table):
+            drawn[name] = _envelope(tables[table]["time_s"], factor * tables[table][source])
+    due_s, widths_us = pulses["planned_time_s"].tolist(), pulses["sent_pulse_width_us"].tolist()
+    end_s = due_s[-1] + 1.0 / rate_hz if due_s else 0.0
+    widths_us = [width_us if math.isfinite(width_us) else None for width_us in [*widths_us, *widths_us[-1:]]]
+    angle = drawn.get("angle_deg")
     return {
-        "time_s": time_s,
-        "torque_nm": torque_nm,
-        "pulse_time_s": [at_s for at_s, _ in pulses],
-        "sent_pulse_width_us": [width_us for _, width_us in pulses],
-        "pulses_end_s": pulses[-1][0] if pulses else 0.0,
-        **_angle(columns),
-        "segments": [{"name": str(name), "start_s": float(start), "end_s": float(end)} for name, start, end in rows],
+        "time_s": drawn["torque_nm"][0],
+        "torque_nm": drawn["torque_nm"][1],
+        "pulse_time_s": [*due_s, end_s] if due_s else [],
+        "sent_pulse_width_us": widths_us,
+        "pulses_end_s": end_s,
+        **({"angle_time_s": angle[0], "angle_deg": angle[1]} if angle and angle[0] else {}),
+        "segments": [
+            {"name": str(name), "start_s": float(start), "end_s": float(end)}
+            for name, start, end in zip(labels, spans["start_s"], spans["end_s"], strict=True)
+        ],
     }
 
 
-def _columns(path: Path) -> dict[str, Any]:
-    import h5py
-
-    columns: dict[str, Any] = {}
-    with h5py.File(path) as file:
-        for name in NUMBERS:
-            columns[name] = np.asarray(file[name], float)
-        columns |= {name: np.asarray(file[name], float) for name in ANGLES if name in file}
-        names: Any = file["segments/name"]
-        columns["segments/name"] = names.asstr()[:]
-        columns["rate_hz"] = float(np.asarray(file.attrs["pulse_rate_hz"]))
-    return columns
-
-
-def _angle(columns: dict[str, Any]) -> dict[str, Any]:
-    """The joint's angle, °, rounded; nothing where it was not recorded."""
-    if not set(columns) >= set(ANGLES) or not columns[ANGLES[0]].size:
-        return {}
-    time_s, angle_rad = (columns[name] for name in ANGLES)
-    known = np.isfinite(time_s) & np.isfinite(angle_rad)
-    time_s, angle_deg = _envelope(time_s[known], np.degrees(angle_rad[known]))
-    return {"angle_time_s": time_s, "angle_deg": angle_deg}
-
-
-def _changes(due_s: Any, sent_us: Any, rate_hz: float) -> list[tuple[float, float | None]]:
-    """When the pulse width became another one, and at last when the pulses ended; what was before a dropped pulse
-    reaches to it."""
-    if not due_s.size:
-        return []
-    changed = np.flatnonzero(np.append(True, np.diff(np.nan_to_num(sent_us, nan=-1.0)) != 0))
-    widths_us = [float(sent_us[k]) if np.isfinite(sent_us[k]) else None for k in changed]
-    times_s = [float(due_s[k]) for k in changed]
-    changes = list(zip(times_s, widths_us, strict=True))
-    for k in reversed(range(1, len(changes))):
-        if changes[k][1] is None:
-            changes.insert(k, (changes[k][0], changes[k - 1][1]))
-    return [*changes, (float(due_s[-1]) + 1.0 / rate_hz, widths_us[-1])]
-
-
-def _envelope(time_s: Any, torque_nm: Any) -> tuple[list[float], list[float]]:
-    """The lowest and the highest sample of each bin, in their order."""
-    if time_s.size > 2 * BINS:
-        parts = np.array_split(np.arange(time_s.size), BINS)
-        picked = sorted({int(part[pick(torque_nm[part])]) for part in parts for pick in (np.argmin, np.argmax)})
-        time_s, torque_nm = time_s[picked], torque_nm[picked]
-    return time_s.round(4).tolist(), torque_nm.round(4).tolist()
+def _envelope(time_s: Any, values: Any) -> tuple[list[float], list[float]]:
+    """Return the lowest and the highest known sample of each bin, in their order."""
+    known = np.flatnonzero(np.isfinite(values) & np.isfinite(time_s))
+    if known.size > 2 * BINS:
+        parts = np.array_split(known, BINS)
+        known = sorted({int(part[pick(values[part])]) for part in parts for pick in (np.argmin, np.argmax)})
+    return time_s[known].round(4).tolist(), values[known].round(4).tolist()

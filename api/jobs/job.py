@@ -30,6 +30,11 @@ class Job:
     urgent: bool = False
     background: bool = False
     on_progress: Callable[[Job], None] | None = None
+    # of a job that a person asked for, and that REST lists
+    id: str = ""
+    subject: str = ""
+    part: Job | None = None
+    """The job in a worker process that this one awaits now."""
     state: str = "queued"  # queued, running, completed, failed or cancelled
     progress: float = 0.0
     text: str = ""
@@ -38,11 +43,6 @@ class Job:
     """Estimated total time: the least of all estimates so far."""
     result: asyncio.Future[Any] = field(default_factory=lambda: asyncio.get_running_loop().create_future())
     test_id: str | None = field(default_factory=current_test.get)
-    # of a job that a person asked for, and that REST lists
-    id: str = ""
-    subject: str = ""
-    part: Job | None = None
-    """The job in a worker process that this one awaits now."""
 
     def __post_init__(self) -> None:
         # an error that nobody awaits is in the log already
@@ -78,14 +78,13 @@ class Job:
 
     def complete(self, result: Any) -> None:
         """End it with its result."""
-        self.state, self.progress = "completed", 1.0
+        self.state = "completed"
         if not self.result.done():
             self.result.set_result(result)
 
     def fail(self, error: Exception) -> None:
         """End it with an error."""
-        is_cancelled = isinstance(error, ApiError) and error.code == "cancelled"
-        self.state = "cancelled" if is_cancelled else "failed"
+        self.state = "cancelled" if isinstance(error, ApiError) and error.code == "cancelled" else "failed"
         if not self.result.done():
             self.result.set_exception(error)
 
@@ -96,8 +95,8 @@ class Job:
 
     @property
     def problem(self) -> ApiError | None:
-        """Why it failed or was cancelled."""
-        error = self.result.exception() if self.state in ("failed", "cancelled") and self.result.done() else None
+        """Why a job that a person asked for failed or was cancelled."""
+        error = self.result.exception() if self.state in ("failed", "cancelled") else None
         return error if isinstance(error, ApiError) else None
 
     def progress_document(self) -> dict[str, Any]:
@@ -113,11 +112,12 @@ class Job:
 
     def document(self) -> dict[str, Any]:
         """Return a job that a person asked for, as clients see it."""
+        of_participant = self.kind == FIT_TOGETHER
         return {
             "id": self.id,
             "kind": self.kind,
-            "model_id": None if self.kind == FIT_TOGETHER else self.subject,
-            "participant": self.subject if self.kind == FIT_TOGETHER else None,
+            "model_id": None if of_participant else self.subject,
+            "participant": self.subject if of_participant else None,
             "state": self.state,
             "done": self.result.done(),
             **self.progress_document(),

@@ -1,13 +1,13 @@
-"""Worker processes and a queue of jobs: never in the web process, cancellable, kept warm."""
+"""Workers and a queue of jobs: never in the web process, cancellable, kept warm."""
 
 from __future__ import annotations
 
 import asyncio
 import logging
-from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import Job, cancelled
 from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.jobs.worker import Worker
@@ -15,6 +15,8 @@ from stimrig.api.logs import current_test
 
 log = logging.getLogger("stimrig.jobs")
 BACKGROUND_NICE = 15
+MOST_QUEUED = 50
+"""Jobs that wait; more are refused, but urgent ones."""
 
 
 class Pool:
@@ -34,32 +36,29 @@ class Pool:
         self.workers = [worker() for _ in range(workers)]
         self.reserved = self.workers[0] if workers > 1 else None
         self.background = worker(nice=BACKGROUND_NICE) if background else None
-        self.queue: deque[Job] = deque()
-        self.done_count = 0
-        self.failed_count = 0
+        self.all_workers = [*self.workers, *([self.background] if self.background else [])]
+        self.queue: list[Job] = []
+        self.done_count = self.failed_count = 0
         self.busy_s = 0.0
         self._tasks = Tasks(log)
 
-    @property
-    def all_workers(self) -> list[Worker]:
-        """All of them, with the one for the background."""
-        return [*self.workers, *([self.background] if self.background else [])]
-
     def submit(
-        self,
-        kind: str,
-        *,
-        urgent: bool = False,
-        background: bool = False,
-        on_progress: Callable[[Job], None] | None = None,
-        **arguments: Any,
-    ) -> Job:
-        """Queue a job of one verb; await its `result`."""
+        self, kind: str, *, urgent: bool = False, background: bool = False,
+        on_progress: Callable[[Job], None] | None = None, **arguments: Any,
+    ) -> Job:  # fmt: skip
+        """Queue a job of one verb; await its `result`. Who is cancelled as he awaits it cancels the job.
+
+        Raises ApiError: 503 too many wait already.
+        """
+        if len(self.queue) >= MOST_QUEUED and not urgent:
+            problem = ApiError(
+                503, "busy", "Too much at once", "Too many analyses wait already. Try again in a minute."
+            )
+            problem.headers["Retry-After"] = "60"
+            raise problem
         job = Job(kind, arguments, urgent, background, on_progress)
-        if urgent:
-            self.queue.appendleft(job)
-        else:
-            self.queue.append(job)
+        job.result.add_done_callback(lambda result: self.cancel(job) if result.cancelled() else None)
+        self.queue.insert(0 if urgent else len(self.queue), job)
         self._dispatch()
         return job
 
@@ -89,19 +88,16 @@ class Pool:
 
     def _dispatch(self) -> None:
         for worker in self.all_workers:
-            job = self._next_for(worker) if worker.job is None else None
+            job = next((job for job in self.queue if self._does(worker, job)), None) if worker.job is None else None
             if job is not None:
                 self.queue.remove(job)
                 worker.job = job
                 job.start()
                 self._tasks.begin(self._work(worker, job))
 
-    def _next_for(self, worker: Worker) -> Job | None:
-        for job in self.queue:
-            fits = job.background == (worker is self.background)
-            if fits and (worker is not self.reserved or job.urgent or job.kind == "warm"):
-                return job
-        return None
+    def _does(self, worker: Worker, job: Job) -> bool:
+        kept_free = worker is self.reserved and not job.urgent and job.kind != "warm"
+        return job.background == (worker is self.background) and not kept_free
 
     async def _work(self, worker: Worker, job: Job) -> None:
         current_test.set(job.test_id)  # a task of its own; whoever happened to dispatch it may have had another test

@@ -24,6 +24,7 @@ class Jobs:
         self.all: dict[str, Job] = {}
         self._numbers = itertools.count(1)
         self._tasks = Tasks(log)
+        self.close = self._tasks.close
 
     def start(self, kind: str, subject: str, work: Callable[[Job], Awaitable[str]]) -> Job:
         """Start work that returns the address of its result, or return the same job that runs already.
@@ -36,7 +37,7 @@ class Jobs:
         job = Job(kind, id=f"J{next(self._numbers)}", subject=subject)
         job.start()
         self.all[job.id] = job
-        for old in [known.id for known in self.all.values() if known.state != "running"][: -MOST_FINISHED or None]:
+        for old in [known.id for known in self.all.values() if known.state != "running"][:-MOST_FINISHED]:
             del self.all[old]
         self._tasks.begin(self._run(job, work))
         return job
@@ -60,7 +61,3 @@ class Jobs:
         """Cancel the job in a worker process that it awaits; what is done already stays done."""
         if job.state == "running" and job.part is not None:
             self.pool.cancel(job)
-
-    async def close(self) -> None:
-        """Cancel all work."""
-        await self._tasks.close()

@@ -62,18 +62,13 @@ def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
     return {"json": text, "found": json_value(carried.finding())}
 
 
-def diagnosis(
-    data: str, progress: Progress, model_json: str | None = None, columns: Sequence[str] | None = None
-) -> dict[str, Any]:
+def diagnosis(data: str, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
     """Diagnose what is missing in a model's structure, what each effect would explain, and the test that decides.
 
-    Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis.
+    Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis;
+    `improvement` holds the models that come of it.
     """
-    return diagnosed(identify.read(Path(data), map=columns), progress, model_json)
-
-
-def diagnosed(record: Any, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
-    """Diagnose a record; `improvement` holds the models that come of it."""
+    record = identify.read(Path(data))
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
     return finding_of(record, *identify.diagnose_and_improve(record, progress, model), structure)
@@ -81,59 +76,47 @@ def diagnosed(record: Any, progress: Progress, model_json: str | None = None) ->
 
 def finding_of(record: Any, diagnosis: Any, improvement: Any, structure: Sequence[str]) -> dict[str, Any]:
     """Return a diagnosis as it is stored, with the improvement that the same search gives."""
-    document = with_experiment(record, diagnosis, structure)
-    document["signatures"] = signatures(record, improvement)
-    document["refused"] = list(improvement.refused)
-    document["improvement"] = {**improvement.to_dict(), "structure": list(structure)}
-    return json_value(document)
+    return json_value({
+        **with_experiment(record, diagnosis, structure),
+        "signatures": signatures(record, improvement),
+        "refused": list(improvement.refused),
+        "improvement": {**improvement.to_dict(), "structure": list(structure)},
+    })  # fmt: skip
 
 
 def with_experiment(record: Any, diagnosis: Any, structure: Sequence[str]) -> dict[str, Any]:
-    """Return a diagnosis with the library's entries of its effects, and the next experiment."""
-    from stimrig.identify import effects
+    """Return a diagnosis with the library's entries of the effects that it names, and the next experiment."""
+    from stimrig.identify.diagnosis import planned
+    from stimrig.identify.effects import library
 
     document = {**diagnosis.to_dict(), "structure": list(structure)}
-    document["library"] = {entry["id"]: entry for entry in effects.library() if entry["id"] in mentioned(document)}
-    planned = experiment(document["missing"], document["deciding_experiment"])
+    named = {row["effect"] for rows in (document.get("candidates") or []) for row in rows}
+    for entry in [*document["missing"], *document["free"]]:
+        named |= {entry["effect"], *(entry.get("confused_with") or [])}
+    document["library"] = {entry["id"]: entry for entry in library() if entry["id"] in named}
+    plan = planned(document["missing"], document["deciding_experiment"])
     # A list of widths is one of pulses: at another rate it would be another test, and could not be joined.
-    document["experiment"] = planned and {**planned, "pulse_rate_hz": record.pulse_rate_hz}
+    document["experiment"] = plan and {
+        **plan.to_dict(), "effect": next(iter(plan.rivals), ""), "pulse_rate_hz": record.pulse_rate_hz,
+    }  # fmt: skip
     return document
-
-
-def mentioned(document: dict[str, Any]) -> set[str]:
-    named = {entry["effect"] for entry in document["missing"]}
-    named |= {rival for entry in document["missing"] for rival in entry.get("confused_with") or []}
-    named |= {entry["effect"] for entry in document["free"]}
-    return named | {row["effect"] for rows in document.get("candidates") or [] for row in rows}
 
 
 def signatures(record: Any, improvement: Any) -> dict[str, Any]:
     """Return what each effect explains of the residual of the model before it: measured beside expected.
 
-    ``seen_nm`` is measurement minus the model before, ``expected_nm`` the model with the effect minus the model before.
+    ``seen_nm`` is measurement minus the model before, averaged over a tenth of a second, so that a slow signature shows
+    through the noise; ``expected_nm`` is the model with the effect minus the model before.
     """
     pick = slice(None, None, max(1, -(-record.time_s.size // SIGNATURE_POINTS)))
+    width = max(1, round(0.1 * record.sample_rate_hz))
     curves: dict[str, Any] = {"time_s": record.time_s[pick].round(4)}
     torques = [np.asarray(identify.predict(model, record)) for model in improvement.models]
     for step, before, after in zip(improvement.steps[1:], torques, torques[1:], strict=False):
-        measured_nm, expected_nm = smooth(record, record.torque_nm - before), after - before
+        padded = np.pad(record.torque_nm - before, (width // 2, width - 1 - width // 2), mode="edge")
+        measured_nm, expected_nm = np.convolve(padded, np.ones(width) / width, "valid"), after - before
         curves[step["added"]] = {"seen_nm": measured_nm[pick].round(4), "expected_nm": expected_nm[pick].round(4)}
     return curves
-
-
-def smooth(record: Any, values: Any) -> Any:
-    """Return the running mean over a tenth of a second: a slow signature shows through the noise."""
-    width = max(1, round(0.1 * record.sample_rate_hz))
-    padded = np.pad(values, (width // 2, width - 1 - width // 2), mode="edge")
-    return np.convolve(padded, np.ones(width) / width, "valid")
-
-
-def experiment(missing: Sequence[dict[str, Any]], further: dict[str, Any] | None = None) -> dict[str, Any] | None:
-    """Return the `further` test for what is left, or the one that separates the first effect from its rivals."""
-    from stimrig.identify.diagnosis import planned
-
-    plan = planned(missing, further)
-    return plan and {**plan.to_dict(), "effect": next(iter(plan.rivals), "")}
 
 
 def forecast(
@@ -197,24 +180,20 @@ def effects(progress: Progress) -> dict[str, Any]:
 
 
 def warm(progress: Progress) -> dict[str, Any]:
-    """Load identify and its compiled parts, so that the fit after a test starts at once."""
-    progress(0.1, "loading")
-    identify.fit(_warm_record())
-    adaptive.warm()
-    return {}
-
-
-def _warm_record() -> Any:
-    """A small made-up record, only to have every compiled part compiled: a lag behind a switching input."""
+    """Fit a small made-up record, so that every compiled part is compiled and the fit after a test starts at once."""
     from scipy.signal import lfilter
 
+    progress(0.1, "loading")
     index = np.arange(800)
     time_s = index / 40.0
     switching = 200.0 * (index // 13 % 2)
     width_us = np.select([time_s < 1, time_s < 9], [0.0, switching], np.maximum(0.0, 200 - 40 * abs(time_s - 14)))
     torque_nm = lfilter([0.05 / 40], [1.0, -0.95], width_us) + 0.03 * np.sin(index * index * 0.7)
     segment = np.digitize(time_s, [1, 9])
-    return identify.Record.from_arrays(time_s, width_us, torque_nm, segment, segment_names=["rest", "prbs", "ramp"])
+    names = ["rest", "prbs", "ramp"]
+    identify.fit(identify.Record.from_arrays(time_s, width_us, torque_nm, segment, segment_names=names))
+    adaptive.warm()
+    return {}
 
 
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {"curves": page_curves, "join": joined} | {

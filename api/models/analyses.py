@@ -157,11 +157,11 @@ class Analyses:
         return parts[kind]
 
     async def run(self, verb: str, on_call: OnCall | None = None, **arguments: Any) -> dict[str, Any]:
-        """Have a worker do a verb; it goes on if the caller is cancelled."""
+        """Have a worker do a verb; it is cancelled with the caller."""
         call = self.pool.submit(verb, **arguments)
         if on_call is not None:
             on_call(call)
-        return await asyncio.shield(call.result)
+        return await call.result
 
     # ---- versions -------------------------------------------------------------------------------------------
 

@@ -322,8 +322,8 @@ def hostile(progress: Progress, data: str) -> dict[str, Any]:
     if data == "file":
         with tempfile.TemporaryFile() as file:
             os.posix_fallocate(file.fileno(), 0, 1 << 30)
-    if data == "crash":
-        os.kill(os.getpid(), 11)
+    if data in ("crash", "killed"):
+        os.kill(os.getpid(), 11 if data == "crash" else 9)
     if data == "exit":
         raise SystemExit(3)
     return hostile(progress, data)  # recursion without an end

@@ -35,7 +35,7 @@ class ThreadWorker(processes.Worker):
             given = self._calls, self.ended, asyncio.get_running_loop()
             threading.Thread(target=self._serve, args=given, daemon=True).start()
 
-    async def compute(self, job: Job, processor_s: float) -> bytes:  # noqa: ARG002
+    async def compute(self, job: Job) -> bytes:
         answer: Future[bytes] = Future()
         self._calls.put((job, answer))
         return await asyncio.wrap_future(answer)

@@ -208,7 +208,7 @@ def test_an_upload_waits_as_long_as_the_service_works_on_it(client: Client) -> N
     client.http.event_hooks = {"request": [lambda request: waits.append(request.extensions.get("timeout"))]}
     with pytest.raises(errors.Invalid):
         client.upload("P017", b"")
-    assert waits[-1]["read"] >= worker.WALL_FACTOR * (worker.PROCESSOR_S["fit"] + worker.PROCESSOR_S["carry"])
+    assert waits[-1]["read"] >= worker.LIMITS_S["fit"] + worker.LIMITS_S["carry"]
 
 
 def test_live_signals_come_until_the_end(client: Client, service: Service) -> None:
