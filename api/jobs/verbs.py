@@ -86,7 +86,6 @@ def finding_of(record: Any, diagnosis: Any, improvement: Any, structure: Sequenc
 
 def with_experiment(record: Any, diagnosis: Any, structure: Sequence[str]) -> dict[str, Any]:
     """Return a diagnosis with the library's entries of the effects that it names, and the next experiment."""
-    from stimrig.identify.diagnosis import planned
     from stimrig.identify.effects import library
 
     document = {**diagnosis.to_dict(), "structure": list(structure)}
@@ -94,12 +93,18 @@ def with_experiment(record: Any, diagnosis: Any, structure: Sequence[str]) -> di
     for entry in [*document["missing"], *document["free"]]:
         named |= {entry["effect"], *(entry.get("confused_with") or [])}
     document["library"] = {entry["id"]: entry for entry in library() if entry["id"] in named}
-    plan = planned(document["missing"], document["deciding_experiment"])
+    plan = experiment(document["missing"], document["deciding_experiment"])
     # A list of widths is one of pulses: at another rate it would be another test, and could not be joined.
-    document["experiment"] = plan and {
-        **plan.to_dict(), "effect": next(iter(plan.rivals), ""), "pulse_rate_hz": record.pulse_rate_hz,
-    }  # fmt: skip
+    document["experiment"] = plan and {**plan, "pulse_rate_hz": record.pulse_rate_hz}
     return document
+
+
+def experiment(missing: Sequence[dict[str, Any]], further: dict[str, Any] | None = None) -> dict[str, Any] | None:
+    """Return the `further` test for what is left, or the one that separates the first effect from its rivals."""
+    from stimrig.identify.diagnosis import planned
+
+    plan = planned(missing, further)
+    return plan and {**plan.to_dict(), "effect": next(iter(plan.rivals), "")}
 
 
 def signatures(record: Any, improvement: Any) -> dict[str, Any]:
