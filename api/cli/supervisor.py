@@ -217,9 +217,8 @@ class Services:
             self._folder_lock = reserve(self.settings)
         except HeldError as error:
             raise LaunchError(str(error), 2) from error
-        if self._folder_lock is not None:  # all that is started holds it, until the last of them has ended
-            for child in filter(None, (self.emulator, self.rig, self.api)):
-                child.inherits = (self._folder_lock,)
+        for child in filter(None, (self.emulator, self.rig, self.api)):  # all hold it, until the last has ended
+            child.inherits = (self._folder_lock,)
         if self.emulator is not None:
             self.emulator.start()
         if not self.attached:
@@ -235,7 +234,7 @@ class Services:
                     raise
                 raise LaunchError(f"{place}: {error}", 2) from error
         self.api.environment = {
-            INHERITED: "" if self._folder_lock is None else str(self._folder_lock),
+            INHERITED: str(self._folder_lock),
             "STIMRIG_DATA_DIR": data,
             "STIMRIG_RIG_SOCKET": str(self.socket),
             "STIMRIG_HOST": self.settings.host,

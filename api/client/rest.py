@@ -132,11 +132,11 @@ class Client(Connection):
 
     def archive(self, code: str) -> ParticipantOut:
         """Put a participant into the archive: no test starts any more, and nothing is deleted."""
-        return self._request_as(ParticipantOut, "POST", f"/participants/{code}/archive")
+        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/archived", json={"archived": True})
 
     def unarchive(self, code: str) -> ParticipantOut:
         """Take a participant out of the archive."""
-        return self._request_as(ParticipantOut, "POST", f"/participants/{code}/unarchive")
+        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/archived", json={"archived": False})
 
     def notes(self, participant: str) -> list[NoteOut]:
         """The notes of a participant, newest first, the struck ones among them."""

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
-from sqlalchemy import delete, select
+from sqlalchemy import select
 from sqlalchemy.orm import Session
 from starlette.requests import HTTPConnection
 
@@ -21,14 +21,12 @@ from stimrig.api.people.pace import Guesses, place_of
 from stimrig.api.schemas.shared import Scope
 from stimrig.api.store import Store, audit
 from stimrig.api.store.audit import digest
-from stimrig.api.store.tables import Confirmation, PageSession, Token
+from stimrig.api.store.tables import PageSession, Token
 
 LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
-MOST_SEEN = 1000
+MOST_REMEMBERED = 1000
 """Credentials remembered for a stop while the database is unreachable."""
-
-
 ROLES = {
     "clinician": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL, Scope.APPROVE_MODEL],
     "operator": [Scope.READ_LIVE, Scope.RUN_TEST, Scope.READ_MODEL],
@@ -44,14 +42,17 @@ class Principal:
 
     name: str  # the token's name; goes into the audit trail
     scopes: frozenset[str]  # what the token may do; ``administer`` includes everything
-    csrf: str | None = None  # the session's CSRF token; None for a bearer token
-    session_hash: str | None = None
-    """The session of a person with a password; None for tokens, which have none to ask for again."""
-    page_session: PageSession | None = None  # the browser's session, however it was opened; None for a bearer token
-    locked: bool = False  # whether that session waits to be unlocked: then it may press stop, and nothing else
+    token_hash: str
     participant: str | None = None  # the only one that a controller's key opens; None for everybody else
     plan: dict[str, Any] | None = None  # what trials that key may play
-    token_hash: str = ""  # the token's
+    page_session: PageSession | None = None  # the browser's session, however it was opened; None for a bearer token
+    has_password: bool = False  # whether the session is of a person with a password, who can be asked for it again
+    locked: bool = False  # whether that session waits to be unlocked: then it may press stop, and nothing else
+
+    @property
+    def csrf(self) -> str | None:
+        """The session's CSRF token; None for a bearer token."""
+        return self.page_session and self.page_session.csrf
 
     def may(self, scope: Scope) -> bool:
         """Return whether the scope is held."""
@@ -60,10 +61,9 @@ class Principal:
     @property
     def role(self) -> str:
         """Name of the role with these scopes."""
-        if self.may(Scope.ADMINISTER):
-            return "administrator"
-        if self.may(Scope.APPROVE_MODEL):
-            return "clinician"
+        for scope, role in ((Scope.ADMINISTER, "administrator"), (Scope.APPROVE_MODEL, "clinician")):
+            if self.may(scope):
+                return role
         return "operator" if self.may(Scope.RUN_TEST) else "reader"
 
 
@@ -79,7 +79,13 @@ class Auth:
         """Browsers tell hosts apart, not ports: another service on this host has another name."""
         self._last_names: OrderedDict[str, str] = OrderedDict()
         self._remembering = threading.Lock()
-        self._threads = ThreadPoolExecutor(8, "who-asks")
+        self._threads = ThreadPoolExecutor(8, "authentication")
+
+    def close(self) -> None:
+        """Let the threads go."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+
+    # ---- tokens
 
     def issue(
         self, name: str, scopes: list[Scope], by: str, *, text: str | None = None, origin: str = "issued",
@@ -87,14 +93,24 @@ class Auth:
     ) -> str:  # fmt: skip
         """Make a token and return its text, which is shown this once."""
         text = text or f"stimrig_{secrets.token_urlsafe(32)}"
-        now = self.clock.utc()
         with self.store.write() as session:
-            row = Token(hash=digest(text), prefix=text[:12] if origin == "issued" else "(set)", name=name)
-            row.scopes, row.created_utc, row.origin = [str(scope) for scope in scopes], now, origin
-            row.expires_utc, row.revoked = expires_utc, False
+            prefix = text[:12] if origin == "issued" else "(set)"
+            row = self._token(digest(text), prefix, name, scopes, origin=origin, expires_utc=expires_utc)
             session.merge(row)
-            audit.write(session, now, by, "issue token", name, scopes=row.scopes)
+            audit.write(session, self.clock.utc(), by, "issue token", name, scopes=row.scopes)
         return text
+
+    def token_of_person(self, session: Session, name: str, scopes: list[Scope]) -> Token:
+        """The token that says what a person may do; nobody holds its text."""
+        token = self._token(secrets.token_hex(32), "(user)", name, scopes, origin="user")
+        session.add(token)
+        session.flush()
+        return token
+
+    def _token(self, hashed: str, prefix: str, name: str, scopes: list[Scope], **more: Any) -> Token:
+        written = [str(scope) for scope in scopes]
+        now = self.clock.utc()
+        return Token(hash=hashed, prefix=prefix, name=name, scopes=written, created_utc=now, revoked=False, **more)
 
     def revoke(self, token_id: str, by: str) -> bool:
         """Revoke a token by its public id; False where there is none."""
@@ -109,29 +125,21 @@ class Auth:
             audit.write(session, self.clock.utc(), by, "revoke token", row.name, token=row.hash[:16])
         return bool(rows)
 
-    def close(self) -> None:
-        """Let the threads go."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
-
     def first_administrator(self, configured: str | None) -> str | None:
         """See that an administrator exists; return the new token's text if one was drawn.
 
         A token set from outside (``STIMRIG_ADMIN_TOKEN``) replaces the one set before it.
         """
+        tokens = self.store.all(Token, Token.revoked.is_(False))
         if configured:
-            self._revoke_set_tokens(current_hash=digest(configured))
+            for token in tokens:
+                if token.origin == "settings" and token.hash != digest(configured):
+                    self.revoke(token.hash[:16], "settings")
             self.issue("administrator", [Scope.ADMINISTER], "settings", text=configured, origin="settings")
             return None
-        tokens = self.store.all(Token, Token.revoked.is_(False))
         if any(Scope.ADMINISTER in token.scopes and token.origin == "issued" for token in tokens):
             return None
         return self.issue("administrator", [Scope.ADMINISTER], "first start")
-
-    def _revoke_set_tokens(self, current_hash: str) -> None:
-        with self.store.write() as session:
-            old = select(Token).where(Token.origin == "settings", Token.hash != current_hash, Token.revoked.is_(False))
-            for token in session.scalars(old).all():
-                self.revoke_within(session, token.hash[:16], "settings")
 
     def bearer(self, text: str, address: str = "", *, forgive_age: bool = False) -> Principal:
         """The holder of a bearer token; `forgive_age`: one that ran out, or a revoked key, presses stop.
@@ -143,69 +151,52 @@ class Auth:
         """
         token, place = self.store.get(Token, digest(text)), place_of(address)
         if token is None:
-            self.guesses.unknown_token(place)
+            self.guesses.admit(("token", place))
         elif token.origin == "settings" and not forgive_age:  # a stop waits for no pace
-            self.guesses.chosen_token(token.hash, place)
-        return self._principal(token, forgive_age=forgive_age)
+            self.guesses.chosen_token(place)
+        return self._principal(token, forgive_age)
 
-    def _principal(self, token: Token | None, csrf: str | None = None, *, forgive_age: bool = False) -> Principal:
+    def _principal(self, token: Token | None, forgive_age: bool) -> Principal:
         # A controller's key always presses stop: its trial may be playing when a person revokes it.
         if token is None or (token.revoked and not (forgive_age and token.participant is not None)):
             raise unauthorized("The token is unknown or has been revoked. Ask an administrator for a new one.")
-        if token.expires_utc is not None and token.expires_utc <= self.clock.utc() and not forgive_age:
+        if self._expired(token) and not forgive_age:
             raise unauthorized("The token has expired. Ask an administrator for a new one.")
-        if self.fallen(token) and not forgive_age:
+        if self.creator_lost_rights(token) and not forgive_age:
             raise unauthorized("Who made this key may no longer do so. Ask a person for a new one.")
-        return Principal(
-            token.name, frozenset(token.scopes), csrf, participant=token.participant, plan=token.plan,
-            token_hash=token.hash,
-        )  # fmt: skip
+        return Principal(token.name, frozenset(token.scopes), token.hash, token.participant, token.plan)
 
-    def fallen(self, token: Token) -> bool:
-        """Return whether the key's creator no longer holds the required scopes.
+    def _expired(self, token: Token) -> bool:
+        return token.expires_utc is not None and token.expires_utc <= self.clock.utc()
 
-        Also true once the creator was removed, or the creating token was revoked or expired.
-        """
+    def creator_lost_rights(self, token: Token) -> bool:
+        """Return whether the key's creator no longer holds the required scopes, was removed, revoked or has expired."""
         if token.made_by is None:
             return False
-        maker: Token | None = self.store.get(Token, token.made_by)
-        if maker is None or maker.revoked or (
-            maker.expires_utc is not None and not maker.expires_utc > self.clock.utc()
-        ):  # fmt: skip
+        creator: Token | None = self.store.get(Token, token.made_by)
+        if creator is None or creator.revoked or self._expired(creator):
             return True
         needed = {Scope.APPROVE_MODEL, *token.scopes}
-        return Scope.ADMINISTER not in maker.scopes and not needed <= set(maker.scopes)
+        return Scope.ADMINISTER not in creator.scopes and not needed <= set(creator.scopes)
+
+    # ---- sessions of browsers
 
     def sign_in(self, token_text: str, address: str) -> str:
         """Open a page session for a token's holder; its cookie. Raises as `bearer` does; 403 for a controller's key."""
         principal = self.bearer(token_text, address)
         if principal.participant is not None:
             raise outside(principal.participant)
-        return self.open_session(digest(token_text), principal.name)
+        return self.open_session(principal.token_hash, principal.name)
 
     def open_session(self, token_hash: str, name: str) -> str:
         """Open a page session for the holder of a token; its cookie."""
         cookie, now = secrets.token_urlsafe(32), self.clock.unix_s()
+        row = PageSession(hash=digest(cookie), token_hash=token_hash, csrf=secrets.token_urlsafe(24))
+        row.created_unix_s, row.expires_unix_s = now, now + self.session_s
         with self.store.write() as session:
-            session.add(
-                PageSession(
-                    hash=digest(cookie),
-                    token_hash=token_hash,
-                    csrf=secrets.token_urlsafe(24),
-                    created_unix_s=now,
-                    expires_unix_s=now + self.session_s,
-                )
-            )
+            session.add(row)
             audit.write(session, self.clock.utc(), name, "sign in", "page")
         return cookie
-
-    def token_of_person(self, session: Session, name: str, scopes: list[Scope]) -> Token:
-        """The token that says what a person may do; nobody holds its text."""
-        token = Token(hash=secrets.token_hex(32), prefix="(user)", name=name, origin="user", revoked=False)
-        token.scopes, token.created_utc = [str(scope) for scope in scopes], self.clock.utc()
-        session.add(token)
-        session.flush()
-        return token
 
     def end_sessions(self, session: Session, token_hash: str, but: str | None = None) -> str | None:
         """End the sessions of a token's holder; the one of the hash `but` goes on under a new cookie, which is given.
@@ -216,16 +207,14 @@ class Auth:
         for row in session.scalars(select(PageSession).where(PageSession.token_hash == token_hash)).all():
             if row.hash == but:
                 cookie = secrets.token_urlsafe(32)
-                session.add(PageSession(**{**row.as_dict(), "hash": digest(cookie)}))
-            session.execute(delete(Confirmation).where(Confirmation.session_hash == row.hash))
+                session.add(PageSession(**row.as_dict() | {"hash": digest(cookie), "confirmed_unix_s": None}))
             session.delete(row)
         return cookie
 
-    def sign_out(self, cookie: str) -> None:
+    def sign_out(self, session_hash: str) -> None:
         """Forget a page session."""
         with self.store.write() as session:
-            row = session.get(PageSession, digest(cookie))
-            if row is not None:
+            if (row := session.get(PageSession, session_hash)) is not None:
                 session.delete(row)
 
     def cookie(self, cookie: str, *, forgive_age: bool = False, forgive_lock: bool = False) -> Principal:
@@ -239,15 +228,16 @@ class Auth:
             raise unauthorized("The session has ended. Sign in again.")
         locked = self.idle.locked(row)
         if locked and not (forgive_age or forgive_lock):
-            raise unauthorized(
-                "Enter the password on the page /locked, or send it to POST /v1/sessions/unlock.", *LOCKED
-            )
+            fix = "Enter the password on the page /locked, or send it to POST /v1/sessions/unlock."
+            raise unauthorized(fix, *LOCKED)
         token: Token | None = self.store.get(Token, row.token_hash)
-        principal = replace(self._principal(token, row.csrf, forgive_age=forgive_age), page_session=row, locked=locked)
+        principal = replace(self._principal(token, forgive_age), page_session=row, locked=locked)
         if token is None or token.origin != "user":
             return principal
         more = {Scope.REARM} if principal.may(Scope.RUN_TEST) else set()
-        return replace(principal, session_hash=row.hash, scopes=principal.scopes | more)
+        return replace(principal, has_password=True, scopes=principal.scopes | more)
+
+    # ---- requests
 
     async def authenticate(self, connection: HTTPConnection, **how: bool) -> Principal:
         """Run `identify` in its own threads, so that other work on the database cannot delay it."""
@@ -270,52 +260,43 @@ class Auth:
         A controller's key, which is bound to a participant, is refused (403) unless the caller checks the participant
         itself (`bound`): `stimrig.api.web.guards`, and stop.
         """
+        kind, text = self._credential(connection)
+        key = digest(f"{kind} {text}")
         try:
-            principal = self._identify(connection, forgive_age, forgive_lock)
+            if kind == "header":
+                scheme, _, token = text.partition(" ")
+                if scheme.lower() != "bearer" or not token.strip():
+                    raise unauthorized("Send `Authorization: Bearer <token>`.")
+                address = connection.client.host if connection.client else ""
+                principal = self.bearer(token.strip(), address, forgive_age=forgive_age)
+            elif text:
+                principal = self.cookie(text, forgive_age=forgive_age, forgive_lock=forgive_lock)
+            else:
+                raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
         except ApiError as error:
             if forgive_age and error.status == 401:  # it would not even stop
-                self._forget(connection)
+                self._last_names.pop(key, None)
             raise
-        self._remember(connection, principal.name)
+        with self._remembering:  # many threads ask
+            self._last_names[key] = principal.name
+            self._last_names.move_to_end(key)
+            while len(self._last_names) > MOST_REMEMBERED:
+                self._last_names.popitem(last=False)
         if principal.participant is not None and not bound:
             raise outside(principal.participant)
         return principal
 
-    def _remember(self, connection: HTTPConnection, name: str) -> None:
-        with self._remembering:  # many threads ask
-            self._last_names[self._credential(connection)] = name
-            self._last_names.move_to_end(self._credential(connection))
-            while len(self._last_names) > MOST_SEEN:
-                self._last_names.popitem(last=False)
+    def last_known_name(self, connection: HTTPConnection, *, on_page: bool = False) -> str | None:
+        """Return the name last authenticated with this credential; it authorises a stop only.
 
-    def _forget(self, connection: HTTPConnection) -> None:
-        with self._remembering:
-            self._last_names.pop(self._credential(connection), None)
+        `on_page`: of a browser's session only; None for a bearer token, which opens no page.
+        """
+        kind, text = self._credential(connection)
+        return None if on_page and kind == "header" else self._last_names.get(digest(f"{kind} {text}"))
 
-    def last_known_name(self, connection: HTTPConnection) -> str | None:
-        """Return the name last authenticated with this credential; it authorises a stop only."""
-        return self._last_names.get(self._credential(connection))
-
-    def last_known_name_on_page(self, connection: HTTPConnection) -> str | None:
-        """Return `last_known_name` of a browser's session; None for a bearer token, which opens no page."""
-        return None if connection.headers.get("authorization") else self.last_known_name(connection)
-
-    def _identify(self, connection: HTTPConnection, forgive_age: bool, forgive_lock: bool) -> Principal:
+    def _credential(self, connection: HTTPConnection) -> tuple[str, str]:
         header = connection.headers.get("authorization", "")
-        if header:
-            kind, _, text = header.partition(" ")
-            if kind.lower() != "bearer" or not text.strip():
-                raise unauthorized("Send `Authorization: Bearer <token>`.")
-            address = connection.client.host if connection.client else ""
-            return self.bearer(text.strip(), address, forgive_age=forgive_age)
-        cookie = connection.cookies.get(self.cookie_name)
-        if cookie:
-            return self.cookie(cookie, forgive_age=forgive_age, forgive_lock=forgive_lock)
-        raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
-
-    def _credential(self, connection: HTTPConnection) -> str:
-        header = connection.headers.get("authorization", "")
-        return digest(f"header {header}" if header else f"cookie {connection.cookies.get(self.cookie_name, '')}")
+        return ("header", header) if header else ("cookie", connection.cookies.get(self.cookie_name, ""))
 
 
 def unauthorized(detail: str, code: str = "unauthorized", title: str = "Not signed in") -> ApiError:
@@ -341,59 +322,37 @@ FLUSH_S = 15.0
 class IdleLock:
     """Locks idle sessions, which then need the password again.
 
-    Only a person's actions count, as `stimrig.api.web.guards` tells them from what scripts ask for by themselves. Times
-    of actions are kept in memory and written down now and then, so that no page waits for the disk; a lock holds over a
-    restart.
+    Only a person's actions count, as `stimrig.api.web.guards` tells them from what scripts ask for by themselves, and a
+    live view of a running test. Times of actions are kept in memory and written down now and then, so that no page
+    waits for the disk; a lock holds over a restart.
 
-    `store`: holds the sessions. `clock`: idle times are measured on it. `after_min`: a session locks after so many
-    minutes without an action; 0: never by itself.
+    `after_min`: a session locks after so many minutes without an action; 0: never by itself.
     """
 
     def __init__(self, store: Store, clock: Clock, after_min: float) -> None:
         self.store, self.clock, self.after_s = store, clock, after_min * 60
         self._acted: dict[str, float] = {}
-        self._locked_by_hand: set[str] = set()
         self._lock = threading.Lock()
 
     def locked(self, row: PageSession) -> bool:
         """Return whether this session is locked."""
         if row.locked_unix_s is not None:
             return True
-        return bool(self.after_s) and self.clock.unix_s() - self._last(row) > self.after_s
-
-    def left_s(self, row: PageSession) -> float | None:
-        """Until it locks; None where it never does."""
-        return max(0.0, self._last(row) + self.after_s - self.clock.unix_s()) if self.after_s else None
-
-    def _last(self, row: PageSession) -> float:
-        return max(row.acted_unix_s or row.created_unix_s, self._acted.get(row.hash, 0.0))
+        last_s = max(row.acted_unix_s or row.created_unix_s, self._acted.get(row.hash, 0.0))
+        return bool(self.after_s) and self.clock.unix_s() - last_s > self.after_s
 
     def acted(self, session_hash: str) -> None:
         """Record a person's action in a session that is not locked."""
         with self._lock:
             self._acted[session_hash] = self.clock.unix_s()
 
-    def watches(self, session_hash: str) -> None:
-        """Record that a live view of a running test is open, which delays the idle lock but not a manual one."""
-        if session_hash not in self._locked_by_hand:
-            self.acted(session_hash)
-
-    def lock(self, session_hash: str, by: str) -> None:
-        """Lock it now."""
-        self._locked_by_hand.add(session_hash)
-        self._change(session_hash, self.clock.unix_s(), by, "lock")
-
-    def unlock(self, session_hash: str, by: str) -> None:
-        """The person is back."""
-        self._change(session_hash, None, by, "unlock")
-        self._locked_by_hand.discard(session_hash)
-
-    def _change(self, session_hash: str, locked_unix_s: float | None, by: str, action: str) -> None:
+    def change(self, session_hash: str, lock: bool, by: str) -> None:
+        """Lock a session now, or unlock it, as the person is back."""
         with self.store.write() as session:
-            row = session.get(PageSession, session_hash)
+            row, now_s = session.get(PageSession, session_hash), self.clock.unix_s()
             if row is not None:
-                row.locked_unix_s, row.acted_unix_s = locked_unix_s, self.clock.unix_s()
-                audit.write(session, self.clock.utc(), by, action, "page")
+                row.locked_unix_s, row.acted_unix_s = now_s if lock else None, now_s
+                audit.write(session, self.clock.utc(), by, "lock" if lock else "unlock", "page")
 
     def flush(self) -> None:
         """Write the times of the last actions down."""

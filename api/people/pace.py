@@ -1,14 +1,14 @@
-"""Guesses are held to a pace, and nobody's guesses lock another person out.
+"""Guesses of passwords and tokens are held to a pace, and nobody's guesses lock another person out.
 
-A pace counts wrong tries of a key: some are free, then each doubles the wait, up to five minutes. Memory is bounded,
-and no flood of keys makes it forget one that still counts: newcomers share one count while there is no room.
+Some wrong tries of a key are free, then each doubles the wait, up to five minutes. Memory is bounded, and no flood of
+keys makes it forget one that still counts: newcomers share one count while there is no room.
 """
 
 from __future__ import annotations
 
 import ipaddress
 import threading
-from collections import OrderedDict
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 from stimrig.api.clock import Clock
@@ -19,10 +19,9 @@ FORGOTTEN_S = 3600.0
 """A key counts for so long after its last try: who waits for it to be forgotten is no faster than who tries on."""
 MOST_KEYS = 10_000
 SWEEP_S = 1.0
-OTHERS = "\0"
-"""The key that newcomers share while there is no room."""
-FREE_TRIES, FREE_FOR_A_NAME = 5, 20
-MOST_PROVEN = 1000
+FREE_TRIES, FREE_FOR_A_NAME, MOST_PROVEN = 5, 20, 1000
+Key = tuple[Hashable, ...]
+"""What a try counts for; the first part is its kind: `pair`, `known pair`, `name`, `place`, `session` or `token`."""
 
 
 @dataclass
@@ -34,126 +33,85 @@ class Count:
     last_s: float = 0.0
 
 
-class Pace:
-    """Wrong tries by key.
+class Guesses:
+    """Wrong tries by key; waits are measured on `clock`. So many keys of each kind are told apart."""
 
-    `clock`: waits are measured on it; `free`: so many tries cost nothing; `most_keys`: so many keys are told apart.
-    """
-
-    def __init__(self, clock: Clock, free: int = FREE_TRIES, most_keys: int = MOST_KEYS) -> None:
-        self.clock, self.free, self.most_keys = clock, free, most_keys
-        self._counts: dict[str, Count] = {}
+    def __init__(self, clock: Clock, most_keys: int = MOST_KEYS) -> None:
+        self.clock, self.most_keys = clock, most_keys
+        self._counts: dict[Hashable, dict[Key, Count]] = {}
         self._swept_s = -SWEEP_S
+        self._proven: set[str] = set()
+        self._lock = threading.Lock()
 
-    def wait_s(self, key: str) -> float:
-        """Return how long the next try has to wait, s."""
-        count = self._counts.get(self._slot(key))
+    def admit(self, *keys: Key) -> None:
+        """Count a try for each key before it is known to be wrong. Raises ApiError: 429 with `Retry-After`."""
+        with self._lock:
+            refuse(max(self.wait_s(key) for key in keys))
+            for key in keys:
+                self.count(key)
+
+    def was_right(self, key: Key, *others: Key) -> None:
+        """Let the key start anew; uncount the try for the others, where strangers' tries still count."""
+        with self._lock:
+            self._of_kind(key).pop(key, None)
+            for other in others:
+                if (count := self._of_kind(other).get(self._slot(other))) is not None:
+                    count.tries, count.until_s = max(0, count.tries - 1), 0.0
+
+    def chosen_token(self, place: str) -> None:
+        """Admit a token that a person chose, which may be guessed: while guesses wait it opens only where it did."""
+        with self._lock:
+            if place not in self._proven:
+                refuse(self.wait_s(("token", place)))
+            if len(self._proven) >= MOST_PROVEN:
+                self._proven.clear()
+            self._proven.add(place)
+
+    def wait_s(self, key: Key) -> float:
+        """Return how long the next try of a key has to wait, s."""
+        count = self._of_kind(key).get(self._slot(key))
         return 0.0 if count is None else max(0.0, count.until_s - self.clock.monotonic_s())
 
-    def count(self, key: str) -> None:
+    def count(self, key: Key) -> None:
         """Count a try."""
         now = self.clock.monotonic_s()
-        count = self._counts.setdefault(self._slot(key), Count())
+        count = self._of_kind(key).setdefault(self._slot(key), Count())
         if now - count.last_s > FORGOTTEN_S:
             count.tries = 0
         count.tries, count.last_s = count.tries + 1, now
-        over = count.tries - self.free
+        over = count.tries - (FREE_FOR_A_NAME if key[0] == "name" else FREE_TRIES)
         if over >= 0:
             count.until_s = now + min(LONGEST_WAIT_S, 2.0 ** min(over, 20))
 
-    def give_back(self, key: str) -> None:
-        """Uncount a try that proved right; wrong ones before it still count."""
-        count = self._counts.get(self._slot(key))
-        if count is not None:
-            count.tries, count.until_s = max(0, count.tries - 1), 0.0
+    def _of_kind(self, key: Key) -> dict[Key, Count]:
+        return self._counts.setdefault(key[0], {})
 
-    def forget(self, key: str) -> None:
-        """Forget all tries of a key."""
-        self._counts.pop(key, None)
-
-    def __len__(self) -> int:
-        return len(self._counts)
-
-    def _slot(self, key: str) -> str:
-        if key in self._counts or len(self._counts) < self.most_keys:
+    def _slot(self, key: Key) -> Key:
+        counts, now = self._of_kind(key), self.clock.monotonic_s()
+        if key in counts or len(counts) < self.most_keys:
             return key
-        now = self.clock.monotonic_s()
         if now - self._swept_s >= SWEEP_S:
             self._swept_s = now
-            self._counts = {name: count for name, count in self._counts.items() if now - count.last_s <= FORGOTTEN_S}
-            if len(self._counts) < self.most_keys:
-                return key
-        return OTHERS
+            for old in [name for name, count in counts.items() if now - count.last_s > FORGOTTEN_S]:
+                del counts[old]
+        return key if len(counts) < self.most_keys else key[:1]
 
 
-class Guesses:
-    """Limits the rate of guesses of passwords and tokens.
+def password_keys(name: str, place: str, known: bool) -> list[Key]:
+    """Return what a password for a name counts for.
 
-    A person who has signed in from a place before is counted there apart from everybody else: what strangers try under
-    that name, or from other places, doesn't matter there. A stranger's try counts for name and place together, for the
-    name, whether there is such a person or not, and for the place.
+    A person who has signed in from a place before is counted there apart from everybody else. A stranger's try counts
+    for name and place together, for the name, whether there is such a person or not, and for the place.
     """
-
-    def __init__(self, clock: Clock) -> None:
-        self._known_pairs, self._sessions, self._tokens = Pace(clock), Pace(clock), Pace(clock)
-        self._pairs, self._places = Pace(clock), Pace(clock)
-        self._names = Pace(clock, FREE_FOR_A_NAME)
-        self._proven: OrderedDict[tuple[str, str], None] = OrderedDict()
-        self._lock = threading.Lock()
-
-    def password(self, name: str, place: str, known: bool) -> None:
-        """Admit a password for a name, and count it. Raises ApiError: 429 with `Retry-After`."""
-        self._admit(*self._password_paces(name, place, known))
-
-    def password_was_right(self, name: str, place: str, known: bool) -> None:
-        """The pair starts anew; what strangers did under the name, or from the place, still counts."""
-        with self._lock:
-            (pace, key), *others = self._password_paces(name, place, known)
-            pace.forget(key)
-            for pace, key in others:
-                pace.give_back(key)
-
-    def _password_paces(self, name: str, place: str, known: bool) -> list[tuple[Pace, str]]:
-        pair = f"{place} {name}"
-        return (
-            [(self._known_pairs, pair)] if known else [(self._pairs, pair), (self._names, name), (self._places, place)]
-        )
-
-    def confirmation(self, session: str) -> None:
-        """Admit a password given once more in a live session: only who sits in it is held back."""
-        self._admit((self._sessions, session))
-
-    def confirmation_was_right(self, session: str) -> None:
-        """The session starts anew."""
-        with self._lock:
-            self._sessions.forget(session)
-
-    def unknown_token(self, place: str) -> None:
-        """Count a token that is none. Raises ApiError: 429 with `Retry-After`."""
-        self._admit((self._tokens, place))
-
-    def chosen_token(self, token_hash: str, place: str) -> None:
-        """A token that a person chose may be guessed: where guesses are held back, it opens only if it did before."""
-        with self._lock:
-            pair = (token_hash, place)
-            if pair not in self._proven:
-                refuse(self._tokens.wait_s(place))
-            self._proven[pair] = None
-            self._proven.move_to_end(pair)
-            if len(self._proven) > MOST_PROVEN:
-                self._proven.popitem(last=False)
-
-    def _admit(self, *paces: tuple[Pace, str]) -> None:
-        with self._lock:
-            refuse(max(pace.wait_s(key) for pace, key in paces))
-            for pace, key in paces:
-                pace.count(key)
+    if known:
+        return [("known pair", place, name)]
+    return [("pair", place, name), ("name", name), ("place", place)]
 
 
-def refuse(wait_s: float) -> None:
+def refuse(wait_s: float, title: str = "Too many wrong tries") -> None:
     """Raise 429 with `Retry-After` where there is something to wait for."""
     if wait_s > 0:
-        problem = ApiError(429, "too-many-tries", "Too many wrong tries", f"Try again in {wait_s:.0f} s.")
+        problem = ApiError(429, "too-many-tries", title, f"Try again in {wait_s:.0f} s.")
         problem.headers["Retry-After"] = str(int(wait_s) + 1)
         raise problem
 

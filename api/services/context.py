@@ -101,7 +101,6 @@ class Context:
             task.cancel()
         with contextlib.suppress(SQLAlchemyError):
             await asyncio.to_thread(self.auth.idle.flush)
-        self.people.close()
         self.auth.close()
         self.store.close()
         self.lock.release()

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 from stimrig.api.clock import utc_label
-from stimrig.api.errors import NotFoundError
 from stimrig.api.people.auth import Principal
 from stimrig.api.services import participants
 from stimrig.api.services.context import Context
@@ -32,24 +31,18 @@ def make(context: Context, principal: Principal, code: str, body: KeyFor, tags: 
     return controllers.make_key(context.auth, body.name, code, plan, principal.name, principal.token_hash, tags)
 
 
-def revoke(context: Context, code: str, key_id: str, by: str) -> None:
-    """Revoke a key of a participant. Raises NotFoundError: it has none of this id today."""
-    if not controllers.revoke_key(context.auth, code, key_id, by):
-        raise NotFoundError("key", key_id, f"The page of {code} lists its keys.")
-
-
 def issue_token(context: Context, body: TokenIn, by: str) -> dict[str, Any]:
     """Issue a token to a program; its text is shown this once."""
-    after_days = utc_label(context.clock.unix_s() + 86400.0 * body.days) if body.days else None
-    ends = body.expires_utc or after_days
+    ends = utc_label(context.clock.unix_s() + 86400.0 * body.days) if body.days else None
     text = context.auth.issue(body.name, body.scopes, by, expires_utc=ends)
     return {"token": text, "name": body.name, "scopes": body.scopes, "expires_utc": ends}
 
 
 def all_tokens(context: Context) -> list[dict[str, Any]]:
-    """List all tokens by their prefix; never their text."""
+    """List all tokens by the first digits of their hash; never their text."""
     rows = context.store.all(Token, order=Token.created_utc)
+    hidden = ("hash", "made_by")
     return [
-        {key: value for key, value in row.as_dict().items() if key not in ("hash", "made_by")} | {"id": row.hash[:16]}
+        {"id": row.hash[:16], **{name: value for name, value in row.as_dict().items() if name not in hidden}}
         for row in rows
     ]

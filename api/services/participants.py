@@ -6,6 +6,8 @@ and nothing of theirs is deleted.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,16 +15,14 @@ from sqlalchemy import func, select
 from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError, require_found
-from stimrig.api.models.places import Site, in_words, site_of
+from stimrig.api.models.places import in_words, site_of
 from stimrig.api.models.registry import Versions
 from stimrig.api.services.context import Context, under_limits_lock
 from stimrig.api.services.decisions import Change, Decision
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.requests import MuscleIn, ParticipantIn
 from stimrig.api.store import Store, locking
-from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Approval, Model, Participant, Test
-from stimrig.rig.messages import Status
 
 
 def create(context: Context, body: ParticipantIn, by: str) -> Participant:
@@ -54,20 +54,37 @@ def within(session: Session, code: str) -> Participant:
     return require_found(session.get(Participant, code), "participant", code)
 
 
+@contextmanager
+def deciding(context: Context, code: str, decision: Decision) -> Iterator[tuple[Session, Participant]]:
+    """Open the transaction of a decision. Raises ApiError: 404 no such participant; 412 changed since it was seen."""
+    with context.store.write() as session:
+        row = within(session, code)
+        locking.check(session, row, decision.tags)
+        yield session, row
+
+
 @under_limits_lock
 def change_profile(context: Context, code: str, limits: dict[str, Any], decision: Decision) -> Participant:
     """Change the given limits of a participant; the others stay.
 
-    Raises ApiError: 404 no such participant; 412 changed meanwhile; 422 beyond what the rig takes, or the first ones
-    are not whole; 409 the calibration would be lost, or on a page a limit jumps, and that was not confirmed.
+    Raises ApiError: as `deciding`; 422 beyond what the rig takes, or the first ones are not whole; 409 the calibration
+    would be lost, or on a page a limit jumps, and that was not confirmed.
     """
-    with context.store.write() as session:
-        row = within(session, code)
-        locking.check(session, row, decision.tags)
+    with deciding(context, code, decision) as (session, row):
         before = row.profile
         check_limits(context, before, limits)
         profile, voids = profiles.changed(before, add_calibration_time(context, limits))
-        confirm_profile(context, row, profile, voids, decision)
+        warnings = profiles.jumps(before, profile) if decision.on_page else []
+        if voids:
+            required = context.rig.status is None or context.rig.status.require_calibration is not False
+            then = " Until the participant is calibrated anew, no test starts." if required else ""
+            warnings.append(f"The calibration is lost with it: {voids}.{then}")
+        if warnings:
+            changes = limit_changes(before, profile)
+            button = f"Yes, set {', '.join(change.now for change in changes[: len(profiles.LIMITS)])}"
+            refusal = "voids-calibration" if voids else "confirm"
+            title = f"Set these limits for {code}?"
+            decision.require_confirmation(row.version, title, button, changes, warnings, refusal)
         if profile != before:
             row.profile = profile
             now = context.clock.utc()
@@ -75,33 +92,18 @@ def change_profile(context: Context, code: str, limits: dict[str, Any], decision
     return row
 
 
-def confirm_profile(
-    context: Context, row: Participant, profile: dict[str, Any], voids: str, decision: Decision
-) -> None:  # fmt: skip
-    """Require confirmation of limits that void the calibration; on a page also of a jump."""
-    before = row.profile
-    warnings = profiles.jumps(before, profile) if decision.on_page else []
-    if voids:
-        required = context.rig.status is None or context.rig.status.require_calibration is not False
-        then = " Until the participant is calibrated anew, no test starts." if required else ""
-        warnings = [*warnings, f"The calibration is lost with it: {voids}.{then}"]
-    if not warnings:
-        return
+def limit_changes(before: dict[str, Any], profile: dict[str, Any]) -> list[Change]:
+    """List all limits, each with its value before."""
     changes = [
-        Change(
-            limit.words.capitalize(),
-            f"{profile[name]:g} {limit.unit}",
-            f"{before.get(name, profile[name]):g} {limit.unit}",
-        )
+        Change(limit.words.capitalize(), f"{profile[name]:g} {limit.unit}",
+               f"{before.get(name, profile[name]):g} {limit.unit}")
         for name, limit in profiles.LIMITS.items()
-    ]
-    button = f"Yes, set {', '.join(change.now for change in changes)}"
+    ]  # fmt: skip
     if (range_rad := profiles.range_of(profile)) is not None:
         was_rad = profiles.range_of(before)
         was = profiles.range_words(was_rad) if was_rad else ""
         changes.append(Change("Joint angles", profiles.range_words(range_rad), was))
-    refusal = "voids-calibration" if voids else "confirm"
-    decision.require_confirmation(row.version, f"Set these limits for {row.code}?", button, changes, warnings, refusal)
+    return changes
 
 
 def check_limits(context: Context, profile: dict[str, Any], limits: dict[str, Any]) -> None:
@@ -120,13 +122,8 @@ def add_calibration_time(context: Context, limits: dict[str, Any]) -> dict[str, 
     """Add the time of the sensor's calibration to a range of angles, which is void after the next calibration."""
     if limits.get(profiles.RANGE) is None:
         return limits
-    return {**limits, profiles.SET_AT: calibrated_utc(context.rig.status)}
-
-
-def calibrated_utc(status: Status | None) -> str | None:
-    """Return when the rig's angle sensor was calibrated; None: never."""
-    calibration = status.angle.calibration if status else None
-    return calibration.set_at_utc if calibration else None
+    calibration = context.rig.status.angle.calibration if context.rig.status else None
+    return {**limits, profiles.SET_AT: calibration.set_at_utc if calibration else None}
 
 
 def effect_on_open_work(context: Context, code: str) -> str:
@@ -145,48 +142,36 @@ def effect_on_open_work(context: Context, code: str) -> str:
     return ""
 
 
-def loses_calibration(row: Participant, body: MuscleIn) -> bool:
-    """Return whether a new site voids the calibration."""
-    is_calibrated = any(row.profile.get(name) is not None for name in profiles.CALIBRATION_FIELDS)
-    pairs = zip(site_of(row), site_in(body), strict=True)
-    return is_calibrated and any(before is not None and before != after for before, after in pairs)
-
-
-def site_in(body: MuscleIn) -> Site:
-    """Return the site of a request."""
-    return body.side, body.muscle, body.placement
-
-
 @under_limits_lock
 def change_site(context: Context, code: str, body: MuscleIn, decision: Decision) -> Participant:
     """Change the stimulated site, which voids the calibration, models and keys of the site before.
 
-    Raises ApiError: 404 no such participant; 412 changed meanwhile; 409 a test or calibration of it is under way, or
-    the calibration would be lost, or on a page the approved model, and that was not confirmed.
+    Raises ApiError: as `deciding`; 409 a test or calibration of it is under way, or the calibration would be lost, or
+    on a page the approved model, and that was not confirmed.
     """
     refuse_busy(context, code)
-    now, has_model = context.clock.utc(), decision.on_page and context.versions.approved(code) is not None
-    with context.store.write() as session:
-        row = within(session, code)
-        locking.check(session, row, decision.tags)
-        lost, here = loses_calibration(row, body), site_of(row)
-        before, after = in_words(here), in_words(site_in(body))
+    has_model = decision.on_page and context.versions.approved(code) is not None
+    with deciding(context, code, decision) as (session, row):
+        here, there = site_of(row), (body.side, body.muscle, body.placement)
+        if here == there:
+            return row
+        moves = any(before is not None and before != after for before, after in zip(here, there, strict=True))
+        lost = moves and any(row.profile.get(name) is not None for name in profiles.CALIBRATION_FIELDS)
+        before, after = in_words(here), in_words(there)
         warnings = []
         if lost:
             warnings.append(f"The calibration is lost with it: its thresholds were found at {before}.")
-        if here != site_in(body) and has_model:
+        if has_model:
             warnings.append(f"The approved model and its keys are of {before}. Here there is none.")
         if warnings:
             title, refusal = f"Change side and muscle of {code}?", "voids-calibration" if lost else "confirm"
             changes = [Change("Side and muscle", after, before)]
             decision.require_confirmation(row.version, title, f"Yes, it is {after}", changes, warnings, refusal)
-        if here != site_in(body):
-            if lost:
-                row.profile = {**row.profile, **dict.fromkeys(profiles.CALIBRATION_FIELDS)}
-            row.side, row.muscle, row.placement = site_in(body)
-            locking.write(
-                session, row, now, decision.by, "set muscle", code, **body.model_dump(), voids_calibration=lost
-            )
+        if lost:
+            row.profile = {**row.profile, **dict.fromkeys(profiles.CALIBRATION_FIELDS)}
+        row.side, row.muscle, row.placement = there
+        details = {**body.model_dump(), "voids_calibration": lost}
+        locking.write(session, row, context.clock.utc(), decision.by, "set muscle", code, **details)
     return row
 
 
@@ -203,17 +188,15 @@ def refuse_busy(context: Context, code: str) -> None:
 
 
 @under_limits_lock
-def put_archived(context: Context, code: str, archived: bool, by: str, tags: Tags) -> Participant:
+def put_archived(context: Context, code: str, archived: bool, decision: Decision) -> Participant:
     """Put a participant into the archive, or take it out; doing it again changes nothing. Raises as `change_site`."""
     if archived:
         refuse_busy(context, code)
-    now = context.clock.utc()
-    with context.store.write() as session:
-        row = within(session, code)
-        locking.check(session, row, tags)
+    with deciding(context, code, decision) as (session, row):
         if archived != (row.archived_utc is not None):
+            now = context.clock.utc()
             row.archived_utc = now if archived else None
-            locking.write(session, row, now, by, "archive" if archived else "unarchive", code)
+            locking.write(session, row, now, decision.by, "archive" if archived else "unarchive", code)
     return row
 
 
@@ -227,22 +210,20 @@ class Listed:
     approved: Approval | None
 
 
-def matching(store: Store, q: str = "", archived: bool | None = None) -> list[tuple[Participant, str]]:
-    """Participants whose code holds `q`, each with the time at which it was last tested, or made.
+def matching(store: Store, q: str = "", archived: bool | None = None) -> list[Participant]:
+    """Participants whose code holds `q`, in any case; who was last tested, or made, comes first.
 
-    `store`: holds them. `q`: a part of the code, in any case; empty: all. `archived`: only those that are archived, or
-    that are not.
+    `archived`: only those that are archived, or that are not.
     """
     last = select(Test.participant, func.max(Test.requested_utc).label("utc")).group_by(Test.participant).subquery()
-    newest = func.coalesce(last.c.utc, Participant.created_utc)
-    query = select(Participant, newest).outerjoin(last, last.c.participant == Participant.code)
+    query = select(Participant).outerjoin(last, last.c.participant == Participant.code)
     if q.strip():
         query = query.where(Participant.code.icontains(q.strip(), autoescape=True))
     if archived is not None:
         query = query.where(Participant.archived_utc.is_not(None) if archived else Participant.archived_utc.is_(None))
+    newest_first = func.coalesce(last.c.utc, Participant.created_utc).desc()
     with store.read() as session:
-        rows = session.execute(query.order_by(newest.desc(), Participant.code)).all()
-    return [(row[0], row[1]) for row in rows]
+        return list(session.scalars(query.order_by(newest_first, Participant.code)))
 
 
 def participant_counts(store: Store) -> dict[str, int]:

@@ -236,7 +236,7 @@ def has_key(auth: Auth, participant: str) -> bool:
 
 
 def _key_state(auth: Auth, row: Token) -> str:
-    if row.revoked or auth.fallen(row):
+    if row.revoked or auth.creator_lost_rights(row):
         return "revoked"
     return "expired" if row.expires_utc is not None and row.expires_utc <= auth.clock.utc() else "valid"
 

@@ -187,7 +187,7 @@ def refuse_archived(participant: Participant) -> None:
     if participant.archived_utc is not None:
         detail = (
             f"{participant.code} is in the archive. Take it out first: on its page, or by "
-            f"POST /v1/participants/{participant.code}/unarchive. Nothing was started."
+            f"PUT /v1/participants/{participant.code}/archived. Nothing was started."
         )
         raise ApiError(409, "archived", "This participant is archived", detail)
 

@@ -18,7 +18,6 @@ from pydantic import (
     model_validator,
 )
 
-from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.errors import ApiError
 from stimrig.api.models.tracking import Limits
 from stimrig.api.people import accounts
@@ -369,15 +368,7 @@ class TokenIn(Body):
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,80}$")]
     scopes: Annotated[list[Annotated[Scope, Field(strict=False)]], Field(min_length=1)]
-    days: int | None = Field(None, ge=1, le=366, description="it expires after these, where no `expires_utc` is sent")
-    expires_utc: (
-        Annotated[
-            str,
-            StringConstraints(pattern=r"^[0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2}(\.[0-9]+)?Z$"),
-            AfterValidator(lambda label: utc_label(unix_of(label))),  # the clock's format: labels are compared as text
-        ]
-        | None
-    ) = None
+    days: int | None = Field(None, ge=1, le=366, description="it expires after these")
 
 
 def limits_of(body: TestIn, participant_profile: dict[str, Any] | None) -> dict[str, Any]:

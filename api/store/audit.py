@@ -1,4 +1,4 @@
-"""The audit trail: append-only, each entry holding the hash of the one before; and what every chain is made with."""
+"""The audit trail: append-only, each entry holding the hash of the one before."""
 
 from __future__ import annotations
 
@@ -11,26 +11,21 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.store.tables import AuditEntry
 
-
-def entry_hash(entry: dict[str, Any]) -> str:
-    """SHA-256 of an entry's canonical JSON, its own hash left out."""
-    hashed = {key: value for key, value in entry.items() if key != "hash"}
-    return digest(json.dumps(hashed, sort_keys=True, separators=(",", ":")))
+GENESIS = "0" * 64
+ERASED, ERASE = "(erased)", "erase participant"
+"""Subject of an entry whose content was taken away, and the action of the entry that vouches for what is left of it."""
+ACCOUNTS = ("add user", "change password", "remove user")
+ON_ACCOUNTS = (*ACCOUNTS, "issue token", "revoke token")
+"""Actions whose subject is the name of a user or a key."""
 
 
 def write(session: Session, at_utc: str, actor: str, action: str, subject: str, **detail: Any) -> AuditEntry:
     """Append an entry in the caller's transaction, so that action and entry stand or fall together."""
     last = newest(session)
-    fields = {
-        "seq": last.seq + 1 if last else 1,
-        "at_utc": at_utc,
-        "who": storable(actor),
-        "action": action,
-        "subject": storable(subject),
-        "detail": detail,
-        "previous_hash": last.hash if last else GENESIS,
-    }
-    entry = AuditEntry(**fields, hash=entry_hash(fields))
+    seq, previous = (last.seq + 1, last.hash) if last else (1, GENESIS)
+    entry = AuditEntry(seq=seq, at_utc=at_utc, who=storable(actor), action=action, subject=storable(subject))
+    entry.detail, entry.previous_hash = detail, previous
+    entry.hash = entry_hash(entry)
     session.add(entry)
     session.flush()
     return entry
@@ -41,11 +36,9 @@ def newest(session: Session) -> AuditEntry | None:
     return session.scalars(select(AuditEntry).order_by(AuditEntry.seq.desc()).limit(1)).first()
 
 
-ERASED, ERASE = "(erased)", "erase participant"
-"""Subject of an entry whose content was taken away, and the action of the entry that vouches for what is left of it."""
-ACCOUNTS = ("add user", "change password", "remove user")
-ON_ACCOUNTS = (*ACCOUNTS, "issue token", "revoke token")
-"""Actions whose subject is the name of a user or a key."""
+def entry_hash(entry: AuditEntry) -> str:
+    """SHA-256 of an entry's canonical JSON, its own hash left out."""
+    return digest(canonical({name: value for name, value in entry.as_dict().items() if name != "hash"}))
 
 
 def erase(session: Session, names: set[str], at_utc: str, actor: str, **detail: Any) -> None:
@@ -81,43 +74,36 @@ def left_of(entries: list[AuditEntry]) -> str:
     return digest(canonical([[entry.seq, entry.at_utc, entry.who, entry.action, entry.hash] for entry in entries]))
 
 
-def vouched(entries: list[AuditEntry]) -> set[int]:
-    """Return the numbers of blanked entries that a later, valid entry vouches for."""
-    numbers: set[int] = set()
-    for entry in entries:
-        if entry.action == ERASE and entry.hash == entry_hash(entry.as_dict()):
-            blanked = [
-                blank_entry
-                for blank_entry in entries
-                if blank_entry.seq < entry.seq and blank(blank_entry) == entry.seq
-            ]
-            if len(blanked) == entry.detail.get("entries") and left_of(blanked) == entry.detail.get("kept"):
-                numbers |= {blank_entry.seq for blank_entry in blanked}
-    return numbers
-
-
-def blank(entry: AuditEntry) -> int | None:
-    """Return the number of the entry that blanked this one; None: it has its content."""
-    return entry.detail["erased"] if entry.subject == ERASED and list(entry.detail) == ["erased"] else None
-
-
 def first_broken(entries: list[AuditEntry]) -> int | None:
-    """The sequence number of the first entry that does not hold, or None if the chain is whole."""
-    previous, erased = GENESIS, vouched(entries)
+    """Return the number of the first entry that does not hold; None: the chain is whole."""
+    previous, blank = GENESIS, blanked(entries)
     for number, entry in enumerate(entries, start=1):
-        sound = entry.seq in erased or entry.hash == entry_hash(entry.as_dict())
-        if entry.seq != number or entry.previous_hash != previous or not sound:
+        if entry.seq != number or entry.previous_hash != previous:
+            return entry.seq
+        if entry.seq not in blank and entry.hash != entry_hash(entry):
             return entry.seq
         previous = entry.hash
     return None
 
 
-GENESIS = "0" * 64
+def blanked(entries: list[AuditEntry]) -> set[int]:
+    """Return the numbers of blanked entries that a later, valid entry vouches for."""
+    by_eraser: dict[int, list[AuditEntry]] = {}
+    for entry in entries:
+        if entry.subject == ERASED and list(entry.detail) == ["erased"]:
+            by_eraser.setdefault(int(entry.detail["erased"]), []).append(entry)
+    numbers: set[int] = set()
+    for entry in entries:
+        if entry.action == ERASE and entry.hash == entry_hash(entry):
+            blank = [one for one in by_eraser.get(entry.seq, []) if one.seq < entry.seq]
+            if (len(blank), left_of(blank)) == (entry.detail.get("entries"), entry.detail.get("kept")):
+                numbers |= {one.seq for one in blank}
+    return numbers
 
 
 def canonical(value: Any) -> str:
-    """JSON with sorted keys and no spaces: what is hashed. Raises ValueError for what has no such text."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False, allow_nan=False)
+    """JSON with sorted keys and no spaces: what is hashed."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"))
 
 
 def digest(text: str) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from sqlalchemy import Connection, Engine, create_engine, event, select
+from sqlalchemy import Engine, create_engine, event, select
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
@@ -22,8 +22,19 @@ from stimrig.api import owner_only
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.store import audit, migrations
-from stimrig.api.store.migrations import WRITES
 from stimrig.api.store.tables import Secret
+
+OTHER_WRITER_MS = 10_000
+"""Timeout for another process's lock."""
+POSTGRESQL = {
+    "lock_timeout": OTHER_WRITER_MS,
+    "statement_timeout": 30_000,
+    "idle_in_transaction_session_timeout": 30_000,  # a writer that was stopped in the middle lets go
+    "tcp_keepalives_idle": 10,  # s; a machine that is gone lets go, too
+    "tcp_keepalives_interval": 5,
+    "tcp_keepalives_count": 3,
+}
+KEEPALIVES = {"keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3, "tcp_user_timeout": 10_000}
 
 
 class Store:
@@ -44,7 +55,6 @@ class Store:
         except (ArgumentError, SQLAlchemyError, ImportError, OSError) as error:
             raise ApiError(503, "database", "The database cannot be opened", why_not_opened(error, safe_url)) from error
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
-        self._writing = sessionmaker(self.engine.execution_options(**WRITES), expire_on_commit=False)
         self._write_lock = threading.Lock()
 
     @contextmanager
@@ -56,8 +66,7 @@ class Store:
     @contextmanager
     def write(self) -> Iterator[Session]:
         """A transaction: committed at the end, rolled back at an error. One at a time."""
-        with self._write_lock, self._writing.begin() as session:
-            session.connection()  # begins it now: before anything is read
+        with self._write_lock, self._sessions.begin() as session:
             yield session
 
     def get(self, table: type[Any], key: Any) -> Any:
@@ -67,13 +76,8 @@ class Store:
 
     def all(self, table: Any, *where: Any, order: Any = None, limit: int | None = None) -> list[Any]:
         """Rows, or one column of them, that hold the conditions, in order."""
-        query = select(table).where(*where)
-        if order is not None:
-            query = query.order_by(order)
-        if limit is not None:
-            query = query.limit(limit)
         with self.read() as session:
-            return list(session.scalars(query))
+            return list(session.scalars(select(table).where(*where).order_by(order).limit(limit)))
 
     def first(self, table: Any, *where: Any, order: Any = None) -> Any:
         """The first of these, or None."""
@@ -116,70 +120,38 @@ def why_not_opened(error: Exception, safe_url: str) -> str:
     return f"{first}; {fix}"
 
 
-CONNECT_S, POOL_S = 3, 5
-OTHER_WRITER_MS = 10_000
-"""Timeout for another writer's lock."""
-SERVER_SETTINGS = {
-    "lock_timeout": OTHER_WRITER_MS,
-    "statement_timeout": 30_000,
-    "idle_in_transaction_session_timeout": 30_000,  # a writer that was stopped in the middle lets go
-    "tcp_keepalives_idle": 10,  # s; a machine that is gone lets go, too
-    "tcp_keepalives_interval": 5,
-    "tcp_keepalives_count": 3,
-}
-KEEPALIVES = {"keepalives_idle": 10, "keepalives_interval": 5, "keepalives_count": 3, "tcp_user_timeout": 10_000}
-
-
 def open_engine(url: URL) -> Engine:
-    """An engine for SQLite or PostgreSQL.
+    """An engine for SQLite (WAL, every commit on the disk, for its owner only) or PostgreSQL (through psycopg 3).
+
+    An error's words go to the log: parameters, which may be a code, stay out of them.
 
     Raises ArgumentError: another kind of database. ImportError: the driver is not installed.
     """
     kind = url.get_backend_name()
     if kind == "sqlite":
-        return _sqlite(url)
-    if kind == "postgresql":
-        return _postgresql(url)
-    raise ArgumentError(f"{kind}: neither sqlite nor postgresql")
-
-
-def _sqlite(url: URL) -> Engine:
-    """WAL, every commit on the disk, for its owner only."""
-    path = sqlite_file(url)
-    if path is not None:
-        close_to_others(path)
-    engine = create_engine(url, hide_parameters=True)  # an error's words go to the log: no name, no code
-    event.listen(engine, "connect", _durable_sqlite)
-    event.listen(engine, "begin", _begin_sqlite)
-    return engine
-
-
-def _postgresql(url: URL) -> Engine:
-    """Through psycopg 3; a server that does not answer is given up within seconds."""
-    options = " ".join(f"-c {name}={value}" for name, value in SERVER_SETTINGS.items())
+        if (path := sqlite_file(url)) is not None:
+            close_to_others(path)
+        engine = create_engine(url, hide_parameters=True)
+        event.listen(engine, "connect", _durable_sqlite)
+        event.listen(engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN"))
+        return engine
+    if kind != "postgresql":
+        raise ArgumentError(f"{kind}: neither sqlite nor postgresql")
+    options = " ".join(f"-c {name}={value}" for name, value in POSTGRESQL.items())
     try:
-        engine = create_engine(
+        return create_engine(
             url.set(drivername="postgresql+psycopg"), hide_parameters=True,
-            pool_pre_ping=True, pool_size=10, max_overflow=20, pool_timeout=POOL_S,
-            connect_args={"connect_timeout": CONNECT_S, "options": options, **KEEPALIVES},
+            pool_pre_ping=True, pool_size=10, max_overflow=20, pool_timeout=5,
+            connect_args={"connect_timeout": 3, "options": options, **KEEPALIVES},
         )  # fmt: skip
     except ImportError as error:
         raise ImportError("PostgreSQL needs psycopg: pip install 'stimrig[postgresql]'") from error
-    return engine
 
 
 def _durable_sqlite(connection: Any, _record: Any) -> None:
-    connection.isolation_level = None  # `_begin_sqlite` begins transactions, not the driver
-    cursor = connection.cursor()
-    waits = f"busy_timeout={OTHER_WRITER_MS}"  # SQLite knows no queue: of eight writers one may wait long
-    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", waits):
-        cursor.execute(f"PRAGMA {pragma}")
-    cursor.close()
-
-
-def _begin_sqlite(connection: Connection) -> None:
-    writes = WRITES.items() <= connection.get_execution_options().items()
-    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
+    connection.isolation_level = None  # the event `begin` begins transactions, not the driver
+    for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"busy_timeout={OTHER_WRITER_MS}"):
+        connection.execute(f"PRAGMA {pragma}")
 
 
 def sqlite_file(url: URL) -> Path | None:

@@ -21,8 +21,6 @@ from stimrig.api.store.tables import Table
 REVISIONS = Path(__file__).parent / "revisions"
 BEFORE = "before-upgrade"
 """Folder beside a SQLite database for the copies that are made before an upgrade."""
-WRITES = {"stimrig_writes": True}
-"""Execution option of a transaction that writes."""
 
 
 class SchemaError(Exception):
@@ -48,7 +46,7 @@ def migrate(engine: Engine) -> None:
             f"it is of version {current}, this stimrig knows versions up to {newest}; "
             "install the stimrig that wrote it, or set STIMRIG_DATA_DIR to another folder"
         )
-    with copied_before(engine.url.database, current), engine.execution_options(**WRITES).begin() as writer:
+    with copied_before(engine.url.database, current), engine.begin() as writer:
         config.attributes["connection"] = writer
         command.upgrade(config, "head")
         refuse_incomplete(writer)

@@ -56,7 +56,7 @@ def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
             raise forbidden(f"This needs the scope {scope}; {name} holds {', '.join(sorted(principal.scopes))}.")
         check_csrf(request, principal)
         if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
-            await request.app.state.context.people.refuse_unconfirmed(principal)
+            await asyncio.to_thread(request.app.state.context.people.refuse_unconfirmed, principal)
         return principal
 
     check.__name__ = f"require_{scope.name.lower()}"

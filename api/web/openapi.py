@@ -35,7 +35,7 @@ Live signals come over a WebSocket, `/v1/tests/{id}/live`, with the same token: 
 rig there), `test` (the test's document), `joint`, `adaptive` or `problem` (docs/api.md says what each holds). It closes
 once the test is done.
 
-The same facts as JSON Schemas: `GET /v1/schemas`.
+The same facts as JSON Schemas: `stimrig schema`.
 """
 
 

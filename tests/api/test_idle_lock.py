@@ -13,7 +13,6 @@ import pytest
 
 from stimrig.api.clock import Clock
 from stimrig.api.people.auth import IdleLock
-from stimrig.api.people.pace import Pace
 from tests.api.browser import PASSWORD, without_values
 from tests.api.conftest import HTML, STUB, TOKEN, Service, run_service, wait_done
 from tests.api.forms import find, press
@@ -138,9 +137,7 @@ def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(se
 
 
 def test_guesses_at_the_lock_are_held_to_a_pace(service: Service, clock: SetClock) -> None:
-    for pace in vars(service.context.people.guesses).values():
-        if isinstance(pace, Pace):
-            pace.clock = type("Still", (Clock,), {"monotonic_s": lambda _self: 1000.0})()
+    service.context.people.guesses.clock = type("Still", (Clock,), {"monotonic_s": lambda _self: 1000.0})()
     with signed_in(service, "Jörg Müller") as http:
         http.post("/v1/sessions/lock")
         tries = [http.post("/v1/sessions/unlock", json={"password": f"no {n}"}).status_code for n in range(6)]

@@ -69,8 +69,9 @@ def test_who_decides_again_sends_the_version_of_the_answer(client: httpx.Client,
     tag = client.get(HOME).headers["etag"]
     for method, path, body in (
         ("PUT", f"{HOME}/profile", {"current_ma": 9}), ("POST", f"/v1/models/{model}/approve", {}),
-        ("PUT", f"{HOME}/muscle", {"side": "left"}), ("POST", f"{HOME}/keys", KEY), ("POST", f"{HOME}/archive", None),
-        ("POST", f"/v1/models/{model}/reject", {"reason": "wrong arm"}), ("POST", f"{HOME}/unarchive", None),
+        ("PUT", f"{HOME}/muscle", {"side": "left"}), ("POST", f"{HOME}/keys", KEY),
+        ("PUT", f"{HOME}/archived", {"archived": True}), ("PUT", f"{HOME}/archived", {"archived": False}),
+        ("POST", f"/v1/models/{model}/reject", {"reason": "wrong arm"}),
     ):  # fmt: skip
         old, answer = tag, client.request(method, path, json=body, headers={"If-Match": tag})
         assert answer.is_success, answer.text

@@ -106,7 +106,7 @@ def test_an_upgrade_that_fails_or_cannot_be_copied_leaves_the_database_as_it_was
     [
         (NEWER, "it is of version 0900, .* install the stimrig that wrote it"),
         ("ALTER TABLE models DROP COLUMN etag", "table models lacks etag"),
-        ("DROP TABLE confirmations", "no table confirmations"),
+        ("DROP TABLE notes", "no table notes"),
     ],
     ids=["newer", "column-gone", "table-gone"],
 )

@@ -22,7 +22,7 @@ from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.supervisor import Child, Services
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
-from stimrig.api.store.service_lock import INHERITED, HeldError, ServiceLock, reserve
+from stimrig.api.store.service_lock import HOLDER, INHERITED, HeldError, ServiceLock, reserve
 from stimrig.api.store.tables import Participant
 from tests.api.conftest import PATIENCE_S, TOKEN
 from tests.harness.looks_first import LooksFirst
@@ -76,61 +76,50 @@ def held(**given: Any) -> ServiceLock:
     return ServiceLock(Settings(**given))
 
 
-def test_whichever_way_leads_to_it_it_is_held_once(tmp_path: Path) -> None:
-    one, two, link = tmp_path / "one", tmp_path / "two", tmp_path / "link"
-    first = held(data_dir=one)
-    Store(f"sqlite:///{one}/stimrig.db").close()
-    link.symlink_to(one)
-    (tmp_path / "link.db").symlink_to(one / "stimrig.db")
-    (two).mkdir()
-    ways: list[dict[str, Any]] = [
-        {"data_dir": one},
-        {"data_dir": link},
-        {"data_dir": two / ".." / "one"},
-        {"data_dir": two, "database_url": f"sqlite:///{one}/stimrig.db"},
-        {"data_dir": two, "database_url": f"sqlite:///{link}/stimrig.db"},
-        {"data_dir": two, "database_url": f"sqlite:///{tmp_path}/link.db"},
-        {"data_dir": two, "database_url": f"sqlite:///file:{tmp_path}/link.db?uri=true"},
-        {"data_dir": one, "database_url": "sqlite://"},
-    ]
-    for way in ways:
-        with pytest.raises(HeldError, match=f"another service runs on it: process {os.getpid()} on"):
-            held(**way)
-    apart = held(data_dir=two)
-    apart.release()
-    first.release()
-    held(data_dir=two, database_url=f"sqlite:///{one}/stimrig.db").release()
+@contextmanager
+def closing_lock(**given: Any) -> Iterator[ServiceLock]:
+    lock = held(**given)
+    yield lock
+    lock.release()
 
 
-def test_a_removed_lock_file_lets_nobody_in_and_is_locked_anew(tmp_path: Path) -> None:
-    first = held(data_dir=tmp_path)
-    for lock in tmp_path.glob("*.lock"):
-        lock.unlink()
-    for refused in (held, lambda **given: reserve(Settings(**given))):
-        with pytest.raises(HeldError, match=f"{tmp_path}: another service runs on it"):
-            refused(data_dir=tmp_path)
-    first.renew()
-    assert {lock.name for lock in tmp_path.glob("*.lock")} == {"service.lock", "stimrig.db.lock"}
-    with pytest.raises(HeldError, match=f"process {os.getpid()} on"):
-        held(data_dir=tmp_path / ".." / tmp_path.name)
-    first.release()
+WAYS: list[dict[str, Any]] = [
+    {"data_dir": "one"}, {"data_dir": "link"}, {"data_dir": "two/../one"}, {"data_dir": "one", "database_url": "sqlite://"},
+    {"data_dir": "two", "database_url": "sqlite:///PLACE/one/stimrig.db"},
+    {"data_dir": "two", "database_url": "sqlite:///PLACE/link/stimrig.db"},
+    {"data_dir": "two", "database_url": "sqlite:///PLACE/link.db"},
+    {"data_dir": "two", "database_url": "sqlite:///file:PLACE/link.db?uri=true"},
+]  # fmt: skip
 
 
-def test_a_service_whose_database_another_has_locked_meanwhile_ends(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    signals: list[int] = []
-    monkeypatch.setattr(os, "kill", lambda _, number: signals.append(number))
-    database = {"database_url": f"sqlite:///{tmp_path}/shared.db"}
-    first = held(data_dir=tmp_path / "one", **database)
-    (tmp_path / "shared.db.lock").unlink()
-    second = held(data_dir=tmp_path / "two", **database)
-    second.renew()
-    assert signals == []
-    first.renew()
-    assert signals == [signal.SIGTERM]
-    first.release()
-    second.release()
+@pytest.mark.parametrize("way", WAYS, ids=lambda way: " ".join(way.values()))
+def test_whichever_way_leads_to_it_it_is_held_once(tmp_path: Path, way: dict[str, Any]) -> None:
+    (tmp_path / "two").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "one")
+    (tmp_path / "link.db").symlink_to(tmp_path / "one/stimrig.db")
+    given = {"data_dir": tmp_path / way["data_dir"]}
+    if "database_url" in way:
+        given["database_url"] = way["database_url"].replace("PLACE", str(tmp_path))
+    with closing_lock(data_dir=tmp_path / "one") as first:
+        first.write_holder("http://127.0.0.1:1234")
+        with pytest.raises(HeldError, match=f"process {os.getpid()} on .* at http://127.0.0.1:1234; stop it"):
+            held(**given)
+        held(data_dir=tmp_path / "two").release()
+    with closing_lock(**given), pytest.raises(HeldError) as caught:
+        held(**given)
+    assert "1234" not in str(caught.value), "the message names nobody who is gone"
+
+
+def test_a_removed_lock_file_lets_nobody_in(tmp_path: Path) -> None:
+    with closing_lock(data_dir=tmp_path):
+        (tmp_path / HOLDER).unlink()
+        for refused in (held, lambda **given: reserve(Settings(**given))):
+            with pytest.raises(HeldError, match=f"{tmp_path}: another service runs on it"):
+                refused(data_dir=tmp_path)
+        services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
+        with pytest.raises(LaunchError, match="another service runs on it") as caught, services:
+            pass
+        assert caught.value.exit_code == 2 and services.emulator is not None and services.emulator.process is None
 
 
 def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
@@ -141,21 +130,9 @@ def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
     with pytest.raises(HeldError, match=r"127\.0\.0\.1:1/stimrig: .*STIMRIG_DATABASE_URL") as caught:
         held(data_dir=tmp_path / "b", database_url="postgresql://ann:secret@127.0.0.1:1/stimrig")
     assert "secret" not in str(caught.value) and "\n" not in str(caught.value)
-    (tmp_path / "c").mkdir()
-    (tmp_path / "c" / "service.lock").mkdir()
+    (tmp_path / "c" / HOLDER).mkdir(parents=True)
     with pytest.raises(HeldError, match="this user may write"):
         held(data_dir=tmp_path / "c")
-
-
-def test_serve_says_so_before_it_starts_a_rig(tmp_path: Path) -> None:
-    first = held(data_dir=tmp_path)
-    for lock in tmp_path.glob("*.lock"):
-        lock.unlink()
-    services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
-    with pytest.raises(LaunchError, match="another service runs on it") as caught, services:
-        pass
-    assert caught.value.exit_code == 2 and services.emulator is not None and services.emulator.process is None
-    first.release()
 
 
 def test_each_process_of_serve_is_started_under_the_lock_and_the_service_takes_it_over(
@@ -221,14 +198,3 @@ def test_new_folders_are_closed_and_shared_ones_stay_as_they_are(tmp_path: Path)
     shared.chmod(0o770)
     held(data_dir=shared).release()
     assert mode(shared) == 0o770
-
-
-def test_the_message_names_nobody_who_is_gone(tmp_path: Path) -> None:
-    first = held(data_dir=tmp_path)
-    first.write_holder("http://127.0.0.1:1234")
-    first.release()
-    second = held(data_dir=tmp_path)
-    with pytest.raises(HeldError) as caught:
-        held(data_dir=tmp_path)
-    assert "1234" not in str(caught.value)
-    second.release()

@@ -26,22 +26,25 @@ def make(http: httpx.Client, code: str, **more: Any) -> None:
     assert http.post("/v1/participants", json={"code": code, **more}).status_code == 201
 
 
+def archive(http: httpx.Client, code: str, archived: bool = True) -> httpx.Response:
+    return http.put(f"/v1/participants/{code}/archived", json={"archived": archived})
+
+
 def test_an_archived_participant_is_left_alone_until_it_is_taken_out(http: httpx.Client) -> None:
     make(http, "A1")
-    assert http.post("/v1/participants/A1/archive").json()["archived_utc"]
+    assert archive(http, "A1").json()["archived_utc"]
     for path, body in (("/v1/tests", {"participant": "A1"}), ("/v1/participants/A1/calibration", {})):
         refused = http.post(path, json=body)
         assert refused.status_code == 409 and refused.json()["type"] == "/problems/archived", refused.text
-        assert "unarchive" in refused.json()["detail"]
+        assert "/archived" in refused.json()["detail"]
     assert "A1" not in [row["code"] for row in http.get("/v1/participants", params={"archived": False}).json()]
     assert [row["code"] for row in http.get("/v1/participants", params={"archived": True}).json()] == ["A1"]
-    assert http.post("/v1/participants/A1/unarchive").json()["archived_utc"] is None
+    assert archive(http, "A1", False).json()["archived_utc"] is None
     assert run_test(http, "A1")["state"] == "completed"
     trail = [entry["action"] for entry in http.get("/v1/audit").json()["entries"] if entry["subject"] == "A1"]
     assert trail == ["create participant", "archive", "unarchive"]
     seen = {"If-Match": http.get("/v1/participants/A1").headers["etag"]}
-    refused = http.post("/v1/participants/nobody/archive", headers=seen)
-    assert refused.status_code == 404
+    assert http.put("/v1/participants/nobody/archived", json={"archived": True}, headers=seen).status_code == 404
 
 
 def test_nobody_is_archived_in_the_middle_of_a_test(service: Service, http: httpx.Client) -> None:
@@ -49,13 +52,13 @@ def test_nobody_is_archived_in_the_middle_of_a_test(service: Service, http: http
     service.rig.speed = 2.0
     test = http.post("/v1/tests", json={"participant": "A2"}).json()
     for refused in (
-        http.post("/v1/participants/A2/archive"),
+        archive(http, "A2"),
         http.put("/v1/participants/A2/muscle", json={"side": "right"}),
     ):
         assert refused.status_code == 409 and refused.json()["type"] == "/problems/participant-busy"
     service.rig.speed = 60.0
     assert wait_done(http, test["id"])["side"] == "left"
-    assert http.post("/v1/participants/A2/archive").status_code == 200
+    assert archive(http, "A2").status_code == 200
 
 
 def test_the_list_is_searched_and_most_recent_first(http: httpx.Client) -> None:

@@ -10,7 +10,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import httpx
 import jsonschema_rs
 import numpy as np
 import pytest
@@ -117,15 +116,6 @@ def test_a_schema_is_printed_by_its_name_and_by_its_verb(capsys: pytest.CaptureF
     assert capsys.readouterr().out.split() == [schema["$id"] for schema in ALL.values()]
     assert main.run(["schema", "colour"]) == 2
     assert "colour: no such schema. Give one of audit, " in capsys.readouterr().err
-
-
-def test_schemas_are_served_to_anybody(client: httpx.Client) -> None:
-    nobody = {"Authorization": ""}
-    listed = client.get("/v1/schemas", headers=nobody).json()["schemas"]
-    assert listed == {name: schema["$id"] for name, schema in ALL.items()}
-    answer = client.get("/v1/schemas/model", headers=nobody)
-    assert answer.headers["content-type"] == "application/schema+json" and answer.json() == ALL["model"]
-    assert client.get("/v1/schemas/colour").status_code == 404
 
 
 def test_every_verb_with_json_has_a_schema() -> None:

@@ -21,8 +21,6 @@ GET    /health                                             anybody        200
 GET    /metrics                                            anybody        200
 GET    /static/page.css                                    anybody        200
 GET    /docs                                               anybody        200
-GET    /v1/schemas                                         anybody        200
-GET    /v1/schemas/x                                       anybody        404
 GET    /                                                   anybody        200
 GET    /rig/now                                            anybody        200
 GET    /stopped/x                                          anybody        404
@@ -93,8 +91,7 @@ GET    /participants/x                                     run-test       404
 GET    /participants/x/next                                run-test       404
 GET    /participants/x/calibration                         run-test       404
 PUT    /v1/participants/x/muscle                           run-test       428
-POST   /v1/participants/x/archive                          run-test       428
-POST   /v1/participants/x/unarchive                        run-test       428
+PUT    /v1/participants/x/archived                         run-test       428
 GET    /v1/participants/x/notes                            run-test       404
 POST   /v1/participants/x/notes                            run-test       422
 POST   /v1/participants/x/notes/x/strike                   run-test       404

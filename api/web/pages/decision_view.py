@@ -28,7 +28,7 @@ async def show_risks(request: Request, context: Ctx, principal: Approver, row: V
         "approve_poor.html",
         model=await asyncio.to_thread(context.versions.document, row),
         risks=advice.risks(document, advice.findings(document)),
-        ask_password=not await context.people.is_confirmed(principal.session_hash),
+        ask_password=not context.people.is_confirmed(principal),
         threshold_us=stored_model.threshold_us(row),
         what_to_write=registry.WHAT_TO_WRITE,
     )

@@ -44,7 +44,7 @@ async def home(request: Request, context: Ctx, q: str = "", archived: str = "", 
 
 def _list(context: Context, search: Search) -> dict[str, Any]:
     matching = participants.matching(context.store, search.q, search.archived)
-    listed = [row for row, _last_utc in (matching if search.all else matching[:FIRST_ROWS])]
+    listed = matching if search.all else matching[:FIRST_ROWS]
     count = participants.participant_counts(context.store)
     rows = participants.list_rows(context.store, context.versions, listed)
     return {"rows": rows, "more": len(matching) - len(rows), "count": count}

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from decimal import Decimal
 from typing import Any
 
-from stimrig.api.services.participants import calibrated_utc
 from stimrig.api.sessions import profiles
 from stimrig.rig.messages import Status
 
@@ -37,8 +36,8 @@ def fields(profile: Mapping[str, Any], status: Status | None) -> list[dict[str, 
     ]  # fmt: skip
     if status is None or not status.angle.present:
         return entries
-    range_rad = profiles.range_of(profile)
-    outdated = profiles.range_outdated(profile, calibrated_utc(status))
+    range_rad, calibration = profiles.range_of(profile), status.angle.calibration
+    outdated = profiles.range_outdated(profile, calibration and calibration.set_at_utc)
     texts = ["", ""] if range_rad is None or outdated else [angle_text(angle) for angle in range_rad]
     within = "" if status.angle.range_rad is None else f"within {profiles.range_words(status.angle.range_rad)} (rig)"
     return entries + [

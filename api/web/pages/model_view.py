@@ -61,7 +61,7 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
         why_problem=job.problem if job and job.state == "failed" else None,
         step=await next_step(context, row, version, principal),
         changes=await asyncio.to_thread(context.trend.changes_to, row),
-        ask_password=not await context.people.is_confirmed(principal.session_hash),
+        ask_password=not context.people.is_confirmed(principal),
         threshold_us=stored_model.threshold_us(row),
         has_key=version["served"] and await asyncio.to_thread(controllers.has_key, context.auth, row.participant),
         problem=measured["problem"],

@@ -53,7 +53,7 @@ async def participant(request: Request, context: Ctx, principal: Tester, code: s
             "sensor": limits_form.has_sensor(status),
         }
 
-    ask_password = not await context.people.is_confirmed(principal.session_hash)
+    ask_password = not context.people.is_confirmed(principal)
     return page(request, "participant.html", ask_password=ask_password, **await asyncio.to_thread(gather))
 
 

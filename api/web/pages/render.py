@@ -73,7 +73,7 @@ async def identify_viewer(request: Request) -> None:
     except ApiError:
         return
     except (SQLAlchemyError, TimeoutError):
-        name = context.auth.last_known_name_on_page(request)
+        name = context.auth.last_known_name(request, on_page=True)
         if name is not None and getattr(request.state, "stop_right", None) is None:
             request.state.stop_right = _right_of(context, name)
 

@@ -144,19 +144,6 @@ class SegmentOut(Document):
     settings: Annotated[dict[str, JsonValue], WithJsonSchema(SETTINGS)] = {}
 
 
-class SchemasOut(Document):
-    """The published schemas."""
-
-    schemas: dict[str, str] = Field(description="`$id` by name")
-
-
-class SchemaOut(Document):
-    """A JSON Schema (draft 2020-12)."""
-
-    id: str = Field(alias="$id", description="`urn:stimrig:schema:<name>:<version>`")
-    title: str
-
-
 def published(name: str, description: str) -> dict[str, Any]:
     """An answer that holds to a published schema (`stimrig.api.schemas`)."""
     schema = {"$ref": f"#/components/schemas/{component_name(name)}"}

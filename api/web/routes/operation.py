@@ -6,17 +6,14 @@ import time
 from typing import Any
 
 from fastapi import APIRouter
-from fastapi.responses import JSONResponse, PlainTextResponse, Response
+from fastapi.responses import PlainTextResponse, Response
 from prometheus_client import generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from sqlalchemy import text
 
-from stimrig.api import schemas
-from stimrig.api.errors import NotFoundError
 from stimrig.api.web.dependencies import Ctx
 from stimrig.api.web.monitoring import Figures
-from stimrig.api.web.openapi import problem
-from stimrig.api.web.responses.base import SchemaOut, SchemasOut, describe_answer
+from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import HealthOut
 
 router = APIRouter(tags=["operation"])
@@ -46,31 +43,3 @@ def health(context: Ctx) -> dict[str, Any]:
 def metrics(context: Ctx) -> Response:
     """Figures in Prometheus' text format."""
     return Response(generate_latest(Figures(context)), media_type=CONTENT_TYPE_PLAIN_0_0_4)
-
-
-schemas_router = APIRouter(prefix="/v1/schemas", tags=["schemas"])
-ONE_SCHEMA: dict[int | str, dict[str, Any]] = {
-    200: {"model": SchemaOut, "description": "the schema"},
-    404: problem("no schema of this name"),
-}
-
-
-class SchemaResponse(JSONResponse):
-    """An answer that says that it is a schema."""
-
-    media_type = "application/schema+json"
-
-
-@schemas_router.get("", **describe_answer(SchemasOut))
-def published() -> dict[str, Any]:
-    """The schemas there are, by name, with their ids; an id ends in the version."""
-    return {"schemas": {name: schemas.load(name)["$id"] for name in schemas.NAMES}}
-
-
-@schemas_router.get("/{name}", response_class=SchemaResponse, response_model=None, responses=ONE_SCHEMA)
-def schema(name: str) -> JSONResponse:
-    """One schema, by its name or by the verb that prints it."""
-    try:
-        return SchemaResponse(schemas.load(name))
-    except KeyError:
-        raise NotFoundError("schema", name, f"There are {', '.join(schemas.NAMES)}.") from None

@@ -11,11 +11,18 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 
 from stimrig.api.services import notes, participants
-from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
+from stimrig.api.sessions.requests import Body, MuscleIn, NoteIn, ParticipantIn, ProfileIn
 from stimrig.api.store.tables import Participant
-from stimrig.api.web.dependencies import PROBLEM, Ctx, ParticipantDecision, ParticipantVersion, Tester
+from stimrig.api.web.dependencies import PROBLEM, Ctx, ParticipantDecision, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
+
+
+class ArchivedIn(Body):
+    """Whether a participant is in the archive."""
+
+    archived: bool
+
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
 
@@ -36,7 +43,7 @@ def list_participants(
     archived: Annotated[bool | None, Query(description="only those that are archived, or that are not")] = None,
 ) -> list[dict[str, Any]]:
     """All participants, or those that are looked for; who was last tested, or made, comes first."""
-    return [row.as_dict() for row, _last_utc in participants.matching(context.store, q, archived)]
+    return [row.as_dict() for row in participants.matching(context.store, q, archived)]
 
 
 @router.get("/{code}", **describe_answer(ParticipantOut))
@@ -77,20 +84,12 @@ async def set_muscle(
     return tagged(response, await participants.change_site(context, code, body, decision))
 
 
-@router.post("/{code}/archive", **describe_answer(ParticipantOut))
-async def archive(
-    context: Ctx, principal: Tester, code: str, tags: ParticipantVersion, response: Response
+@router.put("/{code}/archived", **describe_answer(ParticipantOut))
+async def set_archived(
+    context: Ctx, code: str, decision: ParticipantDecision, body: ArchivedIn, response: Response
 ) -> dict[str, Any]:
-    """Put it into the archive: it is listed no more by default, and no test of it starts."""
-    return tagged(response, await participants.put_archived(context, code, True, principal.name, tags))
-
-
-@router.post("/{code}/unarchive", **describe_answer(ParticipantOut))
-async def unarchive(
-    context: Ctx, principal: Tester, code: str, tags: ParticipantVersion, response: Response
-) -> dict[str, Any]:
-    """Take it out of the archive."""
-    return tagged(response, await participants.put_archived(context, code, False, principal.name, tags))
+    """Put it into the archive, where it is listed no more by default and no test of it starts, or take it out."""
+    return tagged(response, await participants.put_archived(context, code, body.archived, decision))
 
 
 notes_router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)

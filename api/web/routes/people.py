@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
+from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, RedirectResponse, Response
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, StringConstraints, ValidationError
+from pydantic import Field, StringConstraints, ValidationError
 
 from stimrig.api.errors import ApiError, NotFoundError
-from stimrig.api.people import accounts
-from stimrig.api.people.auth import ROLES, Principal, Scope, unauthorized
+from stimrig.api.people.auth import ROLES, Scope, unauthorized
 from stimrig.api.services import keys
+from stimrig.api.sessions import controllers
 from stimrig.api.sessions.controllers import KeyFor
-from stimrig.api.sessions.requests import TokenIn
+from stimrig.api.sessions.requests import Body, PersonName, TokenIn
 from stimrig.api.store import audit
-from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import AuditEntry
 from stimrig.api.web.dependencies import (
     PROBLEM,
     Administrator,
     Anyone,
     Approver,
-    Context,
     Ctx,
     EvenLocked,
     ParticipantVersion,
@@ -36,31 +34,20 @@ from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import AuditOut, KeyOut, ListedToken, ListedUser, SessionOut, TokenOut, UserOut
 
 router = APIRouter(prefix="/v1", tags=["people"], responses=PROBLEM)
-
-Name = Annotated[
-    str,
-    StringConstraints(min_length=1, max_length=320),
-    AfterValidator(accounts.written_name),
-    Field(
-        description="letters of any language, digits, spaces and . _ @ - ' , ( ), at most 80", examples=["Ada Çelik"]
-    ),
-]
+token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)
 Password = Annotated[str, StringConstraints(min_length=10, max_length=200)]
+NAME = "letters of any language, digits, spaces and . _ @ - ' , ( ), at most 80"
 
 
-class _Body(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-
-class UserIn(_Body):
+class UserIn(Body):
     """A person who may sign in on the page."""
 
-    name: Name
+    name: Annotated[PersonName, Field(description=NAME, examples=["Ada Çelik"])]
     password: Password
-    scopes: Annotated[list[Scope], Field(min_length=1)] = ROLES["clinician"]
+    scopes: Annotated[list[Annotated[Scope, Field(strict=False)]], Field(min_length=1)] = ROLES["clinician"]
 
 
-class SignIn(_Body):
+class SignIn(Body):
     """Name and password, or a token."""
 
     name: Annotated[str, StringConstraints(max_length=320)] = ""
@@ -68,22 +55,22 @@ class SignIn(_Body):
     token: Annotated[str, StringConstraints(max_length=400)] = ""
 
 
-class PasswordIn(_Body):
-    """A password."""
+class PasswordIn(Body):
+    """A new password."""
 
     password: Password
 
 
-class ConfirmIn(_Body):
+class ConfirmIn(Body):
     """The password, once more."""
 
     password: Annotated[str, StringConstraints(min_length=1, max_length=200)]
 
 
 @router.post("/users", status_code=201, **describe_answer(UserOut, 201, "added"))
-async def add_user(context: Ctx, principal: Administrator, body: UserIn) -> dict[str, Any]:
+def add_user(context: Ctx, principal: Administrator, body: UserIn) -> dict[str, Any]:
     """Add a person; the default scopes are a clinician's."""
-    row = await context.people.add(body.name, body.password, body.scopes, principal.name)
+    row = context.people.add(body.name, body.password, body.scopes, principal.name)
     return {"name": row.name, "scopes": body.scopes, "created_utc": row.created_utc}
 
 
@@ -94,19 +81,10 @@ def list_users(context: Ctx, _principal: Administrator) -> list[dict[str, Any]]:
 
 
 @router.put("/users/{name}/password", status_code=204)
-async def set_password(
-    context: Ctx, principal: Administrator, name: str, tags: UserVersion, body: PasswordIn
-) -> Response:
+def set_password(context: Ctx, principal: Administrator, name: str, tags: UserVersion, body: PasswordIn) -> Response:
     """A new password; the person's sessions end. One that changes its own goes on under the cookie of the answer."""
-    return await renew_password(context, principal, name, body.password, Response(status_code=204), tags)
-
-
-async def renew_password(
-    context: Context, principal: Principal, name: str, password: str, answer: Response, tags: Tags | None = None
-) -> Response:
-    """Change it; the answer carries the cookie of the session that made the change, where it is the person's own."""
-    cookie = await context.people.change_password(name, password, principal, tags)
-    if cookie is not None:
+    answer = Response(status_code=204)
+    if (cookie := context.people.change_password(name, body.password, principal, tags)) is not None:
         set_cookie(context, answer, cookie)
     return answer
 
@@ -130,45 +108,40 @@ async def sign_in(
     """Sign in with name and password, or a token (JSON or a form); the session is a cookie. 429 after wrong tries."""
     same_origin(request)
     form = "form" in request.headers.get("content-type", "")
-    credentials = await _read_sign_in(request, form)
+    try:
+        if form:
+            sent = SignIn.model_validate(dict(await request.form()))
+        else:
+            sent = SignIn.model_validate_json(await request.body())
+    except (ValidationError, TypeError):
+        raise unauthorized("Send `name` and `password`, or `token`.") from None
     address = request.client.host if request.client else ""
-    if credentials.token.strip():
-        cookie = await asyncio.to_thread(context.auth.sign_in, credentials.token.strip(), address)
+    if sent.token.strip():
+        cookie = await run_in_threadpool(context.auth.sign_in, sent.token.strip(), address)
     else:
-        cookie = await context.people.sign_in(credentials.name.strip(), credentials.password, address)
-    principal = await asyncio.to_thread(context.auth.cookie, cookie)
-    answer: Response
+        cookie = await run_in_threadpool(context.people.sign_in, sent.name.strip(), sent.password, address)
     if form:
-        answer = RedirectResponse(local(next), 303)
+        answer: Response = RedirectResponse(local(next), 303)
     else:
+        principal = await run_in_threadpool(context.auth.cookie, cookie)
         scopes = sorted(principal.scopes)
         answer = JSONResponse({"name": principal.name, "scopes": scopes, "csrf": principal.csrf}, 201)
     set_cookie(context, answer, cookie)
     return answer
 
 
-async def _read_sign_in(request: Request, form: bool) -> SignIn:
-    try:
-        if not form:
-            return SignIn.model_validate_json(await request.body())
-        sent = await request.form()
-        return SignIn(**{name: str(sent.get(name) or "") for name in SignIn.model_fields})
-    except (ValidationError, ValueError):
-        raise unauthorized("Send `name` and `password`, or `token`.") from None
-
-
 @router.post("/sessions/confirm", status_code=204)
-async def confirm(context: Ctx, principal: Anyone, body: ConfirmIn) -> None:
+def confirm(context: Ctx, principal: Anyone, body: ConfirmIn) -> None:
     """The password once more, before a model is approved."""
-    await context.people.confirm(principal, body.password)
+    context.people.confirm(principal, body.password)
 
 
 @router.post("/sessions/lock", status_code=204)
-async def lock(context: Ctx, principal: Anyone) -> None:
+def lock(context: Ctx, principal: Anyone) -> None:
     """Lock this session: until it is unlocked every request with it is refused, but for stop."""
     if principal.page_session is None:
         raise ApiError(409, "no-session", "There is nothing to lock", "A token has no session.")
-    await asyncio.to_thread(context.auth.idle.lock, principal.page_session.hash, principal.name)
+    context.auth.idle.change(principal.page_session.hash, True, principal.name)
 
 
 @router.post("/sessions/acted", status_code=204)
@@ -177,18 +150,17 @@ async def acted(_principal: Anyone) -> None:
 
 
 @router.post("/sessions/unlock", status_code=204)
-async def unlock(context: Ctx, principal: EvenLocked, body: ConfirmIn) -> None:
+def unlock(context: Ctx, principal: EvenLocked, body: ConfirmIn) -> None:
     """Unlock this session by its person's password, or by the token that it was opened with."""
-    await context.people.unlock(principal, body.password)
+    context.people.unlock(principal, body.password)
 
 
 @router.delete("/sessions/current", status_code=204)
-def sign_out(context: Ctx, request: Request, _principal: EvenLocked) -> None:
+def sign_out(context: Ctx, principal: EvenLocked) -> None:
     """Sign out."""
-    cookie = request.cookies.get(context.auth.cookie_name)
-    if cookie is None:
+    if principal.page_session is None:
         raise NotFoundError("session", "current", "A token has none; DELETE /v1/tokens/{id} revokes it.")
-    context.auth.sign_out(cookie)
+    context.auth.sign_out(principal.page_session.hash)
 
 
 @router.post("/participants/{code}/keys", status_code=201, **describe_answer(KeyOut, 201, "made"))
@@ -202,19 +174,15 @@ def participant_key(
     """
     text, row, version = keys.make(context, principal, code, body, tags)
     response.headers["ETag"] = f'"{version}"'
-    key_fields = {
-        name: getattr(row, name) for name in ("name", "prefix", "scopes", "expires_utc", "participant", "plan")
-    }
-    return {"key": text, "id": row.hash[:16], **key_fields}
+    fields = ("name", "prefix", "scopes", "expires_utc", "participant", "plan")
+    return {"key": text, "id": row.hash[:16], **{name: getattr(row, name) for name in fields}}
 
 
 @router.delete("/participants/{code}/keys/{key_id}", status_code=204)
 def revoke_participant_key(context: Ctx, principal: Tester, code: str, key_id: str) -> None:
     """Revoke a key of a participant; its trial ends at once."""
-    keys.revoke(context, code, key_id, principal.name)
-
-
-token_router = APIRouter(prefix="/v1", tags=["administration"], responses=PROBLEM)
+    if not controllers.revoke_key(context.auth, code, key_id, principal.name):
+        raise NotFoundError("key", key_id, f"The page of {code} lists its keys.")
 
 
 @token_router.post("/tokens", status_code=201, **describe_answer(TokenOut, 201, "issued"))

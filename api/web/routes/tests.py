@@ -136,7 +136,7 @@ def _admit(socket: WebSocket, context: Context) -> Principal:
     if principal.csrf is not None:
         same_origin(socket)
     if principal.page_session is not None:
-        context.auth.idle.watches(principal.page_session.hash)
+        context.auth.idle.acted(principal.page_session.hash)
     return principal
 
 
