@@ -38,46 +38,37 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 
-FORGIVEN = (SQLAlchemyError, OSError)
-"""Errors of regular work that are logged; the work is done again at the next interval."""
-
-
 class Context:
     """Everything a route of the service may need.
 
-    `worker`: makes a worker process. `lock`: held; let go at the end.
+    `worker`: makes a worker process. `lock`: of the data folder and the database, which is held.
     """
 
     def __init__(self, settings: Settings, clock: Clock, worker: Callable[..., Worker], lock: ServiceLock) -> None:
         make_folders(settings)
         if settings.time_zone:
             set_zone(settings.time_zone)
-        store = Store(settings.database)
-        self.clock, self.store, self.started_s = clock, store, time.monotonic()
-        self.settings, self.lock = settings, lock
+        self.settings, self.clock, self.lock, self.started_s = settings, clock, lock, time.monotonic()
+        store = self.store = Store(settings.database)
         guesses = self.guesses = Guesses(clock)
-        idle = IdleLock(store, clock, settings.idle_lock_min)
-        self.auth = Auth(store, clock, guesses, idle, settings.session_hours)
-        self.drawn_token = self.auth.first_administrator(
-            settings.admin_token.get_secret_value() if settings.admin_token else None
-        )
+        self.auth = Auth(store, clock, guesses, IdleLock(store, clock, settings.idle_lock_min), settings.session_hours)
+        given = settings.admin_token.get_secret_value() if settings.admin_token else None
+        self.drawn_token = self.auth.first_administrator(given)
         self.people = People(store, clock, self.auth, guesses)
         self.versions = Versions(store, clock)
-        rig = self.rig = RigClient(settings.rig_socket, clock)
-        pool = self.pool = Pool(settings.workers, worker, background=True)
-        self.analyses = Analyses(store, clock, pool, self.versions, settings)
+        self.rig = RigClient(settings.rig_socket, clock)
+        self.pool = Pool(settings.workers, worker, background=True)
+        self.analyses = Analyses(store, clock, self.pool, self.versions, settings)
         self.tracked = TrackedVersions(store, clock, self.versions)
         self.limits_lock = asyncio.Lock()
         """Held by a change of limits, and by a calibration or test while it is sent by them: once a change is answered,
         nothing begins with the limits of before."""
-        self.keys_lock = asyncio.Lock()
-        """Trials of controllers' keys are counted and begun one after the other."""
         # processes of their own: they remember a test or a trial, and nothing else keeps them busy
         adviser, tracker = Pool(1, worker), Pool(1, worker)
-        self.stops, self.stop_rights = Stops(store, clock, rig), StopRights(store.secret("stop-right"), clock)
-        trials = Trials(rig, self.tracked, tracker)
-        self.runner = Runner(self.analyses, rig, self.stops, trials, adviser, self.limits_lock)
-        self.trend, self.jobs = Trend(store), Jobs(pool)
+        self.stops, self.stop_rights = Stops(store, clock, self.rig), StopRights(store.secret("stop-right"), clock)
+        trials = Trials(self.rig, self.tracked, tracker)
+        self.runner = Runner(self.analyses, self.rig, self.stops, trials, adviser, self.limits_lock)
+        self.trend, self.jobs = Trend(store), Jobs(self.pool)
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self) -> None:
@@ -94,7 +85,7 @@ class Context:
         self._tasks = [asyncio.create_task(_repeat(every_s, work)) for every_s, work in regular]
 
     async def close(self) -> None:
-        """Let everything go."""
+        """Release all resources."""
         for part in (self.runner, self.stops, self.jobs, self.pool, self.rig):
             await part.close()
         for task in self._tasks:
@@ -107,12 +98,12 @@ class Context:
 
 
 async def _repeat(every_s: float, work: Callable[[], object]) -> None:
-    """Do the work in a thread, at this interval, until it is cancelled."""
+    """Do the work in a thread, at this interval; an error is logged."""
     while True:
         await asyncio.sleep(every_s)
         try:
             await asyncio.to_thread(work)
-        except FORGIVEN:
+        except (SQLAlchemyError, OSError):
             log.exception("regular work failed; it is done again at the next interval")
 
 
@@ -130,7 +121,7 @@ def build(settings: Settings, worker: Callable[..., Worker] = Worker, lock: Serv
 
 
 def make_folders(settings: Settings) -> None:
-    """Folders for their owner only; the rig may share that of recordings with a group."""
+    """Make folders for their owner only; the rig may share that of recordings with a group."""
     owner_only.close(owner_only.folder(settings.recordings_dir), 0o770)
     owner_only.close(owner_only.folder(settings.recordings_dir / uploads.PARTS), 0o700)
     owner_only.close(settings.logs_dir, 0o700)

@@ -8,7 +8,6 @@ import secrets
 from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat, StringConstraints
-from sqlalchemy import select
 
 from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.models.places import site_of
@@ -18,15 +17,21 @@ from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.trials import SEQUENCE
-from stimrig.api.store import Store, locking
+from stimrig.api.store import locking
 from stimrig.api.store.audit import digest
 from stimrig.api.store.locking import ChangedError, Tags
 from stimrig.api.store.tables import Participant, Test, Token
 
 LONGEST_S = 300.0
-HALTED = "The rig is stopped. A person looks at participant and rig and re-arms it."
-NEUTRAL = {"rig-busy": "The rig is in use. Wait until it is free.", "rig-latched": HALTED, "rig-uncertain": HALTED}
+HALTED = "The rig is stopped", "A person looks at participant and rig and re-arms it."
+NEUTRAL = {
+    "rig-busy": ("Another test is running", "The rig is in use. Wait until it is free."),
+    "rig-latched": HALTED,
+    "rig-uncertain": HALTED,
+}
 """Messages to a key, in place of texts that may name another participant."""
+LIMITED = ("current_ma", "max_pulse_width_us")
+"""Limits that a plan narrows."""
 SAME_RATE = 1e-3
 """Share by which a pulse rate may differ from the model's: what writing and reading a number leaves."""
 MOST_TRIALS = 200
@@ -49,7 +54,7 @@ class KeyFor(PlanIn):
 
 def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
     """Return the plan to store with the key. Raises ApiError: 422 wider than the participant's limits."""
-    for name in ("current_ma", "max_pulse_width_us"):
+    for name in LIMITED:
         value, limit = getattr(plan, name), participant.profile.get(name)
         if limit is None or not value <= limit:
             unit = LIMITS[name].unit
@@ -58,9 +63,7 @@ def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
     return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
 
 
-async def start(
-    runner: Runner, lock: asyncio.Lock, store: Store, principal: Principal, body: TestIn, tags: Tags | None
-) -> Test:
+async def start(runner: Runner, principal: Principal, body: TestIn, tags: Tags | None) -> Test:
     """Start a test; where a controller's key asks for it, within its plan.
 
     `tags`: versions of the participant; of a key, those of the model that the trial was planned with.
@@ -70,48 +73,21 @@ async def start(
     """
     if principal.participant is None:
         return await runner.start(body, Requester(principal.name, principal.token_hash, tags))
-    async with lock:  # two requests must not both use the last remaining trial
+    async with runner.keys_lock:  # two requests must not both use the last remaining trial
         try:
             _refuse_kind(principal, body)
-            participant: Participant = await asyncio.to_thread(store.get, Participant, principal.participant)
+            participant: Participant = await asyncio.to_thread(runner.store.get, Participant, principal.participant)
             model = await asyncio.to_thread(_model_sent, runner, body, tags or ())
-            body = await _within_plan(runner, store, principal, body, participant)
+            body = await _within_plan(runner, principal, body, participant)
             version = (str(participant.version),)  # the version that plan and model were checked against
             return await runner.start(body, Requester(principal.name, principal.token_hash, version, model))
         except ChangedError:
             raise trial_overtaken() from None
         except ApiError as error:
-            if error.code not in NEUTRAL:
-                raise
-            title = "Another test is running" if error.code == "rig-busy" else error.title
-            raise ApiError(error.status, error.code, title, NEUTRAL[error.code]) from None
-
-
-async def _within_plan(
-    runner: Runner, store: Store, principal: Principal, body: TestIn, participant: Participant
-) -> TestIn:
-    """Return the test narrowed to the plan's limits; refuse one beyond the plan."""
-    plan = principal.plan or {}
-    begun = (Test.requested_by == principal.name, Test.state != "refused")  # tests that the rig refused do not count
-    if len(await asyncio.to_thread(store.all, Test, *begun)) >= plan["trials"]:
-        raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
-    limits: dict[str, Any] = {}
-    for name in ("current_ma", "max_pulse_width_us"):
-        requested = body.profile.sent().get(name) if body.profile else None
-        unit = LIMITS[name].unit
-        if requested is not None and not requested <= plan[name]:
-            raise beyond(f"{name} {requested:g} {unit} is above the plan's {plan[name]:g} {unit}")
-        limits[name] = min(
-            value for value in (requested, plan[name], participant.profile.get(name)) if value is not None
-        )
-    narrowed = body.model_copy(update={"profile": (body.profile or ProfileIn()).model_copy(update=limits)})
-    preview = await runner.preview(narrowed)
-    if not preview["duration_s"] <= plan["max_duration_s"] + 1e-9:
-        raise beyond(f"{preview['duration_s']:g} s is longer than the plan's {plan['max_duration_s']:g} s")
-    widest_us = max(preview["pulse_width_us"], default=0.0)
-    if not widest_us <= plan["max_pulse_width_us"]:
-        raise beyond(f"A pulse of {widest_us:g} µs is above the plan's {plan['max_pulse_width_us']:g} µs")
-    return narrowed
+            if error.code in NEUTRAL:
+                error.title, error.detail = NEUTRAL[error.code]
+                error.extra.clear()
+            raise
 
 
 def _refuse_kind(principal: Principal, body: TestIn) -> None:
@@ -121,8 +97,7 @@ def _refuse_kind(principal: Principal, body: TestIn) -> None:
         raise beyond(f"The kind is {body.kind!r}. Send kind {SEQUENCE!r}")
     if body.segments is None:
         raise beyond("No segments were sent. Send the trial's segments")
-    wrong = [name for name in ("joins", "ran_by") if getattr(body, name) is not None]
-    if wrong:
+    if wrong := [name for name in ("joins", "ran_by") if getattr(body, name) is not None]:
         raise beyond(f"A key sends no {wrong[0]}. Leave it out")
 
 
@@ -136,16 +111,37 @@ def _model_sent(runner: Runner, body: TestIn, sent: Tags) -> str:
     served = runner.versions.served(body.participant)
     if served is None:
         raise unapproved(body.participant)
-    tags = [
-        document.etag.strip('"') for document in (served, runner.trials.tracked.served(body.participant)) if document
-    ]
-    if (tag := next((tag for tag in tags if tag in sent), None)) is None:
+    tracked = runner.trials.tracked.served(body.participant)
+    tag = next((tag for each in (served, tracked) if each and (tag := each.etag.strip('"')) in sent), None)
+    if tag is None:
         raise trial_overtaken()
     own_hz = float(json.loads(served.body)["pulse_rate_hz"])
     if not abs(body.pulse_rate_hz - own_hz) <= SAME_RATE * own_hz:
         mismatch = f"pulse_rate_hz {body.pulse_rate_hz:g} is not the approved model's {own_hz:g}"
         raise beyond(f"{mismatch} (40, where none is sent). Send the model's pulse_rate_hz")
     return tag
+
+
+async def _within_plan(runner: Runner, principal: Principal, body: TestIn, participant: Participant) -> TestIn:
+    """Return the test narrowed to the plan's limits; refuse one beyond the plan."""
+    plan = principal.plan or {}
+    begun = (Test.requested_by == principal.name, Test.state != "refused")  # tests that the rig refused do not count
+    if len(await asyncio.to_thread(runner.store.all, Test.id, *begun)) >= plan["trials"]:
+        raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
+    profile, sent = body.profile or ProfileIn(), body.profile.sent() if body.profile else {}
+    for name in LIMITED:
+        if not sent.get(name, 0.0) <= plan[name]:
+            unit = LIMITS[name].unit
+            raise beyond(f"{name} {sent[name]:g} {unit} is above the plan's {plan[name]:g} {unit}")
+    limits = {name: min(sent.get(name, plan[name]), plan[name], participant.profile[name]) for name in LIMITED}
+    narrowed = body.model_copy(update={"profile": profile.model_copy(update=limits)})
+    preview = await runner.preview(narrowed)
+    if not preview["duration_s"] <= plan["max_duration_s"] + 1e-9:
+        raise beyond(f"{preview['duration_s']:g} s is longer than the plan's {plan['max_duration_s']:g} s")
+    widest_us = max(preview["pulse_width_us"], default=0.0)
+    if not widest_us <= plan["max_pulse_width_us"]:
+        raise beyond(f"A pulse of {widest_us:g} µs is above the plan's {plan['max_pulse_width_us']:g} µs")
+    return narrowed
 
 
 def unapproved(participant: str) -> ApiError:
@@ -187,46 +183,28 @@ def make_key(
 ) -> tuple[str, Token, int]:  # fmt: skip
     """Make a key that ends with its day: its text, shown this once, its row, and the participant's new version.
 
-    Parameters
-    ----------
-    name : str
-        What people call the controller; the row's name is made unique, since tests are counted by it.
-    participant : str
-        The only one that it opens.
-    plan : dict
-        `current_ma`, `max_pulse_width_us`, `max_duration_s`, `trials`.
-    by : str
-        Who makes it.
-    made_by : str, optional
-        Hash of that one's token: once it is revoked or has expired, the key opens nothing.
-    tags : tuple of str
-        Versions of the participant that it is made on.
+    `name`: of the controller; the row's is made unique, since tests are counted by it. `made_by`: hash of the token of
+    who makes it: once that is revoked or has expired, the key opens nothing. `tags`: versions of the participant.
     """
     text, now = f"stimrig_{secrets.token_urlsafe(32)}", auth.clock.utc()
-    unique_name = f"{name} ({digest(text)[:6]})"
+    row = Token(
+        hash=digest(text), prefix=text[:12], name=f"{name} ({digest(text)[:6]})", created_utc=now,
+        participant=participant, plan=plan, scopes=[str(scope) for scope in KEY_SCOPES], made_by=made_by,
+        expires_utc=auth.clock.end_of_day_utc(),
+    )  # fmt: skip
     with auth.store.write() as session:
         person = require_found(session.get(Participant, participant), "participant", participant)
         locking.check(session, person, tags)
-        row = Token(
-            hash=digest(text), prefix=text[:12], name=unique_name, created_utc=now, participant=participant, plan=plan
-        )
-        row.scopes, row.made_by, row.expires_utc = (
-            [str(scope) for scope in KEY_SCOPES],
-            made_by,
-            auth.clock.end_of_day_utc(),
-        )
         session.add(row)
         bound = {"participant": participant, "plan": plan, "until": row.expires_utc}
-        locking.write(session, person, now, by, "issue token", unique_name, scopes=row.scopes, **bound)
+        locking.write(session, person, now, by, "issue token", row.name, scopes=row.scopes, **bound)
     return text, row, person.version
 
 
 def keys_of(auth: Auth, participant: str) -> list[dict[str, Any]]:
     """Today's keys of a participant, newest first; `id` is for `revoke`, `state` says whether it opens anything."""
-    with auth.store.read() as session:
-        today = Token.created_utc >= auth.clock.start_of_day_utc()
-        of_participant = select(Token).where(Token.participant == participant, today)
-        rows = list(session.scalars(of_participant.order_by(Token.created_utc.desc())))
+    today = Token.participant == participant, Token.created_utc >= auth.clock.start_of_day_utc()
+    rows = auth.store.all(Token, *today, order=Token.created_utc.desc())
     return [{"id": row.hash[:16], "state": _key_state(auth, row), **row.as_dict()} for row in rows]
 
 

@@ -59,6 +59,8 @@ class Runner(Playing):
         self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint)
         self.lifecycle = Lifecycle(analyses, rig, self.kinds, self.hub)
         self.document, self.documents = self.lifecycle.document, self.lifecycle.documents
+        self.keys_lock = asyncio.Lock()
+        """Trials of controllers' keys are counted and begun one after the other."""
         self._tasks = Tasks(log)
         rig.listeners.append(self._on_news)
 

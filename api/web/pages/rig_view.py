@@ -18,14 +18,14 @@ router = APIRouter(include_in_schema=False)
 @router.get("/rig/now")
 async def rig_now(request: Request, context: Ctx) -> Response:
     """Return the state for the bar of every page, also of one whose session has ended."""
-    principal, locked, known = None, False, True
+    principal, locked, signed_in = None, False, False
     try:
         principal = await context.auth.authenticate(request)
+        signed_in = True
     except ApiError as error:  # the state is told all the same
         locked = error.code == LOCKED[0]
     except SQLAlchemyError:
-        known = False
-    signed_in = principal is not None if known else None
+        signed_in = None
     return JSONResponse({**render.rig_now(context, principal), "signed_in": signed_in, "locked": locked})
 
 

@@ -11,18 +11,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.services import rig as services
 from stimrig.api.sessions.requests import StopIn, TestIn
 from stimrig.api.sessions.stops import StopResult
-from stimrig.api.web.dependencies import (
-    PROBLEM,
-    Anyone,
-    Context,
-    Ctx,
-    LatchVersion,
-    LiveReader,
-    MayStop,
-    Rearmer,
-    Tester,
-)
-from stimrig.api.web.guards import Press
+from stimrig.api.web.dependencies import PROBLEM, Anyone, Ctx, LatchVersion, LiveReader, MayStop, Rearmer, Tester
 from stimrig.api.web.middleware import wants_html
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import PreviewOut, RigOut, SequencesOut, StoppedOut
@@ -53,25 +42,20 @@ async def stop(request: Request, context: Ctx, press: MayStop) -> Response:
 
     200 only on the rig's evidence that stimulation has stopped; otherwise a problem that says so.
     """
-    if wants_html(request):
-        return await stop_on_page(request, context, press)
-    current = context.runner.current
-    evidence = await context.stops.stop(press.reason, press.by, current.test_id if current else "rig")
-    rig = {} if press.by_key else {"rig": services.rig_state(context)}
-    return JSONResponse({"stopped": evidence.confirmed, "evidence": evidence.model_dump(), **rig})
-
-
-async def stop_on_page(request: Request, context: Context, press: Press) -> Response:
-    """Stop, and lead to the page that tells what came of it: that one can be loaded again and stops nothing."""
-    current = context.runner.current
+    test_id = context.runner.current.test_id if context.runner.current else None
     answer: StopEvidence | ApiError
     try:
-        answer = await context.stops.stop(press.reason, press.by, current.test_id if current else "rig")
+        answer = await context.stops.stop(press.reason, press.by, test_id or "rig")
     except ApiError as error:
         answer = error
-    right, test_id = getattr(request.state, "stop_right", None), current.test_id if current else None
-    result = StopResult(press.by, press.reason, context.clock.utc(), test_id, right, answer)
-    return RedirectResponse(f"/stopped/{context.stops.add(result)}", 303)
+    if wants_html(request):  # a page of the result, which can be loaded again and stops nothing
+        right = getattr(request.state, "stop_right", None)
+        result = StopResult(press.by, press.reason, context.clock.utc(), test_id, right, answer)
+        return RedirectResponse(f"/stopped/{context.stops.add(result)}", 303)
+    if isinstance(answer, ApiError):
+        raise answer
+    rig = {} if press.by_key else {"rig": services.rig_state(context)}
+    return JSONResponse({"stopped": answer.confirmed, "evidence": answer.model_dump(), **rig})
 
 
 @router.post("/rearm", **describe_answer(RigOut))

@@ -51,7 +51,7 @@ async def start_test(
 
     A controller's key, which reads no participant, sends the `ETag` of `GET /v1/participants/{code}/model`.
     """
-    row = await controllers.start(context.runner, context.keys_lock, context.store, principal, body, tags)
+    row = await controllers.start(context.runner, principal, body, tags)
     response.headers["Location"] = f"/v1/tests/{row.id}"
     return await asyncio.to_thread(context.runner.document, row)
 
@@ -111,21 +111,20 @@ async def live(socket: WebSocket, test_id: str) -> None:
     """
     context = context_of(socket)
     await socket.accept()
-    try:
-        principal = await asyncio.to_thread(_admit, socket, context)
-        row = await asyncio.to_thread(tests.find, context, test_id)
-        await _watched(socket, context, row, by_key=principal.participant is not None)
-    except ApiError as error:
-        with contextlib.suppress(WebSocketDisconnect, RuntimeError, TimeoutError):
-            async with asyncio.timeout(GOODBYE_S):
-                await socket.send_json({"type": "problem", "problem": error.body(socket.url.path)})
-                await socket.close(4000 + error.status, error.title)
-    except (WebSocketDisconnect, RuntimeError):
-        pass
+    with contextlib.suppress(WebSocketDisconnect, RuntimeError):
+        try:
+            principal = await asyncio.to_thread(_admit, socket, context)
+            row = await asyncio.to_thread(tests.find, context, test_id)
+            await _watch(socket, context, row, by_key=principal.participant is not None)
+        except ApiError as error:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(GOODBYE_S):
+                    await socket.send_json({"type": "problem", "problem": error.body(socket.url.path)})
+                    await socket.close(4000 + error.status, error.title)
 
 
 def _admit(socket: WebSocket, context: Context) -> Principal:
-    """Who may watch; a live view of a running test holds the session's lock off.
+    """Return who watches; a live view of a running test keeps the session from being locked as idle.
 
     Raises ApiError: 401 no valid token or session, or it is locked; 403 without the scope, or from another site's page.
     """
@@ -140,28 +139,28 @@ def _admit(socket: WebSocket, context: Context) -> Principal:
     return principal
 
 
-async def _watched(socket: WebSocket, context: Context, row: Test, by_key: bool) -> None:
+async def _watch(socket: WebSocket, context: Context, row: Test, by_key: bool) -> None:
     """Send until the test has ended or the page has gone. Raises ApiError once who watches no longer may."""
     queue = context.runner.hub.open()
-    ends = [asyncio.create_task(work) for work in (_until_gone(socket), _until_refused(socket, context))]
-    sending = asyncio.create_task(_pump(socket, context, row, queue, by_key))
+    works = _send(socket, context, row, queue, by_key), _until_gone(socket), _until_refused(socket, context)
+    tasks = [asyncio.create_task(work) for work in works]
     try:
-        await asyncio.wait([sending, *ends], return_when=asyncio.FIRST_COMPLETED)
-        for task in (*ends, sending):
-            if task.done():
+        ended, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        for task in reversed(tasks):  # why it ends early comes first
+            if task in ended:
                 task.result()
-        if sending.done():
+        if tasks[0] in ended:
             await socket.close()
     finally:
-        for task in (sending, *ends):
+        for task in tasks:
             task.cancel()
-        await asyncio.gather(sending, *ends, return_exceptions=True)
+        await asyncio.gather(*tasks, return_exceptions=True)
         context.runner.hub.close(queue)
 
 
-async def _pump(
+async def _send(
     socket: WebSocket, context: Context, row: Test, queue: asyncio.Queue[dict[str, Any]], by_key: bool
-) -> None:  # fmt: skip
+) -> None:
     history = queue.get_nowait()
     if history["test_id"] == row.id:
         await socket.send_json(history)
@@ -169,24 +168,31 @@ async def _pump(
     await socket.send_json(_test_message(document))
     while not document["done"]:
         message = await _next(queue) or {"type": "idle", "rig_connected": context.rig.connected}
-        if message["type"] == "test":
+        kind = message["type"]
+        if kind == "test":
             if message["test"]["id"] != row.id:
                 continue
             document, message = message["test"], _test_message(message["test"])
-        if message["type"] in ("live", "adaptive", "joint") and message["test_id"] != row.id:
-            continue
-        if by_key and message["type"] == "state" and message["rig"]["test_id"] != row.id:
+        elif kind in ("live", "adaptive", "joint"):
+            if message["test_id"] != row.id:
+                continue
+            if kind == "joint":  # what is still to be done, in words
+                message = {**message, "words": missing_words((message["coverage"] or {}).get("missing"))}
+        elif kind == "state" and by_key and message["rig"]["test_id"] != row.id:
             continue  # the rig is with somebody else, or says why it stopped then
-        if message["type"] == "joint":
-            message = _what_is_missing(message)
         await socket.send_json(message)
 
 
-async def _next(queue: asyncio.Queue[dict[str, Any]]) -> dict[str, Any] | None:
-    """The next message; None after a second without one.
+def _test_message(document: dict[str, Any]) -> dict[str, Any]:
+    """Return the message of how a test stands; `words`: what a page shows of it."""
+    work = (document["identification"] or {}).get("text") or ""
+    return {"type": "test", "test": document, "words": {"reason": document["reason"], "work": work}}
 
-    Not by `asyncio.wait_for`: in Python 3.11 it takes a message that comes at the moment of a cancellation for an
-    answer, and the cancellation is lost. A channel that was to be closed then stayed open.
+
+async def _next(queue: asyncio.Queue[dict[str, Any]]) -> dict[str, Any] | None:
+    """Return the next message; None after a second without one.
+
+    Not by `asyncio.wait_for`, which in Python 3.11 may lose a cancellation: the channel then stayed open.
     """
     try:
         async with asyncio.timeout(1.0):
@@ -195,28 +201,17 @@ async def _next(queue: asyncio.Queue[dict[str, Any]]) -> dict[str, Any] | None:
         return None
 
 
+async def _until_gone(socket: WebSocket) -> None:
+    with contextlib.suppress(RuntimeError):
+        while (await socket.receive())["type"] != "websocket.disconnect":
+            pass
+
+
 async def _until_refused(socket: WebSocket, context: Context) -> None:
-    """Look again and again whether who watches still may: after a sign-out, a lock or a revoked token nobody does."""
+    """Check again and again whether who watches still may: not after a sign-out, a lock or a revoked token."""
     while True:
         await asyncio.sleep(LOOK_S)
         try:
             await asyncio.to_thread(_admit, socket, context)
         except SQLAlchemyError:  # a database that is busy or gone has refused nobody
             log.warning("whether a live channel is still allowed could not be read")
-
-
-def _test_message(document: dict[str, Any]) -> dict[str, Any]:
-    """How the test stands; `words`: what a page shows of it."""
-    work = (document["identification"] or {}).get("text") or ""
-    return {"type": "test", "test": document, "words": {"reason": document["reason"], "work": work}}
-
-
-def _what_is_missing(message: dict[str, Any]) -> dict[str, Any]:
-    """Add to the state of a guided test what is still to be done."""
-    return {**message, "words": missing_words((message["coverage"] or {}).get("missing"))}
-
-
-async def _until_gone(socket: WebSocket) -> None:
-    with contextlib.suppress(RuntimeError):
-        while (await socket.receive())["type"] != "websocket.disconnect":
-            pass
