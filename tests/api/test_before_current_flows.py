@@ -11,7 +11,7 @@ import pytest
 
 from stimrig.api.sessions.previews import CAPACITY_OF_ONE, VALID_S
 from stimrig.api.store.tables import Participant
-from stimrig.rig import messages as m
+from tests.api import fake_rig
 from tests.api.conftest import Service, SetClock, run_test, wait_done
 from tests.api.forms import find, press
 from tests.api.test_forms import tab as tab
@@ -110,8 +110,8 @@ def test_a_rig_set_up_anew_meanwhile_is_looked_at_again(
     tab: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     shown = tab.get(WHERE).text
-    widths, segments = service.rig._widths(m.TestPlan(test_id="T", participant="P", profile=m.Profile()))
-    monkeypatch.setattr(service.rig, "_widths", lambda _plan: ([*widths, 300.0], segments))
+    widths, segments = fake_rig.default_widths()
+    monkeypatch.setattr(fake_rig, "widths_of", lambda _plan: ([*widths, 300.0], segments))
     assert "would now play something else" in problem(start(tab, shown), 409)["detail"]
     assert service.rig.starts == 0 and service.context.runner.current is None
 

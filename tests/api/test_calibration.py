@@ -180,11 +180,11 @@ def test_a_change_waits_for_the_step_on_its_way_and_the_next_one_sees_it(
     order: list[str] = []
     play: Any = service.rig._on_calibrate_step
 
-    async def slow(request: Any, writer: Any) -> Any:
+    async def slow(request: Any) -> Any:
         asked.set()
         await asyncio.to_thread(go.wait, 20)
         order.append("train")
-        return await play(request, writer)
+        return await play(request)
 
     monkeypatch.setattr(service.rig, "_on_calibrate_step", slow)
 

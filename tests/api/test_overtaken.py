@@ -96,11 +96,11 @@ class HeldRig:
         self.reached, self.free = threading.Event(), threading.Event()
         begin = service.rig._on_start
 
-        async def slowly(request: Any, writer: Any) -> Any:
+        async def slowly(request: Any) -> Any:
             self.reached.set()
             while not self.free.is_set():
                 await asyncio.sleep(0.01)
-            return await begin(request, writer)
+            return await begin(request)
 
         monkeypatch.setattr(service.rig, "_on_start", slowly)
 
