@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import os
 import shutil
 import ssl
 import tempfile
@@ -98,9 +97,7 @@ def no_database_on_the_event_loop() -> Iterator[None]:
 
     def off_the_loop(ask: Callable[..., Any]) -> Callable[..., Any]:
         def asked(store: Store) -> Any:
-            if (
-                threading.current_thread() is not threading.main_thread()
-            ):  # there playwright's loop runs, not a service's
+            if threading.current_thread() is not threading.main_thread():  # there playwright's loop runs
                 with pytest.raises(RuntimeError):
                     asyncio.get_running_loop()
             return ask(store)
@@ -221,9 +218,7 @@ class Server:
     def __enter__(self) -> str:
         self.thread = threading.Thread(target=self.server.run, daemon=True)
         self.thread.start()
-        limit = time.monotonic() + PATIENCE_S
-        while not self.server.up.wait(0.5):
-            assert time.monotonic() < limit and self.thread.is_alive()
+        soon(lambda: self.server.up.wait(0.5) or not self.thread.is_alive(), PATIENCE_S)
         port = self.server.servers[0].sockets[0].getsockname()[1]
         return f"http://127.0.0.1:{port}"
 
@@ -354,20 +349,14 @@ def s3() -> Iterator[Any]:
         "AWS_ACCESS_KEY_ID": "testing", "AWS_SECRET_ACCESS_KEY": "testing", "AWS_DEFAULT_REGION": "us-east-1",
         "AWS_ENDPOINT_URL": f"http://{host}:{port}",
     }  # fmt: skip
-    kept = {name: os.environ.get(name) for name in given}
-    os.environ.update(given)
-    try:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in given.items():
+            patch.setenv(name, value)
         import s3fs
 
         s3fs.S3FileSystem.clear_instance_cache()  # one of another module would ask that one's server
         yield s3fs.S3FileSystem(anon=False)
-    finally:
-        server.stop()
-        for name, value in kept.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+    server.stop()
 
 
 @pytest.fixture(scope="module")
@@ -426,38 +415,24 @@ def soon(found: Callable[[], Any], limit_s: float = 60.0) -> Any:
 
 def wait_done(client: httpx.Client, test_id: str, limit_s: float = 120.0) -> dict[str, Any]:
     """Poll a test to its end."""
-    end = time.monotonic() + limit_s
-    while time.monotonic() < end:
-        document = client.get(f"/v1/tests/{test_id}").json()
-        if document["done"]:
-            return document
-        time.sleep(0.02)
-    raise AssertionError(f"not done: {document}")
+    return soon(lambda: (test := client.get(f"/v1/tests/{test_id}").json())["done"] and test, limit_s)
 
 
-def let_go(client: httpx.Client, limit_s: float = 20.0) -> bool:
-    """Whether the rig is soon free: a test is seen to be done a moment before that."""
-    end = time.monotonic() + limit_s
-    while client.get("/v1/rig").json()["holder"] is not None:
-        if time.monotonic() > end:
-            return False
-        time.sleep(0.02)
-    return True
+def let_go(client: httpx.Client) -> bool:
+    """Wait until the rig is free: a test is seen to be done a moment before that."""
+    return soon(lambda: client.get("/v1/rig").json()["holder"] is None, 20.0)
 
 
 def run_test(client: httpx.Client, participant: str, limit_s: float = 120.0) -> dict[str, Any]:
     """Start a test and follow it to its end; nobody looks at it on its way, so the rig is quick."""
-    rig = client.rig_thread.rig if hasattr(client, "rig_thread") else None  # type: ignore[attr-defined]
-    before = rig.speed if rig else 0.0
+    rig = client.rig_thread.rig  # type: ignore[attr-defined]
+    before, rig.speed = rig.speed, QUICK_SPEED
     try:
-        if rig:
-            rig.speed = QUICK_SPEED
         started = client.post("/v1/tests", json={"participant": participant})
         assert started.status_code == 202, started.text
         return wait_done(client, started.json()["id"], limit_s)
     finally:
-        if rig:
-            rig.speed = before
+        rig.speed = before
 
 
 def play_test(client: httpx.Client, code: str) -> dict[str, Any]:
