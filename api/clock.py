@@ -24,19 +24,15 @@ class Clock:
         """Now, as an ISO 8601 label."""
         return utc_label(self.unix_s())
 
-    def start_of_day_utc(self) -> str:
-        """The last midnight where the service stands, as an ISO 8601 label in UTC."""
-        return self._midnight_utc(0)
+    def start_of_day_utc(self, days: int = 0) -> str:
+        """The last midnight where the service stands, or so many days later, as an ISO 8601 label in UTC."""
+        today = datetime.fromtimestamp(self.unix_s()).date()
+        midnight = datetime.combine(today + timedelta(days=days), datetime.min.time())
+        return utc_label(midnight.astimezone().timestamp())
 
     def end_of_day_utc(self) -> str:
         """The next midnight where the service stands, as an ISO 8601 label in UTC."""
-        return self._midnight_utc(1)
-
-    def _midnight_utc(self, days: int) -> str:
-        """The midnight at which today began, or so many days later."""
-        today = datetime.fromtimestamp(self.unix_s()).astimezone().date()
-        midnight = datetime.combine(today + timedelta(days=days), datetime.min.time())
-        return utc_label(midnight.astimezone().timestamp())
+        return self.start_of_day_utc(1)
 
 
 def utc_label(unix_s: float) -> str:
@@ -46,12 +42,12 @@ def utc_label(unix_s: float) -> str:
 
 def unix_of(label: str) -> float:
     """Seconds since 1970 of an ISO 8601 label."""
-    return datetime.fromisoformat(label.replace("Z", "+00:00")).timestamp()
+    return datetime.fromisoformat(label).timestamp()
 
 
 def local_day(label: str) -> str:
     """A UTC label's day where the service stands: 2026-11-21."""
-    return datetime.fromtimestamp(unix_of(label)).astimezone().date().isoformat()
+    return datetime.fromtimestamp(unix_of(label)).date().isoformat()
 
 
 def set_zone(name: str) -> None:

@@ -6,7 +6,7 @@ from datetime import datetime, timedelta
 
 
 def _local(label: str) -> datetime:
-    return datetime.fromisoformat(label.replace("Z", "+00:00")).astimezone()
+    return datetime.fromisoformat(label).astimezone()
 
 
 def day(label: str | None, year: bool = True) -> str:
@@ -36,7 +36,7 @@ def clock(label: str | None) -> str:
 
 def zone(label: str) -> str:
     """Name the zone in which `when` writes at that time: UTC+1."""
-    offset = _local(label).utcoffset() or timedelta(0)
-    minutes = round(offset.total_seconds() / 60)
-    sign, (hours, rest) = "+" if minutes >= 0 else "−", divmod(abs(minutes), 60)
-    return "UTC" if not minutes else f"UTC{sign}{hours}" + (f":{rest:02d}" if rest else "")
+    offset = f"{_local(label):%z}"
+    hours, minutes = int(offset[1:3]), offset[3:5]
+    sign = "−" if offset[0] == "-" else "+"
+    return "UTC" if offset[1:] == "0000" else f"UTC{sign}{hours}" + ("" if minutes == "00" else f":{minutes}")

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError, version
+from importlib.metadata import version
 
 
 def software_version() -> str:
     """The installed distribution's version."""
-    try:
-        return version("stimrig")
-    except PackageNotFoundError:
-        return "0"
+    return version("stimrig")

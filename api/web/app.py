@@ -8,7 +8,6 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import cache
 from types import ModuleType
-from typing import Any
 
 from fastapi import APIRouter, FastAPI
 from starlette.routing import BaseRoute
@@ -20,15 +19,15 @@ from stimrig.api.settings import Settings
 from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.version import software_version
 from stimrig.api.web import openapi, pages, problems, routes
-from stimrig.api.web.middleware import BodyLimit, Headers, LookAgain, RequestId, StrictBody
+from stimrig.api.web.middleware import Boundary
 
 
 class Service(FastAPI):
-    """The application. Its headers are outermost: an unexpected error's answer has them, too."""
+    """The application."""
 
     def build_middleware_stack(self) -> ASGIApp:
-        """Starlette's, within the headers."""
-        return Headers(super().build_middleware_stack())
+        """Starlette's within the boundary: an unexpected error's answer has its headers, too."""
+        return Boundary(super().build_middleware_stack(), self.state.context)
 
 
 def create_app(
@@ -53,23 +52,27 @@ def create_app(
         Another service holds the data folder or the database.
     """
     context = build(settings or Settings(), worker, lock)
+
+    @asynccontextmanager
+    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
+        await context.open()
+        try:
+            yield
+        finally:
+            await context.close()
+
     app = Service(
         title="stimrig",
         summary="Pre-session tests, models of stimulated muscle, and the approved one for the controller.",
         description=openapi.DESCRIPTION,
         version=software_version(),
-        lifespan=_lifespan(context),
+        lifespan=lifespan,
         docs_url=None,
         redoc_url=None,
-        openapi_url="/openapi.json",
         routes=list(_routes()),
+        exception_handlers=dict.fromkeys(problems.PROBLEMS, problems.respond),
     )
     app.state.context = context
-    app.add_middleware(LookAgain, context=context)
-    app.add_middleware(StrictBody)
-    app.add_middleware(BodyLimit, context=context)
-    app.add_middleware(RequestId)  # the last one added stands outside
-    problems.install(app)
     openapi.describe(app)
     return app
 
@@ -86,24 +89,10 @@ def _routes() -> Sequence[BaseRoute]:
     return whole.routes
 
 
-def _lifespan(context: Any):
-    @asynccontextmanager
-    async def lifespan(_app: FastAPI) -> AsyncIterator[None]:
-        await context.open()
-        try:
-            yield
-        finally:
-            await context.close()
-
-    return lifespan
-
-
 def routers(*packages: ModuleType) -> list[APIRouter]:
     """The routers of all files in these packages: a new file is a new subject."""
     names = [
-        f"{package.__name__}.{info.name}"
-        for package in packages
-        for info in sorted(pkgutil.iter_modules(package.__path__))
+        f"{package.__name__}.{info.name}" for package in packages for info in pkgutil.iter_modules(package.__path__)
     ]
-    values = [value for name in names for value in vars(importlib.import_module(name)).values()]
+    values = [value for name in sorted(names) for value in vars(importlib.import_module(name)).values()]
     return [value for value in values if isinstance(value, APIRouter)]

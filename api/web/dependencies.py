@@ -13,7 +13,7 @@ from stimrig.api.services.context import Context
 from stimrig.api.services.decisions import Decision
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model
-from stimrig.api.web.guards import Press, anyone_even_locked, anyone_signed_in, anyone_who_may_stop, if_match, require
+from stimrig.api.web.guards import Press, anyone_who_may_stop, if_match, require
 from stimrig.api.web.openapi import problem
 
 
@@ -29,8 +29,8 @@ async def from_request(request: Request) -> Context:
 
 Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
 Ctx = Annotated[Context, Depends(from_request)]
-Anyone = Annotated[Principal, Depends(anyone_signed_in)]
-EvenLocked = Annotated[Principal, Depends(anyone_even_locked)]
+Anyone = Annotated[Principal, Depends(require())]
+EvenLocked = Annotated[Principal, Depends(require(even_locked=True))]
 MayStop = Annotated[Press, Depends(anyone_who_may_stop)]
 LiveReader = Annotated[Principal, Security(require(Scope.READ_LIVE), scopes=[Scope.READ_LIVE])]
 Tester = Annotated[Principal, Security(require(Scope.RUN_TEST), scopes=[Scope.RUN_TEST])]

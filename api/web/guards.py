@@ -32,7 +32,7 @@ from stimrig.api.sessions.requests import StopIn
 from stimrig.api.store import Store, locking
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model, Participant, Recording, Test
-from stimrig.api.web.middleware import SAFE_METHODS, STOP, entity_tags, wants_html
+from stimrig.api.web.middleware import SAFE_METHODS, STOP, wants_html
 
 POLLED = ("/rig/", "/v1/jobs/")
 """Paths that scripts of pages poll."""
@@ -46,20 +46,30 @@ Session = Annotated[object, Security(SESSION)]
 """For the OpenAPI document, which is given the name of its service's cookie; `Auth.identify` reads both."""
 
 
-def require(scope: Scope) -> Callable[..., Awaitable[Principal]]:
-    """A dependency: the principal, if the scope is held and a session's form carries its CSRF token."""
+def require(scope: Scope | None = None, *, even_locked: bool = False) -> Callable[..., Awaitable[Principal]]:
+    """A dependency: who holds the scope, or anyone with a valid token or session; a session's form has its CSRF token.
+
+    `even_locked`: the session may be locked: to unlock it, or to sign out.
+    """
 
     async def check(request: Request, _token: Token, _session: Session) -> Principal:
-        principal = await identified(request)
-        if not principal.may(scope):
-            name = principal.name
-            raise forbidden(f"This needs the scope {scope}; {name} holds {', '.join(sorted(principal.scopes))}.")
-        check_csrf(request, principal)
-        if scope is Scope.APPROVE_MODEL and request.method not in SAFE_METHODS:
-            await asyncio.to_thread(request.app.state.context.people.refuse_unconfirmed, principal)
+        context = request.app.state.context
+        if even_locked:
+            principal = request.state.principal = await context.auth.authenticate(request, forgive_lock=True)
+        else:
+            principal = await identified(request)
+        if scope is not None and not principal.may(scope):
+            holds = ", ".join(sorted(principal.scopes))
+            raise forbidden(f"This needs the scope {scope}; {principal.name} holds {holds}.")
+        if request.method in SAFE_METHODS:
+            return principal
+        sent = request.headers.get("x-csrf-token", "").encode()
+        if principal.csrf is not None and not hmac.compare_digest(sent, principal.csrf.encode()):
+            raise ApiError(403, "csrf", "The page is out of date", "Load the page again and repeat what you did.")
+        if scope is Scope.APPROVE_MODEL:
+            await asyncio.to_thread(context.people.refuse_unconfirmed, principal)
         return principal
 
-    check.__name__ = f"require_{scope.name.lower()}"
     return check
 
 
@@ -98,29 +108,6 @@ def is_action(request: Request) -> bool:
         return True
     by_script = request.headers.get("sec-fetch-dest") == "empty"
     return not by_script and not request.url.path.startswith(POLLED)
-
-
-async def anyone_signed_in(request: Request, _token: Token, _session: Session) -> Principal:
-    """A dependency: anyone with a valid token or session."""
-    principal = await identified(request)
-    check_csrf(request, principal)
-    return principal
-
-
-async def anyone_even_locked(request: Request, _token: Token, _session: Session) -> Principal:
-    """A dependency: anyone with a valid token or session, which may be locked: to unlock it, or to sign out."""
-    principal = request.state.principal = await request.app.state.context.auth.authenticate(request, forgive_lock=True)
-    check_csrf(request, principal)
-    return principal
-
-
-def check_csrf(request: Request, principal: Principal) -> None:
-    """Refuse a session's write that does not carry the session's CSRF token."""
-    if principal.csrf is None or request.method in SAFE_METHODS:
-        return
-    sent = request.headers.get("x-csrf-token", "")
-    if not hmac.compare_digest(sent.encode(), principal.csrf.encode()):
-        raise ApiError(403, "csrf", "The page is out of date", "Load the page again and repeat what you did.")
 
 
 OPEN = [
@@ -219,24 +206,18 @@ def if_match(document: str, needed: bool = True) -> Any:
     async def tags(request: Request, if_match: list[str] | None = header) -> Tags | None:
         if if_match is None and not needed:
             return None
-        sent = [tag.strip('"') for field in if_match or () for tag in entity_tags(field)][:MOST_TAGS]
-        readable = tuple(tag for tag in sent if re.fullmatch(r"[\w.-]{1,120}", tag, re.ASCII))
-        if not readable:
+        sent = tuple(re.findall(r'"([\w.-]{1,120})"', ",".join(if_match or ()), re.ASCII)[:MOST_TAGS])
+        if not sent:
             participant = request.state.principal.participant  # a controller's key reads no participant
-            of_key = None if participant is None else f"/v1/participants/{participant}/model"
-            raise version_missing(of_key or document.format(**{"code": "{code}", **request.path_params}))
-        return readable
+            names = {"code": "{code}", **request.path_params}
+            shown = f"/v1/participants/{participant}/model" if participant else document.format(**names)
+            detail = f"Send the ETag of GET {shown} as If-Match, as you last saw it. Nothing was done."
+            raise ApiError(428, "version-missing", "Say what this was decided on", detail)
+        return sent
 
     return Depends(tags)
 
 
-def version_missing(document: str) -> ApiError:
-    """428: the request does not say which version it was decided on (RFC 6585, section 3)."""
-    detail = f"Send the ETag of GET {document} as If-Match, as you last saw it. Nothing was done."
-    return ApiError(428, "version-missing", "Say what this was decided on", detail)
-
-
-FIELD, HEADER = "right", "x-stop-right"
 PATIENCE_S, LONGEST_PATIENCE_S = 0.5, 3.0
 """A stop waits so long for its body; and so long where nothing but a right in it would allow the stop."""
 DEFAULT_REASON = "stop pressed"
@@ -258,22 +239,34 @@ async def anyone_who_may_stop(request: Request, _token: Token, _session: Session
 
     The right is looked at first: it needs no database, and nothing that holds back guesses holds it back.
     """
-    coming = asyncio.create_task(_stop_sent(request))
+    coming, refused = asyncio.create_task(_stop_sent(request)), None
     try:
-        reason, by = await _within(PATIENCE_S, request, coming)
-        if by is not None:
-            return Press(by, reason)
-        try:
-            return await _signed_in(request, reason)
-        except ApiError as error:
-            reason, by = await _within(LONGEST_PATIENCE_S - PATIENCE_S, request, coming)
-            if by is not None:
+        for patience_s in (PATIENCE_S, LONGEST_PATIENCE_S - PATIENCE_S):
+            await asyncio.wait([coming], timeout=patience_s)
+            reason, in_form = coming.result() if coming.done() else (DEFAULT_REASON, "")
+            if (by := _holder(request, request.headers.get("x-stop-right") or in_form)) is not None:
                 return Press(by, reason)
-            error.title = "Nothing was stopped"
-            error.detail = f"Use the emergency switch on the stimulator now, or sign in and press Stop. {error.detail}"
-            raise
+            if refused is None:
+                try:
+                    return await _signed_in(request, reason)
+                except ApiError as error:
+                    refused = error
     finally:
         coming.cancel()
+    assert refused is not None
+    refused.title = "Nothing was stopped"
+    refused.detail = f"Use the emergency switch on the stimulator now, or sign in and press Stop. {refused.detail}"
+    raise refused
+
+
+def _holder(request: Request, right: str) -> str | None:
+    """Return who was given a page's right to stop; None: it is none, or of a test that is over."""
+    context = request.app.state.context
+    current, status = context.runner.current, context.rig.status
+    by = context.stop_rights.holder(right, {current and current.test_id, status and status.test_id})
+    if by is not None:
+        request.state.stop_right = right
+    return by
 
 
 async def _signed_in(request: Request, reason: str) -> Press:
@@ -291,25 +284,12 @@ async def _signed_in(request: Request, reason: str) -> Press:
         raise not_answering() from None
 
 
-async def _within(patience_s: float, request: Request, coming: asyncio.Task[tuple[str, str]]) -> tuple[str, str | None]:
-    """The reason, and whose right to stop was sent, as far as they have come in this time."""
-    await asyncio.wait([coming], timeout=patience_s)
-    reason, in_form = coming.result() if coming.done() else (DEFAULT_REASON, "")
-    context, right = request.app.state.context, request.headers.get(HEADER) or in_form
-    current, status = context.runner.current, context.rig.status
-    running = {current.test_id if current else None, status.test_id if status else None}
-    by = context.stop_rights.holder(right, running)
-    if by is not None:
-        request.state.stop_right = right
-    return reason, by
-
-
 async def _stop_sent(request: Request) -> tuple[str, str]:
     """The body's reason and right; whatever it holds, a stop is a stop."""
     try:
         if "form" in request.headers.get("content-type", ""):
             form = await request.form()
-            return str(form.get("reason") or DEFAULT_REASON)[:200], str(form.get(FIELD) or "")
+            return str(form.get("reason") or DEFAULT_REASON)[:200], str(form.get("right") or "")
         body = await request.body()
         return StopIn.model_validate_json(body).reason if body.strip() else DEFAULT_REASON, ""
     except (ValidationError, ValueError, ApiError, HTTPException, ClientDisconnect):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import get_args
 
@@ -16,31 +16,12 @@ from stimrig.api.version import software_version
 from stimrig.api.web.dependencies import Context
 from stimrig.rig.messages import RigState
 
-QUANTILES = {"median": "0.5", "p99": "0.99", "max": "1"}
+QUANTILES = {"0.5": "median", "0.99": "p99", "1": "max"}
 
 
-@dataclass(frozen=True)
-class Figures:
-    """The service's figures, read when they are asked for."""
-
-    context: Context
-
-    def collect(self) -> Iterator[Metric]:
-        """Give one family after the other."""
-        for part in (_tests, _rig, _pulses, _store, _jobs, _operation):
-            yield from part(self.context)
-        yield from self.context.stops.registry.collect()
-
-
-def gauges(rows: Iterable[tuple[str, str, float]]) -> Iterator[Metric]:
-    """Gauges without labels: name, words, value."""
-    for name, words, value in rows:
-        yield GaugeMetricFamily(name, words, value)
-
-
-def by_label(name: str, words: str, label: str, values: dict[str, float]) -> Metric:
+def gauge(name: str, words: str, label: str, values: dict[str, float]) -> Metric:
     """A gauge with one label."""
-    family = GaugeMetricFamily(name, words, labels=[label])
+    family = GaugeMetricFamily(f"stimrig_{name}", words, labels=[label])
     for key, value in values.items():
         family.add_metric([key], value)
     return family
@@ -51,69 +32,51 @@ def known(value: float | None) -> float:
     return -1.0 if value is None else float(value)
 
 
-def _tests(context: Context) -> Iterator[Metric]:
-    states = Counter(row.state for row in context.store.all(Test))
-    yield by_label("stimrig_tests", "Tests by state", "state", dict(sorted(states.items())))
+@dataclass(frozen=True)
+class Figures:
+    """The service's figures, read when they are asked for."""
 
+    context: Context
 
-def _rig(context: Context) -> Iterator[Metric]:
-    rig = context.rig
-    now = rig.status.state if rig.status and rig.connected else "disconnected"
-    states = {name: float(name == now) for name in get_args(RigState)}
-    yield by_label("stimrig_rig_state", "1 for the state that the rig is in", "state", states)
-    torque_s = rig.status.torque_age_s if rig.status else None
-    yield from gauges((
-        ("stimrig_rig_connected", "1 where the rig's socket is open", float(rig.connected)),
-        ("stimrig_rig_age_seconds", "Time since the rig spoke; -1: never", known(rig.age_s)),
-        ("stimrig_rig_torque_age_seconds", "Age of the newest torque; -1: none", known(torque_s)),
-    ))  # fmt: skip
-
-
-def _pulses(context: Context) -> Iterator[Metric]:
-    """Of the newest test: what is lost while it runs, and how late its pulses were once it has ended."""
-    newest, rig = context.runner.hub.newest, context.rig.status
-    summary = rig.finished.summary if rig and rig.finished else {}
-    for name, words, key in (
-        ("stimrig_pulse_lateness_seconds", "Of the pulses of the newest test that ended", "lateness_ms"),
-        ("stimrig_pulse_acknowledgement_seconds", "From a pulse to its acknowledgement, in it", "ack_delay_ms"),
-    ):
-        quantiles = summary.get(key) or {}
-        values = {
-            QUANTILES[level]: 1e-3 * quantiles[level]
-            for level in QUANTILES
-            if isinstance(quantiles.get(level), float | int)
-        }
-        yield by_label(name, words, "quantile", values)
-    yield from gauges((
-        ("stimrig_live_listeners", "Open live channels", context.runner.hub.listeners),
-        ("stimrig_lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
-        ("stimrig_dropped_pulses", "Dropped in it", newest.dropped_pulses if newest else 0),
-    ))  # fmt: skip
-
-
-def _store(context: Context) -> Iterator[Metric]:
-    approved = context.versions.all_approved(context.store.all(Participant.code))
-    entries = context.store.first(AuditEntry.seq, order=AuditEntry.seq.desc())
-    yield from gauges((
-        ("stimrig_models", "Model versions", len(context.store.all(Model.id))),
-        ("stimrig_approved_models", "Participants with one approved today", len(approved)),
-        ("stimrig_audit_entries", "Entries of the audit trail", entries or 0),
-        ("stimrig_free_disk_bytes", "Free where the data lie", shutil.disk_usage(context.settings.data_dir).free),
-    ))  # fmt: skip
-
-
-def _jobs(context: Context) -> Iterator[Metric]:
-    pool = context.pool
-    yield GaugeMetricFamily("stimrig_jobs_queued", "Analyses waiting", len(pool.queue))
-    for name, words, value in (
-        ("stimrig_jobs_done_total", "Analyses done", pool.done_count),
-        ("stimrig_jobs_failed_total", "Analyses failed", pool.failed_count),
-        ("stimrig_jobs_busy_seconds_total", "Time in analyses", pool.busy_s),
-    ):
-        yield CounterMetricFamily(name, words, value)
-
-
-def _operation(context: Context) -> Iterator[Metric]:
-    """The process."""
-    yield by_label("stimrig_build_info", "1; the label names the release", "version", {software_version(): 1.0})
-    yield from gauges((("stimrig_up_seconds", "Time since start", time.monotonic() - context.started_s),))
+    def collect(self) -> Iterator[Metric]:
+        """Give one family after the other."""
+        context = self.context
+        rig, pool, store, hub = context.rig, context.pool, context.store, context.runner.hub
+        status, newest = rig.status, hub.newest
+        now = status.state if status and rig.connected else "disconnected"
+        yield gauge("tests", "Tests by state", "state", dict(sorted(Counter(store.all(Test.state)).items())))
+        states = {name: float(name == now) for name in get_args(RigState)}
+        yield gauge("rig_state", "1 for the state that the rig is in", "state", states)
+        summary = status.finished.summary if status and status.finished else {}
+        for name, words, key in (
+            ("pulse_lateness_seconds", "Of the pulses of the newest test that ended", "lateness_ms"),
+            ("pulse_acknowledgement_seconds", "From a pulse to its acknowledgement, in it", "ack_delay_ms"),
+        ):
+            levels = {label: (summary.get(key) or {}).get(level) for label, level in QUANTILES.items()}
+            values = {label: 1e-3 * level for label, level in levels.items() if isinstance(level, float | int)}
+            yield gauge(name, words, "quantile", values)
+        approved = context.versions.all_approved(store.all(Participant.code))
+        entries = store.first(AuditEntry.seq, order=AuditEntry.seq.desc())
+        for name, words, value in (
+            ("rig_connected", "1 where the rig's socket is open", float(rig.connected)),
+            ("rig_age_seconds", "Time since the rig spoke; -1: never", known(rig.age_s)),
+            ("rig_torque_age_seconds", "Age of the newest torque; -1: none", known(status and status.torque_age_s)),
+            ("live_listeners", "Open live channels", hub.listeners),
+            ("lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
+            ("dropped_pulses", "Dropped in it", newest.dropped_pulses if newest else 0),
+            ("models", "Model versions", len(store.all(Model.id))),
+            ("approved_models", "Participants with one approved today", len(approved)),
+            ("audit_entries", "Entries of the audit trail", entries or 0),
+            ("free_disk_bytes", "Free where the data lie", shutil.disk_usage(context.settings.data_dir).free),
+            ("jobs_queued", "Analyses waiting", len(pool.queue)),
+            ("up_seconds", "Time since start", time.monotonic() - context.started_s),
+        ):
+            yield GaugeMetricFamily(f"stimrig_{name}", words, value)
+        for name, words, value in (
+            ("jobs_done_total", "Analyses done", pool.done_count),
+            ("jobs_failed_total", "Analyses failed", pool.failed_count),
+            ("jobs_busy_seconds_total", "Time in analyses", pool.busy_s),
+        ):
+            yield CounterMetricFamily(f"stimrig_{name}", words, value)
+        yield gauge("build_info", "1; the label names the release", "version", {software_version(): 1.0})
+        yield from context.stops.registry.collect()

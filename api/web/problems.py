@@ -7,7 +7,7 @@ from collections.abc import Callable
 from http import HTTPStatus
 from typing import Any
 
-from fastapi import FastAPI, Request
+from fastapi import Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
 from sqlalchemy.exc import DataError, InterfaceError, OperationalError
@@ -87,9 +87,3 @@ async def respond(request: Request, error: Exception) -> Response:
         return problem_page(request, problem)
     body = problem.body(str(request.url.path))
     return JSONResponse(body, problem.status, problem.headers, "application/problem+json")
-
-
-def install(app: FastAPI) -> None:
-    """Hang the table into the application."""
-    for kind in PROBLEMS:
-        app.add_exception_handler(kind, respond)
