@@ -32,9 +32,6 @@ def model_report(document: dict[str, Any]) -> list[str]:
             f"dynamics       Tω {number(dynamics['time_constant_s'], 4)} s, ζ {number(dynamics['damping'], 4)}, "
             f"delay {number(1000 * (dynamics['delay_s'] or 0), 1)} ms"
         )
-    elif dynamics["poles_per_s"]:
-        poles = ", ".join(f"{re:+.3f}{im:+.3f}j" for re, im in dynamics["poles_per_s"])
-        lines.append(f"dynamics       poles {poles} 1/s")
     return [
         *lines,
         f"recruitment    threshold {number(curve['threshold_us'], 0)} µs (5 % of the rise), "

@@ -52,27 +52,33 @@ class Analyses:
         return require_found(recording, "recording", recording_id, "A model's document names its recording.").path
 
     async def comparison(self, model: Model, recording_id: str | None = None) -> dict[str, Any]:
-        """Measurement against model; with the id of another recording, the model against that one."""
-        arguments = {"model_json": stored_model.text(model)}
-        if recording_id in (None, model.recording_id):
-            return await self._find(model, "comparison", arguments)
-        digest = hashlib.sha256(str(recording_id).encode()).hexdigest()[:16]
-        return await self._find(model, f"comparison {digest}", arguments, verb="comparison", recording_id=recording_id)
+        """Compare measurement and model; with the id of another recording, the model and that one."""
+        kind, of = "comparison", recording_id or model.recording_id
+        if of != model.recording_id:
+            kind = f"comparison {hashlib.sha256(of.encode()).hexdigest()[:16]}"
+        return await self._find(model, kind, "comparison", of, model_json=stored_model.text(model))
 
     async def curves(self, model: Model) -> dict[str, Any]:
-        """Measured, predicted and commanded curves, thinned to what a screen shows."""
-        return await self._find(model, "curves", {"model_json": stored_model.text(model)})
+        """Return measured, predicted and commanded curves, thinned to what a screen shows."""
+        return await self._find(model, "curves", "curves", model_json=stored_model.text(model))
 
     async def diagnosis(
         self, model: Model, on_call: OnCall | None = None, *, background: bool = False
     ) -> dict[str, Any]:
         """Diagnose what the structure of a model lacks; versions with the plain structure share one diagnosis."""
-        place, kind, arguments = await asyncio.to_thread(self._criticised, model)
-        diagnosis = await self._find(place, kind, arguments, verb="diagnosis", background=background, on_call=on_call)
-        return explanation.remaining(diagnosis, model.effects, model.fit)
+        diagnosis = await self._diagnose(model, on_call, background=background)
+        return explanation.remaining(diagnosis[2], model.effects, model.fit)
 
-    def _criticised(self, model: Model) -> tuple[Model, str, dict[str, Any]]:
-        """Return the version and the name that a diagnosis is stored under, and the arguments of its worker.
+    async def _diagnose(
+        self, model: Model, on_call: OnCall | None, *, background: bool = False
+    ) -> tuple[Model, str, dict[str, Any]]:
+        place, kind = await asyncio.to_thread(self._criticised, model)
+        own = {"model_json": stored_model.text(place)} if kind == OWN_DIAGNOSIS else {}
+        found = await self._find(place, kind, "diagnosis", on_call=on_call, background=background, **own)
+        return place, kind, found
+
+    def _criticised(self, model: Model) -> tuple[Model, str]:
+        """Return the version and the name that a diagnosis is stored under.
 
         A version with some of what was found missing at once has that diagnosis until all of it is added: a second
         search from there could say something else of the same recording.
@@ -80,27 +86,22 @@ class Analyses:
         if is_plain(model):
             # the diagnosis of the plain structure is stored with the first version made from the recording
             same_recording = Model.recording_id == model.recording_id
-            return self.store.first(Model, same_recording, order=Model.created_utc), DIAGNOSIS, {}
-        own_diagnosis = self.known(model.id, OWN_DIAGNOSIS)  # a diagnosis once made of this version stays
-        parent = self.store.get(Model, model.parent_id) if model.parent_id and own_diagnosis is None else None
-        if parent is not None and parent.recording_id == model.recording_id:
-            above = self._criticised(parent)
-            diagnosis = self.known(above[0].id, above[1])
-            begun_with = [] if above[1] == DIAGNOSIS else above[0].effects
-            if diagnosis and asked_for(diagnosis) > set(model.effects) - set(begun_with):
-                return above
-        return model, OWN_DIAGNOSIS, {"model_json": stored_model.text(model)}
+            return self.store.first(Model, same_recording, order=Model.created_utc), DIAGNOSIS
+        if model.parent_id and self.known(model.id, OWN_DIAGNOSIS) is None:  # one that was made of this version stays
+            parent: Model = self.store.get(Model, model.parent_id)
+            if parent.recording_id == model.recording_id:
+                place, kind = self._criticised(parent)
+                diagnosis = self.known(place.id, kind)
+                begun_with = [] if kind == DIAGNOSIS else place.effects
+                if diagnosis and asked_for(diagnosis) > set(model.effects) - set(begun_with):
+                    return place, kind
+        return model, OWN_DIAGNOSIS
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """Return the diagnosis, or None while there is none."""
-        place, kind, _ = self._criticised(model)
+        place, kind = self._criticised(model)
         diagnosis = self.known(place.id, kind)
         return diagnosis and explanation.remaining(diagnosis, model.effects, model.fit)
-
-    def experiment_before(self, first: Model) -> dict[str, Any] | None:
-        """Return the next experiment of the diagnosis that a joined recording's first model follows up."""
-        before = self.known_diagnosis(self.versions.get(first.parent_id)) if first.parent_id else None
-        return (before or {}).get("experiment")
 
     async def diagnose_ahead(self, model: Model) -> None:
         """Diagnose in advance at low priority; a new test cancels it, which is only logged."""
@@ -117,16 +118,10 @@ class Analyses:
         return row.document if row else None
 
     async def _find(
-        self,
-        model: Model,
-        kind: str,
-        arguments: dict[str, Any],
-        *,
-        verb: str | None = None,
-        recording_id: str | None = None,
-        background: bool = False,
-        on_call: OnCall | None = None,
-    ) -> dict[str, Any]:
+        self, model: Model, kind: str, verb: str, recording_id: str | None = None, *, background: bool = False,
+        on_call: OnCall | None = None, **arguments: Any,
+    ) -> dict[str, Any]:  # fmt: skip
+        """Return a stored analysis; else have a worker do the verb, and store it as `kind`."""
         key = (model.id, kind)
         path = await asyncio.to_thread(self.path, recording_id or model.recording_id)
         if key not in self.running and (known := await asyncio.to_thread(self.known, *key)) is not None:
@@ -136,7 +131,7 @@ class Analyses:
             self.pool.cancel(call)  # a request waits now; at low priority a busy machine could take minutes
             call = None
         if call is None:
-            call = self.running[key] = self.pool.submit(verb or kind, background=background, data=path, **arguments)
+            call = self.running[key] = self.pool.submit(verb, background=background, data=path, **arguments)
         if on_call is not None:
             on_call(call)
         try:
@@ -166,15 +161,9 @@ class Analyses:
     # ---- versions -------------------------------------------------------------------------------------------
 
     async def add_effects(
-        self,
-        model: Model,
-        added: list[str],
-        by: str,
-        *,
-        force: bool = False,
-        reason: str = "",
+        self, model: Model, added: list[str], by: str, *, force: bool = False, reason: str = "",
         on_call: OnCall | None = None,
-    ) -> Model:
+    ) -> Model:  # fmt: skip
         """Fit the model's effects and the added ones together, as a new version.
 
         Raises ApiError: 409 an effect is in it already, or the recording does not ask for it and nobody forces it; 422
@@ -189,26 +178,29 @@ class Analyses:
         same = await asyncio.to_thread(self.versions.child_with, model, effects, [] if force else added)
         if same is not None:
             return same
-        forced: list[str] = []
+        if force and not reason.strip():
+            detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
+            raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
         if force:
-            if not reason.strip():
-                detail = "The evidence is against this effect. Give a reason; it is kept in the audit trail."
-                raise ApiError(422, "reason-missing", "Adding an effect against the evidence needs a reason", detail)
             diagnosis = await asyncio.to_thread(self.known_diagnosis, model)
-            forced = added if diagnosis is None else list(explanation.refusals(diagnosis, added))
         else:
             diagnosis = await self.diagnosis(model, on_call)
-            explanation.require_evidence(diagnosis, added)
+        against = dict.fromkeys(added, "") if diagnosis is None else explanation.refusals(diagnosis, added)
+        if against and not force:
+            detail = " ".join(f"{effect}: {words}" for effect, words in against.items())
+            detail += " To add it against the evidence, send `force` and a reason; the held-out error shows its effect."
+            title = "The recording gives no evidence for this effect"
+            raise ApiError(409, "effect-not-there", title, detail, reasons=against)
         free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in (diagnosis or {}).get("free") or []}
+        forms = free | stored_model.structure(stored_model.read(model))
         path = await asyncio.to_thread(self.path, model.recording_id)
-        forms = stored_model.structure(stored_model.read(model))
-        wanted = [forms.get(effect, free.get(effect, effect)) for effect in effects]
+        wanted = [forms.get(effect, effect) for effect in effects]
         fitted = await self.run("fit", on_call, data=path, method=model.method, effects=wanted)
 
         def store() -> Model:
-            row = self._child(model, added, json.loads(fitted["json"]), by, forced)
-            if forced or reason:
-                action = "force effect" if forced else "add effect"
+            row = self._child(model, added, json.loads(fitted["json"]), by, list(against))
+            if against or reason:
+                action = "force effect" if against else "add effect"
                 self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
             return row
 
@@ -225,29 +217,23 @@ class Analyses:
     async def improve(self, model: Model, by: str, on_call: OnCall | None = None) -> tuple[dict[str, Any], list[Model]]:
         """Add effects to the structure of a model one by one while the evidence lasts, each step a version.
 
-        They descend from the version whose diagnosis names them.
+        They descend from the version whose structure was diagnosed; of the plain one there may be several.
         """
-        place, kind, arguments = await asyncio.to_thread(self._criticised, model)
-        await self._find(place, kind, arguments, verb="diagnosis", on_call=on_call)
-        improvement = await asyncio.to_thread(self.known, place.id, f"{IMPROVEMENT} of {kind}")
-        assert improvement is not None, "kept with the diagnosis"
+        place, kind, _diagnosis = await self._diagnose(model, on_call)
 
-        def store() -> list[Model]:
-            rows = [self._begun_from(model, place, kind)]
-            for step, document in zip(improvement["steps"], improvement["models"], strict=True):
+        def store() -> tuple[dict[str, Any], list[Model]]:
+            improvement = self.known(place.id, f"{IMPROVEMENT} of {kind}")
+            assert improvement is not None, "kept with the diagnosis"
+            rows = [place]
+            if kind == DIAGNOSIS:
+                rows = [next((row for row in [place, *self.versions.ancestry(model)] if is_plain(row)), model)]
+            for step, document in zip(improvement["steps"], improvement.pop("models"), strict=True):
                 if step["added"] is not None:
                     rows.append(self._child(rows[-1], [step["added"]], document, by))
                 step["model_id"] = rows[-1].id
-            return rows
+            return improvement, rows
 
-        rows = await asyncio.to_thread(store)
-        return {key: value for key, value in improvement.items() if key != "models"}, rows
-
-    def _begun_from(self, model: Model, place: Model, kind: str) -> Model:
-        """Return the version whose structure was diagnosed; for the plain structure it may be another one."""
-        if kind == OWN_DIAGNOSIS:
-            return place
-        return next((row for row in [place, *self.versions.ancestry(model)] if is_plain(row)), model)
+        return await asyncio.to_thread(store)
 
     def _child(
         self, parent: Model, added: list[str], document: dict[str, Any], by: str, forced: Sequence[str] = ()
@@ -256,7 +242,7 @@ class Analyses:
         same = self.versions.child_with(parent, [*parent.effects, *added], set(added) - set(forced))
         if same is not None:
             return same
-        stored_model.mark_without_evidence(document, [*(parent.fit.get("without_evidence") or ()), *forced])
+        stored_model.mark_without_evidence(document, [*parent.fit["without_evidence"], *forced])
         document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
         of = (parent.participant, parent.recording_id)
         return self.versions.add(json.dumps(document), *of, by, parent.id, ",".join(added))

@@ -16,12 +16,9 @@ from stimrig.api.jobs.pool import Pool
 from stimrig.api.jobs.worker import Worker
 from stimrig.api.models import stored_model
 from stimrig.api.models.analyses import Analyses, OnCall
-from stimrig.api.models.explanation import name_of
-from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Model
 from stimrig.api.structure import in_words
-from stimrig.identify.conclusion import asked_for
 
 
 async def fit(
@@ -53,39 +50,36 @@ async def carry(analyses: Analyses, plain: Model, path: str, on_call: OnCall | N
     Whatever becomes of the carried structure, the plain model stays; what was found is kept with it, and with the
     child.
     """
-    earlier = await asyncio.to_thread(analyses.versions.last_approved, plain.participant)
+    versions = analyses.versions
+    earlier = await asyncio.to_thread(versions.last_approved, plain.participant)
     if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
         return plain
     try:
         carried = await analyses.run("carry", on_call, data=path, model_json=stored_model.text(earlier), **how)
     except (ApiError, OSError, ValueError) as error:  # every error of a worker's call
-        carried = {"json": None, "found": _not_carried(error)}
-    return await asyncio.to_thread(_store, analyses.versions, carried, plain, earlier)
-
-
-def _store(versions: Versions, carried: dict[str, Any], plain: Model, earlier: Model) -> Model:
-    """Keep the finding with the plain version, and the child, where there is one; return which of them is offered."""
+        why, said = (error.code, f"{error.title}. {error.detail}") if isinstance(error, ApiError) else ("failed", error)
+        found: dict[str, Any] = {key: [] for key in ("still_needed", "no_longer_needed", "undecided", "effects")}
+        reason = f"The structure of the last session was not fitted. {said}".strip()
+        carried = {"json": None, "found": {**found, "offered": "plain", "why": why, "reason": reason}}
     finding = {key: value for key, value in carried["found"].items() if key != "carried_from"}
     finding["from_model_id"] = earlier.id
-    versions.note_carried(plain.id, finding, earlier.id if finding["why"] == "plain-before" else None)
-    if carried["json"] is None:
-        return versions.get(plain.id)
-    document = json.loads(carried["json"])
-    document["extra"] = {**(document.get("extra") or {}), "parent": plain.id}
-    child = versions.add(
-        json.dumps(document), plain.participant, plain.recording_id, plain.created_by, plain.id,
-        ",".join(effect["id"] for effect in document["effects"]), carried_from_id=earlier.id, carried=finding,
-    )  # fmt: skip
-    return child if finding["offered"] == "carried" else versions.get(plain.id)
 
+    def store() -> Model:
+        with versions.store.write() as session:
+            row = session.get_one(Model, plain.id)
+            row.carried = finding
+            row.carried_from_id = earlier.id if finding["why"] == "plain-before" else None
+        if carried["json"] is None:
+            return row
+        document = json.loads(carried["json"])
+        document["extra"] = {**(document.get("extra") or {}), "parent": plain.id}
+        child = versions.add(
+            json.dumps(document), plain.participant, plain.recording_id, plain.created_by, plain.id,
+            ",".join(effect["id"] for effect in document["effects"]), carried_from_id=earlier.id, carried=finding,
+        )  # fmt: skip
+        return child if finding["offered"] == "carried" else row
 
-def _not_carried(error: Exception) -> dict[str, Any]:
-    """Return the finding for a structure that could not be fitted."""
-    why, parts = (error.code, [error.title, error.detail]) if isinstance(error, ApiError) else ("failed", [str(error)])
-    sentences = ["The structure of the last session was not fitted", *filter(None, parts)]
-    reason = " ".join(f"{part.rstrip('.')}." for part in sentences)
-    lists = ("still_needed", "no_longer_needed", "undecided", "effects", "figures")
-    return {"offered": "plain", "why": why, "reason": reason, **{name: [] for name in lists}}
+    return await asyncio.to_thread(store)
 
 
 async def refuse_unknown(settings: Settings, worker: Callable[..., Worker] = Worker) -> None:
@@ -108,35 +102,3 @@ async def refuse_unknown(settings: Settings, worker: Callable[..., Worker] = Wor
     unknown = [effect for effect in settings.structure if effect not in known]
     if unknown:
         raise OSError(f"STIMRIG_STRUCTURE: no effect is called {', '.join(unknown)}. Take some of {', '.join(known)}.")
-
-
-def carried_context(versions: Versions, row: Model, diagnosis: dict[str, Any] | None) -> dict[str, Any] | None:
-    """Return the context of `model.html` on the carried structure, for the plain version or its carried child.
-
-    None where its recording was asked nothing of the kind. `new` is None without a diagnosis; `again`: those left out
-    that the diagnosis asks for; `better`: the carried version is.
-    """
-    carried = row.carried
-    if carried is None or carried["why"] == "plain-before":
-        return None
-    is_plain, earlier = row.carried_from_id is None, versions.get(carried["from_model_id"])
-    wanted = set() if diagnosis is None else asked_for(diagnosis)  # effects that are only named are not requested
-    missing = [entry for entry in (diagnosis or {}).get("missing", []) if entry["effect"] in wanted]
-    known = [effect["effect"] for effect in carried["effects"]]
-    reappearing = {entry["effect"] for entry in missing} & {*carried["no_longer_needed"], *carried["undecided"]}
-    absent = [effect for effect in carried["effects"] if effect["effect"] not in reappearing]
-    below = [other for other in versions.lineage(row) if other.parent_id == row.id and other.carried_from_id]
-    return {
-        "earlier": {"id": earlier.id, "created_utc": earlier.created_utc},
-        "kept": [effect for effect in carried["effects"] if effect["needed"]],
-        "dropped": [effect for effect in absent if effect["needed"] is False],
-        "undecided": [effect for effect in absent if effect["needed"] is None],
-        "new": None
-        if diagnosis is None
-        else [name_of(entry["effect"], {entry["effect"]: entry}) for entry in missing if entry["effect"] not in known],
-        "again": [effect["name"] for effect in carried["effects"] if effect["effect"] in reappearing],
-        "other": next((other.id for other in below), None) if is_plain else row.parent_id,
-        "better": carried["offered"] == "carried",
-        "is_plain": is_plain,
-        "reason": carried["reason"],
-    }

@@ -8,13 +8,12 @@ from typing import Any
 
 from stimrig.api.clinical_words import segment_words
 from stimrig.api.effect_words import effect_words, effects_words, parameter_words, without_unit
-from stimrig.api.errors import ApiError
 from stimrig.api.structure import worded
 from stimrig.identify.conclusion import asked_for, conclude, in_order, is_likely
 from stimrig.identify.healing import stands_out
 from stimrig.identify.summary import probability, sure
 
-SPLITS: dict[str, str] = {
+SPLITS = {
     "segment": "By part of the test",
     "level": "By level of pulse width",
     "direction": "By direction of pulse width",
@@ -32,6 +31,7 @@ PARTS = {
     "h": "h(x, ẋ), the passive torque over angle and velocity",
 }
 """Position of an effect in the paper's Fig. 2."""
+NOT_TESTED = "It was not tested on this recording: the recording lacks the columns that it needs."
 
 
 def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -39,32 +39,31 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
 
     `diagnosis`: as the verb `diagnosis` of the workers gives it; `comparison`: `identify.compare` of the same model.
     """
-    library, base = diagnosis.get("library") or {}, diagnosis.get("base") or {}
-    missing, free = in_order(diagnosis), diagnosis.get("free") or []
-    wanted = asked_for(diagnosis)
+    library, missing, free = diagnosis.get("library") or {}, in_order(diagnosis), diagnosis.get("free") or []
+    wanted, conclusion, compared = asked_for(diagnosis), conclude(diagnosis), comparison or {}
     to_add = [entry for entry in [*missing, *free] if entry["effect"] in wanted]
-    conclusion = conclude(diagnosis)
     noise = conclusion.kind == "nothing" and not (comparison and stands_out(comparison))
-    compared = comparison or {}
     where = [] if noise else compared.get("where") or diagnosis.get("where") or []
     places = [place(entry, number) for number, entry in enumerate(where, start=1)]
     mostly = f" It sits mostly here: {places[0]['words']}." if places and conclusion.kind == "unexplained" else ""
-    experiment = diagnosis.get("experiment")
+    experiment, named = diagnosis.get("experiment"), {entry["effect"] for entry in missing}
     return {
-        "kind": conclusion.kind,
-        "title": conclusion.title,
+        **asdict(conclusion),
         "words": conclusion.words + mostly,
-        "advice": conclusion.advice,
-        "missing": [card(entry, library, base) for entry in missing],
-        "free": [free_card(entry, library) for entry in free],
+        "missing": [card(entry, library, diagnosis.get("base") or {}) for entry in missing],
+        "free": [{**entry, "id": entry["effect"], "parameters": _labelled(entry, library)} for entry in free],
         "to_add": [entry["effect"] for entry in to_add],
         "likely": [name_of(entry["effect"], library) for entry in to_add if is_likely(entry)],
         "structure": effects_words(diagnosis.get("structure") or []) or "plain",
         "places": places,
         "splits": [] if noise else splits(compared),
         "tests": (compared.get("tests") or {}).get("tests", []),
-        "experiment": experiment and tidy_experiment(experiment, library),
-        "others": others(diagnosis, library),
+        "experiment": experiment and tidy_experiment(experiment),
+        "others": [
+            {"id": row["effect"], "name": name_of(row["effect"], library), "reason": row["reason"]}
+            for row in diagnosis.get("refused") or []
+            if row["effect"] not in named
+        ],
         "notes": diagnosis.get("notes") or [],
         "noise_sd_nm": diagnosis.get("noise_sd_nm"),
     }
@@ -75,17 +74,15 @@ def remaining(diagnosis: dict[str, Any], effects: Sequence[str], fit: Mapping[st
 
     `fit`: the statistics of that version.
     """
-    named = {entry["effect"] for key in ("missing", "free") for entry in diagnosis.get(key) or []}
+    rows = {key: diagnosis.get(key) or [] for key in ("missing", "free")}
+    named = {entry["effect"] for entries in rows.values() for entry in entries}
     included = named & set(effects)
     if not included:
         return diagnosis
     base, experiment = diagnosis.get("base") or {}, diagnosis.get("experiment")
     reduced = {
         **diagnosis,
-        **{
-            key: [row for row in diagnosis.get(key) or [] if row["effect"] not in included]
-            for key in ("missing", "free")
-        },
+        **{key: [entry for entry in entries if entry["effect"] not in included] for key, entries in rows.items()},
         "add": [effect for effect in diagnosis.get("add", sorted(named)) if effect not in included],
         "base": {**base, **{key: fit[key] for key in base if key in fit}},
         "structure": [*(diagnosis.get("structure") or []), *sorted(included)],
@@ -96,27 +93,21 @@ def remaining(diagnosis: dict[str, Any], effects: Sequence[str], fit: Mapping[st
     return {**reduced, "conclusion": asdict(conclusion), "plain": plain}
 
 
-def decided(experiment: Mapping[str, Any] | None, diagnosis: Mapping[str, Any], effects: Sequence[str]) -> str:
-    """Say what a further test found of the effects between which it was to decide; empty where it was not to.
+def refusals(diagnosis: Mapping[str, Any], added: Sequence[str]) -> dict[str, str]:
+    """Return why the recording gives no evidence for these effects; an effect without a reason is left out.
 
-    `experiment`: of the diagnosis before the test; `diagnosis`: of the recordings joined; `effects`: that the model
-    holds already, one of which may have been added by what the test said.
+    There is none against an effect that cannot be told from one that is asked for.
     """
-    rivals = (experiment or {}).get("rivals") or []
-    if len(rivals) < 2 or not set(rivals).isdisjoint(effects):
-        return ""
-    library = diagnosis.get("library") or {}
-    named = [row for row in diagnosis["missing"] if row["effect"] in rivals]
-    if not named:
-        answer = "with it, none of them is asked for"
-    elif any(not set(row.get("confused_with") or []).isdisjoint(rivals) for row in named):
-        answer = "it has not told them apart"
-    elif len(named) > 1:
-        answer = "it asks for more than one of them"
-    else:
-        answer = f"it is {_in_a_sentence(named[0]['effect'], library)}"
-    between = " and ".join(_in_a_sentence(rival, library) for rival in rivals)
-    return f"The further test was to decide between {between}: {answer}."
+    reasons = dict.fromkeys(added, NOT_TESTED)
+    reasons |= {row["effect"]: row["reason"] for row in diagnosis.get("refused") or []}
+    reasons |= {row["effect"]: "" for row in diagnosis.get("free") or []}
+    for row in diagnosis["missing"]:
+        reasons |= dict.fromkeys(row.get("confused_with") or [], "")
+    reasons |= {row["effect"]: row.get("objection") or "" for row in diagnosis["missing"]}
+    return {effect: reasons[effect] for effect in added if reasons[effect]}
+
+
+# ---- effects --------------------------------------------------------------------------------------------------------
 
 
 def name_of(effect: str, library: Mapping[str, Any]) -> str:
@@ -124,49 +115,36 @@ def name_of(effect: str, library: Mapping[str, Any]) -> str:
     return (library.get(effect) or {}).get("name") or effect_words(effect)
 
 
-def _in_a_sentence(effect: str, library: Mapping[str, Any]) -> str:
-    name = name_of(effect, library)
-    return name[:1].lower() + name[1:]
-
-
 def card(entry: Mapping[str, Any], library: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:
     """Describe an effect that is missing. `base`: the errors of this model.
 
     An effect that was found beside another one begins at other errors: these are left out.
     """
-    known = library.get(entry["effect"]) or {}
+    known, chance = library.get(entry["effect"]) or {}, entry.get("probability")
     errors = []
     for label, prefix in (("fitted pulses", ""), ("held-out pulses", "held_out_")):
         before_nm, own_nm = entry.get(f"{prefix}rms_before_nm"), base.get(f"{prefix}rms_nm")
         if before_nm is not None and (own_nm is None or abs(before_nm - own_nm) <= OWN_SHARE * own_nm):
             errors.append((label, before_nm, entry[f"{prefix}rms_after_nm"]))
+    rivals = [name_of(rival, library) for rival in entry.get("confused_with") or []]
     return {
+        **dict.fromkeys(("plain", "equation", "objection"), ""),
         **entry,
         "id": entry["effect"],
         "name": entry.get("name") or name_of(entry["effect"], library),
-        "objection": entry.get("objection"),
-        "sure_words": how_sure(entry.get("probability")),
-        "plain": entry.get("plain") or "",
-        "signature": known.get("signature") or "",
-        "equation": entry.get("equation") or "",
-        "source": known.get("source") or "",
+        "sure_words": "" if chance is None else f"{sure(chance)} missing · {probability(chance)}",
+        "signature": known.get("signature"),
+        "source": known.get("source"),
         "part": PARTS.get(known.get("part") or ""),
         "next_experiment": worded(entry.get("next_experiment") or ""),
-        "rivals": [_in_a_sentence(rival, library) for rival in entry.get("confused_with") or []],
+        "rivals": [f"{name[:1].lower()}{name[1:]}" for name in rivals],
         "errors": errors,
-        "parameters": _labelled(entry.get("parameters") or {}, known, entry.get("form")),
+        "parameters": _labelled(entry, library),
     }
 
 
-def free_card(entry: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
-    """Describe a free effect: what it does, and its picture."""
-    known = library.get(entry["effect"]) or {}
-    parameters = _labelled(entry["parameters"], known, entry.get("form"))
-    return {**entry, "id": entry["effect"], "parameters": parameters}
-
-
 def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """Describe the free effects of a model as `free_card` does those of a diagnosis."""
+    """Describe the free effects of a model as `view` does those of a diagnosis."""
     return [
         {
             "id": effect["id"],
@@ -175,26 +153,25 @@ def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
             **effect["shape"],
             "axis": effect["shape"]["effect"],
             "left_out": "",
-            "parameters": _labelled(effect["parameters"], {}, None),
+            "parameters": _labelled({"effect": effect["id"], "parameters": effect["parameters"]}, {}),
         }
         for effect in document.get("effects") or []
         if effect.get("shape")
     ]
 
 
-def how_sure(chance: float | None) -> str:
-    """Format the probability that an effect is missing, in words and as a number."""
-    return "" if chance is None else f"{sure(chance)} missing · {probability(chance)}"
-
-
-def _labelled(parameters: Mapping[str, Any], known: Mapping[str, Any], form: str | None) -> dict[str, Any]:
-    """Label each parameter with its meaning in this form and its symbol in the equation."""
-    forms = sorted(known.get("forms") or [], key=lambda each: each.get("name") == form)
+def _labelled(entry: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
+    """Label each parameter of an effect with its meaning in this form and its symbol in the equation."""
+    known = (library.get(entry["effect"]) or {}).get("forms") or []
+    forms = sorted(known, key=lambda each: each.get("name") == entry.get("form"))
     about = {parameter["name"]: parameter.get("about") or "" for each in forms for parameter in each["parameters"]}
     return {
         name: {**value, "label": about.get(name, "") or parameter_words(name), "symbol": without_unit(name)}
-        for name, value in parameters.items()
+        for name, value in (entry.get("parameters") or {}).items()
     }
+
+
+# ---- the error ------------------------------------------------------------------------------------------------------
 
 
 def place(entry: Mapping[str, Any], number: int) -> dict[str, Any]:
@@ -219,24 +196,18 @@ def splits(comparison: Mapping[str, Any]) -> list[dict[str, Any]]:
         while kind == "frequency" and len(rows) > 1 and rows[-1]["share_of_excess"] < LEAST_SHARE:
             rows.pop()
         if rows:
-            named = [
-                {**row, "words": segment_words(row["label"]) if kind == "segment" else row["label"]} for row in rows
-            ]
-            largest_share = max(row["share_of_excess"] for row in rows) or 1.0
-            tables.append({"title": title, "rows": named, "most": largest_share})
+            words = segment_words if kind == "segment" else str
+            named = [{**row, "words": words(row["label"])} for row in rows]
+            tables.append({"title": title, "rows": named, "most": max(row["share_of_excess"] for row in rows) or 1.0})
     return tables
 
 
-def tidy_experiment(experiment: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:
+def tidy_experiment(experiment: Mapping[str, Any]) -> dict[str, Any]:
     """Describe the next experiment for people."""
     rate_hz = experiment.get("pulse_rate_hz")
     played = [(segment_words(row["sequence"]), _seconds(row["settings"], rate_hz)) for row in experiment["segments"]]
-    return {
-        **experiment,
-        "text": worded(experiment["text"]),
-        "names": [_in_a_sentence(rival, library) for rival in experiment["rivals"]],
-        "shown": [f"{name} {seconds}".strip() for name, seconds in played],
-    }
+    shown = [f"{name} {seconds}".strip() for name, seconds in played]
+    return {**experiment, "text": worded(experiment["text"]), "shown": shown}
 
 
 def _seconds(settings: Mapping[str, Any], pulse_rate_hz: float | None) -> str:
@@ -248,23 +219,15 @@ def _seconds(settings: Mapping[str, Any], pulse_rate_hz: float | None) -> str:
     return " + ".join(parts) + times + (f" to {width:g} µs" if width else "")
 
 
-def others(diagnosis: Mapping[str, Any], library: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """List the effects that were tried and rejected, with the reason, best first."""
-    named = {entry["effect"] for entry in diagnosis["missing"]}
-    return [
-        {"id": row["effect"], "name": name_of(row["effect"], library), "reason": row["reason"]}
-        for row in diagnosis.get("refused") or []
-        if row["effect"] not in named
-    ]
+# ---- versions -------------------------------------------------------------------------------------------------------
 
 
 def versions(rows: Sequence[Mapping[str, Any]], current: str) -> list[dict[str, Any]]:
-    """List the versions of one recording in order of descent."""
-    return [{"reason": None, **row, "label": label(row), "current": row["id"] == current} for row in rows]
+    """List the versions of one recording in order of descent, each named by what it has beside its parent."""
+    return [{"reason": None, **row, "label": _label(row), "current": row["id"] == current} for row in rows]
 
 
-def label(row: Mapping[str, Any]) -> str:
-    """Name a version by what it has beside the one that it was made from."""
+def _label(row: Mapping[str, Any]) -> str:
     forced = row.get("without_evidence") or ()
     if row["added_effect"]:
         return f"+ {effects_words(row['added_effect'].split(','), forced)}"
@@ -279,33 +242,3 @@ def step_versions(improvement: Mapping[str, Any]) -> list[dict[str, Any]]:
     return versions(
         [{"id": str(number), "added_effect": step["added"], **undecided, **step} for number, step in steps], ""
     )
-
-
-# ---- effects that the recording does not ask for --------------------------------------------------------------------
-
-NOT_TESTED = "It was not tested on this recording: the recording lacks the columns that it needs."
-
-
-def require_evidence(diagnosis: Mapping[str, Any], added: Sequence[str]) -> None:
-    """Refuse effects that the recording does not ask for. Raises ApiError: 409, with the reason for each effect."""
-    if reasons := refusals(diagnosis, added):
-        detail = " ".join(f"{effect}: {reason}" for effect, reason in reasons.items())
-        detail += (
-            " To add it against the evidence, send `force` and a reason; the held-out error then shows its effect."
-        )
-        title = "The recording gives no evidence for this effect"
-        raise ApiError(409, "effect-not-there", title, detail, reasons=reasons)
-
-
-def refusals(diagnosis: Mapping[str, Any], added: Sequence[str]) -> dict[str, str]:
-    """Return why the recording gives no evidence for these effects; an effect without a reason is left out.
-
-    There is none against an effect that cannot be told from one that is asked for.
-    """
-    reasons = dict.fromkeys(added, NOT_TESTED)
-    reasons |= {row["effect"]: row["reason"] for row in diagnosis.get("refused") or []}
-    reasons |= {row["effect"]: "" for row in diagnosis.get("free") or []}
-    for row in diagnosis["missing"]:
-        reasons |= dict.fromkeys(row.get("confused_with") or [], "")
-    reasons |= {row["effect"]: row.get("objection") or "" for row in diagnosis["missing"]}
-    return {effect: reasons[effect] for effect in added if reasons[effect]}

@@ -18,21 +18,14 @@ def site_of(row: Participant) -> Site:
     return row.side, row.muscle, row.placement
 
 
-def holds_at(site: list[Any] | None, row: Participant) -> bool:
-    """Return whether the stored site is still the participant's site."""
-    return stored_site(site) == site_of(row)
+def stored_site(site: list[Any] | None) -> Site | None:
+    """Return the site of its stored list."""
+    return None if site is None else (site[0], site[1], site[2])
 
 
 def site_of_recording(recording: Recording, test: Test | None) -> Site | None:
     """Return the site of a recording's test; None: uploaded before sites were stored."""
-    if test is not None:
-        return test.plan.get("side"), test.plan.get("muscle"), test.plan.get("placement")
-    return stored_site(recording.site)
-
-
-def stored_site(site: list[Any] | None) -> Site | None:
-    """Return the site of its stored list."""
-    return None if site is None else (site[0], site[1], site[2])
+    return stored_site(recording.site) if test is None else place_of(test)[:3]
 
 
 def in_words(site: Site) -> str:

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import logging
 import re
 from collections.abc import Collection
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from sqlalchemy import select
 from sqlalchemy.orm import Session, defer
@@ -16,28 +14,18 @@ from sqlalchemy.orm import Session, defer
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
-from stimrig.api.models.places import (
-    Site,
-    holds_at,
-    in_words,
-    place_of,
-    site_of,
-    site_of_recording,
-)
+from stimrig.api.models.places import Site, in_words, place_of, site_of, site_of_recording, stored_site
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, locking
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Approval, Model, Participant, Recording, Test
 
-log = logging.getLogger("stimrig.models")
 COLUMNS = tuple(column.name for column in Model.__table__.columns if column.name not in ("document", "etag", "fit"))
 """Columns of a version that clients see as they are."""
 POOR = ("not usable", "unknown")
 """Verdicts that require a reason for an approval."""
 AT_ONCE = 16
 """Decisions that are read from the database at a time, the newest first."""
-WORDS, LETTERS, DIFFERENT = 3, 10, 5
-"""So many different words, so many letters, so many different letters; "ok", "asdf" and "......" have fewer."""
 WHAT_TO_WRITE = (
     "Write in a few words why the controller may have this model and who watches it, "
     "for example: only the delay is used today, the engineer stands by."
@@ -45,26 +33,18 @@ WHAT_TO_WRITE = (
 
 
 def is_reason(text: str) -> bool:
-    """Return whether a text is a usable reason: several different words, none a repeated letter."""
-    words = [word.casefold() for word in re.findall(r"[^\W\d_]+", text)]
-    letters = "".join(words)
-    return (
-        len(set(words)) >= WORDS
-        and len(letters) >= LETTERS
-        and len(set(letters)) >= DIFFERENT
-        and not any(re.search(r"(.)\1{3}", word) for word in words)
-    )
+    """Return whether a text is a usable reason: three different words or more, none a repeated letter."""
+    words = {word for word in re.findall(r"[^\W\d_]+", text.casefold()) if len(set(word)) > 1}
+    return len(words) >= 3 and sum(map(len, words)) >= 10
 
 
-@dataclass(frozen=True)
-class Served:
-    """The document served to the controller: the bytes and their tag."""
+class Served(NamedTuple):
+    """The document served to the controller, its tag, and since when it holds."""
 
     body: bytes
     etag: str
     approval_id: int
     at_utc: str
-    """Since when it holds."""
 
 
 class Versions:
@@ -72,62 +52,35 @@ class Versions:
 
     def __init__(self, store: Store, clock: Clock) -> None:
         self.store, self.clock = store, clock
-        self._damaged: set[str] = set()
 
     def add(
-        self,
-        model_json: str,
-        participant: str,
-        recording_id: str,
-        by: str,
-        parent_id: str | None = None,
-        added_effect: str | None = None,
-        *,
-        carried_from_id: str | None = None,
-        carried: dict[str, Any] | None = None,
-    ) -> Model:
-        """Store a new version."""
-        document = json.loads(model_json)
-        body = model_json.encode()
-        now = self.clock.utc()
+        self, model_json: str, participant: str, recording_id: str, by: str, parent_id: str | None = None,
+        added_effect: str | None = None, **carried: Any,
+    ) -> Model:  # fmt: skip
+        """Store a new version; `carried`: the columns `carried` and `carried_from_id`."""
+        document, body, now = json.loads(model_json), model_json.encode(), self.clock.utc()
+        fit = {
+            **stored_model.figures(document),
+            **stored_model.quality(document),
+            "figures": stored_model.muscle_figures(document),
+            "without_evidence": stored_model.without_evidence(document),
+        }
         row = Model(
-            id=str(document["model_id"]),
-            participant=participant,
-            recording_id=recording_id,
-            parent_id=parent_id,
-            added_effect=added_effect,
-            carried_from_id=carried_from_id,
-            carried=carried,
-            method=str(document.get("method") or document.get("kind") or ""),
-            effects=list(stored_model.structure(document)),
-            fit={
-                **stored_model.figures(document),
-                **stored_model.quality(document),
-                "figures": stored_model.muscle_figures(document),
-                "without_evidence": stored_model.without_evidence(document),
-            },
-            document=body,
-            etag=hashlib.sha256(body).hexdigest(),
-            created_utc=now,
-            created_by=by,
-        )
+            id=document["model_id"], participant=participant, recording_id=recording_id, parent_id=parent_id,
+            added_effect=added_effect, method=document.get("method") or document.get("kind") or "",
+            effects=list(stored_model.structure(document)), fit=fit, document=body,
+            etag=hashlib.sha256(body).hexdigest(), created_utc=now, created_by=by, **carried,
+        )  # fmt: skip
         with self.store.write() as session:
             same = session.get(Model, row.id)
+            if same is not None and same.etag == row.etag:
+                return same
             if same is not None:
-                if same.etag == row.etag:
-                    return same
                 detail = f"{row.id} is stored already, with other contents. Nothing was overwritten."
                 raise ApiError(409, "model-exists", "A model version cannot be changed", detail)
             session.add(row)
             audit.write(session, now, by, "store model", row.id, recording=recording_id, effects=row.effects)
         return row
-
-    def note_carried(self, model_id: str, carried: dict[str, Any], carried_from_id: str | None) -> None:
-        """Keep beside a plain version what its recording said of the structure of an earlier session."""
-        with self.store.write() as session:
-            row = session.get(Model, model_id)
-            assert row is not None
-            row.carried, row.carried_from_id = carried, carried_from_id
 
     def get(self, model_id: str) -> Model:
         """Return a version by its id."""
@@ -135,7 +88,7 @@ class Versions:
         return require_found(self.store.get(Model, model_id), "model", model_id, fix)
 
     def of(self, participant: str, since_utc: str = "") -> list[dict[str, Any]]:
-        """A participant's versions as clients see them, newest first; with `since_utc` those made since then.
+        """Return a participant's versions as clients see them, newest first; with `since_utc` those made since then.
 
         Three queries, and no model is read whole.
         """
@@ -147,7 +100,13 @@ class Versions:
             rows = list(session.scalars(query.order_by(Model.created_utc.desc())))
             newest = {decision.model_id: decision for decision in session.scalars(decided)}
         holding = self.approved(participant)
-        return [self._document(row, newest.get(row.id), holding) for row in rows]
+        return [_document(row, newest.get(row.id), holding) for row in rows]
+
+    def document(self, row: Model) -> dict[str, Any]:
+        """Return a version as clients see it, without the model itself."""
+        return _document(row, self.decision(row.id), self.approved(row.participant))
+
+    # ---- descent ---------------------------------------------------------------------------------------------------
 
     def child_with(self, parent: Model, effects: list[str], with_evidence: Collection[str] = ()) -> Model | None:
         """Return the child of `parent`, of the same recording, that has exactly these effects.
@@ -174,12 +133,36 @@ class Versions:
             path.insert(0, rows[str(path[0].parent_id)])
         return path
 
+    # ---- decisions -------------------------------------------------------------------------------------------------
+
+    def decide(
+        self, model_id: str, approved: bool, by: str, reason: str, tracking: Limits | None = None,
+        *, tags: Tags | None = None,
+    ) -> int:  # fmt: skip
+        """Approve or reject a version; only a person does this. Return the participant's new version.
+
+        `tracking`: how far it may be tracked; None: not at all. `tags`: versions that it is decided on.
+
+        Raises ApiError: 422 it is not usable, and nobody says why the controller may have it all the same; 500 it is
+        damaged; 412 the participant was changed since it was shown; 409 it was measured at another site.
+        """
+        row = self.get(model_id)
+        if approved:
+            stored_model.whole(row)
+            if row.fit["verdict"] in POOR and not is_reason(reason):
+                title = "This model is not usable: say why it is approved all the same"
+                raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
+        with self.store.write() as session:
+            person = session.get_one(Participant, row.participant)
+            locking.check(session, person, tags)
+            self._decide(session, person, row, approved, by, reason, tracking.model_dump() if tracking else None)
+            return person.version
+
     def undo(self, model_id: str, by: str, reason: str, tags: Tags | None = None) -> tuple[Model, int]:
         """Go back to the version this one was made from: this one is rejected, and where it was in use, that one is.
 
-        Return it, and the participant's new version.
-
-        One that is not usable comes into use by nobody's silence: then the controller gets what was approved before.
+        Return it, and the participant's new version. A parent that is not usable is never approved implicitly: then the
+        controller gets what was approved before.
 
         Raises ApiError: 409 there is nothing before it.
         """
@@ -195,92 +178,45 @@ class Versions:
             person = session.get_one(Participant, row.participant)
             locking.check(session, person, tags)
             holding = self.approved(row.participant)
-            self._decide(session, row, False, by, words).undone = True
-            usable = self.quality(parent)["verdict"] not in POOR
-            if holding is not None and holding.model_id == row.id and usable:
-                self._decide(session, parent, True, by, words, holding.tracking)
+            self._decide(session, person, row, False, by, words).undone = True
+            if holding is not None and holding.model_id == row.id and parent.fit["verdict"] not in POOR:
+                self._decide(session, person, parent, True, by, words, holding.tracking)
         return parent, person.version
 
-    def decide(
-        self, model_id: str, approved: bool, by: str, reason: str, tracking: Limits | None = None,
-        *, tags: Tags | None = None,
-    ) -> int:  # fmt: skip
-        """Approve or reject a version; only a person does this. Return the participant's new version.
-
-        Parameters
-        ----------
-        tracking : Limits, optional
-            How far it may be tracked; None: not at all.
-        tags : tuple of str
-            Versions that it is decided on.
-
-        Raises
-        ------
-        ApiError
-            422: it is not usable, and nobody says why the controller may have it all the same. 500: it is damaged.
-            412: the participant was changed since it was shown. 409: it was measured at another site than the present
-            one.
-        """
-        row = self.get(model_id)
-        if approved:
-            stored_model.whole(row)
-            if self.quality(row)["verdict"] in POOR and not is_reason(reason):
-                title = "This model is not usable: say why it is approved all the same"
-                raise ApiError(422, "reason-needed", title, f"{WHAT_TO_WRITE} Nothing was decided.")
-        with self.store.write() as session:
-            person = session.get_one(Participant, row.participant)
-            locking.check(session, person, tags)
-            self._decide(session, row, approved, by, reason, tracking.model_dump() if tracking else None)
-            return person.version
-
     def _decide(
-        self, session: Session, row: Model, approved: bool, by: str, reason: str,
+        self, session: Session, person: Participant, row: Model, approved: bool, by: str, reason: str,
         tracking: dict[str, float] | None = None,
     ) -> Approval:  # fmt: skip
         """Write a decision and its audit entry, with the figures that the person was shown."""
-        now, person = self.clock.utc(), session.get_one(Participant, row.participant)
-        decision = Approval(
-            model_id=row.id,
-            participant=row.participant,
-            approved=approved,
-            reason=reason,
-            by=by,
-            at_utc=now,
-            site=self._site(session, row, person, approved),
-            expires_utc=self.clock.end_of_day_utc() if approved else None,
-            tracking=tracking if approved else None,
-        )
-        session.add(decision)
-        detail: dict[str, Any] = {"shown": {name: value for name, value in row.fit.items() if name != "figures"}}
-        detail |= {"tracking": decision.tracking} if decision.tracking else {}
-        action, entry = "approve" if approved else "reject", {"participant": person.code, "reason": reason}
-        locking.write(session, person, now, by, action, row.id, **entry, **detail)
-        return decision
-
-    def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
-        """Return the site and current (mA) of a version's recording; None: unknown."""
-        with self.store.read() as session:
-            return self._measured_at(session, row)
-
-    def _measured_at(self, session: Session, row: Model) -> tuple[Site | None, float | None]:
-        recording = session.get_one(Recording, row.recording_id)
-        test = session.scalars(select(Test).where(Test.recording_id == recording.id)).first()
-        return site_of_recording(recording, test), None if test is None else place_of(test)[3]
-
-    def _site(self, session: Session, row: Model, person: Participant, approved: bool) -> list[Any]:
-        """Return the participant's site; 409 where the model to approve was measured at another one."""
-        here, (there, _current) = site_of(person), self._measured_at(session, row)
+        now, here, (there, _current) = self.clock.utc(), site_of(person), self.measured_at(row)
         if approved and there not in (None, here):
             detail = (
                 f"{row.id} was measured at {in_words(there)}. {row.participant} is now stimulated at {in_words(here)}. "
                 "Test anew there, or set the site back on the participant's page. Nothing was decided."
             )
             raise ApiError(409, "other-site", "This model is of another site", detail)
-        return list(here)
+        decision = Approval(
+            model_id=row.id, participant=person.code, approved=approved, reason=reason, by=by, at_utc=now,
+            site=list(here), expires_utc=self.clock.end_of_day_utc() if approved else None, tracking=tracking,
+        )  # fmt: skip
+        session.add(decision)
+        detail: dict[str, Any] = {"shown": {name: value for name, value in row.fit.items() if name != "figures"}}
+        detail |= {"tracking": tracking} if tracking else {}
+        action, entry = "approve" if approved else "reject", {"participant": person.code, "reason": reason}
+        locking.write(session, person, now, by, action, row.id, **entry, **detail)
+        return decision
+
+    def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
+        """Return the site and current (mA) of a version's recording; None: unknown."""
+        recording: Recording = self.store.get(Recording, row.recording_id)
+        test: Test | None = self.store.first(Test, Test.recording_id == recording.id)
+        return site_of_recording(recording, test), None if test is None else place_of(test)[3]
 
     def decision(self, model_id: str) -> Approval | None:
         """Return the newest decision on a version."""
         return self.store.first(Approval, Approval.model_id == model_id, order=Approval.id.desc())
+
+    # ---- what holds ------------------------------------------------------------------------------------------------
 
     def approved(self, participant: str) -> Approval | None:
         """Return the participant's valid approval of today."""
@@ -288,9 +224,8 @@ class Versions:
 
     def all_approved(self, participants: Collection[str]) -> dict[str, Approval]:
         """Return the valid approvals of many participants, in one query."""
-        now = self.clock.utc()
-        approvals = self._last_approvals(participants)
-        return {code: row for code, row in approvals.items() if row.expires_utc is None or row.expires_utc > now}
+        now, approvals = self.clock.utc(), self._last_approvals(participants)
+        return {code: row for code, row in approvals.items() if (row.expires_utc or "") > now}
 
     def last_approved(self, participant: str) -> Model | None:
         """Return the version approved last and not rejected since, whether or not the approval has expired."""
@@ -303,13 +238,13 @@ class Versions:
         newest: dict[str, Approval] = {}
         with self.store.read() as session:
             of = session.scalars(select(Participant).where(Participant.code.in_(participants)))
-            people = {row.code: row for row in of}
+            sites = {row.code: site_of(row) for row in of}
             for decision in session.scalars(query.execution_options(yield_per=AT_ONCE)):
-                if len(newest) == len(people):
+                if len(newest) == len(sites):
                     break  # avoids reading years of decisions
                 if not decision.approved:
                     rejected.add(decision.model_id)
-                elif decision.model_id not in rejected and holds_at(decision.site, people[decision.participant]):
+                elif decision.model_id not in rejected and stored_site(decision.site) == sites[decision.participant]:
                     newest.setdefault(decision.participant, decision)
         return newest
 
@@ -330,38 +265,26 @@ class Versions:
         return Served(stored_model.whole(row), f'"{row.etag}"', approval.id, approval.at_utc)
 
     def recruitment(self, participant: str) -> dict[str, list[float]] | None:
-        """Recruitment curve of the approved model; None where nothing is approved, or where that cannot be read."""
+        """Return the recruitment curve of the approved model; None where nothing is approved, or it is damaged."""
         try:
             served = self.served(participant)
-        except ApiError as error:
-            if error.detail not in self._damaged:  # logged once, not on every read
-                self._damaged.add(error.detail)
-                log.warning("%s Without it no torque-time is estimated.", error.detail)
+        except ApiError:  # the page of the model says so
             return None
-        if served is None:
-            return None
-        curve = json.loads(served.body)["recruitment"]
-        return {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
+        curve = json.loads(served.body)["recruitment"] if served else None
+        return curve and {name: curve[name] for name in ("pulse_width_us", "torque_nm")}
 
-    def quality(self, row: Model) -> dict[str, Any]:
-        """Return the verdict of a version from its stored figures."""
-        return {key: row.fit[key] for key in ("verdict", "words", "reasons")}
 
-    def document(self, row: Model) -> dict[str, Any]:
-        """A version as clients see it, without the model itself."""
-        return self._document(row, self.decision(row.id), self.approved(row.participant))
-
-    def _document(self, row: Model, decision: Approval | None, holding: Approval | None) -> dict[str, Any]:
-        return {
-            "model_id": row.id,
-            **{name: getattr(row, name) for name in COLUMNS},
-            **row.fit,
-            "decision": None if decision is None else ("approved" if decision.approved else "rejected"),
-            "decided_by": decision.by if decision else None,
-            "decided_utc": decision.at_utc if decision else None,
-            "undone": bool(decision and decision.undone),
-            "decision_reason": decision.reason if decision else None,
-            "expires_utc": decision.expires_utc if decision else None,
-            "tracking": decision.tracking if decision else None,
-            "served": holding is not None and holding.model_id == row.id,
-        }
+def _document(row: Model, decision: Approval | None, holding: Approval | None) -> dict[str, Any]:
+    return {
+        "model_id": row.id,
+        **{name: getattr(row, name) for name in COLUMNS},
+        **row.fit,
+        "decision": None if decision is None else "approved" if decision.approved else "rejected",
+        "undone": bool(decision and decision.undone),
+        "decided_by": decision.by if decision else None,
+        "decided_utc": decision.at_utc if decision else None,
+        "decision_reason": decision.reason if decision else None,
+        "expires_utc": decision.expires_utc if decision else None,
+        "tracking": decision.tracking if decision else None,
+        "served": holding is not None and holding.model_id == row.id,
+    }

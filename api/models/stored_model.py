@@ -1,18 +1,12 @@
-"""MODEL.json: the bytes as they were stored, and what a person reads off it.
-
-Figures and verdict, threshold and plateau, natural period and damping; and the figures that are followed over sessions,
-each with its standard deviation.
-"""
+"""MODEL.json: the bytes as they were stored, and what a person reads off it."""
 
 from __future__ import annotations
 
 import cmath
 import hashlib
 import json
-import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stimrig.api.effect_words import fact_of
 from stimrig.api.errors import ApiError
@@ -21,11 +15,21 @@ from stimrig.identify.yardstick import repetition_sentences
 if TYPE_CHECKING:
     from stimrig.api.store.tables import Model
 
-# ---- as it was stored ---------------------------------------------------------------------------------------------
+UNDEFINED = "not defined: the torque is level there"
+"""Placeholder for a model that has an error but no best-fit %."""
+NO_VERDICT = {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
+FIT = (
+    "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
+    "rms_nm", "held_out_rms_nm", "held_out_by", "noise_sd_nm",
+)  # fmt: skip
+Figure = dict[str, Any]
+"""`value`, `sd` (None: not known) and `unit`; of an effect's parameter, the effect's `form` besides."""
+UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "damping": "1", "delay_s": "s"}
+"""Figures that are followed over sessions."""
 
 
 def whole(row: Model) -> bytes:
-    """A version's bytes, for the controller and for files. Raises ApiError (500) where they are damaged."""
+    """Return a version's bytes, for the controller and for files. Raises ApiError (500): they are damaged."""
     if hashlib.sha256(row.document).hexdigest() != row.etag:
         detail = (
             f"{row.id} is no longer what was stored (its checksum differs). Restore the database from a backup, or fit "
@@ -36,12 +40,12 @@ def whole(row: Model) -> bytes:
 
 
 def read(row: Model) -> dict[str, Any]:
-    """A version's document. Raises ApiError (500) where it is damaged."""
+    """Return a version's document. Raises ApiError (500): it is damaged."""
     return json.loads(whole(row))
 
 
 def text(row: Model) -> str:
-    """A version's document as workers are given it. Raises ApiError (500) where it is damaged."""
+    """Return a version's document as workers are given it. Raises ApiError (500): it is damaged."""
     return whole(row).decode()
 
 
@@ -58,14 +62,6 @@ def is_plain(document: Mapping[str, Any]) -> bool:
 
 # ---- verdict and fit ----------------------------------------------------------------------------------------------
 
-UNDEFINED = "not defined: the torque is level there"
-"""Placeholder for a model that has an error but no best-fit %."""
-NO_VERDICT = {"verdict": "unknown", "words": "No verdict was stored with this model: fit it again.", "reasons": []}
-FIT = (
-    "fit_percent", "ceiling_percent", "held_out_fit_percent", "held_out_ceiling_percent",
-    "rms_nm", "held_out_rms_nm", "held_out_by", "noise_sd_nm",
-)  # fmt: skip
-
 
 def repetition(document: Mapping[str, Any]) -> dict[str, Any]:
     """Return the repetition statistics of a MODEL.json, with `sentences`; None for unknown ones."""
@@ -79,13 +75,13 @@ def figures(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def quality(document: Mapping[str, Any]) -> dict[str, Any]:
-    """The verdict of identify on a model: `verdict`, `words` (a sentence) and `reasons`; "unknown" without one."""
+    """Return the verdict of identify: `verdict`, `words` (a sentence) and `reasons`; "unknown" without one."""
     stored = document.get("quality") or NO_VERDICT
     return {name: stored[name] for name in NO_VERDICT}
 
 
 def without_evidence(document: Mapping[str, Any]) -> list[str]:
-    """The effects of a model that a person added although the recording did not ask for them."""
+    """Return the effects of a model that a person added although the recording did not ask for them."""
     return (document.get("quality") or {}).get("gates", {}).get("evidence", {}).get("effects", [])
 
 
@@ -100,37 +96,30 @@ def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> N
         judged |= {"verdict": "usable with care", "words": f"{reason.capitalize()}."}
 
 
-@dataclass(frozen=True)
-class Followed:
-    """Return how much of the torque a model explains: the same figure of merit on every page.
-
-    Best fit, and the most that the sensor noise allows on the same pulses, %; None where it is not defined. `where`:
-    the pulses it was found on, as the beginning of a sentence.
-    """
+class Followed(NamedTuple):
+    """How much of the torque a model explains, %; None where it is not defined."""
 
     percent: float | None
-    ceiling_percent: float | None
-    where: str
+    ceiling_percent: float | None  # what the sensor noise allows on the same pulses
+    where: str  # the pulses it was found on, as the beginning of a sentence
     held_out: bool = True
 
 
 def followed(fit: Mapping[str, Any]) -> Followed:
-    """The figure of a model's `fit`: of pulses not used for fitting where there are any."""
+    """Return the one figure of merit of every page: of pulses not used for fitting where there are any."""
     if fit.get("held_out_fit_percent") is None:
         where = "On the pulses that it was fitted to"
         return Followed(fit.get("fit_percent"), fit.get("ceiling_percent"), where, held_out=False)
-    if fit.get("held_out_by") == "cross-validation":
-        where = "On parts of the recording that were left out in turn"
-    else:
-        where = "On held-out pulses (not used for fitting)"
-    return Followed(fit["held_out_fit_percent"], fit.get("held_out_ceiling_percent"), where)
+    by_parts = fit.get("held_out_by") == "cross-validation"
+    parts, pulses = "On parts of the recording that were left out in turn", "On held-out pulses (not used for fitting)"
+    return Followed(fit["held_out_fit_percent"], fit.get("held_out_ceiling_percent"), parts if by_parts else pulses)
 
 
 # ---- curve and dynamics -------------------------------------------------------------------------------------------
 
 
 def recruitment(document: Mapping[str, Any]) -> dict[str, float | None]:
-    """Threshold (µs), plateau (N·m) and the width at which 95 % of it is reached (µs).
+    """Return threshold (µs), plateau (N·m) and the width at which 95 % of it is reached (µs).
 
     Where stimulation lowers the torque of the record the curve falls, and its plateau is below zero.
     """
@@ -138,34 +127,20 @@ def recruitment(document: Mapping[str, Any]) -> dict[str, float | None]:
     return {name: stored[name]["value"] for name in ("threshold_us", "plateau_nm", "saturation_us")}
 
 
-def dynamics(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Tω (s), ζ and delay (s) where the linear part is of second order; its poles (1/s) besides.
-
-    Tω and ζ are those of eq. (31) with damping: 1 / (Tω² s² + 2 ζ Tω s + 1).
-    """
+def dynamics(document: Mapping[str, Any]) -> dict[str, float | None]:
+    """Return Tω (s), ζ and delay (s) of 1 / (Tω² s² + 2 ζ Tω s + 1), eq. (31) with damping; None for another order."""
     linear = document["linear"]
-    values: dict[str, Any] = {key: linear.get(key) for key in ("time_constant_s", "damping", "delay_s")}
-    step_s = linear.get("step_s") or 1.0 / document["sample_rate_hz"]
-    poles = _poles(linear["a"], step_s)
-    values["poles_per_s"] = [[round(pole.real, 4), round(pole.imag, 4)] for pole in poles]
-    if values["time_constant_s"] is None and len(poles) == 2 and abs(poles[0] * poles[1]) > 0:
-        speed = math.sqrt(abs(poles[0] * poles[1]))
-        values["time_constant_s"], values["damping"] = 1.0 / speed, -(poles[0] + poles[1]).real / 2 / speed
-    return values
-
-
-def _poles(a: list[float], step_s: float) -> list[complex]:
-    """Continuous poles of a denominator of at most second order, 1/s."""
-    while len(a) > 1 and a[-1] == 0.0:
-        a = a[:-1]
-    if len(a) == 2:
-        roots = [complex(-a[1] / a[0])]
-    elif len(a) == 3:
+    values = {key: linear.get(key) for key in ("time_constant_s", "damping", "delay_s")}
+    a = [*linear["a"]]
+    while a and a[-1] == 0.0:
+        a.pop()
+    if values["time_constant_s"] is None and len(a) == 3:  # read off the poles of a second-order denominator
         root = cmath.sqrt(a[1] ** 2 - 4 * a[0] * a[2])
-        roots = [(-a[1] + root) / (2 * a[0]), (-a[1] - root) / (2 * a[0])]
-    else:
-        return []
-    return [cmath.log(root) / step_s for root in roots if root != 0]
+        step_s = linear.get("step_s") or 1.0 / document["sample_rate_hz"]
+        poles = [cmath.log((sign * root - a[1]) / (2 * a[0])) / step_s for sign in (1, -1)]
+        if speed := abs(poles[0] * poles[1]) ** 0.5:
+            values |= {"time_constant_s": 1.0 / speed, "damping": -sum(poles).real / 2 / speed}
+    return values
 
 
 def validity(document: Mapping[str, Any]) -> str | None:
@@ -182,13 +157,6 @@ def validity(document: Mapping[str, Any]) -> str | None:
     return f"Valid for {', '.join(named)}." if named else None
 
 
-# ---- followed over sessions ---------------------------------------------------------------------------------------
-
-Figure = dict[str, Any]
-"""`value`, `sd` (None where it is not known) and `unit`; of an effect's parameter, the effect's `form` besides."""
-UNITS = {"threshold_us": "µs", "plateau_nm": "N·m", "time_constant_s": "s", "damping": "1", "delay_s": "s"}
-
-
 def muscle_figures(document: Mapping[str, Any]) -> dict[str, Figure]:
     """Return threshold, plateau, dynamics, and the main parameter of each effect as `effect.parameter`."""
     stored, read_off = document["uncertainty"]["figures"], dynamics(document)
@@ -199,17 +167,12 @@ def muscle_figures(document: Mapping[str, Any]) -> dict[str, Figure]:
     for effect in document.get("effects") or []:
         known = effect.get("parameters") or {}
         for name in [*(name for name in fact_of(effect["id"], "main", ()) if name in known), *known][:1]:
-            figure = {"unit": "1", **known[name]}
-            figures[f"{effect['id']}.{name}"] = {
-                "value": figure["value"],
-                "sd": figure["sd"],
-                "unit": figure["unit"],
-                "form": effect.get("form") or "",
-            }
+            value = {"unit": "1", **known[name], "form": effect.get("form") or ""}
+            figures[f"{effect['id']}.{name}"] = {key: value[key] for key in ("value", "sd", "unit", "form")}
     return figures
 
 
 def threshold_us(row: Model) -> float | None:
-    """The threshold of a version's curve, µs; None where it has none."""
+    """Return the threshold of a version's curve, µs; None where it has none."""
     value: float | None = row.fit["figures"]["threshold_us"]["value"]
     return value

@@ -27,28 +27,23 @@ async def fit(
     analyses: Analyses, participant: str, recordings: Sequence[str], effects: Sequence[str], by: str,
     on_call: OnCall | None = None,
 ) -> Model:  # fmt: skip
-    """Join the recordings and fit them as one.
+    """Join the recordings, each named once, and fit them as one; a single one is fitted as it is.
 
-    Parameters
-    ----------
-    recordings : sequence of str
-        Ids, each once; a single one is fitted as it is.
-    effects : sequence of str
-        Of the model.
-
-    Raises
-    ------
-    ApiError
-        404: no such recording; 422: of another participant, named twice, without the joint's angle although an effect
-        needs it, or the data do not allow the fit.
+    Raises ApiError: 404 no such recording; 422 of another participant, without the joint's angle although an effect
+    needs it, or the data do not allow the fit.
     """
-    rows = await asyncio.to_thread(_find_recordings, analyses, participant, recordings)
-    ids = _ids(effects)
+    rows = []
+    for name in recordings:
+        fix = "GET /v1/tests?participant={code} names those of its tests."
+        row: Recording | None = await asyncio.to_thread(analyses.store.get, Recording, name)
+        rows.append(row := require_found(row, "recording", name, fix))
+        if row.participant != participant:
+            detail = f"{name} is a recording of {row.participant}, the model is to be one of {participant}."
+            raise ApiError(422, "other-participant", "The recording is another participant's", detail)
+    ids, of_joint = ([name.partition(":")[0] for name in names] for names in (effects, JOINT_EFFECTS))
     await analyses.check_known(ids)
-    whole = rows[0]
-    if len(rows) > 1:
-        needs = [ANGLE] if {*ids} & {*_ids(JOINT_EFFECTS)} else []
-        whole = await join(analyses, [row.id for row in rows], participant, needs)
+    needs = [ANGLE] if {*ids} & {*of_joint} else []
+    whole = rows[0] if len(rows) == 1 else await join(analyses, recordings, participant, needs)
     fitted = await analyses.run("fit", on_call, data=whole.path, effects=list(effects))
 
     def store() -> Model:
@@ -59,23 +54,6 @@ async def fit(
     return await asyncio.to_thread(store)
 
 
-def _ids(effects: Sequence[str]) -> list[str]:
-    """The ids of effects that may say their forms, too."""
-    return [name.partition(":")[0] for name in effects]
-
-
-def _find_recordings(analyses: Analyses, participant: str, recordings: Sequence[str]) -> list[Recording]:
-    rows = []
-    for identity in recordings:
-        fix = "GET /v1/tests?participant={code} names those of its tests."
-        row = require_found(analyses.store.get(Recording, identity), "recording", identity, fix)
-        if row.participant != participant:
-            detail = f"{identity} is a recording of {row.participant}, the model is to be one of {participant}."
-            raise ApiError(422, "other-participant", "The recording is another participant's", detail)
-        rows.append(row)
-    return rows
-
-
 async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs: Sequence[str] = ()) -> Recording:
     """Join recordings to one, itself a recording (`origin` joined), to which all else applies.
 
@@ -84,10 +62,9 @@ async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs
     id.
     """
     paths = [await asyncio.to_thread(analyses.path, part) for part in parts]
-    settings = analyses.settings
     # the only folder that a worker may write to
-    export = settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"
-    path = settings.recordings_dir / export.name
+    export = analyses.settings.exports_dir / f"{uploads.JOINED}{secrets.token_hex(8)}.csv"
+    path = analyses.settings.recordings_dir / export.name
     try:
         joined = await analyses.run("join", urgent=True, parts=paths, out=str(export), needs=list(needs))
         await asyncio.to_thread(export.replace, uploads.part_of(path))
@@ -96,18 +73,18 @@ async def join(analyses: Analyses, parts: Sequence[str], participant: str, needs
         if isinstance(error, ApiError):
             place, _, number = str(error.extra.get("place", "")).partition("recording ")
             if not place and number.isdecimal():
-                named = f"recording {parts[int(number) - 1]}"
-                error.detail = error.detail.replace(f"recording {number}", named, 1)
-                error.extra["place"] = named
+                error.extra["place"] = f"recording {parts[int(number) - 1]}"
+                error.detail = error.detail.replace(f"recording {number}", error.extra["place"], 1)
         raise
     stored = asyncio.to_thread(_store_joined, analyses, path, joined["file_sha256"], participant, list(parts))
     return await asyncio.shield(stored)
 
 
 def _store_joined(analyses: Analyses, path: Path, digest: str, participant: str, parts: list[str]) -> Recording:
-    now, identity = analyses.clock.utc(), path.stem
-    row = Recording(id=identity, participant=participant, path=str(path), file_sha256=digest, origin="joined")
-    row.test_id, row.created_utc = None, now
+    now = analyses.clock.utc()
+    row = Recording(
+        id=path.stem, participant=participant, path=str(path), file_sha256=digest, origin="joined", created_utc=now
+    )
     with uploads.taken_in(path), analyses.store.write() as session:
         tests = {test.recording_id: test for test in session.scalars(select(Test).where(Test.recording_id.in_(parts)))}
         rows = session.scalars(select(Recording).where(Recording.id.in_(parts)))
@@ -119,7 +96,7 @@ def _store_joined(analyses: Analyses, path: Path, digest: str, participant: str,
         row.warnings = list(dict.fromkeys(text for part in parts for text in warnings(session, part))) or None
         session.add(row)
         session.flush()
-        audit.write(session, now, "service", "join recordings", identity, parts=parts, sha256=digest)
+        audit.write(session, now, "service", "join recordings", row.id, parts=parts, sha256=digest)
     return row
 
 

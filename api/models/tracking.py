@@ -8,16 +8,28 @@ from typing import Annotated, Any
 
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from stimrig.api.clock import local_day
-from stimrig.api.local_time import clock, day, when
+from stimrig.api.local_time import when
 
 USUAL_PERCENT = 20.0
-QUANTITIES = {"gain": "gain", "threshold_shift_us": "threshold", "time_scale": "time scale"}
-"""The quantities of `stimrig.identify.tracking`, named here, too, so that the service need not load it, and what people
-read."""
 MIDDLES = {"gain": 1.0, "threshold_shift_us": 0.0, "time_scale": 1.0}
-"""Their values for the approved model."""
+"""The quantities of `stimrig.identify.tracking` and their values for the approved model; named here, too, so that the
+service need not load it."""
+QUANTITIES = {"gain": "gain", "threshold_shift_us": "threshold", "time_scale": "time scale"}
 CONTRADICTS, NO_TORQUE, NOT_FOLLOWED = "contradicts", "no-torque", "not-followed"
+OUTCOMES = {
+    "followed": "followed",
+    "little": "too little to learn from",
+    "odd": "unlike the trials before; the model hardly moved",
+    CONTRADICTS: "does not fit the model",
+    NO_TORQUE: "next to no torque came: look at electrodes and cables",
+    NOT_FOLLOWED: "not followed",
+}
+CHANGES = {
+    "gain": ("plateau", "lower", "higher"),
+    "threshold_shift_us": ("threshold", "lower", "higher"),
+    "time_scale": ("muscle", "faster", "slower"),
+}
+"""What a quantity describes, and the words for less and for more of it."""
 NEW_TEST = "A new test is needed; the shortest is the adaptive test, which stops by itself."
 
 Bounds = dict[str, tuple[float, float]]
@@ -56,9 +68,21 @@ class Limits(BaseModel):
 
         The muscle changes all the same where the model is held.
         """
-        return Limits(**{name: percent or USUAL_PERCENT for name, percent in self.model_dump().items()}).bounds(
-            threshold_us
-        )
+        watched = {name: percent or USUAL_PERCENT for name, percent in self.model_dump().items()}
+        return Limits(**watched).bounds(threshold_us)
+
+
+def limits_words(limits: Mapping[str, float] | None, threshold_us: float | None) -> str:
+    """Say in a sentence how far a model is tracked. `limits`: fields of `Limits`; None: the usual ones."""
+    allowed = Limits(**(limits or {}))
+    bounds = allowed.bounds(threshold_us)
+    if not bounds:
+        return "The model does not follow the muscle from trial to trial: all stays as approved."
+    parts = []
+    for (name, words), percent in zip(QUANTITIES.items(), allowed.model_dump().values(), strict=True):
+        shift = f" (±{bounds[name][1]:.3g}\u00a0µs)" if name in bounds and name == "threshold_shift_us" else ""
+        parts.append(f"{words} ±{percent:g}\u00a0%{shift}" if name in bounds else f"{words} as approved")
+    return f"The model follows the muscle from trial to trial, at most: {', '.join(parts)}."
 
 
 def new_test_reason(number: int, step: Mapping[str, Any], bounds: Bounds) -> str | None:
@@ -66,44 +90,27 @@ def new_test_reason(number: int, step: Mapping[str, Any], bounds: Bounds) -> str
 
     The bounds are for what is expected, not for its band.
 
-    `number`: of the trial; `step`: `identify.tracking.Step.to_dict()`; `bounds`: beyond these a person is asked
-    (`Limits.alarms`).
+    `number`: of the trial; `step`: `identify.tracking.Step.to_dict()`; `bounds`: `Limits.alarms`.
     """
-    words = None
     if step["outcome"] == NO_TORQUE:
-        words = (
-            f"In trial {number} the pulses gave next to no torque. Look at the electrodes and cables; if they are in "
-            "place:"
-        )
-    elif step["outcome"] == CONTRADICTS:
+        words = f"In trial {number} the pulses gave next to no torque. Look at the electrodes and cables; if they are "
+        return f"{words}in place: {NEW_TEST}"
+    if step["outcome"] == CONTRADICTS:
         times = step["error_nm"] / step["expected_error_nm"]
-        words = (
+        return (
             f"Trial {number} contradicts the structure of the approved model: its error is {times:.1f} times the "
-            "expected one, whatever the gain, threshold and time scale are."
+            f"expected one, whatever the gain, threshold and time scale are. {NEW_TEST}"
         )
-    else:
-        for name, (low, high) in bounds.items():
-            value = step["coming"][name]["value"]
-            if value is None or not math.isfinite(value):
-                words = f"After trial {number} it is unknown what to expect of the {QUANTITIES[name]}."
-            elif not (low <= value <= high):
-                words = f"After trial {number} the {QUANTITIES[name]} is expected {_beyond(name, value, low, high)}"
-            if words:
-                break
-    return words and f"{words} {NEW_TEST}"
-
-
-def _beyond(name: str, value: float, low: float, high: float) -> str:
-    """Describe a value beyond its limits; where rounding would show the limit itself, as "just beyond"."""
-    if name == "threshold_shift_us":
-        moved, upper = f"{value:+.1f}", f"{high:.3g}"
-        if abs(float(moved)) <= float(upper):
-            return f"just beyond the {upper} µs that it may move."
-        return f"to have moved by {moved} µs; {upper} µs either way are allowed."
-    percent, lower, upper = f"{100.0 * value:.1f}", f"{100.0 * low:g}", f"{100.0 * high:g}"
-    if float(lower) <= float(percent) <= float(upper):
-        return f"just beyond the {lower} to {upper} % of the approved one that are allowed."
-    return f"to be {percent} % of the approved one; {lower} to {upper} % are allowed."
+    for name, (low, high) in bounds.items():
+        value = step["coming"][name]["value"]
+        if value is None or not math.isfinite(value):
+            return f"After trial {number} it is unknown what to expect of the {QUANTITIES[name]}. {NEW_TEST}"
+        if not low <= value <= high:
+            words = f"be {100.0 * value:.2f} % of the approved one; {100.0 * low:g} to {100.0 * high:g} % are allowed."
+            if name == "threshold_shift_us":
+                words = f"have moved by {value:+.2f} µs; {high:.2f} µs either way are allowed."
+            return f"After trial {number} the {QUANTITIES[name]} is expected to {words} {NEW_TEST}"
+    return None
 
 
 def not_followed(number: int) -> str:
@@ -112,24 +119,6 @@ def not_followed(number: int) -> str:
         f"Trials {number - 1} and {number} could not be followed; their table says why. Whether the model still holds "
         f"is not known. {NEW_TEST}"
     )
-
-
-OUTCOMES = {
-    "followed": "followed",
-    "little": "too little to learn from",
-    "odd": "unlike the trials before; the model hardly moved",
-    CONTRADICTS: "does not fit the model",
-    NO_TORQUE: "next to no torque came: look at electrodes and cables",
-    NOT_FOLLOWED: "not followed",
-}
-CHANGES = {
-    "gain": ("plateau", "lower", "higher"),
-    "threshold_shift_us": ("threshold", "lower", "higher"),
-    "time_scale": ("muscle", "faster", "slower"),
-}
-"""What a quantity describes, and the words for less and for more of it."""
-NARROW = {"gain": 0.05, "threshold_shift_us": 5.0, "time_scale": 0.1}
-"""The muscle is called unchanged where each band holds the middle and leaves it by no more than this."""
 
 
 def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
@@ -141,25 +130,13 @@ def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
     known = [trial for trial in trials if trial["now"] and trial["distance"] is not None]
     if not known:
         return []
-    number, now = known[-1]["number"], known[-1]["now"]
-    same_day, time = local_day(since_utc) == local_day(known[-1]["at_utc"]), clock(since_utc)[:5]
-    day_of_month, _, month = day(since_utc).partition(" ")
-    than = f"at {time}" if same_day else f"on {day_of_month} {month} at {time}"
+    number, now, since = known[-1]["number"], known[-1]["now"], when(since_utc)
     changes = []
     for name, (what, less, more) in CHANGES.items():
-        value, middle = now[name]["value"], MIDDLES[name]
-        change = f"{abs(value):.1f} µs" if name == "threshold_shift_us" else _percent(value)
-        if now[name]["high"] < middle or now[name]["low"] > middle:
-            way = less if now[name]["high"] < middle else more
-            changes.append(f"In trial {number} the {what} is {change} {way} than {than}.")
-    if changes:
-        return changes
-    ends = [(abs(now[name][end] - MIDDLES[name]), NARROW[name]) for name in MIDDLES for end in ("low", "high")]
-    if all(distance <= narrow for distance, narrow in ends):
-        return [f"In trial {number} the muscle is as it was {than}."]
-    return [f"By trial {number} no change since {time if same_day else when(since_utc)} is certain."]
-
-
-def _percent(factor: float) -> str:
-    change = abs(100.0 * (factor - 1.0))
-    return f"{change:.0f} %" if change >= 9.5 else f"{change:.1f} %"
+        level, middle = now[name], MIDDLES[name]
+        percent = abs(100.0 * (level["value"] - middle))
+        change = f"{percent / 100.0:.1f} µs" if name == "threshold_shift_us" else f"{percent:.1f} %"
+        if level["high"] < middle or level["low"] > middle:
+            way = less if level["high"] < middle else more
+            changes.append(f"In trial {number} the {what} is {change} {way} than on {since}.")
+    return changes or [f"By trial {number} no change since {since} is certain."]

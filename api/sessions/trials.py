@@ -20,7 +20,7 @@ from stimrig.api.models.tracked import TrackedVersions, Trial
 from stimrig.api.sessions.kinds import Kind
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.sessions.rig_client import RigClient
-from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
+from stimrig.api.store.tables import Approval, Recording, Test, Tracked
 
 log = logging.getLogger("stimrig.tracking")
 SEQUENCE = "sequence"
@@ -64,7 +64,7 @@ class Trials(Kind):
         if approval is None:
             return
         try:
-            text = await asyncio.to_thread(self.tracked.text, approval)
+            _version, text = await asyncio.to_thread(self.tracked.find, approval.model_id)
             await asyncio.to_thread(self.tracked.earlier, approval)
             await self.tracker.submit("track_warm", model_json=text).result
         except ApiError as error:
@@ -106,17 +106,14 @@ class Trials(Kind):
     async def _examine(self, trial: Trial) -> dict[str, Any]:
         """Return the worker's result, or the reason for none: no trial is lost."""
         recording: Recording | None = await asyncio.to_thread(self.store.get, Recording, trial.test.recording_id or "")
-        if recording is None or trial.problem:
-            return {"reason": trial.problem or "It has no recording."}
+        if recording is None:
+            return {"reason": "It has no recording."}
         if await asyncio.to_thread(self.tracked.elsewhere, trial.approval, [place_of(trial.test)]):
             return {"reason": ELSEWHERE}
         try:
-            return await self.tracker.submit(
-                "track", data=recording.path, model_json=trial.model_json, bounds=trial.bounds,
-                state=trial.state, missed=trial.missed, earlier=trial.earlier,
-                reference_torque_nm=trial.test.plan.get("reference_torque_nm"),
-                between=await asyncio.to_thread(self._between, trial, recording),
-            ).result  # fmt: skip
+            arguments = await asyncio.to_thread(self.tracked.arguments, trial)
+            between = await asyncio.to_thread(self._between, trial, recording)
+            return await self.tracker.submit("track", data=recording.path, between=between, **arguments).result
         except ApiError as error:
             if error.code == "worker-died":
                 self.warm(trial.test.participant)
@@ -127,9 +124,9 @@ class Trials(Kind):
 
         Where nothing was followed yet, it begins with the approved model's test.
         """
-        model: Model = self.store.get(Model, trial.approval.model_id)
-        since: Recording | None = self.store.get(Recording, trial.since)
-        if since is None or not model.effects:
+        since_id = (trial.last and trial.last.recording_id) or trial.model.recording_id
+        since: Recording | None = self.store.get(Recording, since_id)
+        if since is None or not trial.model.effects:
             return []
         conditions = (
             Recording.participant == recording.participant, Recording.test_id.is_not(None),
@@ -140,7 +137,7 @@ class Trials(Kind):
         tests = {row.id: row for row in self.store.all(Test, Test.id.in_([row.test_id for row in recordings]))}
         place = place_of(trial.test)
         here = [row for row in recordings if row.test_id in tests and not differ(place_of(tests[row.test_id]), place)]
-        return [row.path for row in (here if trial.state else [since, *here])]
+        return [row.path for row in (here if trial.last else [since, *here])]
 
     def resume(self) -> None:
         """Follow the trials that a restart left open, and warm the worker where a model may be tracked."""
