@@ -190,11 +190,11 @@ class Versions:
         """Write a decision and its audit entry, with the figures that the person was shown."""
         now, here, (there, _current) = self.clock.utc(), site_of(person), self.measured_at(row)
         if approved and there not in (None, here):
-            detail = (
+            words = (
                 f"{row.id} was measured at {in_words(there)}. {row.participant} is now stimulated at {in_words(here)}. "
                 "Test anew there, or set the site back on the participant's page. Nothing was decided."
             )
-            raise ApiError(409, "other-site", "This model is of another site", detail)
+            raise ApiError(409, "other-site", "This model is of another site", words)
         decision = Approval(
             model_id=row.id, participant=person.code, approved=approved, reason=reason, by=by, at_utc=now,
             site=list(here), expires_utc=self.clock.end_of_day_utc() if approved else None, tracking=tracking,

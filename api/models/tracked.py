@@ -141,8 +141,8 @@ class TrackedVersions:
             elif reason != SUPERSEDED and trial.before and trial.before[-1].outcome == NOT_FOLLOWED:
                 row.ask = tracking.not_followed(number)
             if step is not None and row.ask is None:
-                row.document = _body(json.loads(result["model"]), approval, number, row.test_id, now, step)
-                row.etag = hashlib.sha256(row.document).hexdigest()
+                body = _body(json.loads(result["model"]), approval, number, row.test_id, now, step)
+                row.document, row.etag = body, hashlib.sha256(body).hexdigest()
             session.add(row)
             detail = {"trial": number, "outcome": row.outcome, "reason": reason, "etag": row.etag, "ask": row.ask}
             audit.write(session, now, f"test {row.test_id}", "track model", row.model_id, **detail)

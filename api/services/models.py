@@ -1,66 +1,94 @@
-"""Models: approval, and pulse widths for a reference within the limits of participant and rig."""
+"""What a model foretells of a trial: the torque of given pulse widths, and the pulse widths for a reference torque."""
 
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Annotated, Any
 
-from stimrig.api.errors import ApiError
-from stimrig.api.models.tracking import Limits
+from pydantic import Field, FiniteFloat, StrictBool, model_validator
+
 from stimrig.api.services.context import Context
-from stimrig.api.sessions.requests import tighter
-from stimrig.api.store.locking import Tags
-from stimrig.api.store.tables import Model, Participant
-
-
-async def approve(context: Context, row: Model, by: str, reason: str, tracking: Limits, tags: Tags) -> int:
-    """Approve a version; the worker that follows its trials is warm by the first one."""
-    version = await asyncio.to_thread(context.versions.decide, row.id, True, by, reason, tracking, tags=tags)
-    context.runner.trials.warm(row.participant)
-    return version
-
-
-def none_approved(code: str) -> ApiError:
-    """404, with what to do."""
-    detail = (
-        f"Participant {code!r} has no model approved today; an approval ends with its day. "
-        "POST /v1/models/{id}/approve approves one."
-    )
-    return ApiError(404, "no-approved-model", "No approved model", detail)
-
-
-async def invert(
-    context: Context, model_id: str, reference: dict[str, Any], width_us: float | None = None,
-    rise_us: float | None = None, whole: bool = True,
-) -> dict[str, Any]:  # fmt: skip
-    """Invert a model for a reference torque, within the limits of participant and rig.
-
-    `reference`: the torque to follow, as the verb `invert` takes it; `width_us`, `rise_us`: further limits.
-    """
-    text = await asyncio.to_thread(context.tracked.text_of, model_id)
-    version = await asyncio.to_thread(context.tracked.version_of, model_id)
-    participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
-    largest_us = tighter(width_us, participant.profile.get("max_pulse_width_us"))
-    rig = context.rig.status
-    bound, shortest_us = (rig.limits.get(RISE), rig.stimulator.get("shortest_us")) if rig else (None, None)
-    rise_us = tighter(rise_us, bound and bound.hi)
-    call = context.pool.submit(
-        "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=whole,
-        shortest_us=shortest_us or 0.0, **reference,
-    )  # fmt: skip
-    inverted = await call.result
-    limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us, "shortest_pulse_us": shortest_us}
-    return {"model_id": model_id, **inverted, **limits, "segments": segments(inverted["pulse_width_us"])}
-
-
-def segments(pulse_width_us: list[float]) -> list[dict[str, Any]]:
-    """Return a trial of these widths between two rests, for `POST /v1/tests`."""
-    rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": REST_S}}
-    return [rest, {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": pulse_width_us}}, rest]
-
+from stimrig.api.sessions.requests import Body, tighter
+from stimrig.api.store.tables import Participant
 
 RISE = "width_rise_us"
-
-
 REST_S = 1.0
 """Before and after a trial: its torque is measured against the rest before it."""
+Column = Annotated[list[FiniteFloat], Field(min_length=1, max_length=60_000)]
+WidthUs = Annotated[FiniteFloat, Field(ge=0, le=500)]
+ModelsRateHz = Annotated[
+    Annotated[FiniteFloat, Field(ge=1.0, le=100.0)] | None,
+    Field(description="null: the model's; more than a quarter off that is refused, Hz"),
+]
+Angles = Annotated[
+    list[Annotated[FiniteFloat, Field(ge=-7, le=7)]],
+    Field(
+        min_length=1, max_length=60_000, description="of the joint where it moves, rad; as many as torques or widths"
+    ),
+]
+
+
+class WidthsIn(Body):
+    """One pulse width for each pulse."""
+
+    pulse_width_us: Annotated[list[WidthUs], Field(min_length=1, max_length=12_000, description="µs")]
+    pulse_rate_hz: ModelsRateHz = None
+    angle_rad: Angles | None = None
+
+    @model_validator(mode="after")
+    def _as_many(self) -> WidthsIn:
+        if self.angle_rad is not None and len(self.angle_rad) != len(self.pulse_width_us):
+            raise ValueError(f"{len(self.angle_rad)} angles for {len(self.pulse_width_us)} widths: give one for each")
+        return self
+
+
+class ReferenceIn(Body):
+    """A torque to follow, as numbers or as the text of a table."""
+
+    reference_torque_nm: (
+        Annotated[Column, Field(description="above rest, N·m; one for each pulse, without `time_s`")] | None
+    ) = None
+    table: Annotated[str, Field(description="instead: a CSV file with `time_s,torque_nm`, or `torque_nm`")] | None = (
+        None
+    )
+    time_s: Annotated[Column, Field(description="times of the torques, s, rising by at most 1 s")] | None = None
+    angle_rad: Angles | None = None
+    pulse_rate_hz: ModelsRateHz = None
+    max_pulse_width_us: FiniteFloat | None = Field(None, gt=0, le=500, description="never above the participant's, µs")
+    max_rise_us: FiniteFloat | None = Field(None, gt=0, le=500, description="from pulse to pulse, µs; None: the rig's")
+    whole_us: StrictBool = Field(True, description="whole µs")
+
+    @model_validator(mode="after")
+    def _one_reference(self) -> ReferenceIn:
+        if (self.reference_torque_nm is None) == (self.table is None):
+            raise ValueError("give reference_torque_nm, or the text of a table")
+        return self
+
+
+async def predict(context: Context, model_id: str, body: WidthsIn) -> dict[str, Any]:
+    """Predict the mean torque in each pulse's period, of a version or of one that was tracked from it."""
+    _version, text = await asyncio.to_thread(context.tracked.find, model_id)
+    forecast = await context.pool.submit("forecast", urgent=True, model_json=text, **body.model_dump()).result
+    return {"model_id": model_id, **forecast}
+
+
+async def invert(context: Context, model_id: str, body: ReferenceIn) -> dict[str, Any]:
+    """Invert a version, or one that was tracked from it, within the limits of participant and rig.
+
+    `segments` is the trial of these widths between two rests, for `POST /v1/tests`.
+    """
+    version, text = await asyncio.to_thread(context.tracked.find, model_id)
+    participant: Participant = await asyncio.to_thread(context.store.get, Participant, version.participant)
+    rig = context.rig.status
+    rise, shortest_us = (rig.limits.get(RISE), rig.stimulator.get("shortest_us")) if rig else (None, None)
+    largest_us = tighter(body.max_pulse_width_us, participant.profile.get("max_pulse_width_us"))
+    rise_us = tighter(body.max_rise_us, rise and rise.hi)
+    reference = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz", "table"})
+    inverted = await context.pool.submit(
+        "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=body.whole_us,
+        shortest_us=shortest_us or 0.0, **reference,
+    ).result  # fmt: skip
+    rest = {"name": "rest", "sequence": "rest", "settings": {"duration_s": REST_S}}
+    trial = {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": inverted["pulse_width_us"]}}
+    limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us, "shortest_pulse_us": shortest_us}
+    return {"model_id": model_id, **inverted, **limits, "segments": [rest, trial, rest]}

@@ -38,7 +38,7 @@ def addresses(service: Service) -> list[str]:
     return [
         "/", "/participants/P017", "/participants/P018", "/participants/P017/calibration",
         "/participants/P018/calibration", "/participants/P017/joint", "/rig/angle", f"/tests/{test['id']}",
-        f"/models/{model}", f"/models/{make_poor(service, model)}/approve", "/participants/P019", "/administration",
+        f"/models/{model}", f"/models/{make_poor(service, model)}", "/participants/P019", "/administration",
     ]  # fmt: skip
 
 

@@ -19,7 +19,6 @@ from stimrig.api.cli import main
 from stimrig.api.cli.commands.diagnose import effect_lines
 from stimrig.api.cli.reports import report_test
 from stimrig.api.models import advice, explanation, registry, stored_model
-from stimrig.api.web.pages import report_view
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.report_file import comparison_html
 from stimrig.identify.estimation import quality
@@ -35,7 +34,7 @@ def test_the_report_names_the_hash_of_the_file_and_that_of_its_contents(
     model = run_test(client, participant)["model_id"]
     told = {"data": {"sha256": "c0ffee" * 11}}
     assert "of its contents" not in pages.get(f"/models/{model}/report").text
-    monkeypatch.setattr(report_view.stored_model, "read", lambda row: json.loads(row.document) | told)
+    monkeypatch.setattr(stored_model, "read", lambda row: json.loads(row.document) | told)
     text = pages.get(f"/models/{model}/report").text
     assert "SHA-256 of the file <span" in text and ", of its contents, as in MODEL.json <span" in text
     assert ">c0ffeec0ffeec0ff…</span>" in text

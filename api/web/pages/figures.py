@@ -34,7 +34,7 @@ async def of_model(
     request: Request, context: Ctx, _principal: ModelReader, row: Version, name: str, width: Width = 720
 ) -> Response:
     """Return one of the charts of a model's page, its kind at the end of its name."""
-    figures = await model_view.figures_of(context, row)
+    figures = (await model_view.parts(context, row))["figures"]
     return await asyncio.to_thread(answer, request, figures, name, width)
 
 

@@ -10,12 +10,11 @@ from fastapi.responses import Response
 
 from stimrig.api.charts.drawing import svg
 from stimrig.api.clock import local_day
-from stimrig.api.models import explanation, stored_model
 from stimrig.api.models.places import site_of, site_of_recording
 from stimrig.api.services import notes
 from stimrig.api.store.tables import Note, Participant, Recording, Test
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
-from stimrig.api.web.pages.model_view import draw_model, facts, measurement, versions_of
+from stimrig.api.web.pages.model_view import parts
 from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
@@ -34,29 +33,17 @@ MOST_NOTES = 12
 @router.get("/models/{model_id}/report")
 async def report(request: Request, context: Ctx, _principal: ModelReader, row: Version) -> Response:
     """Show one sheet on a model."""
-    document, measured = stored_model.read(row), await measurement(context, row)
-    charts = draw_model(document, measured)
-    diagnosis = await asyncio.to_thread(context.analyses.known_diagnosis, row)
+    shown = await parts(context, row)
     recording: Recording = await asyncio.to_thread(context.store.get, Recording, row.recording_id)
     charts_svg = await asyncio.to_thread(
         lambda: {
-            name: svg(charts[name], width, height, words, light=True)
+            name: svg(shown["figures"][name], width, height, words, light=True)
             for name, (width, height, words) in CHARTS.items()
-            if name in charts
+            if name in shown["figures"]
         }
     )
-    return page(
-        request,
-        "report_sheet.html",
-        model=await asyncio.to_thread(context.versions.document, row),
-        **await facts(context, row, document),
-        drawn=charts_svg,
-        problem=measured["problem"],
-        why=explanation.view(diagnosis, measured["comparison"]) if diagnosis else None,
-        versions=await asyncio.to_thread(versions_of, context, row),
-        recording=recording,
-        session=await asyncio.to_thread(session_of, context, recording),
-    )
+    session = await asyncio.to_thread(session_of, context, recording)
+    return page(request, "report_sheet.html", **shown, drawn=charts_svg, recording=recording, session=session)
 
 
 def session_of(context: Context, recording: Recording) -> dict[str, Any]:

@@ -7,13 +7,14 @@ from email.utils import formatdate
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Response
-from pydantic import Field, FiniteFloat, StrictBool, model_validator
 
 from stimrig.api.clock import unix_of
+from stimrig.api.errors import ApiError
 from stimrig.api.models import stored_model
-from stimrig.api.services import models as services
-from stimrig.api.services import participants
-from stimrig.api.sessions.requests import ApprovalIn, Body, DecisionIn
+from stimrig.api.services import models, participants
+from stimrig.api.services.context import Context
+from stimrig.api.services.models import ReferenceIn, WidthsIn
+from stimrig.api.sessions.requests import ApprovalIn, DecisionIn
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import (
     PROBLEM,
@@ -48,7 +49,7 @@ WITH_MODEL: dict[str, Any] = {
 
 @router.get("/participants/{code}/model", response_class=Response, responses=APPROVED)
 async def approved_model(
-    context: Ctx, _principal: ModelReader, code: str, if_none_match: Annotated[str | None, Header()] = None,
+    context: Ctx, _principal: ModelReader, code: str, if_none_match: Annotated[str, Header()] = "",
     tracked: Annotated[bool, Query(description="as tracked to the last trial, within the approved limits")] = False,
 ) -> Response:  # fmt: skip
     """The approved model, for the ILC controller: MODEL.json with its `ETag`; 304 where it is known already.
@@ -60,20 +61,13 @@ async def approved_model(
         await context.runner.trials.settled()
     served = await asyncio.to_thread(context.tracked.served if tracked else context.versions.served, code)
     if served is None:
-        await asyncio.to_thread(participants.find, context, code)
-        raise services.none_approved(code)
+        raise await asyncio.to_thread(none_approved, context, code)
     headers = {"ETag": served.etag, "Cache-Control": "private, no-cache"}
     if tracked:
         headers["Last-Modified"] = formatdate(unix_of(served.at_utc), usegmt=True)
-    if if_none_match and matches(if_none_match, served.etag):
+    if {"*", served.etag} & {*entity_tags(if_none_match)}:  # RFC 9110, section 13.1.2
         return Response(status_code=304, headers=headers)
     return Response(served.body, media_type="application/json", headers=headers)
-
-
-def matches(if_none_match: str, etag: str) -> bool:
-    """RFC 9110, section 13.1.2: weak comparison against a list, or `*`."""
-    tags = entity_tags(if_none_match)
-    return "*" in tags or etag in tags
 
 
 @router.get("/participants/{code}/tracking", **describe_answer(TrackingOut))
@@ -81,9 +75,18 @@ def tracking(context: Ctx, _principal: ModelReader, code: str) -> dict[str, Any]
     """The trials since the approval that holds, oldest first; 404 where no model is approved today."""
     document = context.tracked.document(code)
     if document is None:
-        participants.find(context, code)
-        raise services.none_approved(code)
+        raise none_approved(context, code)
     return document
+
+
+def none_approved(context: Context, code: str) -> ApiError:
+    """404, with what to do; that of the participant where there is none."""
+    participants.find(context, code)
+    detail = (
+        f"Participant {code!r} has no model approved today; an approval ends with its day. "
+        "POST /v1/models/{id}/approve approves one."
+    )
+    return ApiError(404, "no-approved-model", "No approved model", detail)
 
 
 @router.get("/participants/{code}/models", response_model=list[VersionOut])
@@ -114,10 +117,13 @@ async def approve(
     body: ApprovalIn | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Let the controller have this version, and what is tracked from it within limits, until the day ends."""
-    approval = body or ApprovalIn()
-    row = await asyncio.to_thread(context.versions.get, model_id)
-    version = await services.approve(context, row, principal.name, approval.reason, approval.tracking, tags)
+    approval, decide = body or ApprovalIn(), context.versions.decide
+    version = await asyncio.to_thread(
+        decide, model_id, True, principal.name, approval.reason, approval.tracking, tags=tags
+    )
     response.headers["ETag"] = f'"{version}"'
+    row = await asyncio.to_thread(context.versions.get, model_id)
+    context.runner.trials.warm(row.participant)  # the worker that follows its trials is warm by the first one
     return await asyncio.to_thread(context.versions.document, row)
 
 
@@ -144,72 +150,13 @@ def undo(
     return context.versions.document(parent)
 
 
-# ---- a trial foretold: what widths would give, and which widths give a torque that is wanted -------------------------
-
-Column = Annotated[list[FiniteFloat], Field(min_length=1, max_length=60_000)]
-WidthUs = Annotated[FiniteFloat, Field(ge=0, le=500)]
-ModelsRateHz = Annotated[
-    Annotated[FiniteFloat, Field(ge=1.0, le=100.0)] | None,
-    Field(description="null: the model's; more than a quarter off that is refused, Hz"),
-]
-Angles = Annotated[
-    list[Annotated[FiniteFloat, Field(ge=-7, le=7)]],
-    Field(
-        min_length=1, max_length=60_000, description="of the joint where it moves, rad; as many as torques or widths"
-    ),
-]
-
-
-class WidthsIn(Body):
-    """One pulse width for each pulse."""
-
-    pulse_width_us: Annotated[list[WidthUs], Field(min_length=1, max_length=12_000, description="µs")]
-    pulse_rate_hz: ModelsRateHz = None
-    angle_rad: Angles | None = None
-
-    @model_validator(mode="after")
-    def _as_many(self) -> WidthsIn:
-        if self.angle_rad is not None and len(self.angle_rad) != len(self.pulse_width_us):
-            raise ValueError(f"{len(self.angle_rad)} angles for {len(self.pulse_width_us)} widths: give one for each")
-        return self
-
-
 @router.post("/models/{model_id}/prediction", **describe_answer(PredictionOut))
 async def prediction(context: Ctx, _principal: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
     """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included.
 
     Of a version, or of one that was tracked from it (its `model_id`).
     """
-    text = await asyncio.to_thread(context.tracked.text_of, model_id)
-    call = context.pool.submit(
-        "forecast", urgent=True, model_json=text, pulse_width_us=body.pulse_width_us,
-        pulse_rate_hz=body.pulse_rate_hz, angle_rad=body.angle_rad,
-    )  # fmt: skip
-    forecast = await call.result
-    return {"model_id": model_id, **forecast}
-
-
-class ReferenceIn(Body):
-    """A torque to follow, as numbers or as the text of a table."""
-
-    reference_torque_nm: (
-        Annotated[Column, Field(description="above rest, N·m; one for each pulse, without `time_s`")] | None
-    ) = None
-    table: Annotated[str, Field(description="instead: a CSV file with `time_s,torque_nm`, or `torque_nm`")] | None = (
-        None
-    )
-    time_s: Annotated[Column, Field(description="times of the torques, s, rising by at most 1 s")] | None = None
-    angle_rad: Angles | None = None
-    pulse_rate_hz: ModelsRateHz = None
-    max_pulse_width_us: FiniteFloat | None = Field(None, gt=0, le=500, description="never above the participant's, µs")
-    max_rise_us: FiniteFloat | None = Field(None, gt=0, le=500, description="from pulse to pulse, µs; None: the rig's")
-    whole_us: StrictBool = Field(True, description="whole µs")
-
-    @model_validator(mode="after")
-    def _one_reference(self) -> ReferenceIn:
-        if (self.reference_torque_nm is None) == (self.table is None):
-            raise ValueError("give reference_torque_nm, or the text of a table")
-        return self
+    return await models.predict(context, model_id, body)
 
 
 @router.post("/models/{model_id}/widths", **describe_answer(InversionOut))
@@ -218,5 +165,4 @@ async def widths(context: Ctx, _principal: ModelReader, model_id: str, body: Ref
 
     Of a version, or of one that was tracked from it (its `model_id`).
     """
-    reference = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz", "table"})
-    return await services.invert(context, model_id, reference, body.max_pulse_width_us, body.max_rise_us, body.whole_us)
+    return await models.invert(context, model_id, body)
