@@ -50,7 +50,7 @@ class JointTests(Watched):
         of angles, or one that is too small, or the target is not in it; what the rig refuses.
         """
         angle_in, longest_s = body.angle or AngleIn(), body.max_duration_s
-        angle = messages.AnglePlan(range_rad=self.range_of(plan), tolerance_rad=angle_in.tolerance_rad)
+        angle = messages.AnglePlan(range_rad=self.range_of(plan), tolerance_rad=profiles.TOLERANCE_RAD)
         shared = await self._layout(plan, longest_s, preview_s)
         bounds, segments = None, shared.held if plan.kind == HELD else shared.moving
         if plan.kind == HELD:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import unicodedata
+from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
 from pydantic import (
@@ -24,7 +25,7 @@ from stimrig.api.people import accounts
 from stimrig.api.people.auth import Scope
 from stimrig.api.schemas.shared import SETTINGS, NoteKind
 from stimrig.api.sessions import profiles
-from stimrig.api.sessions.profiles import LIMITS
+from stimrig.api.sessions.profiles import LIMITS, RANGE
 from stimrig.rig.messages import HELD, LABELS, MOVING, PASSIVE, PULSE_RATES_HZ, Labels, Profile
 
 LONGEST_NOTE = 500
@@ -92,29 +93,21 @@ class FirstProfileIn(Body):
 
 FIRST_PROFILE = FirstProfileIn(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0)
 """Limits of a new participant until a person sets them or calibrates."""
+KEPT: Any = None
+"""Default of a limit that keeps its value where it is left out; null is refused as no number."""
 
 
 class ProfileIn(Body):
     """Some of a participant's limits; one that is left out keeps its value."""
 
-    current_ma: CurrentMa | None = None
-    max_pulse_width_us: WidthUs | None = None
-    max_torque_nm: TorqueNm | None = None
+    current_ma: CurrentMa = KEPT
+    max_pulse_width_us: WidthUs = KEPT
+    max_torque_nm: TorqueNm = KEPT
     angle_range_rad: RangeRad | None = Field(default=None, description="null: the participant has none any more")
-
-    @field_validator("current_ma", "max_pulse_width_us", "max_torque_nm", mode="before")
-    @classmethod
-    def _no_null(cls, value: Any) -> Any:
-        if value is None:
-            raise ValueError("give a number, or leave the field out: then it keeps its value")
-        return value
 
     def sent(self) -> dict[str, Any]:
         """Return the sent limits in the form of a profile."""
-        sent = self.model_dump(exclude_unset=True)
-        if (range_rad := sent.get(profiles.RANGE)) is not None:
-            sent[profiles.RANGE] = list(range_rad)
-        return sent
+        return self.model_dump(mode="json", exclude_unset=True)
 
 
 class SegmentIn(Body):
@@ -147,25 +140,21 @@ class AngleIn(Body):
     target_rad: AngleRad | None = Field(
         default=None, description="kind `held`: the angle to hold; null: the next one that is open"
     )
-    tolerance_rad: Annotated[FiniteFloat, Field(ge=0.02, le=0.35, description="around the target, at the start")] = (
-        profiles.TOLERANCE_RAD
-    )
     still_s: FiniteFloat | None = Field(
         default=None, ge=1, le=60, description="kinds `passive`, `moving` and `sequence`: the test stops after so long "
         "without a movement, s; null: 8, 5 and never"
     )  # fmt: skip
 
 
-OWN_FIELDS: dict[str, set[str]] = {
+CHOSEN_PLAN = {"segments", "protocol", "joins"}
+FIELDS_OF: dict[str, set[str]] = {
     "adaptive": {"target", "max_duration_s", "max_torque_time_nm_s", "anyway"},
-    "sequence": {"reference_torque_nm", "angle"},
+    "sequence": {"reference_torque_nm", "angle", *CHOSEN_PLAN},
     PASSIVE: {"angle", "max_duration_s"},
     HELD: {"angle"},
     MOVING: {"angle", "max_duration_s", "max_torque_time_nm_s"},
 }
-"""Fields that only tests of some kinds have."""
-PLANNED_BY_ITSELF = {"segments", "protocol", "joins"}
-"""What is not chosen for a test that chooses its own segments."""
+"""Fields that only tests of some kinds have; the kinds that are not named have a chosen plan alone."""
 
 
 class TestIn(Labels, Body):
@@ -241,15 +230,9 @@ class TestIn(Labels, Body):
         sent = set(self.model_dump(exclude_defaults=True, exclude_none=True))
         if self.plan_hash is not None and (more := sent - {"participant", "plan_hash"}):
             raise ValueError(f"plan_hash: all else is as it was previewed; leave out {', '.join(sorted(more))}")
-        wrong = sent & (set().union(*OWN_FIELDS.values()) - OWN_FIELDS.get(self.kind, set()))
-        planned = self.kind in ("adaptive", PASSIVE, HELD, MOVING)
-        if "reference_torque_nm" in wrong:
-            raise ValueError("reference_torque_nm: only a test of the kind sequence has one; leave it out")
-        which = "has no such thing" if planned else "has a fixed plan"
-        if planned and (chosen := sent & PLANNED_BY_ITSELF):
-            wrong, which = chosen, "chooses its own segments"
-        if wrong:
-            raise ValueError(f"{', '.join(sorted(wrong))}: a test of the kind {self.kind} {which}; leave it out")
+        elsewhere = set().union(*FIELDS_OF.values()) - FIELDS_OF.get(self.kind, CHOSEN_PLAN)
+        if wrong := sent & elsewhere:
+            raise ValueError(f"{', '.join(sorted(wrong))}: a test of the kind {self.kind} takes none; leave it out")
         if self.angle is not None and self.angle.target_rad is not None and self.kind != HELD:
             raise ValueError("angle.target_rad: only a test of the kind held has a target; leave it out")
         if self.protocol is not None and self.segments is not None:
@@ -371,71 +354,44 @@ class TokenIn(Body):
     days: int | None = Field(None, ge=1, le=366, description="it expires after these")
 
 
-def limits_of(body: TestIn, participant_profile: dict[str, Any] | None) -> dict[str, Any]:
+def limits_of(body: TestIn, participant_profile: Mapping[str, Any] | None) -> dict[str, Any]:
     """Return the limits of a test, as fields of a `TestPlan`.
 
     The participant's profile stays whole (thresholds, day, rest), so that the rig judges the calibration that a person
-    made; what the request narrows is added to it.
+    made; what the request narrows is added to it. Of the request's `profile` only the fields that were sent count.
 
-    Parameters
-    ----------
-    body : TestIn
-        The request; of its `profile`, only the fields that were sent count.
-    participant_profile : dict or None
-        The participant's profile.
-
-    Raises
-    ------
-    ApiError
-        422: the participant has no limits; a limit is wider than the participant's, which it is and by how much.
+    Raises ApiError: 422: the participant has no limits; a limit is wider than the participant's, which and by how much.
     """
-    width_us, torque_nm = body.max_pulse_width_us, body.max_torque_nm
-    requested = body.profile.sent() if body.profile else {}
-    if lacking := [name for name in LIMITS if (participant_profile or {}).get(name) is None]:
-        detail = (
-            f"{body.participant} has no {', '.join(lacking)}. Set all of them: PUT /v1/participants/{{code}}/profile."
-        )
+    own, asked = participant_profile or {}, body.profile.sent() if body.profile else {}
+    if lacking := [name for name in LIMITS if own.get(name) is None]:
+        fix = "Set all of them: PUT /v1/participants/{code}/profile."
+        detail = f"{body.participant} has no {', '.join(lacking)}. {fix}"
         raise ApiError(422, "no-limits", "The participant has no limits", detail)
-    assert participant_profile is not None
-    profile = Profile(**participant_profile)
-    wider = [
-        words
-        for name in LIMITS
-        if name in requested
-        if (words := _wider(name, requested[name], getattr(profile, name)))
-    ]
-    range_rad = profiles.range_of(requested)
-    if range_rad is not None and profile.angle_range_rad is None:
-        wider.append(
-            f"{profiles.RANGE} {profiles.range_words(range_rad)} narrows nothing: {body.participant} has no range"
-        )
-    elif range_rad is not None and not profiles.range_within(range_rad, profile.angle_range_rad):
-        own_words = profiles.range_words(profile.angle_range_rad or ())
-        wider.append(f"{profiles.RANGE} {profiles.range_words(range_rad)} is beyond the participant's {own_words}")
-    if wider:
-        detail = "; ".join(wider) + ". A test may narrow them; to widen them, calibrate anew or set the participant's."
-        errors = [{"field": f"profile.{words.split()[0]}", "detail": words} for words in wider]
-        raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail, errors=errors)
-    return {
-        "profile": profile.model_copy(
-            update={
-                "current_ma": requested.get("current_ma", profile.current_ma),
-                profiles.RANGE: range_rad or profile.angle_range_rad,
-            }
-        ),
-        "max_pulse_width_us": tighter(width_us, requested.get("max_pulse_width_us")),
-        "max_torque_nm": tighter(torque_nm, requested.get("max_torque_nm")),
+    wider = {
+        name: f"{asked[name]:g} {limit.unit} is above the participant's {own[name]:g} {limit.unit} by "
+        f"{asked[name] - own[name]:g}"
+        for name, limit in LIMITS.items()
+        if name in asked and not (asked[name] <= own[name])  # NaN counts as wider
     }
-
-
-def _wider(name: str, value: float, limit: float) -> str | None:
-    if value <= limit:  # NaN compares false, so it counts as wider
-        return None
-    unit = LIMITS[name].unit
-    return f"{name} {value:g} {unit} is above the participant's {limit:g} {unit} by {value - limit:g}"
+    range_rad, own_rad = profiles.range_of(asked), profiles.range_of(own)
+    if range_rad is not None and own_rad is None:
+        wider[RANGE] = f"{profiles.range_words(range_rad)} narrows nothing: {body.participant} has no range"
+    elif range_rad is not None and not profiles.range_within(range_rad, own_rad):
+        own_words = profiles.range_words(own_rad or ())
+        wider[RANGE] = f"{profiles.range_words(range_rad)} is beyond the participant's {own_words}"
+    if wider:
+        errors = [{"field": f"profile.{name}", "detail": f"{name} {words}"} for name, words in wider.items()]
+        narrow = "A test may narrow them; to widen them, calibrate anew or set the participant's."
+        detail = f"{'; '.join(error['detail'] for error in errors)}. {narrow}"
+        raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail, errors=errors)
+    profile = {**own, **{name: asked[name] for name in ("current_ma", RANGE) if asked.get(name) is not None}}
+    return {
+        "profile": Profile(**profile),
+        "max_pulse_width_us": tighter(body.max_pulse_width_us, asked.get("max_pulse_width_us")),
+        "max_torque_nm": tighter(body.max_torque_nm, asked.get("max_torque_nm")),
+    }
 
 
 def tighter(first: float | None, second: float | None) -> float | None:
     """Return the smaller of the two limits; None where neither is set."""
-    values = [value for value in (first, second) if value is not None]
-    return min(values) if values else None
+    return min((value for value in (first, second) if value is not None), default=None)

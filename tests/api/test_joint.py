@@ -254,7 +254,7 @@ def test_what_does_not_go_together_is_refused(client: httpx.Client, ready: str) 
         ("moving", {"target": {"curve_percent": 3}}), ("held", {"max_duration_s": 20}), ("passive", {"joins": "M1"}),
         ("passive", {"angle": {"target_rad": 1.0}}), ("pre-session", {"angle": {}}), ("held", {"angle": {"x": 1}}),
         ("passive", {"max_torque_time_nm_s": 3}), ("held", {"angle": {"target_rad": 2.5}}),
-        ("held", {"angle": {"tolerance_rad": 1.0}}), ("moving", {"angle": {"still_s": 0}}),
+        ("moving", {"angle": {"still_s": 0}}),
     ]  # fmt: skip
     for kind, more in wrong:
         answer = begin(client, ready, kind, **more)
