@@ -49,7 +49,6 @@ class Current:
     participant: str
     by: str
     kind: str = ""
-    """Id of the test."""
     started: bool = False
     """The rig has said that it plays."""
     ending: bool = False
@@ -77,7 +76,7 @@ class Current:
 
 
 class Playing:
-    """Return the current test's row, if there is one."""
+    """The current test, and whether it may still be played."""
 
     def __init__(self, store: Store, clock: Clock, rig: RigClient) -> None:
         self.store, self.clock, self.rig = store, clock, rig
@@ -90,8 +89,10 @@ class Playing:
 
     def refuse_second(self) -> None:
         """409 while a test runs, its holder named."""
-        if self.current is not None:
-            raise busy(self.current)
+        if (current := self.current) is not None:
+            test = f"{current.test_id} for participant {current.participant}, started by {current.by},"
+            detail = f"{test} uses the rig. Wait for its end, or stop it."
+            raise ApiError(409, "rig-busy", "Another test is running", detail, holder=current.holder)
 
     async def let_end(self) -> None:
         """A test is seen to be done a moment before the rig is let go: who starts the next one then is not refused."""
@@ -116,8 +117,7 @@ class Playing:
         A test that has not begun plays no pulse; a controller's trial whose right has ended ends at once. Where the rig
         does not take that, it is stopped, and asked again.
         """
-        current = self.current
-        if current is None:
+        if (current := self.current) is None:
             return
         async with current.state_lock:
             version, changes, lost = current.version, list[dict[str, Any]](), self.is_over(current)
@@ -185,10 +185,8 @@ def other_than(asker: str, ran_by: str | None) -> str | None:
 def refuse_archived(participant: Participant) -> None:
     """409: nothing is begun with a participant in the archive."""
     if participant.archived_utc is not None:
-        detail = (
-            f"{participant.code} is in the archive. Take it out first: on its page, or by "
-            f"PUT /v1/participants/{participant.code}/archived. Nothing was started."
-        )
+        way_out = f"on its page, or by PUT /v1/participants/{participant.code}/archived"
+        detail = f"{participant.code} is in the archive. Take it out first: {way_out}. Nothing was started."
         raise ApiError(409, "archived", "This participant is archived", detail)
 
 
@@ -198,13 +196,3 @@ def right_ended() -> ApiError:
         "A controller's key ends with its day or its maker's token, and a right when it is revoked. Nothing was sent."
     )
     return ApiError(409, "changed-meanwhile", "The right to this test has ended", detail)
-
-
-def busy(current: Current) -> ApiError:
-    """Return the 409 that names the holder of the rig."""
-    holder_name = current.by
-    detail = (
-        f"{current.test_id} for participant {current.participant}, started by {holder_name}, uses the rig. "
-        "Wait for its end, or stop it."
-    )
-    return ApiError(409, "rig-busy", "Another test is running", detail, holder=current.holder)

@@ -29,6 +29,11 @@ class Named:
     lowest: float
     highest: float
 
+    def on(self, limits: Mapping[str, Bound]) -> tuple[float, str]:
+        """Return the highest value that this rig takes, and who set that; of any rig where this one is unknown."""
+        bound = limits.get(self.bound)
+        return (self.highest, "any rig's") if bound is None or bound.hi is None else (bound.hi, bound.owner)
+
 
 LIMITS: dict[str, Named] = {
     "current_ma": Named("current", "Current of every pulse (mA)", "mA", "current_ma", 0.5, 130.0),
@@ -43,13 +48,17 @@ JUMP = 1.25
 """More than a quarter above the last value is a jump: a slip of the keyboard is mostly a factor of two or ten."""
 
 
+def is_calibrated(profile: Profile) -> bool:
+    """Return whether the profile holds a calibration, of today or not."""
+    return any(profile.get(name) is not None for name in CALIBRATION_FIELDS)
+
+
 def calibration(profile: Profile, now_utc: str) -> Literal["none", "valid", "expired"]:
     """Return the state of the calibration."""
-    if all(profile.get(name) is None for name in CALIBRATION_FIELDS):
+    if not is_calibrated(profile):
         return "none"
     expires = profile.get("expires_at_utc")
-    valid = expires is not None and unix_of(now_utc) < unix_of(expires)
-    return "valid" if valid else "expired"
+    return "valid" if expires is not None and unix_of(now_utc) < unix_of(expires) else "expired"
 
 
 def changed(profile: Profile, changes: Mapping[str, Any]) -> tuple[dict[str, Any], str]:
@@ -59,21 +68,19 @@ def changed(profile: Profile, changes: Mapping[str, Any]) -> tuple[dict[str, Any
     maximum falls below the motor threshold.
     """
     new = {**profile, **changes}
-    if RANGE in changes and changes[RANGE] is None:
-        del new[RANGE]
-        new.pop(SET_AT, None)
-    if all(profile.get(name) is None for name in CALIBRATION_FIELDS):
+    if changes.get(RANGE, ...) is None:
+        new = {name: value for name, value in new.items() if name not in (RANGE, SET_AT)}
+    if not is_calibrated(profile):
         return new, ""
-    voids = next((_above(name, new[name], profile[name]) for name in LIMITS if not (new[name] <= profile[name])), "")
-    motor_us = profile.get("motor_pulse_width_us") or 0.0
-    if not voids and not (new["max_pulse_width_us"] >= motor_us):
-        voids = f"the muscle moves from {motor_us:g} µs on, above the new {new['max_pulse_width_us']:g} µs"
-    return ({**new, **dict.fromkeys(CALIBRATION_FIELDS)} if voids else new), voids
-
-
-def _above(name: str, value: float, was: float) -> str:
-    limit = LIMITS[name]
-    return f"{limit.words} {value:g} {limit.unit} is above the {was:g} {limit.unit} that it was found with"
+    voids = [
+        f"{limit.words} {new[name]:g} {limit.unit} is above the {profile[name]:g} {limit.unit} that it was found with"
+        for name, limit in LIMITS.items()
+        if not (new[name] <= profile[name])
+    ]
+    motor_us, width_us = profile.get("motor_pulse_width_us") or 0.0, new["max_pulse_width_us"]
+    if not (width_us >= motor_us):
+        voids.append(f"the muscle moves from {motor_us:g} µs on, above the new {width_us:g} µs")
+    return ({**new, **dict.fromkeys(CALIBRATION_FIELDS)}, voids[0]) if voids else (new, "")
 
 
 def jumps(profile: Profile, new: Profile) -> list[str]:
@@ -83,15 +90,15 @@ def jumps(profile: Profile, new: Profile) -> list[str]:
     """
     if not profile:
         return []
-    rises = [
-        _rise(limit.words, profile[name], new[name], limit.unit)
-        for name, limit in LIMITS.items()
-        if not (new[name] <= JUMP * profile[name])
+    figures = [(limit.words, profile[name], new[name], limit.unit) for name, limit in LIMITS.items()]
+    charge_figures = ("charge of the widest pulse", charge(profile), charge(new), "µC")
+    rises = [figure for figure in figures if not (figure[2] <= JUMP * figure[1])]
+    if not rises and not (charge_figures[2] <= JUMP * charge_figures[1]):
+        rises = [charge_figures]
+    return [
+        f"The {words} rises from {was:.4g} to {now:.4g} {unit}, {now / was:.3g} times as much."
+        for words, was, now, unit in rises
     ]
-    was_uc, charge_uc = charge(profile), charge(new)
-    if not rises and not (charge_uc <= JUMP * was_uc):
-        rises.append(_rise("charge of the widest pulse", was_uc, charge_uc, "µC"))
-    return rises
 
 
 def charge(profile: Profile) -> float:
@@ -99,45 +106,28 @@ def charge(profile: Profile) -> float:
     return profile["current_ma"] * profile["max_pulse_width_us"] * 1e-3
 
 
-def _rise(words: str, was: float, now: float, unit: str) -> str:
-    return f"The {words} rises from {was:.4g} to {now:.4g} {unit}, {now / was:.3g} times as much."
-
-
-def highest(limits: Mapping[str, Bound], name: str) -> tuple[float, str]:
-    """Return the highest value that this rig accepts for a limit, and the owner of that bound."""
-    bound = limits.get(LIMITS[name].bound)
-    if bound is None or bound.hi is None:
-        return LIMITS[name].highest, "any rig's"
-    return bound.hi, bound.owner
-
-
 def range_help(name: str, limits: Mapping[str, Bound]) -> str:
     """Describe the range that this rig accepts for a limit, for the help text of its field."""
-    limit, (highest_value, owner) = LIMITS[name], highest(limits, name)
-    return f"at least {limit.lowest:g}, at most {highest_value:g} {limit.unit} ({owner})"
+    highest, owner = LIMITS[name].on(limits)
+    return f"at least {LIMITS[name].lowest:g}, at most {highest:g} {LIMITS[name].unit} ({owner})"
 
 
-def outside(requested: Mapping[str, Any], profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
+def outside(requested: Profile, profile: Profile, limits: Mapping[str, Bound]) -> dict[str, str]:
     """List the requested limits that this rig would refuse: the reason by the limit's name.
 
-    `requested`: the changed limits. `profile`: the participant's limits. `limits`: the rig's own bounds; where they are
-    unknown, the widest of any rig apply.
+    `requested`: the changed limits. `profile`: the participant's limits. `limits`: the rig's own bounds.
     """
     errors = {}
-    for name in [name for name in LIMITS if name in requested]:
-        value = requested[name]
-        limit, (highest_value, owner) = LIMITS[name], highest(limits, name)
-        if not (limit.lowest <= value <= highest_value):
-            bounds = f"at least {limit.lowest:g} and at most {highest_value:g} {limit.unit}"
-            errors[name] = f"{value:g} {limit.unit} is not {bounds}, as this rig asks ({owner})"
-    phase = limits.get("charge_per_phase_uc")
+    for name, limit in LIMITS.items():
+        highest, owner = limit.on(limits)
+        if name in requested and not (limit.lowest <= requested[name] <= highest):
+            bounds = f"at least {limit.lowest:g} and at most {highest:g} {limit.unit}"
+            errors[name] = f"{requested[name]:g} {limit.unit} is not {bounds}, as this rig asks ({owner})"
+    whole, phase = {**profile, **requested}, limits.get("charge_per_phase_uc")
     of_charge = [name for name in ("max_pulse_width_us", "current_ma") if name in requested]
-    known = {**profile, **requested}.keys() >= {"max_pulse_width_us", "current_ma"}
-    if not errors and of_charge and known and phase is not None and phase.hi is not None:
-        charge_uc = charge({**profile, **requested})
-        if not (charge_uc <= phase.hi):
-            above = f"above the {phase.hi:g} µC that this rig takes ({phase.owner})"
-            errors[of_charge[0]] = f"with it a pulse carries {charge_uc:.3g} µC, {above}"
+    if not errors and of_charge and phase is not None and phase.hi is not None and not (charge(whole) <= phase.hi):
+        above = f"above the {phase.hi:g} µC that this rig takes ({phase.owner})"
+        errors[of_charge[0]] = f"with it a pulse carries {charge(whole):.3g} µC, {above}"
     return errors
 
 
@@ -187,7 +177,6 @@ def range_words(range_rad: Sequence[float]) -> str:
 def range_outside(requested: Profile, rig_rad: Sequence[float] | None) -> dict[str, str]:
     """Return why this rig would refuse the requested range, by field; empty where it accepts the range."""
     range_rad = range_of(requested)
-    if range_rad is None or range_within(range_rad, rig_rad):
+    if range_rad is None or rig_rad is None or range_within(range_rad, rig_rad):
         return {}
-    assert rig_rad is not None
     return {RANGE: f"{range_words(range_rad)} is not within {range_words(rig_rad)}, as this rig asks"}
