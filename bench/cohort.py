@@ -115,7 +115,7 @@ def once(client: Any, folder: Path, output: Path, verb: str, every: int = 0) -> 
     task = Task(verb, software=software_version())
     with Watched(output, task, every=every) as results:
         began_s = time.perf_counter()
-        run_records(client, lambda: list_records([str(folder)]), task, Bounds(), results)
+        run_records(client, list_records([str(folder)]), task, Bounds(), results)
         took_s = time.perf_counter() - began_s
         results.join()
     return took_s, results.samples

@@ -27,8 +27,6 @@ LEFT_OUT = "left out"
 FIGURES = (
     "fit_percent", "ceiling_percent", "rms_nm", "held_out_fit_percent", "held_out_rms_nm", "held_out_by",
 )  # fmt: skip
-MODEL = "model"
-"""What a parameter belongs to where it is none of an effect's."""
 Row = dict[str, Any]
 
 
@@ -100,15 +98,9 @@ def failed(kind: str, line: str) -> Row:
 
 def _fit(record: Any, task: Task) -> Row:
     document = identify.fit(record, method=task.method, effects=task.effects).to_dict()
-    fit, quality = document["fit"], document["quality"]
-    return {
-        **{name: fit.get(name) for name in FIGURES},
-        "noise_sd_nm": fit.get("noise_sd_nm"),
-        "verdict": quality["verdict"],
-        "reasons": quality.get("reasons") or [],
-        "effects": [_effect(effect) for effect in document["effects"]],
-        "parameters": _model_parameters(document),
-    }
+    quality = document["quality"]
+    about = {"verdict": quality["verdict"], "reasons": quality.get("reasons") or []}
+    return _model(document, document["fit"]) | about
 
 
 def _diagnose(record: Any, _task: Task) -> Row:
@@ -134,17 +126,9 @@ def _diagnose(record: Any, _task: Task) -> Row:
 def _improve(record: Any, _task: Task) -> Row:
     improved = identify.improve(record)
     answer, document = improved.to_dict(), improved.models[-1].to_dict()
-    figures = {**document["fit"], **answer["steps"][-1]}
-    return {
-        **{name: figures.get(name) for name in FIGURES},
-        "noise_sd_nm": answer["noise_sd_nm"],
-        "verdict": answer["verdict"],
-        "reasons": [step["reason"] for step in answer["steps"][1:]],
-        "effects": [_effect(effect) for effect in document["effects"]],
-        "parameters": _model_parameters(document),
-        "steps": answer["steps"],
-        "refused": answer["refused"],
-    }
+    about = {name: answer[name] for name in ("noise_sd_nm", "verdict", "steps", "refused")}
+    reasons = [step["reason"] for step in answer["steps"][1:]]
+    return _model(document, {**document["fit"], **answer["steps"][-1]}) | about | {"reasons": reasons}
 
 
 ANSWERS = {"fit": _fit, "diagnose": _diagnose, "improve": _improve}
@@ -156,19 +140,28 @@ def _effect(effect: Mapping[str, Any]) -> Row:
     return {**effect, "effect": name, "confused_with": effect.get("confused_with") or []}
 
 
-def _model_parameters(document: Mapping[str, Any]) -> list[Row]:
-    """List the parameters of a MODEL.json: those that a person reads off it, and those of its effects."""
-    rows = _parameters(MODEL, document.get("figures") or document["uncertainty"].get("figures") or {})
+def _model(document: Mapping[str, Any], figures: Mapping[str, Any]) -> Row:
+    """Return the columns of a MODEL.json: figures, effects, parameters of itself and of its effects."""
+    parameters = _parameters("model", document.get("figures") or document["uncertainty"].get("figures") or {})
     for effect in document["effects"]:
-        rows += _parameters(effect["id"], effect["parameters"])
-    return rows
+        parameters += _parameters(effect["id"], effect["parameters"])
+    effects = [_effect(effect) for effect in document["effects"]]
+    figures = {name: figures.get(name) for name in (*FIGURES, "noise_sd_nm")}
+    return {**figures, "effects": effects, "parameters": parameters}
 
 
 def _parameters(of: str, parameters: Mapping[str, Any]) -> list[Row]:
-    rows = []
-    for name, entry in parameters.items():
-        if isinstance(entry.get("value"), int | float):  # a parameter in several values has no figure
-            sd = entry.get("sd")
-            sd = sd if isinstance(sd, int | float) else None
-            rows.append({"of": of, "name": name, "value": entry["value"], "sd": sd, "unit": entry.get("unit") or "1"})
-    return rows
+    def number(value: Any) -> Any:
+        return value if isinstance(value, int | float) else None
+
+    return [
+        {
+            "of": of,
+            "name": name,
+            "value": entry["value"],
+            "sd": number(entry.get("sd")),
+            "unit": entry.get("unit") or "1",
+        }
+        for name, entry in parameters.items()
+        if number(entry.get("value")) is not None  # a parameter in several values has no figure
+    ]

@@ -7,11 +7,12 @@ run with the same options skips the records that have a row, in the output or in
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import json
 import shutil
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import IO, Self
 
@@ -22,15 +23,15 @@ from stimrig.api.cohort import table
 from stimrig.api.cohort.errors import CohortError, InterruptedRunError
 from stimrig.api.cohort.record import LEFT_OUT, Row
 from stimrig.api.cohort.sources import Entry
-from stimrig.api.cohort.task import Task, describe_differences
-from stimrig.api.cohort.worker import COPY, digest
+from stimrig.api.cohort.task import Task
 from stimrig.api.whole_file import whole_file
 
 PART_ROWS = 500
 PART_S = 10.0
 """What a run that is killed loses at most."""
 GROUP_ROWS = 5000
-MAX_CONTENTS = 1000
+COPY = "copy"
+"""Status of a row whose content has a newer row: of another address."""
 TRANSIENT = ("timeout", "killed", "out of memory", "unreadable", "unexpected")
 """Errors that another try may not meet (`--again`)."""
 
@@ -56,9 +57,7 @@ class Results:
     def __init__(self, output: Path, task: Task, again: bool = False) -> None:
         self.output, self.task, self.again = output, task, again
         self.folder = output.with_name(output.name + ".parts")
-        self._places: set[bytes] = set()  # of files in the state in which they were done
-        self._contents: dict[int, list[bytes]] = {}  # with a result, by size
-        self._copied: set[bytes] = set()  # contents that this run found at another address, too
+        self._done: set[bytes] = set()  # files in the state in which they were done
         self._waiting: list[Row] = []
         self._written_s = time.monotonic()
         self._lock: IO[bytes] | None = None
@@ -91,7 +90,7 @@ class Results:
             self._close()
 
     def _close(self) -> None:
-        if not any(self.folder.glob("[0-9]*.parquet")):  # nothing to resume from
+        if not self._parts():  # nothing to resume from
             shutil.rmtree(self.folder, ignore_errors=True)
         self._unlock()
 
@@ -100,54 +99,43 @@ class Results:
             self._lock.close()
             self._lock = None
 
+    def _parts(self) -> list[Path]:
+        return sorted(self.folder.glob("[0-9]*.parquet"))
+
     def _files(self) -> list[Path]:
         """List the files with rows, the oldest first."""
-        return [*([self.output] if self.output.exists() else []), *sorted(self.folder.glob("[0-9]*.parquet"))]
+        return [*([self.output] if self.output.exists() else []), *self._parts()]
 
     def _read(self) -> None:
         """Compare the options, and read which records are done."""
+        now = self.task.options()
         for file in self._files():
-            if differences := describe_differences(table.read_options(file), self.task.options()):
-                raise CohortError(f"{file}: made with other options ({differences}). Give another -o, or remove it.")
-            for row in table.read_rows(file, (*table.KEYS, "status", "error_kind")):
-                if not (self.again and row["error_kind"] in TRANSIENT):
-                    self._remember(row)
-
-    def _remember(self, row: Row) -> None:
-        if row.get("stamp"):
-            self._places.add(digest(row["address"], row["stamp"]))
-        if row["status"] == "ok":
-            self._contents.setdefault(row["bytes"], []).append(digest(row["sha256"]))
+            before = table.read_options(file)
+            if other := [name for name in now if before.get(name) != now[name]]:
+                words = ", ".join(f"{name} {before.get(name, 'none')}, now {now[name]}" for name in other)
+                raise CohortError(f"{file}: made with other options ({words}). Give another -o, or remove it.")
+            for row in table.read_rows(file, ("address", "stamp", "error_kind")):
+                if row["stamp"] and not (self.again and row["error_kind"] in TRANSIENT):
+                    self._done.add(_digest(row["address"], row["stamp"]))
 
     def has(self, entry: Entry) -> bool:
         """Return whether this file, in its state of now, has a row."""
-        return bool(entry.stamp) and digest(entry.address, entry.stamp) in self._places
-
-    def contents(self, entry: Entry) -> list[bytes]:
-        """Return digests of contents with a result that this file may be a copy of."""
-        return self._contents.get(entry.size or 0, [])[:MAX_CONTENTS]
+        return bool(entry.stamp) and _digest(entry.address, entry.stamp) in self._done
 
     def add(self, row: Row) -> str:
-        """Add a record's row; return its status, which is `copy` if its content has a result already."""
-        if row["status"] == LEFT_OUT:
-            return LEFT_OUT
-        content = digest(row.get("sha256") or "")
-        if row["status"] == COPY or content in self._contents.get(row.get("bytes", -1), []):
-            self._copied.add(content)
-            return COPY
-        self._remember(row)
-        self._waiting.append(row)
-        if len(self._waiting) >= PART_ROWS or time.monotonic() - self._written_s > PART_S:
-            self.flush()
+        """Add a record's row, unless it was not selected; return its status."""
+        if row["status"] != LEFT_OUT:
+            self._waiting.append(row)
+            if len(self._waiting) >= PART_ROWS or time.monotonic() - self._written_s > PART_S:
+                self.flush()
         return row["status"]
 
     def flush(self) -> None:
         """Write the rows that wait as a part. Raises InterruptedRunError: the disk refuses."""
         self._written_s = time.monotonic()
         if self._waiting:
-            parts = sorted(self.folder.glob("[0-9]*.parquet"))
-            number = 1 + int(parts[-1].stem) if parts else 0
-            self._write(self.folder / f"{number:08d}.parquet", iter([table.rows_to_table(self._waiting)]))
+            number = 1 + int(([Path("0"), *self._parts()])[-1].stem)
+            self._write(self.folder / f"{number:08d}.parquet", [table.rows_to_table(self._waiting)])
             self._waiting = []
 
     def join(self) -> Counter[str]:
@@ -156,14 +144,45 @@ class Results:
         Raises InterruptedRunError: the disk refuses; the parts stay.
         """
         self.flush()
-        counts: Counter[str] = Counter()
-        self._write(self.output, self._current(counts))
+        statuses = self._statuses()
+        self._write(self.output, self._current(iter(statuses)))
         shutil.rmtree(self.folder, ignore_errors=True)
-        return counts
+        return Counter(status for status in statuses if status)
 
-    def _write(self, file: Path, tables: Iterator[pa.Table]) -> None:
-        about = {"format": table.FORMAT, "format_version": table.FORMAT_VERSION}
-        schema = table.SCHEMA.with_metadata(about | {"options": json.dumps(self.task.options())})
+    def _statuses(self) -> list[str | None]:
+        """Return the status of each row, the oldest first; None: its file has a newer row."""
+        statuses: list[str | None] = []
+        places, contents = set[bytes](), set[str]()
+        for file in reversed(self._files()):
+            for row in reversed(list(table.read_rows(file, ("address", "sha256", "status")))):
+                place, status = _digest(row["address"]), row["status"]
+                if place in places:
+                    status = None
+                elif status != "error":
+                    status = COPY if row["sha256"] in contents else "ok"
+                    contents.add(row["sha256"])
+                places.add(place)
+                statuses.append(status)
+        return statuses[::-1]
+
+    def _current(self, statuses: Iterator[str | None]) -> Iterator[pa.Table]:
+        """Yield the rows that have a status, many at a time."""
+        column, waiting = table.SCHEMA.get_field_index("status"), [table.SCHEMA.empty_table()]
+        for file in self._files():
+            with pq.ParquetFile(file) as rows:
+                for batch in rows.iter_batches(table.BATCH_ROWS):
+                    new = pa.array([next(statuses) for _ in range(len(batch))], pa.string())
+                    marked = pa.Table.from_batches([batch]).set_column(column, "status", new)
+                    waiting.append(marked.filter(new.is_valid()).cast(table.SCHEMA))
+                    if sum(map(len, waiting)) >= GROUP_ROWS:
+                        yield pa.concat_tables(waiting)
+                        waiting = []
+        if waiting:
+            yield pa.concat_tables(waiting)
+
+    def _write(self, file: Path, tables: Iterable[pa.Table]) -> None:
+        about = {"format": table.FORMAT, "options": json.dumps(self.task.options())}
+        schema = table.SCHEMA.with_metadata(about)
         try:
             with whole_file(file) as place, pq.ParquetWriter(place, schema, compression="zstd") as writer:
                 for rows in tables:
@@ -171,37 +190,7 @@ class Results:
         except OSError as error:
             raise InterruptedRunError(f"{file}: {error.strerror}. Make room; the same command goes on.") from None
 
-    def _current(self, counts: Counter[str]) -> Iterator[pa.Table]:
-        """Yield the rows that count, many at a time, and count them."""
-        current = self._current_rows()
-        waiting = [table.SCHEMA.empty_table()]
-        for file in self._files():
-            with pq.ParquetFile(file) as rows:
-                for batch in rows.iter_batches(table.BATCH_ROWS):
-                    counted = pa.array([next(current) for _ in range(len(batch))])
-                    current_rows = pa.Table.from_batches([batch]).filter(counted).cast(table.SCHEMA)
-                    counts.update(current_rows["status"].to_pylist())
-                    waiting.append(current_rows)
-                    if sum(map(len, waiting)) >= GROUP_ROWS:
-                        yield pa.concat_tables(waiting)
-                        waiting = []
-        if waiting:
-            yield pa.concat_tables(waiting)
 
-    def _current_rows(self) -> Iterator[bool]:
-        """Yield for each row whether it counts, the oldest first: the newest of its address and of its content.
-
-        A file that was replaced takes its old row with it, unless the old content lies elsewhere, too.
-        """
-        current: list[bool] = []
-        places, contents = set[bytes](), set[bytes]()
-        for file in reversed(self._files()):
-            for row in reversed(list(table.read_rows(file, ("address", "sha256", "status")))):
-                place, content = digest(row["address"]), digest(row["sha256"] or "")
-                replaced = place in places and not (row["status"] == "ok" and content in self._copied)
-                current.append(not replaced and content not in contents)
-                if file != self.output:  # of its rows none replaced another one
-                    places.add(place)
-                if row["status"] == "ok":
-                    contents.add(content)
-        return reversed(current)
+def _digest(*texts: str) -> bytes:
+    """Return sixteen bytes that stand for texts: a run remembers every record."""
+    return hashlib.blake2b("\0".join(texts).encode(), digest_size=16).digest()

@@ -8,7 +8,7 @@ from __future__ import annotations
 import time
 from asyncio import CancelledError
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from datetime import UTC, datetime
 from itertools import islice
 from pathlib import Path
@@ -20,13 +20,13 @@ from distributed.scheduler import KilledWorker
 
 from stimrig.api.cohort.cluster import connect, parse_memory
 from stimrig.api.cohort.errors import RESUMABLE, SCHEDULER_GONE, CohortError, InterruptedRunError
-from stimrig.api.cohort.progress import progress_of
+from stimrig.api.cohort.progress import records_bar
 from stimrig.api.cohort.record import LEFT_OUT, Row, failed
-from stimrig.api.cohort.results import Results
+from stimrig.api.cohort.results import COPY, Results
 from stimrig.api.cohort.select import Selection
-from stimrig.api.cohort.sources import Entry, check_addresses, list_records
+from stimrig.api.cohort.sources import Entry, count_records, list_records
 from stimrig.api.cohort.task import METHOD, Task
-from stimrig.api.cohort.worker import COPY, Bounds, base_row, record_row
+from stimrig.api.cohort.worker import Bounds, base_row, record_row
 from stimrig.api.version import software_version
 
 IN_FLIGHT = 24
@@ -64,40 +64,30 @@ def run_cohort(
     task = Task(verb, Selection(select).text, method, tuple(effects), tuple(columns or ()), software_version())
     task.check()
     bounds = Bounds(limit, parse_memory(memory))
-    check_addresses(data)
-    began_s = time.monotonic()
+    total, began_s = count_records(data), time.monotonic()
     with Results(output, task, again) as results:
         with connect(scheduler, workers, wait) as client:
-            counts = run_records(client, lambda: list_records(data), task, bounds, results)
+            counts = run_records(client, list_records(data), task, bounds, results, total)
         rows = results.join()
     return {
         "output": str(output),
-        "records": rows.total(),
+        "records": rows["ok"] + rows["error"],
         "ok": rows["ok"],
         "errors": rows["error"],
         "computed": counts["ok"] + counts["error"],
         "done_before": counts[DONE_BEFORE],
         "left_out": counts[LEFT_OUT],
-        "copies": counts[COPY],
+        "copies": rows[COPY],
         "took_s": round(time.monotonic() - began_s, 1),
     }
 
 
 def run_records(
-    client: Client, entries: Callable[[], Iterator[Entry]], task: Task, bounds: Bounds, results: Results
+    client: Client, entries: Iterable[Entry], task: Task, bounds: Bounds, results: Results, total: int = 0
 ) -> Counter[str]:
     """Compute every record without a row on the client's workers; return counts by status, `done before` among them.
 
-    Parameters
-    ----------
-    client : Client
-        With workers.
-    entries : callable
-        Lists the records.
-    task, bounds
-        The verb with its options, and what one record may take.
-    results : Results
-        Open; the caller joins them.
+    `results` is open; the caller joins them. `total`: of the entries, for the bar.
 
     Raises
     ------
@@ -106,43 +96,35 @@ def run_records(
     InterruptedRunError
         The scheduler is gone, a worker cannot compute, or the disk is full.
     """
-    counts: Counter[str] = Counter()
-    selection = Selection(task.select)
+    counts, selection = Counter[str](), Selection(task.select)
+    with records_bar(total) as bar:
 
-    def selected() -> Iterator[Entry]:
-        return (entry for entry in entries() if selection(entry.known) is not False)
-
-    def not_done() -> Iterator[Entry]:
-        for entry in selected():
-            if results.has(entry):
-                counts[DONE_BEFORE] += 1
-                bar.update()
+        def is_open(entry: Entry) -> bool:
+            if selection(entry.known) is False:
+                status = LEFT_OUT
+            elif results.has(entry):
+                status = DONE_BEFORE
             else:
-                yield entry
-
-    waiting, sent, pending = not_done(), dict[Any, Entry](), as_completed()
-
-    def send() -> None:
-        threads: Any = client.nthreads()  # now: workers may come and go
-        room = IN_FLIGHT * max(1, sum(threads.values())) - len(sent)
-        if batch := list(islice(waiting, room)):
-            contents = [results.contents(entry) for entry in batch]
-            futures = client.map(record_row, batch, contents, task=task, bounds=bounds, pure=False, retries=RETRIES)
-            sent.update((future.key, entry) for future, entry in zip(futures, batch, strict=True))
-            pending.update(futures)
-
-    with progress_of(selected) as bar:
-        send()
-        batch_size = len(sent)
-        for future in pending:
-            row = _result(client, future, sent.pop(future.key), task)
-            counts[results.add({**row, "computed_utc": datetime.now(UTC)})] += 1
-            bar.set_postfix_str(f"{counts['error']} failed" if counts["error"] else "", refresh=False)
+                return True
+            counts[status] += 1
             bar.update()
-            if len(sent) <= batch_size // 2:
-                send()
-                batch_size = max(batch_size, len(sent))
-    return counts
+            return False
+
+        waiting, sent, pending = filter(is_open, entries), dict[Any, Entry](), as_completed()
+        while True:
+            threads: Any = client.nthreads()  # now: workers may come and go
+            room = IN_FLIGHT * max(1, sum(threads.values())) - len(sent)
+            if batch := list(islice(waiting, max(0, room))):
+                futures = client.map(record_row, batch, task=task, bounds=bounds, pure=False, retries=RETRIES)
+                sent.update((future.key, entry) for future, entry in zip(futures, batch, strict=True))
+                pending.update(futures)
+            if not sent:
+                return counts
+            for future in islice(pending, (len(sent) + 1) // 2):
+                row = _result(client, future, sent.pop(future.key), task)
+                counts[results.add({**row, "computed_utc": datetime.now(UTC)})] += 1
+                bar.set_postfix_str(f"{counts['error']} failed" if counts["error"] else "", refresh=False)
+                bar.update()
 
 
 def _result(client: Client, future: Future[Row], entry: Entry, task: Task) -> Row:

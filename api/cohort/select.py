@@ -46,17 +46,14 @@ FIELDS: dict[str, Field] = {
 record says nothing of it."""
 EXAMPLE = 'Give something like participant == "P001" and duration_s > 20.'
 MAX_CHARACTERS = 2000
-Condition = Callable[[Mapping[str, Any]], bool | None]
-
-
-def _if_given(compare: Callable[[Any, Any], bool]) -> Callable[[Any, Any], bool]:
-    return lambda content, value: content is not None and compare(content, value)
-
-
-COMPARISONS: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
-    ast.Eq: operator.eq, ast.NotEq: operator.ne, ast.Lt: _if_given(operator.lt), ast.LtE: _if_given(operator.le),
-    ast.Gt: _if_given(operator.gt), ast.GtE: _if_given(operator.ge),
+ORDERED: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
+    ast.Lt: operator.lt, ast.LtE: operator.le, ast.Gt: operator.gt, ast.GtE: operator.ge,
 }  # fmt: skip
+WITHIN: dict[type[ast.cmpop], Callable[[Any, Any], bool]] = {
+    ast.In: lambda part, whole: part in whole,
+    ast.NotIn: lambda part, whole: whole is None or part not in whole,
+}
+COMPARISONS = {ast.Eq: operator.eq, ast.NotEq: operator.ne, **ORDERED, **WITHIN}
 
 
 class Selection:
@@ -69,10 +66,10 @@ class Selection:
         self.text = " ".join(text.split())
         if len(self.text) > MAX_CHARACTERS:
             raise CohortError(f"--select: more than {MAX_CHARACTERS} characters. Give a folder of the records instead.")
-        self._condition: Condition = lambda _fields: True
         try:
-            if self.text:
-                self._condition = _condition(ast.parse(self.text, mode="eval").body)
+            self._tree = ast.parse(self.text, mode="eval").body if self.text else None
+            if self._tree is not None:
+                _check(self._tree)
         except SyntaxError as error:
             where = f", character {error.offset}" if error.offset else ""
             raise CohortError(f"--select{where}: {error.msg}. {EXAMPLE}") from None
@@ -81,7 +78,7 @@ class Selection:
 
     def __call__(self, fields: Mapping[str, Any]) -> bool | None:
         """Return whether a record is selected; None while a field that decides it is unknown."""
-        return self._condition(fields)
+        return self._tree is None or _evaluate(self._tree, fields)
 
 
 def parse_day(text: str) -> date | None:
@@ -96,48 +93,41 @@ def _refusal(node: ast.AST, reason: str) -> CohortError:
     return CohortError(f"--select, character {getattr(node, 'col_offset', 0) + 1}: {reason}. {EXAMPLE}")
 
 
-def _condition(node: ast.expr) -> Condition:
+def _check(node: ast.expr) -> None:
+    """Raise CohortError unless `_evaluate` knows all that the expression holds."""
     match node:
-        case ast.BoolOp(op=op, values=values):
-            return _joined([_condition(value) for value in values], decisive=isinstance(op, ast.Or))
+        case ast.BoolOp(values=values):
+            for value in values:
+                _check(value)
         case ast.UnaryOp(op=ast.Not(), operand=operand):
-            inner = _condition(operand)
-            return lambda fields: None if (selected := inner(fields)) is None else not selected
-        case ast.Compare(left=ast.Name() as name, ops=[ast.In() | ast.NotIn() as op], comparators=[choices]):
+            _check(operand)
+        case ast.Compare(left=ast.Name() as name, ops=[ast.In() | ast.NotIn()], comparators=[choices]):
             if not isinstance(choices, ast.Tuple | ast.List | ast.Set):
                 raise _refusal(choices, 'after `in` stands a list, as participant in ("P001", "P002")')
-            values = {_value(name, item) for item in choices.elts}
-            return _of_field(name, lambda content: (content in values) is isinstance(op, ast.In))
-        case ast.Compare(left=part, ops=[ast.In() | ast.NotIn() as op], comparators=[ast.Name() as name]):
-            text = _literal(part)
-            if not isinstance(text, str) or _field(name).type == "number":
+            for item in choices.elts:
+                _check_literal(name, item)
+        case ast.Compare(left=part, ops=[ast.In() | ast.NotIn()], comparators=[ast.Name() as name]):
+            if not isinstance(_literal(part), str) or _field(name).type == "number":
                 raise _refusal(node, "`in` looks for a text in quotes within a text")
-            return _of_field(
-                name, lambda content: (content is not None and text in str(content)) is isinstance(op, ast.In)
-            )
         case ast.Compare(left=ast.Name() as name, ops=[op], comparators=[right]) if type(op) in COMPARISONS:
-            compare, value = COMPARISONS[type(op)], _value(name, right)
-            if value is None and not isinstance(op, ast.Eq | ast.NotEq):
+            _check_literal(name, right)
+            if type(op) in ORDERED and _literal(right) is None:
                 raise _refusal(right, "None has no order; compare with == or !=")
-            return _of_field(name, lambda content: compare(content, value))
-    raise _refusal(node, "only comparisons of a field, on their left, and, or, not and brackets can be used")
+        case _:
+            raise _refusal(node, "only comparisons of a field, on their left, and, or, not and brackets can be used")
 
 
-def _joined(conditions: list[Condition], decisive: bool) -> Condition:
-    """Join by `or` (decisive: True) or `and` (False); unknown where none is decisive and one is unknown."""
-
-    def condition(fields: Mapping[str, Any]) -> bool | None:
-        results = [test(fields) for test in conditions]
-        if decisive in results:
-            return decisive
-        return None if None in results else not decisive
-
-    return condition
-
-
-def _of_field(name: ast.Name, test: Callable[[Any], bool]) -> Condition:
-    _field(name)
-    return lambda fields: test(fields[name.id]) if name.id in fields else None
+def _check_literal(name: ast.Name, node: ast.expr) -> None:
+    """Raise CohortError unless a field can be compared with the literal."""
+    kind, value = _field(name).type, _literal(node)
+    if value is None:
+        return
+    if kind == "number" and (isinstance(value, bool) or not isinstance(value, int | float)):
+        raise _refusal(node, f"{name.id} is a number")
+    if kind != "number" and not isinstance(value, str):
+        raise _refusal(node, f"{name.id} is a text: write it in quotes")
+    if kind == "day" and str(parse_day(str(value))) != value:
+        raise _refusal(node, f"{name.id} is a day, as 2026-01-31")
 
 
 def _field(name: ast.Name) -> Field:
@@ -146,26 +136,28 @@ def _field(name: ast.Name) -> Field:
     return FIELDS[name.id]
 
 
-def _value(name: ast.Name, node: ast.expr) -> Any:
-    """Return the literal with which a field is compared; a day as a date."""
-    kind = _field(name).type
-    value: Any = _literal(node)
-    if value is None:
-        return None
-    if kind == "number" and (isinstance(value, bool) or not isinstance(value, int | float)):
-        raise _refusal(node, f"{name.id} is a number")
-    if kind != "number" and not isinstance(value, str):
-        raise _refusal(node, f"{name.id} is a text: write it in quotes")
-    if kind == "day":
-        day = parse_day(str(value))
-        if day is None or day.isoformat() != value:
-            raise _refusal(node, f"{name.id} is a day, as 2026-01-31")
-        return day
-    return value
-
-
 def _literal(node: ast.expr) -> Any:
     try:
         return ast.literal_eval(node)
     except (ValueError, TypeError):
         raise _refusal(node, "only a text in quotes, a number or None can stand here") from None
+
+
+def _evaluate(node: Any, fields: Mapping[str, Any]) -> bool | None:
+    """Return what an expression gives; None where a field is unknown that decides it."""
+    if isinstance(node, ast.BoolOp):
+        decisive, results = isinstance(node.op, ast.Or), [_evaluate(value, fields) for value in node.values]
+        return decisive if decisive in results else None if None in results else not decisive
+    if isinstance(node, ast.UnaryOp):
+        inner = _evaluate(node.operand, fields)
+        return None if inner is None else not inner
+    sides: list[Any] = []
+    for side in (node.left, node.comparators[0]):
+        if isinstance(side, ast.Name) and side.id not in fields:
+            return None
+        value = fields[side.id] if isinstance(side, ast.Name) else ast.literal_eval(side)
+        sides.append(value.isoformat() if isinstance(value, date) else value)
+    try:
+        return COMPARISONS[type(node.ops[0])](*sides)
+    except TypeError:  # None has no order and holds nothing
+        return False

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,6 @@ SUFFIXES = (".h5", ".hdf5", ".csv", ".tsv", ".txt", ".mat")
 """Suffixes of records in a folder; Parquet files may be results. A file that is named itself needs none of them."""
 EXPORT_TABLES = ("records.csv", "errors.csv")
 """The two tables that `stimrig export` writes beside the records of its folder."""
-TOO_LARGE = f"more than {LARGEST_FILE_BYTES // 2**20} MB. Cut the record, or give the sealed recording."
 
 
 @dataclass(frozen=True)
@@ -40,11 +39,6 @@ class Entry:
         """Name of the file."""
         return self.known["name"]
 
-    @property
-    def size(self) -> int | None:
-        """Bytes, where the listing says how many."""
-        return self.known.get("bytes")
-
 
 class SourceError(Exception):
     """The record cannot be fetched, or is too large: kind and one line, for its row."""
@@ -54,12 +48,11 @@ class SourceError(Exception):
         self.kind = kind
 
 
-def check_addresses(addresses: Sequence[str]) -> None:
-    """Raise CohortError if there is no address, or one that cannot be used."""
+def count_records(addresses: Sequence[str]) -> int:
+    """Count the records below the addresses. Raises CohortError: there is no address, or one that cannot be used."""
     if not addresses:
         raise CohortError("DATA is missing. Give files, folders, or addresses like s3://….")
-    for address in addresses:
-        next(list_records([address]), None)
+    return sum(1 for _ in list_records(addresses))
 
 
 def list_records(addresses: Sequence[str]) -> Iterator[Entry]:
@@ -74,53 +67,45 @@ def list_records(addresses: Sequence[str]) -> Iterator[Entry]:
 
 def read_content(entry: Entry) -> bytes:
     """Return the content of a record. Raises SourceError."""
-    if (entry.size or 0) > LARGEST_FILE_BYTES:
-        raise SourceError("bad record", TOO_LARGE)
+    size, content = entry.known.get("bytes", 1), b""
     try:
-        if entry.bucket:
-            files, _ = _open_bucket(entry.bucket)
-            # An empty range cannot be requested.
-            content = b"" if entry.size == 0 else files.cat_file(entry.path, start=0, end=LARGEST_FILE_BYTES + 1)
-        else:
+        if size > LARGEST_FILE_BYTES:
+            pass
+        elif entry.bucket and size:  # an empty range cannot be requested
+            content = _open_bucket(entry.bucket)[0].cat_file(entry.path, start=0, end=LARGEST_FILE_BYTES + 1)
+        elif not entry.bucket:
             # Not blocking: a pipe in the file's place would never end.
             with os.fdopen(os.open(entry.path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
                 content = file.read(LARGEST_FILE_BYTES + 1)
     except Exception as error:  # each protocol has errors of its own
         raise SourceError("unreadable", f"cannot be read ({_one_line(error)})") from None
-    if len(content) > LARGEST_FILE_BYTES:
-        raise SourceError("bad record", TOO_LARGE)
+    if max(size, len(content)) > LARGEST_FILE_BYTES:
+        limit = f"more than {LARGEST_FILE_BYTES // 2**20} MB. Cut the record, or give the sealed recording."
+        raise SourceError("bad record", limit)
     return content
 
 
-def _is_record(name: str, exported: bool) -> bool:
-    """Return whether a folder's file may be a record; `exported`: the folder holds both tables of an export."""
-    hidden = name.startswith((".", "_")) or (exported and name in EXPORT_TABLES)
-    return not hidden and name.lower().endswith(SUFFIXES)
+def _records_of(names: Iterable[str]) -> list[str]:
+    """Return the names of a folder's files that may be records."""
+    tables = set(EXPORT_TABLES) if set(EXPORT_TABLES) <= set(names) else set()
+    shown = (name for name in names if name not in tables and not name.startswith((".", "_")))
+    return sorted(name for name in shown if name.lower().endswith(SUFFIXES))
 
 
 def _list_folder(place: Path) -> Iterator[Entry]:
+    def refuse(error: OSError) -> None:
+        raise CohortError(f"{error.filename}: {error.strerror}. Give a folder that can be read.") from None
+
     if place.is_file():
         yield _file_entry(place, place)
-    elif place.is_dir():
-        yield from _list_within(place, place)
-    else:
+    elif not place.is_dir():
         raise CohortError(f"{place}: no such file or folder. Give a path, s3://… or https://…")
-
-
-def _list_within(folder: Path, origin: Path) -> Iterator[Entry]:
-    try:
-        items = sorted(os.scandir(folder), key=lambda item: item.name)
-    except OSError:  # reading it as a record gives the reason, as its row
-        path = str(folder.absolute())
-        yield _entry(path, path, str(origin))
-        return
-    exported = set(EXPORT_TABLES) <= {item.name for item in items}
-    for item in items:
-        if item.is_dir(follow_symlinks=False):
-            if not item.name.startswith("."):
-                yield from _list_within(Path(item), origin)
-        elif _is_record(item.name, exported) and item.is_file():  # a link counts, a pipe does not
-            yield _file_entry(Path(item), origin)
+    else:
+        for folder, folders, names in os.walk(place, onerror=refuse):
+            folders[:] = sorted(name for name in folders if not name.startswith("."))
+            for path in (Path(folder, name) for name in _records_of(names)):
+                if path.is_file():  # a link counts, a pipe does not
+                    yield _file_entry(path, place)
 
 
 def _file_entry(path: Path, origin: Path) -> Entry:
@@ -128,12 +113,10 @@ def _file_entry(path: Path, origin: Path) -> Entry:
     with contextlib.suppress(OSError):  # gone since: its row will say so
         status = path.stat()
         size, stamp = status.st_size, f"{status.st_size}:{status.st_mtime_ns}"
-    return _entry(str(path), str(path), str(origin), size=size, stamp=stamp)
+    return _entry(str(path), str(path), str(origin), size, stamp)
 
 
-def _entry(
-    address: str, path: str, origin: str, *, bucket: str = "", size: int | None = None, stamp: str = ""
-) -> Entry:
+def _entry(address: str, path: str, origin: str, size: int | None, stamp: str, bucket: str = "") -> Entry:
     # The name of a file may not be UTF-8, which results cannot store.
     address, origin = (text.encode("utf-8", "replace").decode() for text in (address, origin))
     known = {"name": address.rstrip("/").rpartition("/")[2], "origin": origin}
@@ -150,9 +133,6 @@ def _open_bucket(url: str) -> tuple[Any, str]:
 def _list_bucket(url: str) -> Iterator[Entry]:
     try:
         files, path = _open_bucket(url)
-    except (ImportError, ValueError) as error:
-        raise CohortError(f"{url}: {url.partition('://')[0]}:// cannot be used here ({_one_line(error)}).") from None
-    try:
         if files.isfile(path):
             yield _object_entry(files, files.info(path), url)
             return
@@ -161,10 +141,8 @@ def _list_bucket(url: str) -> Iterator[Entry]:
         for _, folders, objects in files.walk(path, detail=True, on_error="raise"):
             for hidden in [name for name in folders if name.startswith(".")]:
                 del folders[hidden]
-            exported = set(EXPORT_TABLES) <= objects.keys()
-            for name, item in sorted(objects.items()):
-                if _is_record(name, exported):
-                    yield _object_entry(files, item, url)
+            for name in _records_of(objects):
+                yield _object_entry(files, objects[name], url)
     except CohortError:
         raise
     except Exception as error:  # each protocol has errors of its own
@@ -175,7 +153,7 @@ def _object_entry(files: Any, item: dict[str, Any], url: str) -> Entry:
     size = item.get("size")
     version = next((item[key] for key in ("ETag", "etag", "LastModified", "mtime") if item.get(key)), "")
     stamp = f"{size}:{version}" if version else ""
-    return _entry(files.unstrip_protocol(item["name"]), item["name"], url, size=size, stamp=stamp, bucket=url)
+    return _entry(files.unstrip_protocol(item["name"]), item["name"], url, size, stamp, url)
 
 
 def _one_line(error: BaseException) -> str:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
-from typing import Any
+from dataclasses import asdict, dataclass
 
 from stimrig.api.cohort.errors import CohortError
 
@@ -22,9 +20,10 @@ class Task:
     columns: tuple[str, ...] = ()  # of other tools' tables, as --map gives them
     software: str = ""  # version of stimrig
 
-    def options(self) -> dict[str, Any]:
-        """Return the options as JSON holds them."""
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in asdict(self).items()}
+    def options(self) -> dict[str, str]:
+        """Return the options in words, as the results hold them."""
+        words = {name: value if isinstance(value, str) else ", ".join(value) for name, value in asdict(self).items()}
+        return {name: value or "none" for name, value in words.items()}
 
     def check(self) -> None:
         """Raise CohortError if a method, an effect or a column is unknown."""
@@ -41,16 +40,3 @@ class Task:
             parsed(list(self.columns) or None)
         except IdentifyError as error:
             raise CohortError(str(error)) from error
-
-
-OPTIONS = tuple(field.name for field in fields(Task))
-
-
-def describe_differences(before: Mapping[str, Any], now: Mapping[str, Any]) -> str:
-    """Say how the options of two runs differ; empty if they do not."""
-    names = [name for name in OPTIONS if now.get(name) != before.get(name)]
-    return ", ".join(f"{name} {_in_words(before.get(name))}, now {_in_words(now.get(name))}" for name in names)
-
-
-def _in_words(value: Any) -> str:
-    return ", ".join(map(str, value)) or "none" if isinstance(value, list) else str(value) if value else "none"

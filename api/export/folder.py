@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any
 
 from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.progress import progress_of
+from stimrig.api.cohort.progress import records_bar
 from stimrig.api.cohort.record import read_selected
 from stimrig.api.cohort.select import LABELS, Selection
-from stimrig.api.cohort.sources import EXPORT_TABLES, Entry, SourceError, check_addresses, list_records, read_content
+from stimrig.api.cohort.sources import EXPORT_TABLES, Entry, SourceError, count_records, list_records, read_content
 from stimrig.api.export.record_file import write_record
 from stimrig.api.whole_file import whole_path
 from stimrig.identify.errors import IdentifyError
@@ -55,7 +55,7 @@ def export_records(
     CohortError
         An address is missing, or the folder is not empty or cannot be written.
     """
-    check_addresses(data)
+    total = count_records(data)
     rows: dict[str, dict[str, Any]] = {}  # by the SHA-256 of the record's file
     errors: list[tuple[str, str]] = []
     counts = Counter(left_out=0, copies=0)
@@ -63,10 +63,7 @@ def export_records(
         folder.mkdir(parents=True, exist_ok=True)
         if any(folder.iterdir()):
             raise CohortError(f"{folder}: is not empty. Give a new folder.")
-        with (
-            tempfile.TemporaryDirectory(prefix="stimrig-export-") as scratch,
-            progress_of(lambda: list_records(data)) as bar,
-        ):
+        with tempfile.TemporaryDirectory(prefix="stimrig-export-") as scratch, records_bar(total) as bar:
             for entry in list_records(data):
                 path = Path(scratch) / f"record{Path(entry.name).suffix.lower()[:8]}"
                 try:

@@ -12,7 +12,7 @@ import pytest
 from stimrig.api.cohort import sources
 from stimrig.api.cohort.errors import CohortError
 from stimrig.api.cohort.select import FIELDS, Selection, parse_day
-from stimrig.api.cohort.sources import Entry, SourceError, check_addresses, list_records, read_content
+from stimrig.api.cohort.sources import Entry, SourceError, count_records, list_records, read_content
 
 pytestmark = pytest.mark.slow
 
@@ -27,7 +27,7 @@ def names(*addresses: object) -> list[str]:
 
 def refusal(*addresses: str) -> str:
     with pytest.raises(CohortError) as caught:
-        check_addresses(addresses)
+        count_records(addresses)
     assert "\n" not in str(caught.value)
     return str(caught.value)
 
@@ -88,22 +88,17 @@ def test_file_that_is_too_large_is_not_read_whole(tmp_path: Path, monkeypatch: p
         assert caught.value.kind == "bad record"
 
 
-def test_folder_without_permission_is_one_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "open").mkdir()
-    (tmp_path / "open" / "a.h5").write_bytes(b"x")
+def test_folder_without_permission_ends_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "shut").mkdir()
     scan = os.scandir
 
     def scandir(path: Any) -> Any:  # the tests may run as root, whom no permission stops
         if str(path).endswith("shut"):
-            raise PermissionError(13, "Permission denied")
+            raise PermissionError(13, "Permission denied", str(path))
         return scan(path)
 
     monkeypatch.setattr(os, "scandir", scandir)
-    entries = listed(tmp_path)
-    assert [entry.name for entry in entries] == ["a.h5", "shut"]
-    with pytest.raises(SourceError, match="cannot be read"):
-        read_content(entries[1])
+    assert "shut: Permission denied" in refusal(str(tmp_path))
 
 
 def test_unusable_addresses_are_refused(tmp_path: Path) -> None:
@@ -125,7 +120,7 @@ def test_bucket_lists_and_reads_its_objects(bucket: Any, monkeypatch: pytest.Mon
     entries, keys = listed("s3://records"), ("P1/a.h5", "P1/b.csv", "P2/c.h5")
     assert [entry.address for entry in entries] == [f"s3://records/{key}" for key in keys]
     assert [read_content(entry) for entry in entries] == [b"aaaa", b"bb", b""]
-    assert all(entry.stamp for entry in entries) and entries[0].size == 4
+    assert all(entry.stamp for entry in entries) and entries[0].known["bytes"] == 4
     assert names("s3://records/P2") == ["c.h5"] and names("s3://records/P1/a.h5") == ["a.h5"]
     bucket.pipe("records/P1/b.csv", b"cc")
     assert listed("s3://records/P1/b.csv")[0].stamp != entries[1].stamp
@@ -138,7 +133,7 @@ def test_bucket_lists_and_reads_its_objects(bucket: Any, monkeypatch: pytest.Mon
 def test_any_protocol_of_fsspec() -> None:
     fsspec.filesystem("memory").pipe({"/held/P1/a.h5": b"aaaa", "/held/readme.pdf": b"x"})
     (entry,) = listed("memory://held")
-    assert (entry.address, entry.size) == ("memory:///held/P1/a.h5", 4)
+    assert (entry.address, entry.known["bytes"]) == ("memory:///held/P1/a.h5", 4)
     assert read_content(entry) == b"aaaa"
     assert "memory://nowhere" in refusal("memory://nowhere")
 
