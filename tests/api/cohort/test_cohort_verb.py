@@ -180,7 +180,8 @@ def test_ctrl_c_ends_a_run_and_all_its_processes_in_one_line(processes: Processe
     run = processes.begin(pause_s=600.0)
     os.killpg(run.pid, signal.SIGINT)  # as a terminal does
     out, err = run.communicate(timeout=PATIENCE_S)
-    assert (run.returncode, out) == (130, "") and err.count("\n") == 1 and "the same command goes on" in err, err
+    (line,) = (line for line in err.splitlines() if line and "records]" not in line)  # a slow machine draws the bar
+    assert (run.returncode, out) == (130, "") and "the same command goes on" in line, err
     assert processes.rows() >= 3 and not processes.output.exists()
     processes.until(lambda: not group(run.pid), "the end of its processes")
 
