@@ -91,8 +91,6 @@ def _routes() -> Sequence[BaseRoute]:
 
 def routers(*packages: ModuleType) -> list[APIRouter]:
     """The routers of all files in these packages: a new file is a new subject."""
-    names = [
-        f"{package.__name__}.{info.name}" for package in packages for info in pkgutil.iter_modules(package.__path__)
-    ]
-    values = [value for name in sorted(names) for value in vars(importlib.import_module(name)).values()]
+    files = [info for package in packages for info in pkgutil.iter_modules(package.__path__, f"{package.__name__}.")]
+    values = [value for info in files for value in vars(importlib.import_module(info.name)).values()]
     return [value for value in values if isinstance(value, APIRouter)]

@@ -11,23 +11,13 @@ from urllib.parse import parse_qs, urlsplit
 import httpx
 import pytest
 
-from stimrig.api.clock import Clock
 from stimrig.api.people.auth import IdleLock
 from tests.api.browser import PASSWORD, without_values
-from tests.api.conftest import HTML, STUB, TOKEN, Service, run_service, wait_done
+from tests.api.conftest import HTML, STUB, TOKEN, Service, SetClock, run_service, wait_done
 from tests.api.forms import find, press
+from tests.api.test_people import standing_still
 
 SCRIPT = {"Sec-Fetch-Dest": "empty", "Sec-Fetch-Mode": "cors"}
-
-
-class SetClock(Clock):
-    """Stands still, ahead of when it was made: no busy machine lets a session grow idle."""
-
-    def __init__(self) -> None:
-        self.made_s, self.ahead_s = super().unix_s(), 0.0
-
-    def unix_s(self) -> float:
-        return self.made_s + self.ahead_s
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +32,11 @@ def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterat
 
 @pytest.fixture
 def clock(service: Service) -> SetClock:
-    found = SetClock()
-    service.context.auth.idle.clock = found
-    return found
+    """Stands still from now on: no busy machine lets a session grow idle."""
+    clock = SetClock()
+    clock.unix = service.context.clock.unix_s()
+    service.context.auth.idle.clock = clock
+    return clock
 
 
 @contextmanager
@@ -58,20 +50,23 @@ def signed_in(service: Service, name: str = "Ada") -> Iterator[httpx.Client]:
 
 def locked(http: httpx.Client) -> bool:
     """Asked as a script asks, which is nobody's action."""
-    said = http.get("/rig/now").json()
-    assert said["locked"] != said["signed_in"]
-    return said["locked"]
+    now = http.get("/rig/now").json()
+    assert now["locked"] != now["signed_in"]
+    return now["locked"]
 
 
-def test_it_locks_after_ten_minutes_and_not_before(service: Service, clock: SetClock) -> None:
-    with signed_in(service) as http:
-        clock.ahead_s = 599
+def test_it_locks_after_ten_minutes_without_an_action_on_any_tab(service: Service, clock: SetClock) -> None:
+    with signed_in(service) as http, service.client(token=None, cookies=http.cookies) as other:
+        clock.unix += 590
+        assert http.post("/v1/sessions/acted").status_code == 204
+        clock.unix += 590
+        assert not locked(other) and other.get("/", headers=HTML).status_code == 200
+        clock.unix += 590
         assert not locked(http)
-        clock.ahead_s = 900
-        assert locked(http)
+        clock.unix += 20
+        assert locked(http) and locked(other)
         refused = http.get("/v1/rig")
-        assert refused.status_code == 401
-        assert refused.json()["type"] == "/problems/locked"
+        assert refused.status_code == 401 and refused.json()["type"] == "/problems/locked"
         assert "participant" not in http.get("/rig/now").text, "nothing about a participant"
         page = http.get("/participants/L1?x=1", headers=HTML)
         assert page.status_code == 303
@@ -81,40 +76,22 @@ def test_it_locks_after_ten_minutes_and_not_before(service: Service, clock: SetC
 
 
 @pytest.mark.parametrize(
-    ("path", "headers"),
-    [
-        ("/rig/now", {}),
-        ("/v1/jobs/none", {}),
-        ("/", {**SCRIPT, **HTML}),
-        ("/v1/rig", SCRIPT),
-    ],
+    ("path", "headers"), [("/rig/now", {}), ("/v1/jobs/none", {}), ("/", {**SCRIPT, **HTML}), ("/v1/rig", SCRIPT)]
 )
 def test_what_scripts_read_by_themselves_keeps_no_session_open(
     service: Service, clock: SetClock, path: str, headers: dict[str, str]
 ) -> None:
     with signed_in(service) as http:
-        for clock.ahead_s in (300.0, 590.0):
+        for _ in range(2):
+            clock.unix += 295
             http.get(path, headers=headers)
-        clock.ahead_s = 900.0
+        clock.unix += 295
         assert locked(http)
-
-
-def test_an_action_on_any_tab_keeps_all_of_them_open(service: Service, clock: SetClock) -> None:
-    with signed_in(service) as http, service.client(token=None, cookies=http.cookies) as other:
-        clock.ahead_s = 590.0
-        assert http.post("/v1/sessions/acted").status_code == 204
-        clock.ahead_s = 1180.0
-        assert not locked(other)
-        assert other.get("/", headers=HTML).status_code == 200
-        clock.ahead_s = 1770.0
-        assert not locked(http)
-        clock.ahead_s = 1790.0
-        assert locked(http) and locked(other)
 
 
 def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(service: Service, clock: SetClock):
     with signed_in(service) as http:
-        clock.ahead_s = 900.0
+        clock.unix += 900
         assert http.post("/v1/participants", json={"code": "L9"}).status_code == 401
         shown = http.get("/locked", headers=HTML).text
         assert "Ada" in shown
@@ -137,7 +114,7 @@ def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(se
 
 
 def test_guesses_at_the_lock_are_held_to_a_pace(service: Service, clock: SetClock) -> None:
-    service.context.people.guesses.clock = type("Still", (Clock,), {"monotonic_s": lambda _self: 1000.0})()
+    standing_still(service)
     with signed_in(service, "Jörg Müller") as http:
         http.post("/v1/sessions/lock")
         tries = [http.post("/v1/sessions/unlock", json={"password": f"no {n}"}).status_code for n in range(6)]
@@ -202,18 +179,16 @@ def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
             assert locked(http)
 
 
-def test_actions_are_written_down_once_and_what_comes_meanwhile_is_kept(service: Service) -> None:
+def test_actions_are_written_down_for_a_restart(service: Service, clock: SetClock) -> None:
     context = service.context
-    clock = SetClock()
     idle = IdleLock(context.store, clock, 10)
     with signed_in(service) as http:
         row = context.auth.cookie(http.cookies[context.auth.cookie_name]).page_session
-        clock.ahead_s = 500.0
+        clock.unix += 500
         idle.acted(row.hash)
         idle.flush()
-        clock.ahead_s = 1000.0
-        again = IdleLock(context.store, clock, 10)  # as after a restart
-        assert not again.locked(context.store.get(type(row), row.hash))
-        clock.ahead_s = 1200.0
-        assert again.locked(context.store.get(type(row), row.hash))
-        assert not IdleLock(context.store, clock, 0).locked(context.store.get(type(row), row.hash)), "0: never"
+        kept = context.store.get(type(row), row.hash)
+        for later_s, expected in ((500, False), (200, True)):
+            clock.unix += later_s
+            assert IdleLock(context.store, clock, 10).locked(kept) is expected
+        assert not IdleLock(context.store, clock, 0).locked(kept), "0: never"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import json
 import sqlite3
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,24 +13,16 @@ import httpx
 import pytest
 
 from stimrig.api.cli import main
-from stimrig.api.clock import utc_label
+from stimrig.api.clock import Clock, utc_label
+from stimrig.api.errors import ApiError
 from stimrig.api.people import accounts
-from stimrig.api.people.auth import Scope
+from stimrig.api.people.auth import Auth, IdleLock, Scope
+from stimrig.api.people.pace import Guesses
+from stimrig.api.services.context import build
 from stimrig.api.settings import Settings
+from stimrig.api.store import Store
 from stimrig.api.web.server import configuration, loopback, refuse_open_door
-from tests.api.conftest import (
-    HTML,
-    PATIENCE_S,
-    STUB,
-    TOKEN,
-    Service,
-    SetClock,
-    run_service,
-    run_test,
-    signed_in,
-    wait_done,
-)
-from tests.api.forms import press
+from tests.api.conftest import HTML, PATIENCE_S, TOKEN, Service, SetClock, run_test, signed_in, wait_done
 
 PASSWORD = "correct horse battery"
 
@@ -77,19 +68,18 @@ def test_approval_needs_the_password_once_more(
 
 def test_a_form_signs_in_and_leads_on_and_another_site_does_not(service: Service, clinician: httpx.Client) -> None:
     with service.client(token=None, follow_redirects=False) as browser:
-        form, on = {"name": "Ada", "password": PASSWORD}, {"next": "/participants/P1"}
+        form = {"name": "Ada", "password": PASSWORD}
+        for target, on in (("/participants/P1", "/participants/P1"), *dict.fromkeys(AWAY, "/").items()):
+            answer = browser.post("/v1/sessions", data=form, params={"next": target})
+            assert answer.status_code == 303 and answer.headers["location"] == on
         foreign = browser.post("/v1/sessions", data=form, headers={"Origin": "https://elsewhere.example"})
         assert foreign.status_code == 403
-        answer = browser.post("/v1/sessions", data=form, params=on)
-        assert answer.status_code == 303 and answer.headers["location"] == "/participants/P1"
-        elsewhere = browser.post("/v1/sessions", data=form, headers={"Origin": "https://elsewhere.example"})
-        assert elsewhere.status_code == 403
-        for target in ("//evil.example", "https://evil.example", "/\\evil.example"):
-            away = browser.post("/v1/sessions", data=form, params={"next": target})
-            assert away.headers["location"] == "/"
         browser.cookies.clear()
         led = browser.get("/participants/P1", headers=HTML)
         assert led.status_code == 303 and led.headers["location"] == "/sign-in?next=/participants/P1"
+
+
+AWAY = ("//evil.example", "https://evil.example", "/\\evil.example")
 
 
 def tries(asgi: Any, peer: str, forwarded: list[str]) -> list[int]:
@@ -187,9 +177,6 @@ def test_audit_is_verified_and_exported_by_a_command(
     capsys.readouterr()
     assert main.run(["audit", "verify", "--data", data]) == 1
     assert "broken at entry 2" in capsys.readouterr().out
-
-
-def test_an_audit_of_no_database_is_told(tmp_path: Path) -> None:
     assert main.run(["audit", "verify", "--data", str(tmp_path / "nowhere")]) == 2
 
 
@@ -221,46 +208,17 @@ def test_database_holds_no_token(service: Service, client: httpx.Client) -> None
     assert token not in dump and TOKEN not in dump and PASSWORD not in dump and "'$argon2id$" in dump
 
 
-def test_first_start_draws_a_token_once(tmp_path) -> None:
-    from stimrig.api.services.context import build
-
-    settings = Settings(data_dir=tmp_path)
-    first = build(settings)
-    first.lock.release()
-    second = build(settings)
-    assert first.drawn_token is not None and len(first.drawn_token) > 40
-    assert second.drawn_token is None
-    assert second.auth.bearer(first.drawn_token).may(Scope.ADMINISTER)
-
-
-def test_changing_the_set_token_withdraws_the_old_one(tmp_path) -> None:
-    from stimrig.api.errors import ApiError
-    from stimrig.api.services.context import build
-
-    build(Settings(data_dir=tmp_path, admin_token="first-one")).lock.release()  # pyright: ignore[reportArgumentType]
-    later = build(Settings(data_dir=tmp_path, admin_token="second-one"))  # pyright: ignore[reportArgumentType]
-    assert later.auth.bearer("second-one").may(Scope.ADMINISTER)
+def test_first_start_draws_a_token_once_and_a_set_one_replaces_the_one_before(tmp_path: Path) -> None:
+    contexts = []
+    for more in ({}, {}, {"admin_token": "first-one"}, {"admin_token": "second-one"}):
+        contexts.append(build(Settings(data_dir=tmp_path, **more)))  # pyright: ignore[reportArgumentType]
+        contexts[-1].lock.release()
+    drawn = contexts[0].drawn_token
+    assert len(drawn or "") > 40 and [context.drawn_token for context in contexts[1:]] == [None] * 3
+    for text in (drawn, "second-one"):
+        assert contexts[-1].auth.bearer(text).may(Scope.ADMINISTER)
     with pytest.raises(ApiError, match="revoked"):
-        later.auth.bearer("first-one")
-
-
-def test_signing_out_ends_the_session(service: Service, pages: httpx.Client) -> None:
-    cookie = dict(pages.cookies)
-    press(pages, "/", "DELETE /v1/sessions/current")
-    assert service.client(None, cookies=cookie).get("/v1/rig").status_code == 401
-
-
-# ---- stop ---------------------------------------------------------------------------------------------------
-
-
-def test_stop_by_json_and_without_a_body_says_the_rigs_evidence(
-    client: httpx.Client, service: Service, participant: str
-) -> None:
-    service.rig.speed = 0.5
-    client.post("/v1/tests", json={"participant": participant})
-    answer = client.post("/v1/stop", json={"reason": "pain"}).json()
-    assert answer["stopped"] and answer["evidence"]["device_state"] == "not initialised"
-    assert client.post("/v1/stop").json()["stopped"]
+        contexts[-1].auth.bearer("first-one")
 
 
 def test_stop_says_so_when_the_rig_is_gone(client: httpx.Client, service: Service) -> None:
@@ -296,29 +254,11 @@ def test_approval_ends_with_its_day(client: httpx.Client, service: Service, part
     assert client.get(fetch).status_code == 200
 
 
-# ---- Browsers tell hosts apart, not ports: services on one host leave one another's sessions alone
-
-
-@pytest.fixture
-def urls(tmp_path: Path, short_dir: Path) -> Iterator[list[str]]:
-    """Services of two rigs."""
-    for one in run_service(tmp_path / "a", short_dir, STUB):
-        for other in run_service(tmp_path / "b", tmp_path, STUB):
-            yield [one.url, other.url]
-
-
-def test_one_browser_stays_signed_in_at_every_service_of_a_host(urls: list[str]) -> None:
-    for url in urls:
-        answer = httpx.post(
-            f"{url}/v1/users", headers={"Authorization": f"Bearer {TOKEN}"}, timeout=60,
-            json={"name": "Ada", "password": PASSWORD, "scopes": ["administer"]},
-        )  # fmt: skip
-        assert answer.status_code == 201, answer.text
-    with httpx.Client(timeout=60) as browser:
-        csrf = {}
-        for url in urls:
-            csrf[url] = browser.post(f"{url}/v1/sessions", json={"name": "Ada", "password": PASSWORD}).json()["csrf"]
-        assert len(browser.cookies) == len(urls)
-        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [200, 200]
-        browser.delete(f"{urls[0]}/v1/sessions/current", headers={"X-CSRF-Token": csrf[urls[0]]}).raise_for_status()
-        assert [browser.get(f"{url}/v1/users").status_code for url in urls] == [401, 200]
+def test_services_of_one_host_leave_one_anothers_cookies_alone(tmp_path: Path) -> None:
+    """Browsers tell hosts apart, not ports."""
+    stores = [Store(f"sqlite:///{tmp_path}/{name}.db") for name in "ab"]
+    clock = Clock()
+    names = [Auth(store, clock, Guesses(clock), IdleLock(store, clock, 0)).cookie_name for store in stores * 2]
+    assert len(set(names)) == 2 and names[:2] == names[2:], "one for each, over a restart, too"
+    for store in stores:
+        store.close()
