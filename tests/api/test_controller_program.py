@@ -7,13 +7,11 @@ import os
 import signal
 import subprocess
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from tests.harness.c_program import compiled
@@ -24,12 +22,13 @@ BEGUN = {"id": "T1", "done": False, "state": "running"}
 DONE = {**BEGUN, "done": True, "state": "completed", "reason": "", "recording_id": "R1"}
 
 
-class Service:
-    """A server with an answer for each method and path."""
+class Service(ThreadingHTTPServer):
+    """A server with an answer for each method and the last part of the path."""
 
     def __init__(self) -> None:
+        super().__init__(("127.0.0.1", 0), Handler)
         self.heard: list[tuple[str, Any]] = []
-        self.polled = threading.Event()
+        self.polled, self.turn = threading.Event(), threading.Lock()
         self.answers: dict[str, Any] = {  # status and JSON; status 0: the connection is closed without an answer
             "GET /model": (200, {"model_id": "M1"}),
             "POST /widths": (200, PLANNED),
@@ -38,62 +37,39 @@ class Service:
             "GET /R1": (200, "file"),
             "POST /stop": (200, {"stopped": True}),
         }
-        self.url = ""
-
-    def __call__(self, request: httpx.Request) -> httpx.Response:
-        path = request.url.raw_path.decode()
-        self.heard.append((f"{request.method} {path}", json.loads(request.read() or "null")))
-        if path.endswith("/T1"):
-            self.polled.set()
-        status, document = self.answers[f"{request.method} /{path.rsplit('/', 1)[1]}"]
-        if not status:
-            raise httpx.ReadError("closed")
-        return httpx.Response(status, json=document)
 
     @property
     def stops(self) -> int:
         return [path for path, _ in self.heard].count("POST /v1/stop")
 
 
-@contextmanager
-def answering(answer: Callable[[httpx.Request], httpx.Response]) -> Iterator[str]:
-    """Address of a server that answers one request after the other; a broken line closes the connection."""
-    turn = threading.Lock()
+class Handler(BaseHTTPRequestHandler):
+    protocol_version = "HTTP/1.1"
+    server: Service
 
-    class Handler(BaseHTTPRequestHandler):
-        protocol_version = "HTTP/1.1"
+    def answer(self) -> None:
+        length = int(self.headers.get("Content-Length", 0))
+        body = self.rfile.read(length)
+        if len(body) < length:
+            return  # whoever sent it was killed
+        with self.server.turn:
+            self.server.heard.append((f"{self.command} {self.path}", json.loads(body or b"null")))
+        status, document = self.server.answers[f"{self.command} /{self.path.rsplit('/', 1)[1]}"]
+        if self.path.endswith("/T1"):
+            self.server.polled.set()
+        if not status:
+            self.close_connection = True
+            return
+        content = json.dumps(document).encode()
+        self.send_response(status)
+        self.send_header("Content-Length", str(len(content)))
+        self.end_headers()
+        self.wfile.write(content)
 
-        def answer(self) -> None:
-            length = int(self.headers.get("Content-Length", 0))
-            body = self.rfile.read(length)
-            if len(body) < length:
-                return  # whoever sent it was killed
-            request = httpx.Request(self.command, f"http://here{self.path}", headers=dict(self.headers), content=body)
-            try:
-                with turn:
-                    given = answer(request)
-            except httpx.TransportError:
-                self.close_connection = True
-                return
-            self.send_response(given.status_code)
-            self.send_header("Content-Length", str(len(given.content)))
-            self.end_headers()
-            self.wfile.write(given.content)
+    do_GET = do_POST = answer  # noqa: N815
 
-        do_GET = do_POST = do_PUT = answer  # noqa: N815
-
-        def log_message(self, *_: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_port}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    def log_message(self, *_: object) -> None:
+        pass
 
 
 @pytest.fixture(scope="module")
@@ -103,13 +79,16 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def service() -> Iterator[Service]:
-    found = Service()
-    with answering(found) as found.url:
-        yield found
+    with Service() as server:
+        thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
+        thread.start()
+        yield server
+        server.shutdown()
+        thread.join()
 
 
 def begun(program: Path, service: Service, folder: Path, code: str = CODE) -> subprocess.Popen[str]:
-    words = [str(program), service.url, code, str(folder / "trial.h5")]
+    words = [str(program), f"http://127.0.0.1:{service.server_port}", code, str(folder / "trial.h5")]
     return subprocess.Popen(words, env={**os.environ, "STIMRIG_TOKEN": "key"}, stderr=subprocess.PIPE, text=True)
 
 
@@ -120,13 +99,9 @@ def ended(run: subprocess.Popen[str]) -> tuple[int, str]:
 
 def test_the_trial_has_the_rate_of_its_widths_and_the_code_is_escaped(program: Path, service: Service, tmp_path: Path):
     assert ended(begun(program, service, tmp_path, ODD_CODE)) == (0, "")
-    paths, sent = [path for path, _ in service.heard], dict(service.heard)["POST /v1/tests"]
-    assert paths[0] == "GET /v1/participants/P%201%2F..%2FP2%3Fx/model"
-    assert sent == {
-        "participant": ODD_CODE,
-        "kind": "sequence",
-        **{k: PLANNED[k] for k in ("segments", "pulse_rate_hz")},
-    }
+    assert service.heard[0][0] == "GET /v1/participants/P%201%2F..%2FP2%3Fx/model"
+    trial = {"participant": ODD_CODE, "kind": "sequence", "segments": PLANNED["segments"], "pulse_rate_hz": 50.0}
+    assert dict(service.heard)["POST /v1/tests"] == trial
     assert service.stops == 0 and json.loads((tmp_path / "trial.h5").read_text()) == "file"
 
 

@@ -6,11 +6,11 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
 
+from tests.api.conftest import soon
 from tests.harness.processes import READY_TIMEOUT_S
 
 BUSY = """
@@ -27,8 +27,6 @@ main.main(sys.argv[1:])
 """
 DEAF = "while True:\n        try:\n            time.sleep(60)\n        except KeyboardInterrupt:\n            pass"
 """As a library that calls us from its C code: the exception is dropped."""
-
-
 SLOW = """
 import sys, time
 
@@ -48,11 +46,8 @@ main()
 def interrupted(log: Path, said: str, *words: object) -> tuple[int, str]:
     """Begin a command, interrupt it once it has said something; its process group, and all that it said."""
     with log.open("wb") as file:
-        process = subprocess.Popen(list(map(str, words)), stdout=file, stderr=file, start_new_session=True)
-    end = time.monotonic() + READY_TIMEOUT_S
-    while said not in log.read_text():
-        assert time.monotonic() < end and process.poll() is None, log.read_text()
-        time.sleep(0.02)
+        process = subprocess.Popen([sys.executable, *map(str, words)], stdout=file, stderr=file, start_new_session=True)
+    soon(lambda: said in log.read_text() or process.poll() is not None, READY_TIMEOUT_S)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(timeout=READY_TIMEOUT_S) == 130, log.read_text()
     return process.pid, log.read_text()
@@ -65,23 +60,19 @@ def test_ctrl_c_ends_a_verb_whatever_it_is_in(record: Path, tmp_path: Path, verb
     output.write_text("as it was")
     options = () if verb == "diagnose" else ("-o", output)
     code = BUSY.format(function=verb, hold=hold)
-    log = tmp_path / "log"
-    _, said = interrupted(log, "computing", sys.executable, "-c", code, verb, record, *options)
+    _, said = interrupted(tmp_path / "log", "computing", "-c", code, verb, record, *options)
     assert "interrupted" in said and "Traceback" not in said
     assert output.read_text() == "as it was" and [path.name for path in output.parent.iterdir()] == ["MODEL.json"]
 
 
 def test_ctrl_c_while_libraries_are_loaded_is_no_traceback(record: Path, tmp_path: Path) -> None:
-    assert "Traceback" not in interrupted(tmp_path / "log", "loading", sys.executable, "-c", SLOW, record)[1]
+    assert "Traceback" not in interrupted(tmp_path / "log", "loading", "-c", SLOW, record)[1]
 
 
 def test_copies_of_a_search_end_with_it(record: Path, tmp_path: Path) -> None:
-    watched = (sys.executable, "-X", "importtime", "-m", "stimrig", "explain", record)
+    watched = ("-X", "importtime", "-m", "stimrig", "explain", record)
     group, _ = interrupted(tmp_path / "log", "stimrig.identify.diagnosis.free", *watched)
-    end = time.monotonic() + READY_TIMEOUT_S
-    while any(_group(path) == group for path in Path("/proc").glob("[0-9]*")):
-        assert time.monotonic() < end
-        time.sleep(0.05)
+    soon(lambda: all(_group(path) != group for path in Path("/proc").glob("[0-9]*")), READY_TIMEOUT_S)
 
 
 def _group(process: Path) -> int:
