@@ -43,17 +43,15 @@ def contrast(one: str, other: str) -> float:
 MODES = modes()
 SURFACES = ("card", "paper", "soft", "chart")
 TEXT = [
-    *((ink, surface) for surface in SURFACES for ink in ("ink", "dim", "accent", "accent-dark")),
+    *((ink, surface) for surface in SURFACES for ink in ("ink", "dim", "accent")),
     *((ink, kind + "-bg") for kind in ("good", "warn", "bad") for ink in (kind, "ink", "dim")),
-    *((f"on-{name}", name) for name in ("stimulate", "stop", "tag", "running", "unknown", "emulated")),
-    *((f"on-{name}", f"{name}-hover") for name in ("stimulate", "stop")),
-    ("on-primary", "accent"), ("on-primary", "accent-dark"),
-    ("ink", "field"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"), ("card", "good"),
+    *((f"on-{name}", name) for name in ("unknown", "emulated")), ("on-strong", "stimulate"), ("on-strong", "stop"),
+    ("on-primary", "accent"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"), ("card", "good"),
 ]  # fmt: skip
 """Ink and what it stands on."""
 SEEN = [
     *((part, surface) for part in ("edge", "focus", "stop", "stimulate", "accent") for surface in ("card", "paper")),
-    *((lamp, "card") for lamp in ("lamp-good", "lamp-warn", "cursor", "running", "unknown")), ("edge", "field"),
+    *((part, "card") for part in ("good", "warn", "cursor", "unknown")),
     *((f"series-{k}", "chart") for k in range(1, 7)),
     *((role, "chart") for role in ("measured", "model", "residual", "width", "rising", "falling", "limit", "worst")),
 ]  # fmt: skip

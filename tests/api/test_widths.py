@@ -16,6 +16,7 @@ import pytest
 from stimrig import Client
 from stimrig.api.cli import main
 from stimrig.rig.messages import Bound
+from tests.api.browser import painted_soon
 from tests.api.conftest import PATIENCE_S, REAL, TOKEN, Service, run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_jobs import made_up_csv
@@ -154,7 +155,7 @@ def test_the_page_shows_what_comes_of_a_reference_and_what_is_out_of_reach(
         tab.locator("#reference").set_input_files(tmp_path / name)
         tab.get_by_role("button", name="Find the pulse widths").click()
         tab.locator("#result-title", has_text=name).wait_for()
-        tab.locator("#widths-plot .scatterlayer").first.wait_for()
+        assert painted_soon(tab, "torque-chart") and painted_soon(tab, "width-chart")
         assert tab.locator("#lacking").is_visible() == (name == "beyond.csv")
     assert "too high for the widest pulse" in tab.locator("#lacking").inner_text()
     with tab.expect_download() as saved:

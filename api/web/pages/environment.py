@@ -56,6 +56,5 @@ environment.policies["json.dumps_kwargs"] = {"sort_keys": True}
 environment.globals |= {
     "site_words": site_words,
     "site_of": site_of,
-    "known_words": clinical_words.WORDS,
     "label_titles": LABEL_TITLES,
 }

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -21,15 +20,6 @@ FIRST_ROWS = 50
 """Participants listed on the first page before *all* is chosen."""
 
 
-@dataclass(frozen=True)
-class Search:
-    """Filter of the list: a part of the code, the archive, all rows."""
-
-    q: str = ""
-    archived: bool = False
-    all: bool = False
-
-
 @router.get("/")
 async def home(request: Request, context: Ctx, q: str = "", archived: str = "", all: str = "") -> Response:
     """Show participants and the rig; the sign-in form to who is not signed in."""
@@ -37,17 +27,22 @@ async def home(request: Request, context: Ctx, q: str = "", archived: str = "", 
         principal = await identified(request)
     except ApiError as error:
         return await sign_in(request, context) if error.code != LOCKED[0] else problem_page(request, error)
-    search = Search(q[:80].strip(), archived == "1", all == "1")
-    listed = await asyncio.to_thread(_list, context, search) if principal.may(Scope.RUN_TEST) else None
+    search: dict[str, Any] = {"q": q[:80].strip(), "archived": archived == "1"}
+    listed = None
+    if principal.may(Scope.RUN_TEST):
+        listed = await asyncio.to_thread(list_participants, context, **search, limit=None if all == "1" else FIRST_ROWS)
     return page(request, "home.html", search=search, listed=listed)
 
 
-def _list(context: Context, search: Search) -> dict[str, Any]:
-    matching = participants.matching(context.store, search.q, search.archived)
-    listed = matching if search.all else matching[:FIRST_ROWS]
-    count = participants.participant_counts(context.store)
-    rows = participants.list_rows(context.store, context.versions, listed)
-    return {"rows": rows, "more": len(matching) - len(rows), "count": count}
+def list_participants(context: Context, q: str, archived: bool, limit: int | None) -> dict[str, Any]:
+    """Return the rows of the list, how many more match, and how many participants there are."""
+    matching = participants.matching(context.store, q, archived)
+    rows = participants.list_rows(context.store, context.versions, matching[:limit])
+    return {
+        "rows": rows,
+        "more": len(matching) - len(rows),
+        "count": participants.participant_counts(context.store),
+    }
 
 
 @router.get("/sign-in")

@@ -14,125 +14,19 @@ from sqlalchemy.exc import SQLAlchemyError
 from stimrig.api import local_time
 from stimrig.api.clock import zone_name
 from stimrig.api.errors import ApiError
-from stimrig.api.local_time import clock
 from stimrig.api.people.auth import LOCKED, Principal, Scope
 from stimrig.api.sessions.joint_plan import PASSIVE
 from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment
 
-COLOURS = "stimrig_colours"
-"""The choice, written by `colours.js`; it says nothing about who chose."""
-CHOICES = ("light", "dark", "system")
-LOOK_S = 1.0
-
-
+IDENTIFY_TIMEOUT_S = 1.0
+"""Time within which the database has to say who looks at a public page."""
 NEWEST = 30
 """Rows of a long table that are shown before somebody asks for all."""
-
-
-def rows_shown(request: Request) -> int | None:
-    """Return the requested number of rows of a long table; None: all."""
-    return None if request.query_params.get("all") else NEWEST
-
-
-BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
-
-
-def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
-    """A page, with the bar that every page has."""
-    viewer: Principal | None = getattr(request.state, "principal", None)
-    principal = None if viewer is None or viewer.locked else viewer
-    context: Context = request.app.state.context
-    bar = {**bar_of(context, principal), "right": stop_right(request, viewer), "version": request.app.version}
-    common = {"bar": bar, "principal": principal, "here": here(request), "zone": zone(context)}
-    common["shown_version"] = getattr(request.state, "version", 0)
-    common["csrf"] = (viewer.csrf if viewer else None) or ""
-    colours = request.cookies.get(COLOURS, "")
-    common["colours"] = colours if colours in CHOICES else "system"
-    html = environment.get_template(template).render(request=request, **common, **values)
-    return HTMLResponse(html, status_code=status)
-
-
-def zone(context: Context) -> str:
-    """The time zone of all times on the page: Europe/Berlin (UTC+1)."""
-    name, offset = zone_name(), local_time.zone(context.clock.utc())
-    return offset if name in ("", offset, "Etc/UTC") else f"{name} ({offset})"
-
-
-async def identify_viewer(request: Request) -> None:
-    """Identify the viewer of a public page, for its bar.
-
-    Without an answer of the database the page has no viewer, and its stop button has the right of the last user known
-    for the session.
-    """
-    if getattr(request.state, "principal", None) is not None:
-        return
-    context = request.app.state.context
-    try:
-        request.state.principal = await context.auth.authenticate_within(request, LOOK_S, forgive_age=True)
-    except ApiError:
-        return
-    except (SQLAlchemyError, TimeoutError):
-        name = context.auth.last_known_name(request, on_page=True)
-        if name is not None and getattr(request.state, "stop_right", None) is None:
-            request.state.stop_right = _right_of(context, name)
-
-
-def stop_right(request: Request, principal: Principal | None) -> str | None:
-    """Return the right of the page's stop button; the answer to a stop keeps the right that was used."""
-    if principal is None:
-        return getattr(request.state, "stop_right", None)
-    return _right_of(request.app.state.context, principal.name)
-
-
-def _right_of(context: Context, name: str) -> str:
-    current = context.runner.current
-    return context.stop_rights.give(name, current.test_id if current else None)
-
-
-def bar_of(context: Context, principal: Principal | None) -> dict[str, Any]:
-    """Return the values of the bar at the top of every page."""
-    return {
-        "rig": context.rig.status,
-        "connected": context.rig.connected,
-        "current": context.runner.current,
-        "now": rig_now(context, principal),
-        "may_rearm": principal is not None and principal.may(Scope.REARM),
-    }
-
-
-def here(request: Request) -> str:
-    """Return the address of the page that is shown; the first page where a form was posted."""
-    if request.method != "GET":
-        return "/"
-    return request.url.path + (f"?{request.url.query}" if request.url.query else "")
-
-
-def problem_page(request: Request, problem: ApiError) -> Response:
-    """A problem as a page that says what to do; the way to the door where nobody is signed in."""
-    if problem.code == LOCKED[0]:
-        return RedirectResponse(f"/locked?next={quote(here(request), safe='')}", 303)
-    if problem.status == 401 and request.method == "GET":
-        return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
-    values: dict[str, Any] = {"problem": problem, "back": back_from(request.url.path)}
-    response = page(request, "problem.html", problem.status, **values)
-    response.headers.update(problem.headers)
-    return response
-
-
-def back_from(path: str) -> tuple[str, str] | None:
-    """Address and words of the page that a form was on."""
-    parts = path.strip("/").split("/")
-    if len(parts) < 3 or parts[0] not in BACK:
-        return None
-    return f"/{parts[0]}/{quote(parts[1])}", BACK[parts[0]]
-
-
 SILENT_S = 1.6
 """The rig answers once a second and sends its torque more often. After such a silence its state is unknown."""
 TORQUE_OLD_S = 1.0
 """An older torque is not shown as the torque of now."""
-
 WORDS: dict[str, tuple[str, str]] = {
     "ready": ("No stimulation", "ready"),
     "calibrating": ("No stimulation", "a calibration is open"),
@@ -148,10 +42,94 @@ WORDS: dict[str, tuple[str, str]] = {
     "silent": ("Unknown", "the rig does not answer"),
 }
 """For each state: whether stimulation is on, and one more thing to know."""
+BACK = {"models": "Back to the model", "participants": "Back to the participant", "tests": "Back to the test"}
+
+
+def rows_shown(request: Request) -> int | None:
+    """Return the requested number of rows of a long table; None: all."""
+    return None if request.query_params.get("all") else NEWEST
+
+
+# ---- pages ---------------------------------------------------------------------------------------------------------
+
+
+def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
+    """Render a page, with the bar that every page has."""
+    viewer: Principal | None = getattr(request.state, "principal", None)
+    principal = None if viewer is None or viewer.locked else viewer
+    context: Context = request.app.state.context
+    right = getattr(request.state, "stop_right", None) if viewer is None else stop_right(context, viewer.name)
+    bar = {
+        "rig": context.rig.status,
+        "current": context.runner.current,
+        "now": rig_now(context, principal),
+        "may_rearm": principal is not None and principal.may(Scope.REARM),
+        "right": right,
+        "version": request.app.version,
+    }
+    html = environment.get_template(template).render(
+        request=request, bar=bar, principal=principal, here=here(request), zone=zone(context),
+        shown_version=getattr(request.state, "version", 0), csrf=(viewer.csrf if viewer else None) or "", **values,
+    )  # fmt: skip
+    return HTMLResponse(html, status_code=status)
+
+
+def zone(context: Context) -> str:
+    """Name the time zone of all times on the page: Europe/Berlin (UTC+1)."""
+    name, offset = zone_name(), local_time.zone(context.clock.utc())
+    return offset if name in ("", offset, "Etc/UTC") else f"{name} ({offset})"
+
+
+def here(request: Request) -> str:
+    """Return the address of the page that is shown; the first page where a form was posted."""
+    if request.method != "GET":
+        return "/"
+    return request.url.path + (f"?{request.url.query}" if request.url.query else "")
+
+
+def stop_right(context: Context, name: str) -> str:
+    """Return the right of the stop button on a page that this person sees."""
+    current = context.runner.current
+    return context.stop_rights.give(name, current.test_id if current else None)
+
+
+async def identify_viewer(request: Request) -> None:
+    """Identify the viewer of a public page, for its bar.
+
+    Without an answer of the database the page has no viewer, and its stop button has the right of the last user known
+    for the session. The page that answers a stop keeps the right that was used.
+    """
+    if getattr(request.state, "principal", None) is not None:
+        return
+    context: Context = request.app.state.context
+    try:
+        request.state.principal = await context.auth.authenticate_within(request, IDENTIFY_TIMEOUT_S, forgive_age=True)
+    except ApiError:
+        return
+    except (SQLAlchemyError, TimeoutError):
+        name = context.auth.last_known_name(request, on_page=True)
+        if name is not None and getattr(request.state, "stop_right", None) is None:
+            request.state.stop_right = stop_right(context, name)
+
+
+def problem_page(request: Request, problem: ApiError) -> Response:
+    """Show a problem and what to do; lead to the door where nobody is signed in."""
+    if problem.code == LOCKED[0]:
+        return RedirectResponse(f"/locked?next={quote(here(request), safe='')}", 303)
+    if problem.status == 401 and request.method == "GET":
+        return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
+    kind, *rest = request.url.path.strip("/").split("/")
+    back = (f"/{kind}/{quote(rest[0])}", BACK[kind]) if len(rest) > 1 and kind in BACK else None
+    response = page(request, "problem.html", problem.status, problem=problem, back=back)
+    response.headers.update(problem.headers)
+    return response
+
+
+# ---- the rig's state -----------------------------------------------------------------------------------------------
 
 
 def state_of(context: Context) -> str:
-    """The rig's state as far as it is known now."""
+    """Return the rig's state as far as it is known now."""
     rig = context.rig
     if not rig.connected or rig.status is None:
         return "unreachable"
@@ -160,46 +138,30 @@ def state_of(context: Context) -> str:
     return rig.status.state
 
 
-def plays_passive(context: Context) -> bool:
-    """Whether what the rig plays is a passive test, in which it refuses every pulse."""
-    status, current = context.rig.status, context.runner.current
-    return current is not None and current.kind == PASSIVE and status is not None and status.test_id == current.test_id
-
-
-def torque_now(context: Context) -> tuple[float | None, float | None]:
-    """The newest torque (N·m) and its age (s); no torque where it is old or no number, no age where none ever came."""
-    torque_nm, age_s = context.runner.hub.torque()
-    status = context.rig.status
-    known = status is not None and status.torque_nm is not None and age_s is not None and age_s <= TORQUE_OLD_S
-    return (torque_nm if known else None), age_s
-
-
 def rig_now(context: Context, principal: Principal | None) -> dict[str, Any]:
     """Return the rig's state. Without a sign-in: the state only, nothing about a participant."""
-    state = state_of(context)
-    if state in ("arming", "running") and plays_passive(context):
-        state = PASSIVE
-    flow, more = WORDS[state]
-    torque_nm, age_s = torque_now(context)
-    public: dict[str, Any] = {
+    state, status, current, hub = state_of(context), context.rig.status, context.runner.current, context.runner.hub
+    if state in ("arming", "running") and current is not None and current.kind == PASSIVE:
+        # in a passive test the rig refuses every pulse
+        state = PASSIVE if status is not None and status.test_id == current.test_id else state
+    public = {
         "state": state,
-        "flow": str(flow),
-        "more": str(more),
-        "at": clock(context.clock.utc()),
+        "flow": WORDS[state][0],
+        "more": WORDS[state][1],
+        "at": local_time.clock(context.clock.utc()),
         "emulated": context.settings.emulated,
         "ready": state == "ready",
     }
     if principal is None:
         return public
-    current, status = context.runner.current, context.rig.status
-    angle_rad = context.runner.hub.angle()
+    (torque_nm, age_s), angle_rad = hub.torque(), hub.angle()
+    known = status is not None and status.torque_nm is not None and age_s is not None and age_s <= TORQUE_OLD_S
     return {
         **public,
-        "torque_nm": torque_nm,
+        "torque_nm": torque_nm if known else None,
         "torque_age_s": age_s,
         "test": {"id": current.test_id, "participant": current.participant} if current else None,
         "notice": notice_key(context, state),
-        "sensor": status is not None and status.angle.present,
         "angle_deg": None if angle_rad is None else round(math.degrees(angle_rad), 1),
     }
 
@@ -214,11 +176,12 @@ def notice_key(context: Context, state: str) -> str:
 
 def what_to_check(reason: str) -> str:
     """Return what to check before pressing *Reconnect*."""
+    devices = "cables and power of the stimulator and the load cell"
     if reason.startswith(("load cell", "load_cell")):
-        return "Check the cable and the power of the load cell. Then press Reconnect."
-    if reason.startswith("stimulator"):
-        return "Check the cable of the stimulator, and that it is switched on. Then press Reconnect."
-    return "Check cables and power of the stimulator and the load cell. Then press Reconnect."
+        devices = "the cable and the power of the load cell"
+    elif reason.startswith("stimulator"):
+        devices = "the cable of the stimulator, and that it is switched on"
+    return f"Check {devices}. Then press Reconnect."
 
 
 environment.filters["what_to_check"] = what_to_check

@@ -20,8 +20,6 @@ from stimrig.api.web.pages.environment import HERE, environment
 router = APIRouter(include_in_schema=False)
 
 KINDS = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8", ".svg": "image/svg+xml"}
-
-
 OF_PACKAGES = {
     "plotly.min.js": ("plotly", "package_data"),
     "swagger-ui-bundle.js": ("fastapi_offline", "static"),
@@ -30,18 +28,13 @@ OF_PACKAGES = {
 """Files that a package on this machine brings along: the package and its folder."""
 
 
-def packaged(name: str) -> Path:
-    """A file of a package, found without importing it."""
-    package, folder = OF_PACKAGES[name]
-    spec = find_spec(package)
-    assert spec is not None and spec.submodule_search_locations is not None
-    return Path(spec.submodule_search_locations[0]) / folder / name
-
-
 def locate(name: str) -> Path:
-    """A file by its public name; nothing outside the folder."""
+    """Return a file by its public name; nothing outside the folder, and packages are not imported."""
     if name in OF_PACKAGES:
-        return packaged(name)
+        package, folder = OF_PACKAGES[name]
+        spec = find_spec(package)
+        assert spec is not None and spec.submodule_search_locations is not None
+        return Path(spec.submodule_search_locations[0]) / folder / name
     path = HERE / "static" / name
     if path.suffix not in KINDS or path.parent != HERE / "static" or not path.is_file():
         raise NotFoundError("file", name)
@@ -50,13 +43,13 @@ def locate(name: str) -> Path:
 
 @lru_cache(maxsize=32)
 def contents(path: Path, _changed: float) -> tuple[bytes, bytes, str]:
-    """A file, the same compressed, and its tag."""
+    """Return a file, the same compressed, and its tag."""
     body = path.read_bytes()
     return body, gzip.compress(body, 6, mtime=0), hashlib.sha256(body).hexdigest()[:16]
 
 
 def url(name: str) -> str:
-    """A file's address with its tag in it, so that a browser may keep it for long."""
+    """Return a file's address with its tag in it, so that a browser may keep it for long."""
     path = locate(name)
     return f"/static/{name}?v={contents(path, path.stat().st_mtime)[2]}"
 
@@ -66,7 +59,7 @@ environment.globals["static"] = url
 
 @router.get("/static/{name}")
 def static(request: Request, name: str) -> Response:
-    """A file of the page."""
+    """Return a file of the page."""
     path = locate(name)
     body, packed, tag = contents(path, path.stat().st_mtime)
     headers = {"Cache-Control": "public, max-age=31536000, immutable", "ETag": f'"{tag}"', "Vary": "Accept-Encoding"}
@@ -79,5 +72,5 @@ def static(request: Request, name: str) -> Response:
 
 @router.get("/docs")
 def docs() -> HTMLResponse:
-    """Every route, with what it takes and gives; it sends no request but GET: nothing is started by reading."""
+    """Show every route, with what it takes and gives; it sends no request but GET: nothing is started by reading."""
     return HTMLResponse(environment.get_template("docs.html").render())

@@ -3,14 +3,15 @@
 {
   const LOOK_MS = 250, READ_MS = 2000;
   const part = () => document.getElementById("calibration"), open = () => part().dataset.open !== undefined, plays = () => part().dataset.playing !== undefined;
-  const heard = document.getElementById("told");
+  const buttons = () => [...part().querySelectorAll("button:not([disabled])")];
+  const disable = () => { for (const box of buttons()) box.disabled = true; };
   let looking = false, refused_ms = -READ_MS;
 
   addEventListener("keydown", (event) => {
     if (!open() || event.ctrlKey || event.altKey || event.metaKey || event.shiftKey || event.isComposing) return;
-    if (event.target instanceof Element && event.target.closest("input, textarea, select, a, dialog, [contenteditable], [role=region]")) return;
-    const onOther = event.key === "Enter" && event.target instanceof Element && event.target.closest("button") && !event.target.closest("[data-keys], [id^=mark-], .touch button");
-    if (onOther) return; // Stop, Discard, Sign out: Enter presses them, as anywhere
+    const at = event.target instanceof Element ? event.target : document.body;
+    if (at.closest("input, textarea, select, a, dialog, [contenteditable], [role=region]")) return;
+    if (event.key === "Enter" && at.closest("button") && !at.closest("[data-keys], [id^=mark-]")) return; // Stop, Discard, Sign out: Enter presses them, as anywhere
     const button = [...part().querySelectorAll("[data-keys]")].find((box) => box.dataset.keys.split(" ").includes(event.key));
     if (!button && event.key !== "Enter") return;
     event.preventDefault(); // Enter never presses the button that has the focus by chance
@@ -30,22 +31,18 @@
   });
 
   addEventListener("renewed", () => {
-    const left_ms = READ_MS - (performance.now() - refused_ms); // what came under the hand instead is read before it is pressed
-    if (heard.textContent !== part().dataset.told) heard.textContent = part().dataset.told;
+    const status = document.getElementById("told"), left_ms = READ_MS - (performance.now() - refused_ms);
+    if (status.textContent !== part().dataset.told) status.textContent = part().dataset.told;
     if (left_ms <= 0) return;
-    const held = [...part().querySelectorAll("button:not([disabled])")];
-    for (const box of held) box.disabled = true;
+    const held = buttons(); // what came under the hand instead is read before it is pressed
+    disable();
     setTimeout(() => { for (const box of held) box.disabled = act.busy() || plays(); }, left_ms);
   });
-
-  function disable() { for (const box of part().querySelectorAll("button")) box.disabled = true; }
 
   function doubt() {
     disable();
     if (part().querySelector(".no-answer")) return;
-    const box = Object.assign(document.createElement("p"), { className: "notice bad no-answer", textContent: part().dataset.noAnswer });
-    box.setAttribute("role", "alert");
-    part().prepend(box);
+    part().prepend(act.make("p", { className: "notice bad no-answer", role: "alert", textContent: "The service does not answer. It is not known whether the train was sent. If stimulation may be on, use the emergency switch on the stimulator." }));
   }
 
   async function look(anyway) {

@@ -2,51 +2,40 @@
 // What was typed is kept in this tab meanwhile, and put back for the same person.
 "use strict";
 {
-  const EVERY_MS = 20000, lock = document.getElementById("lock"), waits = document.getElementById("locked");
-  const who = () => (document.querySelector(".who b") || {}).textContent || "";
-  const key = "typed " + location.pathname + location.search;
-  let told = -Infinity, due = 0;
-
-  function tell() {
-    due = 0; told = performance.now();
-    act.request("POST /v1/sessions/acted").catch(() => {}); // the next action tells again
-  }
+  const EVERY_MS = 20000, lock = document.getElementById("lock"), locked = document.getElementById("locked");
+  const name = document.querySelector(".who b")?.textContent || "", key = "typed " + act.here();
+  const fields = () => [...document.querySelectorAll("main :is(input, textarea, select)")].filter((field) => !["hidden", "password", "file"].includes(field.type));
+  const property = (field) => (["checkbox", "radio"].includes(field.type) ? "checked" : "value");
+  let told = performance.now(), waiting = false; // loading the page was an action
 
   function acted(event) {
-    if (!event.isTrusted || due) return;
-    due = setTimeout(tell, Math.max(0, EVERY_MS - (performance.now() - told)));
+    if (!event.isTrusted || waiting) return;
+    waiting = true;
+    setTimeout(() => {
+      waiting = false; told = performance.now();
+      act.request("POST /v1/sessions/acted").catch(() => {}); // the next action tells again
+    }, Math.max(0, EVERY_MS - (performance.now() - told)));
   }
 
-  const fields = () => [...document.querySelectorAll("main input, main textarea, main select")]
-    .filter((field) => !["hidden", "password", "file", "submit"].includes(field.type));
-
   function keep() {
-    const typed = fields().map((field) => (field.type === "checkbox" || field.type === "radio" ? field.checked : field.value));
-    try { sessionStorage.setItem(key, JSON.stringify({ who: who(), typed })); } catch { /* full: then it is typed anew */ }
+    try { sessionStorage.setItem(key, JSON.stringify({ name, typed: fields().map((field) => field[property(field)]) })); } catch { /* full: then it is typed anew */ }
   }
 
   function putBack() {
-    const kept = JSON.parse(sessionStorage.getItem(key) || "null"), found = fields();
+    const kept = JSON.parse(sessionStorage.getItem(key) || "null"), all = fields();
     sessionStorage.removeItem(key);
-    if (!kept || kept.who !== who() || kept.typed.length !== found.length) return; // another page by now
-    found.forEach((field, i) => {
-      if (typeof kept.typed[i] === "boolean") field.checked = kept.typed[i]; else field.value = kept.typed[i];
-    });
+    if (kept?.name !== name || kept.typed.length !== all.length) return; // another page by now
+    all.forEach((field, k) => { field[property(field)] = kept.typed[k]; });
   }
 
   if (lock) {
     putBack();
-    told = performance.now(); // loading the page was an action
-    for (const name of ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"]) addEventListener(name, acted, { passive: true, capture: true });
+    for (const kind of ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"]) addEventListener(kind, acted, { passive: true, capture: true });
     lock.addEventListener("submit", keep);
-    addEventListener("rig-now", (event) => {
-      if (!event.detail.locked) return;
-      keep();
-      location.replace("/locked?next=" + encodeURIComponent(location.pathname + location.search));
-    });
+    addEventListener("rig-now", ({ detail }) => { if (detail.locked) { keep(); location.replace("/locked?next=" + encodeURIComponent(act.here())); } });
   }
-  if (waits) { // unlocked in another tab
-    addEventListener("rig-now", (event) => { if (event.detail.signed_in) location.replace(waits.dataset.back); });
-    addEventListener("submit", (event) => { if (event.target.id === "leave") sessionStorage.clear(); });
+  if (locked) { // unlocked in another tab; or somebody else signs in
+    addEventListener("rig-now", ({ detail }) => { if (detail.signed_in) location.replace(locked.dataset.back); });
+    addEventListener("submit", ({ target }) => { if (target.id === "leave") sessionStorage.clear(); });
   }
 }

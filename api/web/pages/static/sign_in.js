@@ -1,12 +1,12 @@
 // A link printed by the service may carry the token after '#': that part never leaves the browser.
 "use strict";
-function take() {
-  const carried = new URLSearchParams(location.hash.slice(1)).get("token");
-  if (!carried) return;
+function takeToken() {
+  const token = new URLSearchParams(location.hash.slice(1)).get("token");
+  if (!token) return;
   document.getElementById("by-token").open = true;
-  document.getElementById("token").value = carried;
+  document.getElementById("token").value = token;
   history.replaceState(null, "", location.pathname + location.search);
 }
-addEventListener("hashchange", take);
-take();
+addEventListener("hashchange", takeToken);
+takeToken();
 sessionStorage.clear(); // what somebody else had typed before the session ended
