@@ -228,6 +228,11 @@ def test_without_scripts_the_state_carries_its_time(service: Service, pages: htt
     shown = re.sub(r"<[^>]*>|\s+", " ", pages.get("/").text)
     assert re.search(r"No stimulation +ready +at \d\d:\d\d:\d\d", shown)
     assert re.search(r"0\.43 N·m +at \d\d:\d\d:\d\d", shown)
+    service.rig_thread.become("latched", "one")
+    soon(lambda: service.context.rig.status.state == "latched")
+    page = pages.get("/").text
+    assert re.search(r'id="rearm"><button class="primary" disabled>', page), "until a script has seen which stop it is"
+    bring_to_rest(service)
 
 
 def test_who_is_not_signed_in_learns_the_state_and_no_participant(service: Service, done: dict[str, Any]) -> None:

@@ -140,17 +140,16 @@ def test_limits_for_today_are_set_by_a_key(tab: Any, service: Service) -> None:
 
 def test_a_page_that_waits_takes_nothing_away_that_somebody_writes(tab: Any) -> None:
     """Work that ends while a password is typed must not read the page anew: the next click would be lost."""
-    script = (Path(pages.__file__).parent / "static" / "wait.js").read_text(encoding="utf-8")
+    static = Path(pages.__file__).parent / "static"
+    scripts = "".join((static / name).read_text(encoding="utf-8") for name in ("act.js", "wait.js"))
     body = (
-        '<script type="application/json" id="rig-words">{"left": "{seconds} s", "show": "Show it", "news": "News."}'
-        "</script>"
         '<input id="mine"><div data-job="J"><b data-words></b><span data-left></span><progress></progress></div>'
-        f"<script>const act = {{ busy: () => false }};{script}</script>"
+        f"<script>{scripts}</script>"
     )
     job = {"progress": 0.5, "text": "at work", "time_left_s": 2.0, "done": False}
     answers = iter([500, 503])  # of a service that starts again
     tab.route("http://wait.test/v1/jobs/J", lambda route: route.fulfill(json=job, status=next(answers, 200)))
-    tab.route("http://wait.test/", lambda route: route.fulfill(body=body, content_type="text/html"))
+    tab.route("http://wait.test/", lambda route: route.fulfill(body=body, content_type="text/html; charset=utf-8"))
     tab.goto("http://wait.test/")
     tab.get_by_text("at work").wait_for()
     tab.locator("#mine").fill("half a passw")

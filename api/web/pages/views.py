@@ -36,25 +36,16 @@ async def test(request: Request, context: Ctx, _principal: LiveReader, test_id: 
         "limits": limits_of(row, status), "words": {kind: WORDS[kind] for kind in ("segment", "state")},
         "sensor": joint is not None or (status is not None and status.angle.present),
     }  # fmt: skip
-<<<<<<< HEAD
-    picture: dict[str, Any] = (
-        await draw_ended(context, row) if document["done"] else {"drawn": None, "drawn_problem": None}
-    )
-    noted = await asyncio.to_thread(notes.of_test, context.store, test_id)
-    missing = missing_words(((joint or {}).get("coverage") or {}).get("missing"))
-    return page(request, "test.html", test=document, data=data, limits=bounds, notes=noted, missing=missing, **picture)
-=======
     drawn, problem = None, None
     try:
         drawn = await draw(context, row, fixed_us) if document["done"] else None
     except ApiError as error:
         problem = error
-    notes = await asyncio.to_thread(context.notes.test_notes, test_id)
+    noted = await asyncio.to_thread(notes.of_test, context.store, test_id)
     missing = missing_words(((joint or {}).get("coverage") or {}).get("missing"))
     return page(
-        request, "test.html", test=document, data=data, notes=notes, missing=missing, drawn=drawn, problem=problem
+        request, "test.html", test=document, data=data, notes=noted, missing=missing, drawn=drawn, problem=problem
     )
->>>>>>> 7909004b (api: draw live charts by one function; follow the system's colours)
 
 
 def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
@@ -71,7 +62,7 @@ def limits_of(row: Test, status: Status | None) -> dict[str, float | None]:
 
 
 async def draw(context: Context, row: Test, plan_us: list[float]) -> Markup | None:
-    """Draw a test that is over: beside its model where there is one, else what was recorded; the unplayed plan faint."""
+    """Draw a test that is over: beside its model, or what was recorded with the rest of the plan faint."""
     if row.model_id:
         model = await asyncio.to_thread(context.versions.get, row.model_id)
         measured = await measurement(context, model)
