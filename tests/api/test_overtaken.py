@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 from unittest.mock import Mock
 
@@ -20,89 +20,55 @@ from tests.api.test_profiles import mark_all
 
 
 class Held:
-    """A start that waits in the service, after all that was read for it and before its command to the rig."""
+    """Holds a call back until it is let go; `reached` says that it has come."""
 
-    def __init__(self, service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
+    def __init__(self) -> None:
         self.reached, self.free = threading.Event(), threading.Event()
-        target = service.context.runner
-        write = target._write_intent
 
-        def slowly(*arguments: Any) -> Any:
-            row = write(*arguments)
-            self.reached.set()
-            assert self.free.wait(20)
-            return row
-
-        monkeypatch.setattr(target, "_write_intent", slowly)
-
-    def start(self, pool: ThreadPoolExecutor, client: httpx.Client, participant: str) -> Future[httpx.Response]:
-        asked = pool.submit(client.post, "/v1/tests", json={"participant": participant}, timeout=30)
-        assert self.reached.wait(20)
-        return asked
+    def wait(self) -> None:
+        self.reached.set()
+        assert self.free.wait(20)
 
 
-@pytest.fixture
-def held(service: Service, monkeypatch: pytest.MonkeyPatch) -> Iterator[Held]:
-    held = Held(service, monkeypatch)
-    yield held
-    held.free.set()
+def stopped_and_re_armed(client: httpx.Client) -> None:
+    assert client.post("/v1/stop", json={"reason": "now"}).status_code == 200
+    assert client.post("/v1/rearm").status_code == 200
 
 
-def test_a_start_that_a_stop_has_overtaken_is_not_played_after_a_rearm(
-    client: httpx.Client, service: Service, participant: str, held: Held
-) -> None:
+def lowered(client: httpx.Client) -> None:
+    assert client.put("/v1/participants/P017/profile", json={"current_ma": 5}).status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("meanwhile", "within_s", "status", "words"),
+    [
+        (stopped_and_re_armed, 10.0, 409, "cancelled by a stop"),
+        (lowered, 10.0, 412, "changed since"),
+        (lambda _client: None, 0.0, 503, "took too long"),
+    ],
+)
+def test_a_start_that_is_overtaken_is_not_played(
+    client: httpx.Client, service: Service, participant: str, monkeypatch: pytest.MonkeyPatch,
+    meanwhile: Callable[[httpx.Client], None], within_s: float, status: int, words: str,
+) -> None:  # fmt: skip
+    """It waits in the service, after all that was read for it and before its command to the rig."""
+    target, held = service.context.runner, Held()
+    write = target._write_intent
+    monkeypatch.setattr(target, "_write_intent", lambda *given: (write(*given), held.wait()))
+    monkeypatch.setattr(runner, "START_S", within_s)
     with ThreadPoolExecutor(1) as pool:
-        asked = held.start(pool, client, participant)
-        assert client.post("/v1/stop", json={"reason": "now"}).status_code == 200
-        assert client.post("/v1/rearm").status_code == 200
+        asked = pool.submit(client.post, "/v1/tests", json={"participant": participant})
+        assert held.reached.wait(20)
+        meanwhile(client)
         held.free.set()
         answer = asked.result()
-    assert answer.status_code == 409 and "cancelled by a stop" in answer.json()["title"]
+    assert answer.status_code == status and words in answer.json()["title"]
     assert service.rig.starts == 0
+    monkeypatch.undo()
     assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
 
 
-def test_limits_lowered_while_a_start_is_on_its_way_are_not_passed_by(
-    client: httpx.Client, service: Service, participant: str, held: Held
-) -> None:
-    with ThreadPoolExecutor(1) as pool:
-        asked = held.start(pool, client, participant)
-        answer = client.put(f"/v1/participants/{participant}/profile", json={"current_ma": 5})
-        assert answer.status_code == 200
-        held.free.set()
-        assert asked.result().status_code == 412
-    assert service.rig.starts == 0
-
-
-def test_a_start_that_took_too_long_is_not_played_any_more(
-    client: httpx.Client, service: Service, participant: str, held: Held, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(runner, "START_S", 0.0)
-    with ThreadPoolExecutor(1) as pool:
-        asked = held.start(pool, client, participant)
-        held.free.set()
-        answer = asked.result()
-    assert answer.status_code == 503 and "took too long" in answer.json()["title"]
-    assert service.rig.starts == 0
-
-
 # ---- between the command and the first pulse ---------------------------------------------------------------------
-
-
-class HeldRig:
-    """A rig that has heard a start, and has not begun yet."""
-
-    def __init__(self, service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.reached, self.free = threading.Event(), threading.Event()
-        begin = service.rig._on_start
-
-        async def slowly(request: Any) -> Any:
-            self.reached.set()
-            while not self.free.is_set():
-                await asyncio.sleep(0.01)
-            return await begin(request)
-
-        monkeypatch.setattr(service.rig, "_on_start", slowly)
 
 
 PLAN = {"name": "ilc", "current_ma": 15, "max_pulse_width_us": 200, "max_duration_s": 60, "trials": 3}
@@ -110,11 +76,9 @@ TRIAL = {"kind": "sequence", "segments": [
     {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [0, 100, 150] * 20}}]}  # fmt: skip
 
 
-def key_of(
-    service: Service, client: httpx.Client, participant: str, maker: httpx.Client | None = None
-) -> tuple[str, httpx.Client]:
+def key_of(service: Service, client: httpx.Client, participant: str) -> tuple[str, httpx.Client]:
     """A controller's key of the participant: its public id, and a client with it."""
-    made = (maker or client).post(f"/v1/participants/{participant}/keys", json=PLAN)
+    made = client.post(f"/v1/participants/{participant}/keys", json=PLAN)
     assert made.status_code == 201, made.text
     return made.json()["id"], service.client(made.json()["key"])
 
@@ -141,7 +105,13 @@ def test_what_a_trial_rests_on_is_looked_at_again_until_its_first_pulse(
     Limits wait in turn for the rig's answer to the start; then the rig is told before they are answered.
     """
     key, controller = key_of(service, client, participant)
-    held = HeldRig(service, monkeypatch)
+    held, begin = Held(), service.rig._on_start
+
+    async def slowly(request: Any) -> Any:
+        await asyncio.to_thread(held.wait)
+        return await begin(request)
+
+    monkeypatch.setattr(service.rig, "_on_start", slowly)
     with ThreadPoolExecutor(2) as pool:
         asked = pool.submit(controller.post, "/v1/tests", json={"participant": participant, **TRIAL}, timeout=30)
         assert held.reached.wait(20)
