@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from zoneinfo import available_timezones
 
 from pydantic import Field, SecretStr, ValidationError, field_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic_settings import BaseSettings, SettingsConfigDict
 
 from stimrig.api.errors import SettingsError
 
@@ -46,9 +46,6 @@ class Settings(BaseSettings):
     workers: Annotated[int, Field(ge=1, le=16)] = 2
     max_upload_mb: Annotated[float, Field(gt=0)] = 64.0
     effects_dir: Path | None = Field(default=None, description="folder of the users' own effects")
-    structure: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="effects, comma-separated, that a new participant's models begin with; default: none"
-    )
 
     def __init__(self, **values: Any) -> None:
         try:
@@ -63,19 +60,6 @@ class Settings(BaseSettings):
         if zone and zone not in available_timezones():
             raise ValueError("no such time zone on this machine; take one like Europe/Berlin or UTC")
         return zone or None
-
-    @field_validator("structure", mode="before")
-    @classmethod
-    def _separated(cls, value: object) -> object:
-        """Split a comma-separated text from the environment; each effect once."""
-        named = [part.strip() for part in value.split(",")] if isinstance(value, str) else value
-        if not isinstance(named, list | tuple):
-            return named
-        named = [name for name in named if name]
-        odd = next((name for name in named if not re.fullmatch(r"[a-z0-9_]{1,64}", str(name))), None)
-        if odd is not None:
-            raise ValueError(f"{odd} is no effect's id (see `stimrig effects`); give ids, separated by commas")
-        return tuple(dict.fromkeys(named))
 
     @property
     def database(self) -> str:

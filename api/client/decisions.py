@@ -7,7 +7,7 @@ from typing import Any
 
 PERSON, MODEL, CALIBRATION = "/v1/participants/{code}", "/v1/models/{model_id}", "/v1/participants/{code}/calibration"
 DECISIONS = {
-    **{f"POST {MODEL}/{word}": MODEL for word in ("approve", "reject", "undo")},
+    **{f"POST {MODEL}/{word}": MODEL for word in ("approve", "reject")},
     **{f"PUT {PERSON}/{word}": PERSON for word in ("profile", "muscle", "archived")},
     **{f"POST {PERSON}/{word}": PERSON for word in ("recordings", "calibration", "keys")},
     **{f"POST {CALIBRATION}/{word}": CALIBRATION for word in ("step", "mark", "finish", "discard")},

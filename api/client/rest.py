@@ -275,10 +275,6 @@ class Client(Connection):
         """Keep this version from the controller."""
         return self._request_as(VersionOut, "POST", f"/models/{model_id}/reject", json={"reason": reason})
 
-    def undo(self, model_id: str, reason: str = "") -> VersionOut:
-        """Go back to the version this one was made from; returns that one."""
-        return self._request_as(VersionOut, "POST", f"/models/{model_id}/undo", json={"reason": reason})
-
     def predict(self, model_id: str, pulse_width_us: Sequence[float], **more: Any) -> list[float]:
         """Mean torque in the period of each pulse, N·m, with all effects of the model. Nothing is played.
 

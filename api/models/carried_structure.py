@@ -1,47 +1,18 @@
 """Fits a new recording with the structure of the participant's last approved model.
 
-It is fitted beside the plain structure, and the better of the two is offered. A participant without an approved model
-begins with the effects that the site has set.
+It is fitted beside the plain structure, and the better of the two is offered.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import Callable
 from typing import Any
 
 from stimrig.api.errors import ApiError
-from stimrig.api.jobs.pool import Pool
-from stimrig.api.jobs.worker import Worker
 from stimrig.api.models import stored_model
 from stimrig.api.models.analyses import Analyses, OnCall
-from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Model
-from stimrig.api.structure import in_words
-
-
-async def fit(
-    analyses: Analyses, participant: str, path: str, on_call: OnCall | None = None, **how: Any
-) -> tuple[dict[str, Any], str]:
-    """Fit the first model of a recording; also returns what had to be left out of its structure, empty for nothing.
-
-    It is plain where a structure is carried over after it, and where nothing in the recording looks like an effect of
-    the site's: a test that a person went through gives a model.
-
-    Raises ApiError: the recording gives no model in the plain structure either.
-    """
-    earlier = await asyncio.to_thread(analyses.versions.last_approved, participant)
-    effects, warning = list(analyses.settings.structure) if earlier is None else [], ""
-    if effects:
-        try:
-            return await analyses.run("fit", on_call, data=path, effects=effects, **how), ""
-        except ApiError as error:
-            if error.code != "data":
-                raise
-            names = in_words(effects).replace("_", " ")
-            warning = f"Fitted in the plain structure, not with {names}: {error.detail}"
-    return await analyses.run("fit", on_call, data=path, **how), warning
 
 
 async def carry(analyses: Analyses, plain: Model, path: str, on_call: OnCall | None = None, **how: Any) -> Model:
@@ -80,25 +51,3 @@ async def carry(analyses: Analyses, plain: Model, path: str, on_call: OnCall | N
         return child if finding["offered"] == "carried" else row
 
     return await asyncio.to_thread(store)
-
-
-async def refuse_unknown(settings: Settings, worker: Callable[..., Worker] = Worker) -> None:
-    """Refuse effects of the site's own that cannot be used, and a structure that names what is not in the library.
-
-    A worker reads the library.
-
-    Raises OSError: which, and what there is; or why the library cannot be read.
-    """
-    if not settings.structure and not settings.effects_dir:
-        return
-    pool = Pool(1, worker)
-    try:
-        library = await pool.submit("effects").result
-    except ApiError as error:
-        raise OSError(f"the library of effects cannot be read: {error}") from error
-    finally:
-        await pool.close()
-    known = sorted(entry["id"] for entry in library["effects"])
-    unknown = [effect for effect in settings.structure if effect not in known]
-    if unknown:
-        raise OSError(f"STIMRIG_STRUCTURE: no effect is called {', '.join(unknown)}. Take some of {', '.join(known)}.")

@@ -237,7 +237,7 @@ def _label(row: Mapping[str, Any]) -> str:
 
 def step_versions(improvement: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Return the steps of an improvement as versions."""
-    undecided = {"decision": None, "served": False, "undone": False, "noise_sd_nm": improvement["noise_sd_nm"]}
+    undecided = {"decision": None, "served": False, "noise_sd_nm": improvement["noise_sd_nm"]}
     steps = enumerate(improvement["steps"])
     return versions(
         [{"id": str(number), "added_effect": step["added"], **undecided, **step} for number, step in steps], ""

@@ -9,7 +9,7 @@ from collections.abc import Collection
 from typing import Any, NamedTuple
 
 from sqlalchemy import select
-from sqlalchemy.orm import Session, defer
+from sqlalchemy.orm import defer
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
@@ -155,56 +155,25 @@ class Versions:
         with self.store.write() as session:
             person = session.get_one(Participant, row.participant)
             locking.check(session, person, tags)
-            self._decide(session, person, row, approved, by, reason, tracking.model_dump() if tracking else None)
+            now, here, (there, _current) = self.clock.utc(), site_of(person), self.measured_at(row)
+            if approved and there not in (None, here):
+                words = (
+                    f"{row.id} was measured at {in_words(there)}. {person.code} is now stimulated at {in_words(here)}. "
+                    "Test anew there, or set the site back on the participant's page. Nothing was decided."
+                )
+                raise ApiError(409, "other-site", "This model is of another site", words)
+            limits = {"tracking": tracking.model_dump()} if approved and tracking else {}
+            expires_utc = self.clock.end_of_day_utc() if approved else None
+            entry = {"participant": person.code, "reason": reason}
+            decision = Approval(
+                **entry, **limits, model_id=row.id, approved=approved, by=by, at_utc=now, expires_utc=expires_utc,
+                site=list(here),
+            )  # fmt: skip
+            session.add(decision)
+            shown = {name: value for name, value in row.fit.items() if name != "figures"}
+            action = "approve" if approved else "reject"
+            locking.write(session, person, now, by, action, row.id, **entry, shown=shown, **limits)
             return person.version
-
-    def undo(self, model_id: str, by: str, reason: str, tags: Tags | None = None) -> tuple[Model, int]:
-        """Go back to the version this one was made from: this one is rejected, and where it was in use, that one is.
-
-        Return it, and the participant's new version. A parent that is not usable is never approved implicitly: then the
-        controller gets what was approved before.
-
-        Raises ApiError: 409 there is nothing before it.
-        """
-        row, newest = self.get(model_id), self.decision(model_id)
-        if row.parent_id is None:
-            detail = f"{model_id} is the first version. Reject it instead."
-            if newest is not None and not newest.approved:
-                detail = f"{model_id} is the first version, and it is rejected. Approve it anew to use it all the same."
-            raise ApiError(409, "nothing-to-undo", "There is no version before this one", detail)
-        words = f"undone: {reason}" if reason else "undone"
-        parent = self.get(row.parent_id)
-        with self.store.write() as session:
-            person = session.get_one(Participant, row.participant)
-            locking.check(session, person, tags)
-            holding = self.approved(row.participant)
-            self._decide(session, person, row, False, by, words).undone = True
-            if holding is not None and holding.model_id == row.id and parent.fit["verdict"] not in POOR:
-                self._decide(session, person, parent, True, by, words, holding.tracking)
-        return parent, person.version
-
-    def _decide(
-        self, session: Session, person: Participant, row: Model, approved: bool, by: str, reason: str,
-        tracking: dict[str, float] | None = None,
-    ) -> Approval:  # fmt: skip
-        """Write a decision and its audit entry, with the figures that the person was shown."""
-        now, here, (there, _current) = self.clock.utc(), site_of(person), self.measured_at(row)
-        if approved and there not in (None, here):
-            words = (
-                f"{row.id} was measured at {in_words(there)}. {row.participant} is now stimulated at {in_words(here)}. "
-                "Test anew there, or set the site back on the participant's page. Nothing was decided."
-            )
-            raise ApiError(409, "other-site", "This model is of another site", words)
-        decision = Approval(
-            model_id=row.id, participant=person.code, approved=approved, reason=reason, by=by, at_utc=now,
-            site=list(here), expires_utc=self.clock.end_of_day_utc() if approved else None, tracking=tracking,
-        )  # fmt: skip
-        session.add(decision)
-        detail: dict[str, Any] = {"shown": {name: value for name, value in row.fit.items() if name != "figures"}}
-        detail |= {"tracking": tracking} if tracking else {}
-        action, entry = "approve" if approved else "reject", {"participant": person.code, "reason": reason}
-        locking.write(session, person, now, by, action, row.id, **entry, **detail)
-        return decision
 
     def measured_at(self, row: Model) -> tuple[Site | None, float | None]:
         """Return the site and current (mA) of a version's recording; None: unknown."""
@@ -280,7 +249,6 @@ def _document(row: Model, decision: Approval | None, holding: Approval | None) -
         **{name: getattr(row, name) for name in COLUMNS},
         **row.fit,
         "decision": None if decision is None else "approved" if decision.approved else "rejected",
-        "undone": bool(decision and decision.undone),
         "decided_by": decision.by if decision else None,
         "decided_utc": decision.at_utc if decision else None,
         "decision_reason": decision.reason if decision else None,

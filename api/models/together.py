@@ -101,7 +101,7 @@ def _store_joined(analyses: Analyses, path: Path, digest: str, participant: str,
 
 
 def warnings(session: Session, recording_id: str) -> list[str]:
-    """Return the warnings about a recording, from the rig or from the fit of its first model."""
+    """Return the warnings about a recording, from the rig or from its upload."""
     recording = session.get(Recording, recording_id)
     test = session.get(Test, recording.test_id) if recording is not None and recording.test_id else None
     sentences = test.summary.get("warnings") if test is not None else recording and recording.warnings

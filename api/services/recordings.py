@@ -8,7 +8,6 @@ import hashlib
 import secrets
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import carried_structure
@@ -42,7 +41,7 @@ async def take_in(
     columns: Sequence[str] = (),
     of: str = "",
 ) -> tuple[Recording, Model, list[str]]:
-    """Keep a recording of another tool and identify a model from it; what was assumed, and left out of its structure.
+    """Keep a recording of another tool and identify a model from it; what was assumed.
 
     Where `columns` are mapped, what is kept is the record as a CSV file of ours, with the SHA-256 of what was sent.
 
@@ -53,12 +52,13 @@ async def take_in(
     part = uploads.part_of(whole)
     try:
         assumed, data = await _rename_columns(context, part, columns, data)
-        fitted, warning = await _identified(context, code, part)
+        with _about_the_upload(part):
+            fitted = await context.analyses.run("fit", data=str(part))
         of = await asyncio.to_thread(_other_owner, context, code, principal, fitted.get("of") or "", data, of)
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
-    warnings = [note for note in (*assumed, *fitted["notes"], warning) if note]
+    warnings = [note for note in (*assumed, *fitted["notes"]) if note]
     row = await asyncio.shield(
         asyncio.to_thread(_store, context, code, whole, data, principal.name, warnings, of, tags)
     )
@@ -100,12 +100,6 @@ async def _rename_columns(context: Context, path: Path, columns: Sequence[str], 
     finally:
         out.unlink(missing_ok=True)
     return table["notes"], await asyncio.to_thread(path.read_bytes)
-
-
-async def _identified(context: Context, code: str, path: Path) -> tuple[dict[str, Any], str]:
-    """The model of an upload, and what was left out of its structure."""
-    with _about_the_upload(path):
-        return await carried_structure.fit(context.analyses, code, str(path))
 
 
 @contextlib.contextmanager

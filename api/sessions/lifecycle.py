@@ -141,7 +141,7 @@ class Lifecycle:
         return row
 
     def warnings(self, recording_id: str) -> list[str]:
-        """Return the warnings about a recording, from the rig or from the fit of its first model."""
+        """Return the warnings about a recording, from the rig or from its upload."""
         with self.store.read() as session:
             return together.warnings(session, recording_id)
 
@@ -204,13 +204,10 @@ class Lifecycle:
         if row.model_id is not None:
             return await asyncio.to_thread(self.versions.get, row.model_id)
         options = await asyncio.to_thread(self.kinds[row.kind].fit_options, row)
-        fit, warning = await carried_structure.fit(
-            self.analyses, row.participant, recording.path, follow, **how, **options
-        )
+        fit = await self.analyses.run("fit", follow, data=recording.path, **how, **options)
         by = f"test {row.id}"
         model = await asyncio.to_thread(self.versions.add, fit["json"], row.participant, recording.id, by, parent)
-        summary = {"warnings": [*(row.summary.get("warnings") or []), warning]} if warning else {}
-        await asyncio.to_thread(self.update, row.id, model_id=model.id, summary=summary)
+        await asyncio.to_thread(self.update, row.id, model_id=model.id)
         return model
 
     def keep_plain(self, test_id: str) -> bool:

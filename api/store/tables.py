@@ -127,8 +127,6 @@ class Approval(Table):
     model_id: Mapped[str] = mapped_column(ForeignKey("models.id"), index=True)
     participant: Mapped[str] = mapped_column(ForeignKey("participants.code"), index=True)
     approved: Mapped[bool]
-    undone: Mapped[bool | None] = mapped_column(default=False)
-    """Whether a rejection was an undo; no typed reason says so."""
     reason: Mapped[str] = mapped_column(default="")
     by: Mapped[str]
     at_utc: Mapped[str]

@@ -22,8 +22,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from stimrig.api import logs
 from stimrig.api.errors import ApiError, SettingsError
+from stimrig.api.jobs.pool import Pool
 from stimrig.api.jobs.worker import limit_environment
-from stimrig.api.models import carried_structure
 from stimrig.api.settings import Settings, loopback
 from stimrig.api.store.service_lock import ServiceLock
 from stimrig.api.web.app import create_app
@@ -49,7 +49,8 @@ def main() -> int:
         host, port = listener.getsockname()[:2]
         url = f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
         lock.write_holder(url)
-        asyncio.run(carried_structure.refuse_unknown(settings))  # before a first token is drawn: it is told only once
+        if settings.effects_dir:  # before a first token is drawn: it is told only once
+            asyncio.run(read_library())
         app = create_app(settings, lock=lock)
     except (ApiError, SettingsError, OSError) as error:
         print(f"stimrig: {error}", file=sys.stderr)
@@ -57,6 +58,15 @@ def main() -> int:
     with contextlib.suppress(KeyboardInterrupt):
         asyncio.run(_serve(app, listener, {"url": url, "port": port, "drawn_token": app.state.context.drawn_token}))
     return 0
+
+
+async def read_library() -> None:
+    """Have a worker read the library with the site's own effects. Raises ApiError: one cannot be used."""
+    pool = Pool(1)
+    try:
+        await pool.submit("effects").result
+    finally:
+        await pool.close()
 
 
 async def _serve(app: FastAPI, listener: socket.socket, ready: dict[str, object]) -> None:

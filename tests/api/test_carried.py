@@ -3,25 +3,19 @@
 from __future__ import annotations
 
 import asyncio
-import html
 import re
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import httpx
 import pytest
 
-from stimrig.api.cli import main
 from stimrig.api.cli.reports import carried_lines
 from stimrig.api.models import carried_structure
-from stimrig.api.settings import Settings
 from stimrig.api.store.tables import Approval, Model
 from tests.api.clinic import Clinic
-from tests.api.conftest import STUB, Service, play_test, run_test, serving, signed_in, soon, wait_done
-from tests.api.test_one_service import command
+from tests.api.conftest import Service, run_test, soon, wait_done
 
 CSV = "time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n"
 
@@ -176,71 +170,16 @@ def test_restart_goes_on_after_the_plain_version(
     assert [row["effects"] for row in rows].count([]) == 1 and test["fit"]["effects"] == ["fatigue"]
 
 
-def test_upload_takes_the_structure_over_too(client: httpx.Client, participant: str, approved: dict[str, Any]) -> None:
+def test_upload_takes_the_structure_over_too(
+    client: httpx.Client, pages: httpx.Client, participant: str, approved: dict[str, Any]
+) -> None:
     taken = client.post(f"/v1/participants/{participant}/recordings", content=CSV).json()
-    assert taken["model"]["effects"] == ["fatigue"] and taken["model"]["carried_from_id"] == approved["id"]
+    model = taken["model"]
+    assert model["effects"] == ["fatigue"] and model["carried_from_id"] == approved["id"]
     plain, child = versions(client, participant, taken)
-    assert child["id"] == taken["model"]["id"] and child["parent_id"] == plain["id"]
-
-
-# ---- The structure that a site's new participants start with: taken by the fit after a test, kept, shown, refused
-
-
-def test_settings_name_effects_separated_by_commas(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert Settings().structure == ()
-    monkeypatch.setenv("STIMRIG_STRUCTURE", " fatigue,threshold_drift ,fatigue,")
-    assert Settings().structure == ("fatigue", "threshold_drift")
-
-
-@pytest.mark.parametrize(
-    ("structure", "approved", "effects", "words"),
-    [(("fatigue",), False, ["fatigue"], ""), (("fatigue",), True, [], ""), (("bad",), False, [], "not with bad: ")],
-)
-def test_the_first_model_has_the_sites_structure_until_one_is_approved(
-    clinic: Clinic, structure: tuple[str, ...], approved: bool, effects: list[str], words: str
-) -> None:
-    """A person went through the test: a structure that the recording does not bear costs it no model."""
-    if approved:
-        clinic.approve(clinic.model().id)
-    analyses: Any = SimpleNamespace(versions=clinic.versions, run=clinic.run, settings=Settings(structure=structure))
-    found, warning = asyncio.run(carried_structure.fit(analyses, "P017", str(clinic.folder / "data.h5")))
-    assert [effect["id"] for effect in found["model"]["effects"]] == effects
-    assert words in warning and bool(warning) == bool(words)
-
-
-def test_what_was_left_out_of_a_sites_structure_is_said_everywhere(tmp_path: Path, short_dir: Path) -> None:
-    """The page, the REST answer and the report say the same, also when they are loaded again."""
-    with serving(tmp_path / "site", short_dir, STUB, structure="fatigue, tremor") as (site, client):
-        first = play_test(client, "P1")["fit"]
-        assert (first["effects"], first["parent_id"]) == (["fatigue", "tremor"], None)
-        own = client.get(f"/v1/models/{first['id']}/diagnosis").json()
-        assert own["structure"] == ["fatigue", "tremor"]
-        assert "fatigue" not in [entry["effect"] for entry in own["missing"]]
-        rows = client.post(f"/v1/models/{first['id']}/improve").json()["versions"]
-        assert [row["parent_id"] for row in rows] == [None, first["id"]]
-        site.context.settings.structure = ("bad",)
-        client.post("/v1/participants", json={"code": "P2"})
-        test, taken = play_test(client, "P3"), client.post("/v1/participants/P2/recordings", content=CSV).json()
-        (told,) = taken["warnings"]
-        assert test["state"] == "completed" and test["summary"]["warnings"][-1] == told
-        with signed_in(site) as browser:
-            for model_id in (test["model_id"], taken["model"]["id"]):
-                for path in (f"/models/{model_id}", f"/models/{model_id}/report"):
-                    assert html.escape(told) in browser.get(path).text
-            exports = browser.get(f"/models/{taken['model']['id']}").text.partition('aria-label="Export"')[2]
-            assert ">CSV<" in exports and ">HDF5<" not in exports.partition("</div>")[0], "it came as a table"
-
-
-@pytest.mark.slow
-def test_unknown_effect_is_one_line_before_the_service_starts(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    given = command(tmp_path, STRUCTURE="fatigue,phlogiston")
-    done = subprocess.run(**given, capture_output=True, timeout=120)
-    (line,) = [line for line in done.stderr.splitlines() if not line.startswith("{")]
-    assert done.returncode == 2 and done.stdout == ""
-    assert line.startswith("stimrig: STIMRIG_STRUCTURE: no effect is called phlogiston. Take some of ")
-    monkeypatch.setenv("STIMRIG_STRUCTURE", "Fatigue!")
-    assert main.run(["serve", "--data", str(tmp_path)]) == 2
-    err = capsys.readouterr().err
-    assert err.count("\n") == 1 and "STIMRIG_STRUCTURE: Fatigue! is no effect's id" in err
+    assert child["id"] == model["id"] and child["parent_id"] == plain["id"]
+    page = pages.get(f"/models/{model['id']}").text
+    carried = page.partition('id="carried"')[2].partition("</details>")[0]
+    assert "A reason of the stub." in carried and approved["id"] in carried and "no longer needed" in carried
+    exports = page.partition('aria-label="Export"')[2].partition("</nav>")[0]
+    assert ">CSV<" in exports and ">HDF5<" not in exports, "it came as a table"

@@ -137,7 +137,7 @@ MODEL = Case(
 )  # fmt: skip
 CASES = {
     "rearm": Case(stopped, None, stopped, "stopped by colleague"),
-    "approve": MODEL, "undo": MODEL,
+    "approve": MODEL,
     "reject": Case(two_approved, MODEL.json, World.model),
     "profile": Case(World.lower, LIMITS),
     "muscle": Case(World.lower, {"side": "left"}),

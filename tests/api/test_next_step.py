@@ -156,7 +156,7 @@ def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service,
     assert shown(service) == shown(service, f"/models/{second}") == DONE_NOW
     better = client.post(f"/v1/models/{second}/effects", json={"effects": ["fatigue"]}).json()["id"]
     assert shown(service)[0] == f"look {better}"
-    client.post(f"/v1/models/{better}/undo")
+    client.post(f"/v1/models/{better}/reject")
     assert shown(service) == DONE_NOW
 
 

@@ -100,7 +100,6 @@ POST   /v1/participants/x/keys                             approve-model  428
 POST   /v1/rearm                                           rearm          428
 POST   /v1/models/x/approve                                approve-model  428
 POST   /v1/models/x/reject                                 approve-model  404
-POST   /v1/models/x/undo                                   approve-model  428
 POST   /v1/tokens                                          administer     422
 GET    /v1/tokens                                          administer     200
 DELETE /v1/tokens/x                                        administer     404

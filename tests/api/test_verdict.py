@@ -168,14 +168,6 @@ def test_the_api_wants_a_reason_for_a_model_that_is_not_usable(
     assert client.post(f"/v1/models/{model}/approve").json()["served"], "nor does a usable one"
 
 
-def test_undo_brings_no_model_into_use_that_is_not_usable(client: httpx.Client, service: Service, participant: str):
-    poor = make_poor(service, run_test(client, participant)["model_id"])
-    better = client.post(f"/v1/models/{poor}/effects", json={"effects": ["fatigue"]}).json()["id"]
-    client.post(f"/v1/models/{better}/approve")
-    assert client.post(f"/v1/models/{better}/undo").json()["id"] == poor
-    assert client.get("/v1/participants/P017/model").status_code == 404
-
-
 # ---- words --------------------------------------------------------------------------------------------------
 
 

@@ -241,7 +241,7 @@ def tests(day: Day) -> None:
 
 
 def models(day: Day) -> None:
-    """Compare, diagnose, add, approve, fetch, follow, undo."""
+    """Compare, diagnose, add, approve, fetch, follow."""
     at = "/v1/models/{model_first}"
     day.ask("GET", "/v1/participants/P1/model")
     for path in ("comparison", "curves", "diagnosis?wait=true"):
@@ -265,7 +265,6 @@ def models(day: Day) -> None:
     day.ask("POST", at + "/widths", {"reference_torque_nm": [0.0, 1.0, 2.0]})
     day.ask("POST", "/v1/models/{model_added}/approve", {})
     day.ask("POST", "/v1/models/{model_second}/reject", {"reason": "worse"})
-    day.ask("POST", "/v1/models/{model_added}/undo", {})
     rows = b"".join(b"%.3f,0,0.1,rest\n" % (k / 40) for k in range(80))
     at, head = "/v1/participants/P2/recordings", {"Content-Type": "text/csv"}
     for data in (b"time_s,pulse_width_us,torque_nm,segment\n" + rows, b"a,b\n1,2\n"):

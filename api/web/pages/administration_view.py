@@ -49,7 +49,6 @@ async def show(request: Request, context: Ctx, _principal: Administrator) -> Res
         **await asyncio.to_thread(gather),
         roles=[(name, words, ROLES[name]) for name, words in MAY.items()],
         now_utc=context.clock.utc(),
-        structure=context.settings.structure,
     )
 
 

@@ -115,7 +115,6 @@ async def parts(context: Context, row: Model) -> dict[str, Any]:
             **missing_parts(why, comparison),
             "versions": rows,
             "earlier": earlier if earlier and earlier["id"] == row.parent_id else None,
-            "undone": next((version for version in later[:1] if version["undone"]), None),
             "added": {name: each["id"] for each in later for name in (each["added_effect"] or "").split(",")},
             "held": explanation.held_free(document),
             "recruitment": stored_model.recruitment(document),

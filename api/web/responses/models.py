@@ -67,7 +67,6 @@ class VersionOut(Document):
     words: str = Field(description="the verdict in one sentence")
     reasons: list[str] = Field(description="what speaks against the model, worst first")
     decision: Literal["approved", "rejected"] | None
-    undone: bool = Field(description="the decision is an undo")
     tracking: Limits | None = Field(description="how far it may be tracked; null: not approved")
     served: bool = Field(description="the controller gets this one")
     created_utc: str

@@ -139,17 +139,6 @@ def reject(
     return context.versions.document(context.versions.get(model_id))
 
 
-@router.post("/models/{model_id}/undo", response_model=VersionOut)
-def undo(
-    context: Ctx, principal: Approver, model_id: str, tags: DecisionVersion, response: Response,
-    body: DecisionIn | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """Go back to the version this one was made from; nothing is deleted."""
-    parent, version = context.versions.undo(model_id, principal.name, body.reason if body else "", tags)
-    response.headers["ETag"] = f'"{version}"'
-    return context.versions.document(parent)
-
-
 @router.post("/models/{model_id}/prediction", **describe_answer(PredictionOut))
 async def prediction(context: Ctx, _principal: ModelReader, model_id: str, body: WidthsIn) -> dict[str, Any]:
     """Mean torque the pulses give in each pulse's period, N·m, after a second of rest; effects included.
