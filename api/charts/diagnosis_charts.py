@@ -1,25 +1,26 @@
-"""Figures of what is missing in a model: the residual with its worst places, signatures, the falling error."""
+"""Figures of what is missing in a model (where the error sits, signatures, the falling error), and of the story."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from stimrig.api.charts import figure as fig
-from stimrig.api.charts.figure import Axis, Band, Curve, Figure, Label, Rule, Shade
-from stimrig.api.charts.model_charts import segment_marks
+from stimrig.api.charts.figure import Figure, axis, curve, figure, time_axis
+from stimrig.api.charts.model_charts import broken_at_pauses, free_effects, segment_marks
 from stimrig.api.models import explanation
 from stimrig.identify.healing import looks_like_noise
 from stimrig.identify.yardstick import floor_nm
 
+AROUND_S = 1.0
+"""Length of the record on each side of the place that the story shows close up, s."""
+Places = Sequence[Mapping[str, Any]]
+
 
 def diagnosis_figures(
-    comparison: dict[str, Any] | None,
-    segments: list[dict[str, Any]],
-    view: dict[str, Any] | None,
-    signatures: dict[str, Any],
-    rows: list[dict[str, Any]],
-) -> dict[str, Figure]:
+    comparison: dict[str, Any] | None, segments: list[dict[str, Any]], view: dict[str, Any] | None,
+    signatures: dict[str, Any], rows: list[dict[str, Any]],
+) -> dict[str, Figure]:  # fmt: skip
     """Return all figures of the section by name."""
     figures = {"falling": falling(rows)} if len(rows) > 1 else {}
     if comparison and comparison.get("series"):
@@ -30,11 +31,6 @@ def diagnosis_figures(
     return figures | free_effects(view["free"] if view else [])
 
 
-def free_effects(entries: list[dict[str, Any]]) -> dict[str, Figure]:
-    """Return the figures of free effects by name."""
-    return {f"free-{entry['id']}": free_effect(entry) for entry in entries}
-
-
 def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the worst places before a diagnosis is there."""
     if looks_like_noise(comparison):
@@ -42,53 +38,40 @@ def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     return [explanation.place(entry, number) for number, entry in enumerate(comparison.get("where") or [], start=1)]
 
 
-def place_labels(places: Sequence[dict[str, Any]]) -> tuple[Label, ...]:
-    """Return the number of each place, at its top."""
-    return tuple(
-        Label((place["start_s"] + place["end_s"]) / 2, str(place["number"]), "good" if place.get("healed") else "worst")
-        for place in places
-    )
+def _marks(places: Places) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Return a shade and a number for each place."""
+    shades, badges = [], []
+    for place in places:
+        ground, start_s, end_s = "good" if place.get("healed") else "worst", place["start_s"], place["end_s"]
+        shades.append(fig.shade("healed-band" if place.get("healed") else "worst-band", start_s, end_s))
+        badges.append(fig.badge((start_s + end_s) / 2, str(place["number"]), ground))
+    return shades, badges
 
 
-def residual(comparison: dict[str, Any], segments: list[dict[str, Any]], places: Sequence[dict[str, Any]]) -> Figure:
+def residual(comparison: dict[str, Any], segments: list[dict[str, Any]], places: Places) -> Figure:
     """Return measurement minus model over time, the noise band, the worst places marked with their numbers."""
     series = comparison["series"]
     time_s, noise_nm = series["time_s"], series.get("noise_band_nm") or 0.0
-    shades, labels = segment_marks(segments)
-    shades += (Shade("noise-band", low=-noise_nm, high=noise_nm),)
-    shades += tuple(Shade("worst-band", place["start_s"], place["end_s"]) for place in places)
-    line = Curve(time_s, series["residual_nm"], "measured − model", "residual", 0.9, value=fig.RESIDUAL,
+    (shades, names), (bands, badges) = segment_marks(segments), _marks(places)
+    line = curve(time_s, series["residual_nm"], "measured − model", "residual", 0.9, hover=fig.RESIDUAL,
                  notes=fig.segment_names(time_s, segments))  # fmt: skip
-    x = Axis("Time (s)", fig.AT_TIME, (time_s[0], time_s[-1]))
-    labels += place_labels(places)
-    return Figure(x, (Axis("Measured − model (N·m)"),), (line,), shades=shades, labels=labels, height=320)
+    shapes = [*shades, fig.level("noise-band", -noise_nm, noise_nm), *bands]
+    x, y = time_axis(time_s[0], time_s[-1]), axis("Measured − model (N·m)")
+    return figure(x, [y], [line], shapes, [*names, *badges], 320)
 
 
 def signature(time_s: list[float], effect: dict[str, list[float]]) -> Figure:
     """Return what is left without an effect, and what adding it explains of that."""
     lines = (
-        Curve(time_s, effect["seen_nm"], "seen: left without it", "measured", 3.2, value=fig.RESIDUAL),
-        Curve(time_s, effect["expected_nm"], "expected: what it explains", "model", 1.8, value=fig.RESIDUAL),
+        curve(time_s, effect["seen_nm"], "seen: left without it", "measured", 3.2, hover=fig.RESIDUAL),
+        curve(time_s, effect["expected_nm"], "expected: what it explains", "model", 1.8, hover=fig.RESIDUAL),
     )
-    x = Axis("Time (s)", fig.AT_TIME, (time_s[0], time_s[-1]))
-    return Figure(x, (Axis("Torque (N·m)"),), lines, height=250)
-
-
-def free_effect(entry: dict[str, Any]) -> Figure:
-    """Return what a free effect does: its curves, each with its band."""
-    lines, bands = [], []
-    for number, (name, curve) in enumerate(entry["lines"].items()):
-        colour = ("model", "measured")[number % 2]
-        lines.append(Curve(entry["at"], curve["value"], name, colour, 2.2, value=fig.SHARE))
-        bands.append(Band(entry["at"], curve["lower"], curve["upper"], colour="series-band" if number else "model-band",
-                          listed=not number))  # fmt: skip
-    return Figure(Axis(entry["driver"]), (Axis(entry["axis"]),), tuple(lines), tuple(bands), height=270)
+    return figure(time_axis(time_s[0], time_s[-1]), [axis("Torque (N·m)")], lines, height=250)
 
 
 def falling(rows: list[dict[str, Any]]) -> Figure:
     """Return the error over the versions, with the noise as the line to fall to."""
     numbers = list(range(len(rows)))
-    current = [number for number in numbers if rows[number]["current"]]
     lines = []
     for key, label, colour, marker in (
         ("rms_nm", "fitted pulses", "measured", "circle"),
@@ -96,13 +79,62 @@ def falling(rows: list[dict[str, Any]]) -> Figure:
     ):
         values = [row[key] for row in rows]
         if key == "rms_nm" or any(value is not None for value in values):
-            lines.append(Curve(numbers, values, label, colour, 2.2, marker=marker, value=fig.ERROR))
-            lines.append(Curve(current, [values[number] for number in current], "", colour, 0, marker=marker, size=13,
-                               listed=False))  # fmt: skip
+            lines.append(curve(numbers, values, label, colour, 2.2, marker=marker, hover=fig.ERROR))
+            lines += [curve([number], [values[number]], "", colour, 0, marker=marker, size=13)
+                      for number in numbers if rows[number]["current"]]  # fmt: skip
     repeats = rows[-1].get("repetition") or {}
     between = "scatter at rest" if repeats.get("found_by") == "estimate" else "between repeats"
     levels = ((rows[-1].get("noise_sd_nm"), "noise", False), (floor_nm(repeats), between, True))
-    rules = tuple(Rule(level, f"{name} {level:.3f} N·m", right=right) for level, name, right in levels if level)
+    rules = [fig.rule(level, f"{name} {level:.3f} N·m", right=right) for level, name, right in levels if level]
     ticks = [(number, f"{number + 1}. {row['label']}") for number, row in enumerate(rows)]
-    x = Axis("Version", limits=(-0.4, len(rows) - 0.6), ticks=ticks)
-    return Figure(x, (Axis("Error (N·m)", from_zero=True),), tuple(lines), rules=rules, height=320)
+    x = axis("Version", limits=(-0.4, len(rows) - 0.6), ticks=ticks)
+    return figure(x, [axis("Error (N·m)", from_zero=True)], lines, rules, height=320)
+
+
+# ---- the story of a model's improvement -----------------------------------------------------------------------------
+
+
+def story_figures(story: dict[str, Any], before: dict[str, Any], after: dict[str, Any]) -> dict[str, Figure]:
+    """Return the figures of the story.
+
+    `story`: as `stimrig.api.models.story` gives it. `before`, `after`: ``curves`` and ``comparison`` of the first model
+    and of the last one; the same where nothing was added.
+    """
+    places, rows = story["places"], story["rows"]
+    figures = {"story-torque": side_by_side(before, after, places)}
+    if places:
+        figures["story-place"] = side_by_side(before, after, places[:1], close=True)
+    if len(rows) > 1:
+        figures["falling"] = falling(rows)
+    return figures
+
+
+def side_by_side(before: dict[str, Any], after: dict[str, Any], places: Places, close: bool = False) -> Figure:
+    """Return torque measured, and predicted before and after; below it what is left before and after.
+
+    With `close` only what is around the first place is drawn.
+    """
+    curves, changed = before["curves"], before is not after
+    start_s, end_s = curves["time_s"][0], curves["time_s"][-1]
+    (shapes, names), (bands, badges) = segment_marks(curves["segments"]), _marks(places)
+    if close:
+        start_s, end_s = max(start_s, places[0]["start_s"] - AROUND_S), min(end_s, places[0]["end_s"] + AROUND_S)
+        shapes, names = [], []
+    noise_nm = after["comparison"]["series"].get("noise_band_nm") or 0.0
+    shapes += [fig.level("noise-band", -noise_nm, noise_nm, panel=1), *bands]
+
+    def line(data: dict[str, Any], key: str, label: str, colour: str, width: float, **more: Any) -> dict[str, Any]:
+        series = broken_at_pauses(data)
+        rows = [row for row in zip(series["time_s"], series[key], strict=True) if start_s <= row[0] <= end_s]
+        hover = fig.RESIDUAL if key == "residual_nm" else fig.TORQUE
+        return curve([row[0] for row in rows], [row[1] for row in rows], label, colour, width, hover=hover, **more)
+
+    predicted, left = "predicted_torque_nm", {"panel": 1, "listed": False}
+    lines = [line(curves, "torque_nm", "measured", "measured", 3.2)]
+    if changed:
+        lines.append(line(curves, predicted, "model at first", "series-2", 1.6, dash="dot"))
+        lines.append(line(before["comparison"]["series"], "residual_nm", "left at first", "series-2", 0.9, **left))
+    lines.append(line(after["curves"], predicted, "model at last" if changed else "model", "model", 1.8))
+    lines.append(line(after["comparison"]["series"], "residual_nm", "left", "residual", 1.0, **left))
+    panels = [axis("Torque (N·m)"), axis("Residual (N·m)")]
+    return figure(time_axis(start_s, end_s), panels, lines, shapes, [*names, *badges], 420, (0.6, 0.35))

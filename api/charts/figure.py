@@ -1,19 +1,36 @@
-"""Data of a figure: panels over one x axis with curves, bands, shades, rules and labels, and colours by role.
+"""Figures as plotly takes them (`data` and `layout`), with colours by role: `var(--role)` of `page.css`.
 
-`interactive.py` turns a figure into plotly's form, `drawing.py` into SVG, PDF or PNG.
+A page hands them to plotly as they are; `drawing.py` draws the same ones by matplotlib.
 """
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from stimrig.api.clinical_words import segment_words
 
 SHEET = Path(__file__).parents[1] / "web" / "pages" / "static" / "page.css"
+CONFIG: dict[str, Any] = {
+    "responsive": True,
+    "displaylogo": False,
+    "showSendToCloud": False,
+    "plotlyServerURL": "",
+    "modeBarButtons": [["toImage"], ["zoom2d", "pan2d", "resetScale2d"]],
+    "displayModeBar": True,
+}
+"""plotly's own set of buttons offers to upload the chart, with a person's torque in it, to its maker's cloud: buttons
+are named one by one, so that later versions' stay away, too."""
+TOOLBAR_PX = 42
+"""On the right of a chart: the buttons stand there one below the other and cover no line."""
+GAP_PX = 30
+TORQUE, RESIDUAL, WIDTH = "%{y:.2f} N·m", "%{y:+.3f} N·m", "%{y:.0f} µs"
+ERROR, SHARE, FACTOR = "%{y:.3f} N·m", "%{y:.3f}", "%{y:.2f}"
+"""How a value is written under the pointer."""
+Figure = dict[str, Any]
 
 
 def _read_light() -> dict[str, str]:
@@ -32,139 +49,193 @@ def variable(role: str) -> str:
     return f"var(--{role})"
 
 
-@dataclass(frozen=True)
-class Value:
-    """Format of a value under the pointer: its unit with the space before it, decimals, and a sign where it matters."""
-
-    unit: str
-    digits: int
-    signed: bool = False
+def in_light(figure: Figure) -> Figure:
+    """Return a figure with the light colours in place of roles, for where no style sheet is."""
+    return json.loads(re.sub(r'"var\(--([\w-]+)\)"', lambda role: f'"{LIGHT[role[1]]}"', json.dumps(figure)))
 
 
-TORQUE, RESIDUAL, WIDTH = Value(" N·m", 2), Value(" N·m", 3, signed=True), Value(" µs", 0)
-ERROR, SHARE, FACTOR = Value(" N·m", 3), Value("", 3), Value("", 2)
-AT_TIME, AT_ANGLE = Value(" s", 2), Value("°", 0)
+def text(words: str) -> str:
+    """Keep plotly from making a link of `<a href=…>` in words of a recording or of a user's own effect."""
+    return words.replace("<", "‹").replace(">", "›").replace("var(--", "var( --")
 
 
-@dataclass(frozen=True)
-class Axis:
-    """An axis: quantity with unit; `share` is the panel's height relative to the others, `ticks` replace numbers."""
+def figure(
+    x: dict[str, Any], panels: Sequence[dict[str, Any]], traces: Sequence[dict[str, Any]],
+    shapes: Sequence[dict[str, Any]] = (), names: Sequence[dict[str, Any]] = (), height: float = 340.0,
+    shares: Sequence[float] = (1.0,),
+) -> Figure:  # fmt: skip
+    """Put a figure together: panels one above another over one x axis.
 
-    label: str
-    value: Value | None = None
-    limits: tuple[float, float] | None = None
-    ticks: Sequence[tuple[float, str]] = ()
-    from_zero: bool = False
-    share: float = 1.0
-
-
-@dataclass(frozen=True)
-class Curve:
-    """Points joined by a line; None breaks it. Without `width` only markers are drawn.
-
-    A `cap` that is not `butt` makes dots of lines without length. `notes` stand behind the values under the pointer,
-    one for each point.
+    Parameters
+    ----------
+    x, panels : dict
+        Axes, of `axis`.
+    traces : sequence of dict
+        Of `curve` and `band`.
+    shapes, names : sequence of dict
+        Of `shade`, `level` and `rule`; of `name` and `badge`.
+    height : float
+        px.
+    shares : sequence of float
+        Heights of the panels relative to one another.
     """
-
-    x: Sequence[float]
-    y: Sequence[float | None]
-    label: str
-    colour: str
-    width: float = 1.6
-    dash: str = "solid"
-    step: bool = False
-    panel: int = 0
-    marker: str = ""
-    size: float = 8
-    every: int = 1
-    hollow: bool = False
-    cap: str = "butt"
-    value: Value | None = None
-    notes: Sequence[str] = ()
-    listed: bool = True
-
-
-@dataclass(frozen=True)
-class Band:
-    """The area between two curves."""
-
-    x: Sequence[float]
-    lower: Sequence[float]
-    upper: Sequence[float]
-    label: str = "95 % band"
-    colour: str = "model-band"
-    panel: int = 0
-    listed: bool = True
-
-
-@dataclass(frozen=True)
-class Shade:
-    """A stretch of x over all panels; with `low` and `high` a range of one panel's values over all x."""
-
-    colour: str
-    start: float = 0.0
-    end: float = 0.0
-    low: float | None = None
-    high: float | None = None
-    panel: int = 0
+    legend, above = sum(trace["showlegend"] for trace in traces) > 1, 18 if names else 0
+    top = (30 if legend else 10) + above
+    plot_px = height - top - 48
+    layout: dict[str, Any] = {
+        "height": height,
+        "font": {"family": "system-ui, -apple-system, 'Segoe UI', 'DejaVu Sans', sans-serif", "size": 13,
+                 "color": variable("ink")},
+        "paper_bgcolor": variable("chart"),
+        "plot_bgcolor": variable("chart"),
+        "margin": {"l": 64, "r": TOOLBAR_PX, "t": top, "b": 48},
+        "showlegend": legend,
+        "legend": {"orientation": "h", "x": 0, "y": 1 + above / plot_px, "yanchor": "bottom", "traceorder": "normal"},
+        "modebar": {"orientation": "v", "bgcolor": "rgba(0,0,0,0)", "color": variable("dim"),
+                    "activecolor": variable("accent")},
+        "hovermode": "x unified",
+        "hoversubplots": "axis",
+        "hoverlabel": {"bgcolor": variable("card"), "bordercolor": variable("line"),
+                       "font": {"color": variable("ink")}},
+        "uirevision": "kept",
+        "separators": ". ",
+        "shapes": list(shapes),
+        "annotations": list(names),
+        "xaxis": {**x, "anchor": _axis_id("y", len(panels) - 1)},
+    }  # fmt: skip
+    gap, high = GAP_PX / plot_px, 1.0
+    free = (1 - gap * (len(panels) - 1)) / sum(shares)
+    for number, (panel, share) in enumerate(zip(panels, shares, strict=True)):
+        low = max(high - free * share, 0.0)
+        layout[_axis_id("yaxis", number)] = {**panel, "domain": [low, high]}
+        high = low - gap
+    return {"data": list(traces), "layout": layout}
 
 
-@dataclass(frozen=True)
-class Rule:
-    """A dashed line at a value of the first panel, or at a place on the x axis; with its text at one end."""
-
-    at: float
-    text: str = ""
-    colour: str = "limit"
-    vertical: bool = False
-    right: bool = False
+def _axis_id(letter: str, number: int) -> str:
+    return f"{letter}{number + 1}" if number else letter
 
 
-@dataclass(frozen=True)
-class Label:
-    """A name above the panels; with a `badge`, the colour of its ground, a number within them."""
+def axis(
+    label: str, hover: str = "", limits: tuple[float, float] | None = None, ticks: Sequence[tuple[float, str]] = (),
+    from_zero: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Return an axis: quantity with its unit; `ticks` stand in place of numbers."""
+    settings: dict[str, Any] = {
+        "title": {"text": text(label), "standoff": 8, "font": {"size": 12}},
+        "gridcolor": variable("grid"), "zerolinecolor": variable("zero"), "automargin": True,
+    }  # fmt: skip
+    if hover:
+        settings["unifiedhovertitle"] = {"text": hover}
+    if limits:
+        settings["range"] = list(limits)
+    if from_zero:
+        settings["rangemode"] = "tozero"
+    if ticks:
+        settings |= {"tickvals": [at for at, _ in ticks], "ticktext": [text(words) for _, words in ticks]}
+    return settings
 
-    x: float
-    text: str
-    badge: str = ""
+
+def time_axis(start_s: float, end_s: float) -> dict[str, Any]:
+    """Return the axis of time."""
+    return axis("Time (s)", "%{x:.2f} s", (start_s, end_s))
 
 
-@dataclass(frozen=True)
-class Figure:
-    """A figure; `height` in px."""
+def curve(
+    x: Sequence[float], y: Sequence[float | None], label: str, colour: str, width: float = 1.6, *, dash: str = "solid",
+    step: bool = False, panel: int = 0, marker: str = "", size: float = 8, hollow: bool = False, most_markers: int = 0,
+    hover: str = "", notes: Sequence[str] = (), listed: bool = True,
+) -> dict[str, Any]:  # fmt: skip
+    """Return points joined by a line, which None breaks; without `width` only markers are drawn.
 
-    x: Axis
-    panels: tuple[Axis, ...]
-    curves: tuple[Curve, ...]
-    bands: tuple[Band, ...] = ()
-    shades: tuple[Shade, ...] = ()
-    rules: tuple[Rule, ...] = ()
-    labels: tuple[Label, ...] = ()
-    height: float = 340
+    Without `hover` the pointer shows no value; `notes` stand behind the values, one for each point.
+    """
+    mode = [name for name, there in (("lines", width), ("markers", marker)) if there]
+    trace: dict[str, Any] = {
+        "type": "scatter", "mode": "+".join(mode), "x": list(x), "y": list(y), "name": text(label),
+        "line": {"color": variable(colour), "width": width, "dash": dash, "shape": "hv" if step else "linear"},
+        "yaxis": _axis_id("y", panel), "showlegend": listed and bool(label),
+    }  # fmt: skip
+    if marker:
+        trace["marker"] = {
+            "symbol": marker, "size": size, "maxdisplayed": most_markers,
+            "color": variable("chart" if hollow else colour),
+            "line": {"color": variable(colour), "width": 1.8 if hollow else 0},
+        }  # fmt: skip
+    if not hover:
+        return trace | {"hoverinfo": "skip"}
+    template = f"{text(label)} {hover}"
+    if notes:
+        trace["customdata"], template = [text(note) for note in notes], template + " %{customdata}"
+    return trace | {"hovertemplate": template + "<extra></extra>"}
 
-    def entries(self) -> list[Band | Curve]:
-        """Return what the legend names; nothing where one line needs no name."""
-        listed = [part for part in (*self.bands, *self.curves) if part.listed and part.label]
-        return listed if len(listed) > 1 else []
+
+def band(
+    x: Sequence[float], lower: Sequence[float], upper: Sequence[float], label: str = "95 % band",
+    colour: str = "model-band", listed: bool = True,
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Return the area between two curves of the first panel."""
+    edge = curve(x, upper, "", colour, 0, listed=False) | {"mode": "lines"}
+    fill = {"fill": "tonexty", "fillcolor": variable(colour), "name": text(label), "showlegend": listed}
+    return [edge, {**edge, "y": list(lower), **fill}]
+
+
+def shade(colour: str, start: float, end: float) -> dict[str, Any]:
+    """Return a stretch of x over all panels."""
+    return _rectangle(colour, {"xref": "x", "yref": "paper", "x0": start, "x1": end, "y0": 0, "y1": 1})
+
+
+def level(colour: str, low: float, high: float, panel: int = 0) -> dict[str, Any]:
+    """Return a range of one panel's values over all x."""
+    place = {"xref": "paper", "yref": _axis_id("y", panel), "x0": 0, "x1": 1, "y0": low, "y1": high}
+    return _rectangle(colour, place)
+
+
+def _rectangle(colour: str, place: dict[str, Any]) -> dict[str, Any]:
+    return {"type": "rect", **place, "fillcolor": variable(colour), "line": {"width": 0}, "layer": "below"}
+
+
+def rule(at: float, words: str = "", colour: str = "limit", *, upright: bool = False, right: bool = False) -> Figure:
+    """Return a dashed line at a value of the first panel, or upright at a place on the x axis, with its words."""
+    place = {"xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": at, "y1": at}
+    if upright:
+        place = {"xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1}
+    where = {"textposition": "end" if right else "start", "yanchor": "bottom", "textangle": 0}
+    label = {"text": text(words), "font": {"color": variable(colour)}, **where}
+    line = {"color": variable(colour), "width": 1.6, "dash": "dash"}
+    return {"type": "line", **place, "line": line, "label": label}
+
+
+def name(x: float, words: str) -> dict[str, Any]:
+    """Return a name above the panels."""
+    font = {"size": 12, "color": variable("mark")}
+    return {"xref": "x", "yref": "paper", "x": x, "y": 1.0, "yanchor": "bottom", "showarrow": False,
+            "text": text(words), "font": font}  # fmt: skip
+
+
+def badge(x: float, words: str, colour: str) -> dict[str, Any]:
+    """Return a number at the top of the panels, on a ground of this colour."""
+    style = {"bgcolor": variable(colour), "borderpad": 3, "font": {"size": 12, "color": variable("on-worst")}}
+    return {**name(x, words), "y": 0.985, "yanchor": "top", "name": "place", **style}
 
 
 # ---- what MODEL.json and recordings give ---------------------------------------------------------------------------
 
 
-def band_of(document: dict[str, Any], curve: str, along: str, colour: str = "model-band") -> Band | None:
-    """Return a curve's band in MODEL.json; None where the method gives none."""
-    known = ((document.get("uncertainty") or {}).get("bands") or {}).get(curve)
-    return Band(known[along], known["whole_lower"], known["whole_upper"], colour=colour) if known else None
+def band_of(document: dict[str, Any], curve_name: str, along: str, **options: Any) -> list[dict[str, Any]]:
+    """Return a curve's band in MODEL.json; nothing where the method gives none."""
+    known = ((document.get("uncertainty") or {}).get("bands") or {}).get(curve_name)
+    return band(known[along], known["whole_lower"], known["whole_upper"], **options) if known else []
 
 
-def half_widths(band: Band | None, x: Sequence[float]) -> list[str]:
+def half_widths(area: list[dict[str, Any]], x: Sequence[float]) -> list[str]:
     """Return the half width of a band at each x, as text."""
     import numpy as np
 
-    if band is None:
+    if not area:
         return []
-    halves = (np.asarray(band.upper) - np.asarray(band.lower)) / 2
-    return [f"± {half:.2f}" for half in np.interp(x, band.x, halves)]
+    upper, lower = (np.asarray(edge["y"], dtype=float) for edge in area)
+    return [f"± {half:.2f}" for half in np.interp(x, area[0]["x"], (upper - lower) / 2)]
 
 
 def segment_names(time_s: Sequence[float], segments: Sequence[dict[str, Any]]) -> list[str]:

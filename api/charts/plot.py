@@ -7,8 +7,7 @@ from typing import Any
 import plotly.graph_objects as go
 
 from stimrig.api.charts import diagnosis_charts, model_charts
-from stimrig.api.charts.figure import LIGHT, Figure
-from stimrig.api.charts.interactive import CHART_CONFIG, plotly_figure
+from stimrig.api.charts.figure import CONFIG, Figure, in_light
 from stimrig.api.jobs.curves import curves, rounded, runs
 from stimrig.api.models import explanation
 from stimrig.identify import BadRequest, Comparison, Diagnosis, Improvement, Model, Record, compare
@@ -18,7 +17,7 @@ CURVES_DOMAIN, SIDE_DOMAIN = [0.0, 0.66], [0.74, 1.0]
 
 
 def _local(options: dict[str, Any]) -> dict[str, Any]:
-    return {**options, "config": {**(options.get("config") or {}), **CHART_CONFIG}}
+    return {**options, "config": {**(options.get("config") or {}), **CONFIG}}
 
 
 class LocalFigure(go.Figure):
@@ -73,36 +72,31 @@ def plot(what: Any, record: Record | None = None) -> LocalFigure:
         It is none of these, a model without a record, or a diagnosis without a free effect.
     """
     if isinstance(what, Model) and record is not None:
-        return _model(what, record)
-    if isinstance(what, Comparison):
+        figure = _model(what, record)
+    elif isinstance(what, Comparison):
         result = what.to_dict()
         segments = runs(result["series"]["segment"], result["series"]["time_s"])
-        return _show(diagnosis_charts.residual(rounded(result), segments, diagnosis_charts.places_of(result)))
-    if isinstance(what, Improvement):
-        return _show(diagnosis_charts.falling(explanation.step_versions({**what.to_dict(), "models": []})))
-    if isinstance(what, Diagnosis) and what.free:
-        return _show(diagnosis_charts.free_effect(dict(what.free[0])))
-    message = (
-        "plot takes a model and its record, a comparison, what improve found, or a diagnosis with a free effect: "
-        "plot(model, record)"
-    )
-    raise BadRequest(message, place="plot")
+        figure = diagnosis_charts.residual(rounded(result), segments, diagnosis_charts.places_of(result))
+    elif isinstance(what, Improvement):
+        figure = diagnosis_charts.falling(explanation.step_versions({**what.to_dict(), "models": []}))
+    elif isinstance(what, Diagnosis) and what.free:
+        figure = model_charts.free_effect(dict(what.free[0]))
+    else:
+        message = (
+            "plot takes a model and its record, a comparison, what improve found, or a diagnosis with a free effect: "
+            "plot(model, record)"
+        )
+        raise BadRequest(message, place="plot")
+    return LocalFigure(in_light(figure))
 
 
-def _show(figure: Figure) -> LocalFigure:
-    return LocalFigure(plotly_figure(figure, LIGHT.__getitem__))
-
-
-def _model(model: Model, record: Record) -> LocalFigure:
-    """Draw measurement and model with residual and pulse widths, and the recruitment curve beside them."""
-    page_curves = curves(model, record)
+def _model(model: Model, record: Record) -> Figure:
+    """Return measurement and model with residual and pulse widths, and the recruitment curve beside them."""
     series = rounded(compare(model, record).to_dict())["series"]
-    large = plotly_figure(
-        model_charts.measurement(page_curves, model.fit.get("noise_sd_nm"), series), LIGHT.__getitem__
-    )
-    curve = plotly_figure(model_charts.recruitment(model.to_dict(), page_curves), LIGHT.__getitem__)
-    large["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in curve["data"]]
+    large = model_charts.measurement(curves(model, record), model.fit.get("noise_sd_nm"), series)
+    side = model_charts.recruitment(model.to_dict())
+    large["data"] += [{**trace, "xaxis": "x2", "yaxis": "y4", "showlegend": False} for trace in side["data"]]
     large["layout"]["xaxis"]["domain"] = CURVES_DOMAIN
-    large["layout"]["xaxis2"] = {**curve["layout"]["xaxis"], "domain": SIDE_DOMAIN, "anchor": "y4"}
-    large["layout"]["yaxis4"] = {**curve["layout"]["yaxis"], "anchor": "x2"}
-    return LocalFigure(large)
+    large["layout"]["xaxis2"] = {**side["layout"]["xaxis"], "domain": SIDE_DOMAIN, "anchor": "y4"}
+    large["layout"]["yaxis4"] = {**side["layout"]["yaxis"], "anchor": "x2"}
+    return large

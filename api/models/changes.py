@@ -8,8 +8,8 @@ model holds). So a floor is added to them; docs/results/trend.md says how it was
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterable
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from stimrig.api import local_time
@@ -33,6 +33,8 @@ FLOORS = {
 structure, and where method or effects differ (fatigue in a model raises its plateau)."""
 OF_EFFECT = ((0.1, 0.0), (0.3, 0.0))
 """The same for a parameter of an effect."""
+CONDITIONS = {"electrodes": "electrodes", "side": "the side", "posture": "posture"}
+"""Kinds of notes that put a comparison in doubt where they differ."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +46,8 @@ class State:
     structure: tuple[str, ...]
     """Its effects, each `id:form`."""
     current_ma: float | None = None
-    notes: tuple[tuple[str, str], ...] = ()
-    """Kind and text of what was noted on the conditions."""
-
-    def same_structure(self, other: State) -> bool:
-        """Return whether method and effects are equal."""
-        return self.method == other.method and sorted(self.structure) == sorted(other.structure)
+    notes: dict[str, str] = field(default_factory=dict)
+    """What was noted on each of the conditions."""
 
 
 def structure_of(effects: Collection[str], figures: dict[str, Figure]) -> tuple[str, ...]:
@@ -73,7 +71,7 @@ def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
         return None
     spread, times = None, None
     if old.get("sd") is not None and new.get("sd") is not None:
-        same = before.same_structure(now)
+        same = (before.method, before.structure) == (now.method, now.structure)
         spread = math.hypot(old["sd"], new["sd"], max(_floor(name, same, first), _floor(name, same, second)))
         times = abs(second - first) / spread if spread > 0 else 0.0
     return {
@@ -103,13 +101,12 @@ def _floor(name: str, same: bool, value: float) -> float:
 
 def comparable(before: State, now: State) -> list[str]:
     """List the figures that both models have with the same meaning."""
-    names = [
+    return [
         name for name, figure in now.figures.items()
         if name in before.figures and before.figures[name].get("form") == figure.get("form")
+        and (name not in OF_THE_CURVE or same_current(before, now))
+        and fact_of(name.partition(".")[0], "muscle", True)
     ]  # fmt: skip
-    if not same_current(before, now):
-        names = [name for name in names if name not in OF_THE_CURVE]
-    return [name for name in names if fact_of(name.partition(".")[0], "muscle", True)]
 
 
 def same_current(before: State, now: State) -> bool:
@@ -135,7 +132,7 @@ class Name:
     `digits` after the point; None: three significant ones. `in_percent`: whether a change of it is told in per cent.
     """
 
-    words: Any
+    words: str
     unit: str
     factor: float = 1.0
     digits: int | None = None
@@ -146,27 +143,31 @@ NAMES = {
     "threshold_us": Name("Threshold", "µs", digits=1),
     "plateau_nm": Name("Plateau", "N·m", digits=2, in_percent=True),
     "time_constant_s": Name("Time constant", "s", digits=3, in_percent=True),
-    "damping": Name("Damping", "1", digits=3, in_percent=True),
+    "damping": Name("Damping", "", digits=3, in_percent=True),
     "delay_s": Name("Delay", "ms", 1e3, digits=1),
-    "follows_percent": Name("Fit", "%", digits=1),
+}
+LAST_NAMES = {
+    "held_out_fit_percent": Name("Fit, held out", "%", digits=1),
     "noise_sd_nm": Name("Noise of the torque sensor", "N·m", digits=3),
     "charge_uc": Name("Dose of the day", "mC", 1e-3, digits=2),
     "current_ma": Name("Current", "mA", digits=1),
 }
-"""In the order in which they are shown."""
+"""Shown after the effects' parameters."""
 UNBROKEN = "\u00a0"
 """Between a number and its unit no line ends."""
-LAST = ("follows_percent", "noise_sd_nm", "charge_uc", "current_ma")
-"""Shown after the effects' parameters."""
-KINDS = {"electrodes": "electrodes", "side": "the side", "posture": "posture"}
+
+
+def in_order(figures: Iterable[str]) -> list[str]:
+    """Return the figures that are shown, in the order in which they are shown."""
+    return [*NAMES, *dict.fromkeys(name for name in figures if "." in name), *LAST_NAMES]
 
 
 def name_of(figure: str, unit: str = "1") -> Name:
     """Return a figure's name; for an effect's parameter, the effect and the parameter without its unit."""
-    if figure in NAMES:
-        return NAMES[figure]
+    if known := NAMES.get(figure) or LAST_NAMES.get(figure):
+        return known
     effect, _dot, parameter = figure.partition(".")
-    return Name(f"{effect_words(effect)}, {parameter_words(parameter)}", unit, in_percent=True)
+    return Name(f"{effect_words(effect)}, {parameter_words(parameter)}", unit.removesuffix("1"), in_percent=True)
 
 
 def value_words(value: float | None, name: Name, unit: bool = True) -> str:
@@ -176,12 +177,12 @@ def value_words(value: float | None, name: Name, unit: bool = True) -> str:
     scaled = value * name.factor
     digits = name.digits if name.digits is not None else _digits(scaled)
     text = f"{round(scaled, digits) + 0.0:.{digits}f}".replace("-", "−")  # + 0.0: no "−0"
-    return f"{text}{UNBROKEN}{name.unit}" if unit and name.unit != "1" else text
+    return f"{text}{UNBROKEN}{name.unit}" if unit and name.unit else text
 
 
 def dose_words(charge_uc: float | None) -> str:
     """A dose on a page: the charge of one phase, summed over the pulses."""
-    return value_words(charge_uc, NAMES["charge_uc"])
+    return value_words(charge_uc, LAST_NAMES["charge_uc"])
 
 
 def uncertain_words(value: float | None, uncertainty: float | None, name: Name, sign: bool = False) -> str:
@@ -228,18 +229,18 @@ def doubt_sentences(before: State, now: State) -> list[str]:
             "The current of a recording is not known: threshold and plateau compare only at the same current."
         )
     elif not same_current(before, now):
-        was, now_is = (value_words(state.current_ma, NAMES["current_ma"]) for state in (before, now))
+        was, now_is = (value_words(state.current_ma, LAST_NAMES["current_ma"]) for state in (before, now))
         reasons.append(f"The current was {was}, now it is {now_is}: threshold and plateau are not compared.")
     large = "only large differences are told"
     if before.method != now.method:
         reasons.append(f"The methods differ ({before.method}, then {now.method}): {large}.")
-    if sorted(before.structure) != sorted(now.structure):
+    if before.structure != now.structure:
         old, new = (effects_words(state.structure) or "none" for state in (before, now))
         differ = f"The models' effects differ ({old}, then {new})"
         ways = f"The models describe {new} in different ways"
         reasons.append(f"{ways if old == new else differ}: {large}.")
-    noted = [(kind, dict(before.notes).get(kind, ""), dict(now.notes).get(kind, "")) for kind in KINDS]
-    for kind, first, second in noted:
+    for kind, words in CONDITIONS.items():
+        first, second = before.notes.get(kind, ""), now.notes.get(kind, "")
         if first.split() != second.split():
-            reasons.append(f"The notes on {KINDS[kind]} differ: “{first[:80] or '–'}”, then “{second[:80] or '–'}”.")
+            reasons.append(f"The notes on {words} differ: “{first[:80] or '–'}”, then “{second[:80] or '–'}”.")
     return reasons

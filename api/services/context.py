@@ -21,7 +21,6 @@ from stimrig.api.jobs.worker import Worker
 from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
-from stimrig.api.models.trend import Trend
 from stimrig.api.people.accounts import People
 from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock
 from stimrig.api.people.pace import Guesses
@@ -68,7 +67,7 @@ class Context:
         self.stops, self.stop_rights = Stops(store, clock, self.rig), StopRights(store.secret("stop-right"), clock)
         trials = Trials(self.rig, self.tracked, tracker)
         self.runner = Runner(self.analyses, self.rig, self.stops, trials, adviser, self.limits_lock)
-        self.trend, self.jobs = Trend(store), Jobs(self.pool)
+        self.jobs = Jobs(self.pool)
         self._tasks: list[asyncio.Task[None]] = []
 
     async def open(self) -> None:

@@ -131,6 +131,5 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: http
     look_closer(tab, "step")
     examined(tab, "model, all open")
     visit(tab, service, f"/models/{first}/report", stop=False)
-    visit(tab, service, f"/compare?model={first}&model={added}", lambda: chart(tab, "step"))
-    for path in ("/participants/X3/trend", f"/models/{first}/widths"):
+    for path in (f"/compare?model={first}&model={added}", "/participants/X3/trend", f"/models/{first}/widths"):
         visit(tab, service, path)

@@ -172,7 +172,7 @@ def test_what_was_not_played_begins_where_the_pulses_end(tmp_path: Path, sent_us
     found = recorded(str(made_up(tmp_path / "r.h5", sent_us, 1.2 if sent_us else 0.0)), lambda *_: None)
     plan_us = [100.0] * 400
     figure = model_charts.recorded(found, plan_us, 40.0, "stopped")
-    (faint,) = [curve for curve in figure.curves if curve.label == "planned, not played"]
-    assert faint.x[0] == pytest.approx(len(sent_us) / 40) and faint.colour == "plan"
+    (faint,) = [trace for trace in figure["data"] if trace["name"] == "planned, not played"]
+    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == "var(--plan)"
     whole = model_charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
-    assert not [curve for curve in whole.curves if curve.label == "planned, not played"]
+    assert not [trace for trace in whole["data"] if trace["name"] == "planned, not played"]

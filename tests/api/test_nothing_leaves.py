@@ -12,7 +12,7 @@ import pytest
 
 import stimrig
 from stimrig import identify
-from stimrig.api.charts.interactive import CHART_CONFIG
+from stimrig.api.charts.figure import CONFIG
 from stimrig.api.jobs.curves import curves, rounded
 from stimrig.api.models.explanation import step_versions
 from stimrig.api.models.story import story
@@ -104,7 +104,7 @@ def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service
         model = play_test(http, "N1")["model_id"]
         added = http.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
     added = added.get("id") or added["model"]["id"]
-    paths = (f"/models/{model}?diagnose=1", f"/models/{added}?diagnose=0", f"/compare?model={model}&model={added}")
+    paths = (f"/models/{model}?diagnose=1", f"/models/{added}?diagnose=0")
     seen: set[str] = set()
     for path in paths:
         tab.goto(service.url + path)
@@ -193,4 +193,4 @@ def test_each_way_of_showing_a_notebooks_figure_is_without_the_upload() -> None:
         finally:
             pio.renderers.default = before
         assert re.search(r"showSendToCloud\W+false", shown, re.IGNORECASE), renderer
-    assert CHART_CONFIG["plotlyServerURL"] == "" and not CHART_CONFIG["showSendToCloud"]
+    assert CONFIG["plotlyServerURL"] == "" and not CONFIG["showSendToCloud"]

@@ -64,7 +64,6 @@ GET    /models/x                                           read-model     404
 GET    /models/x/report                                    read-model     404
 GET    /models/x/figures/x                                 read-model     404
 GET    /models/x/story.html                                read-model     404
-GET    /compare/figures/x                                  read-model     422
 GET    /participants/x/trend                               read-model     404
 GET    /compare                                            read-model     422
 GET    /jobs/x                                             read-model     404

@@ -45,13 +45,14 @@ def explain(
 
 
 def _write_figures(folder: Path, document: dict[str, Any]) -> None:
-    from stimrig.api.charts.story_charts import story_figures
+    from stimrig.api.charts.diagnosis_charts import story_figures
+    from stimrig.api.charts.drawing import file
 
     folder.mkdir(parents=True, exist_ok=True)
     figures = story_figures(document["story"], document["before"], document["after"])
-    for name in figures:
+    for name, figure in figures.items():
         for kind in ("svg", "pdf", "png"):
-            write(folder / f"{name}.{kind}", figures.file(name, kind))
+            write(folder / f"{name}.{kind}", file(figure, kind))
 
 
 def story_lines(document: dict[str, Any]) -> list[str]:

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import asyncio
-from dataclasses import replace
 from typing import Any
 
 from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
-from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
+from stimrig.api.charts import diagnosis_charts, model_charts
 from stimrig.api.charts.drawing import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import FIT_TOGETHER, Job
-from stimrig.api.models import advice, explanation, stored_model
+from stimrig.api.models import advice, explanation, stored_model, trend
 from stimrig.api.models.registry import POOR, WHAT_TO_WRITE
 from stimrig.api.models.tracking import Limits, limits_words
 from stimrig.api.people.auth import Scope
@@ -28,8 +27,6 @@ from stimrig.api.web.pages.report_file import missing_parts
 
 router = APIRouter(include_in_schema=False)
 environment.globals |= {"tracking_words": limits_words, "usual_tracking": Limits().model_dump()}
-OVERVIEW_PX, CURVE_PX = 320.0, 190.0
-"""Heights of the measurement and of the recruitment curve in the first screen."""
 MOST_FINDINGS = 2
 """Failed checks in the first screen; the others stand with the parameters."""
 TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model",
@@ -52,7 +49,7 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
             step = next_view.step(context, participants.find(context, row.participant), principal)
         return {
             "step": None if step is None or step.href == f"/models/{row.id}" else step,
-            "changes": context.trend.changes_to(row),
+            "changes": trend.changes_to(context.store, row),
             "has_key": version["served"] and controllers.has_key(context.auth, row.participant),
             "hdf5": not context.analyses.path(row.recording_id).endswith(".csv"),
         }
@@ -107,7 +104,8 @@ async def parts(context: Context, row: Model) -> dict[str, Any]:
         place = next(number for number, version in enumerate(rows) if version["current"])
         later, earlier = rows[place + 1 :], rows[place - 1] if place else None
         segments, signatures = (measured["curves"] or {}).get("segments") or [], (diagnosis or {}).get("signatures")
-        drawn = diagnosis_charts.diagnosis_figures(comparison, segments, why, signatures or {}, rows)
+        figures = model_charts.model_figures(document, measured["curves"], comparison)
+        figures |= diagnosis_charts.diagnosis_figures(comparison, segments, why, signatures or {}, rows)
         return {
             "model": rows[place],
             "document": document,
@@ -123,7 +121,7 @@ async def parts(context: Context, row: Model) -> dict[str, Any]:
             "validity": stored_model.validity(document),
             "warnings": context.runner.lifecycle.warnings(row.recording_id),
             "now_utc": context.clock.utc(),
-            "figures": Figures(draw_model(document, measured) | drawn, f"/models/{row.id}/figures/{{}}"),
+            "figures": Figures(figures, f"/models/{row.id}/figures"),
         }
 
     return await asyncio.to_thread(read)
@@ -136,16 +134,6 @@ async def measurement(context: Context, row: Model) -> dict[str, Any]:
     except ApiError as error:
         return {"curves": None, "comparison": None, "problem": error}
     return {"curves": curves, "comparison": comparison, "problem": None}
-
-
-def draw_model(document: dict[str, Any], measured: dict[str, Any]) -> dict[str, Any]:
-    """Draw the model's own charts; `overview` and `curve` are low enough for the first screen."""
-    figures = model_charts.model_figures(document, measured["curves"], measured["comparison"])
-    figures["curve"] = replace(figures["recruitment"], height=CURVE_PX)
-    if "overview" in figures:
-        figures["overview"] = replace(figures["overview"], height=OVERVIEW_PX)
-    free = diagnosis_charts.free_effects(explanation.held_free(document))
-    return figures | free | joint_charts.joint_figures(document)
 
 
 @router.get("/jobs/{job_id}")

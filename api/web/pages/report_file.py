@@ -1,4 +1,4 @@
-"""Reports as one HTML file that works offline: `comparison_html`, `diagnosis_html` and `story_html`."""
+"""Reports as one HTML file that works offline: `comparison_html` and `story_html`."""
 
 from __future__ import annotations
 
@@ -7,18 +7,13 @@ from typing import Any
 
 from markupsafe import Markup
 
-from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts, story_charts
+from stimrig.api.charts import diagnosis_charts, model_charts
 from stimrig.api.charts.drawing import Figures
 from stimrig.api.models import explanation, stored_model
 from stimrig.api.web.pages.environment import HERE, environment
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
 """Nothing runs in a report, nothing is loaded, nothing leaves."""
-PARTS: dict[str, Any] = {
-    "lead": "", "model": None, "why": None, "story": None, "test": None, "held": [], "plain": [], "places": [],
-    "splits": [], "tests": [], "refused": [],
-}  # fmt: skip
-"""Parts of `report.html` that a report may leave out."""
 
 
 def comparison_html(
@@ -43,49 +38,26 @@ def comparison_html(
     comparison : dict, optional
         As `identify.compare` gives it, cleaned and thinned.
     """
-    free, effects = explanation.held_free(document), [effect["id"] for effect in document.get("effects") or []]
+    effects, compared = [effect["id"] for effect in document.get("effects") or []], comparison or {}
     model = {**stored_model.figures(document), **stored_model.quality(document)}
+    figures = model_charts.model_figures(document, curves, comparison)
+    figures |= diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, [])
     return _write(
         title=f"{name}: measurement against model",
         lead=f"with {', '.join(effects)}" if effects else "",
         model={**model, "id": document["model_id"], "method": document["method"]},
-        held=free,
+        held=explanation.held_free(document),
         recruitment=stored_model.recruitment(document),
         dynamics=stored_model.dynamics(document),
         repetition=stored_model.repetition(document),
         test=test,
-        figures=Figures(
-            model_charts.model_figures(document, curves, comparison)
-            | joint_charts.joint_figures(document)
-            | diagnosis_charts.free_effects(free)
-            | diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, [])
-        ),
-        plain=(comparison or {}).get("plain") or [],
-        places=diagnosis_charts.places_of(comparison or {}),
-        splits=explanation.splits(comparison or {}),
-        tests=((comparison or {}).get("tests") or {}).get("tests") or [],
+        figures=Figures(figures),
+        plain=compared.get("plain") or [],
+        places=diagnosis_charts.places_of(compared),
+        splits=explanation.splits(compared),
+        tests=(compared.get("tests") or {}).get("tests") or [],
+        story=None,
     )
-
-
-def diagnosis_html(
-    diagnosis: dict[str, Any], comparison: dict[str, Any], segments: list[dict[str, Any]], name: str
-) -> str:
-    """Write what is missing.
-
-    Parameters
-    ----------
-    diagnosis : dict
-        As `stimrig.api.jobs.verbs.diagnosis` gives it.
-    comparison : dict
-        Of the examined model with the record, thinned.
-    segments : list of dict
-        As `stimrig.api.jobs.curves.runs` gives them.
-    name : str
-        Name of the record.
-    """
-    view, signatures = explanation.view(diagnosis, comparison), diagnosis.get("signatures") or {}
-    figures = diagnosis_charts.diagnosis_figures(comparison, segments, view, signatures, [])
-    return _write(title=f"{name}: what is missing", figures=Figures(figures), **missing_parts(view, comparison))
 
 
 def missing_parts(view: dict[str, Any] | None, comparison: dict[str, Any] | None) -> dict[str, Any]:
@@ -117,12 +89,12 @@ def story_html(
     structure : str
         The structure that the first model had.
     """
-    figures = story_charts.story_figures(story, before, after)
     begun = f" · begun with {structure}" if structure else ""
     lead = f"{name} · noise {story['noise_sd_nm'] or 0.0:.4f} N·m{begun}"
-    return _write(title=story["title"], lead=lead, story=story, figures=figures, refused=refused)
+    figures = Figures(diagnosis_charts.story_figures(story, before, after))
+    return _write(title=story["title"], lead=lead, story=story, figures=figures, refused=refused, model=None)
 
 
 def _write(**values: Any) -> str:
     style = Markup((HERE / "static" / "page.css").read_text("utf-8"))
-    return environment.get_template("report.html").render(**PARTS | values, style=style, policy=POLICY)
+    return environment.get_template("report.html").render(**values, style=style, policy=POLICY)

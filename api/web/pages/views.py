@@ -12,11 +12,10 @@ from stimrig.api.charts import model_charts
 from stimrig.api.charts.drawing import svg
 from stimrig.api.clinical_words import WORDS, missing_words
 from stimrig.api.errors import ApiError
-from stimrig.api.models import stored_model
 from stimrig.api.services import notes, tests
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import Context, Ctx, LiveReader
-from stimrig.api.web.pages.model_view import draw_model, measurement
+from stimrig.api.web.pages.model_view import measurement
 from stimrig.api.web.pages.render import page
 from stimrig.rig.messages import Status
 
@@ -67,7 +66,8 @@ async def draw(context: Context, row: Test, plan_us: list[float]) -> Markup | No
         model = await asyncio.to_thread(context.versions.get, row.model_id)
         measured = await measurement(context, model)
         if measured["curves"] is not None:
-            figure = draw_model(stored_model.read(model), measured)["comparison"]
+            series = measured["comparison"].get("series")
+            figure = model_charts.measurement(measured["curves"], model.fit.get("noise_sd_nm"), series)
             words = "Torque measured and predicted, what is left, and the pulse width, over time"
             return await asyncio.to_thread(svg, figure, 1160.0, 520.0, words)
     if not row.recording_id:

@@ -217,6 +217,7 @@ class TrendSessionOut(Document):
     approved_utc: str | None
     method: str
     effects: list[str]
+    without_evidence: list[str] = Field(description="those of them that a person added without evidence")
     verdict: str
     figures: dict[str, TrendFigureOut] = Field(
         description="threshold_us, plateau_nm, time_constant_s, damping, delay_s, fit_percent, held_out_fit_percent, "

@@ -6,7 +6,7 @@ from typing import Any
 
 from fastapi import APIRouter
 
-from stimrig.api.models.trend import newest_changes
+from stimrig.api.models.trend import newest_changes, sessions
 from stimrig.api.services import participants
 from stimrig.api.web.dependencies import PROBLEM, Ctx, ModelReader
 from stimrig.api.web.responses.base import describe_answer
@@ -19,6 +19,6 @@ router = APIRouter(prefix="/v1/participants/{code}", tags=["trend"], responses=P
 def trend(context: Ctx, _principal: ModelReader, code: str) -> dict[str, Any]:
     """Figures with their uncertainty over the sessions, and what changed since the last approved one."""
     participants.find(context, code)
-    sessions = context.trend.sessions(code)
-    documents = [session.document() for session in sessions]
-    return {"participant": code, "sessions": documents, "changes": newest_changes(sessions)}
+    known = sessions(context.store, code)
+    documents = [session.document() for session in known]
+    return {"participant": code, "sessions": documents, "changes": newest_changes(known)}
