@@ -244,7 +244,7 @@ def test_a_notebook_draws_in_light_colours_and_a_free_effect_with_its_bands() ->
     found = object.__new__(identify.Diagnosis)
     entry = {"at": [0.0, 0.5], "lines": lines, "driver": "time (s)", "axis": "opening <a href='x'>"}
     found.__dict__["free"] = (entry,)
-    drawn = plot(found)
+    drawn: Any = plot(found)
     assert [trace.y for trace in drawn.data if trace.name in lines] == [(0.0, 1.0), (0.0, 0.5)]
     assert [trace.y for trace in drawn.data if trace.fill] == [(0.0, 0.9), (0.0, 0.45)]
     assert drawn.layout.yaxis.title.text == "opening ‹a href='x'›" and "var(" not in str(drawn)
