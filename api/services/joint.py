@@ -88,7 +88,7 @@ async def take_pose(context: Context, by: str, body: PoseIn, tags: Tags) -> tupl
     def write(action: str, detail: dict[str, Any]) -> int:
         with context.store.write() as session:
             if action == locking.POSES[0]:
-                locking.check_poses(session, tags)
+                locking.check(session, None, tags)
             return locking.write_pose(session, context.clock.utc(), by, action, **detail)
 
     async with context.limits_lock:  # no other pose comes between looking and taking it

@@ -25,6 +25,7 @@ LIMITS, SITE = ("create participant", "set profile", "finish calibration"), ("cr
 ARCHIVE, MODELS = ("create participant", "archive", "unarchive"), ("approve", "reject")
 SETTINGS = (*LIMITS, "set muscle", "archive", "unarchive")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
+OF_POSES = and_(AuditEntry.subject == "rig", AuditEntry.action.in_(POSES))
 RAN_BY = "set who ran it"
 UNITS = {"_ma": "mA", "_us": "µs", "_nm": "N·m", "_rad": "rad"}
 MOST_CHANGES = 20  # that a refusal lists, the newest
@@ -49,24 +50,16 @@ def write_pose(session: Session, at_utc: str, actor: str, action: str, **detail:
 
 def pose_version(session: Session) -> int:
     """Return the version of the angle sensor's calibration; 0 where there is none."""
-    entry = session.scalars(select(AuditEntry).where(_poses()).order_by(AuditEntry.seq.desc()).limit(1)).first()
+    entry = session.scalars(select(AuditEntry).where(OF_POSES).order_by(AuditEntry.seq.desc()).limit(1)).first()
     return 0 if entry is None else number_of(entry)
 
 
-def check(session: Session, row: Versioned, tags: Tags | None) -> int:
-    """Return the row's version; without tags nothing is checked.
+def check(session: Session, row: Versioned | None, tags: Tags | None) -> int:
+    """Return the version of a row, or with None of the angle sensor; without tags nothing is checked.
 
     Raises ChangedError: it is not among the tags; with each change since: who, when, what it was and what it is.
     """
-    return _check(session, row.version, tags, about(row))
-
-
-def check_poses(session: Session, tags: Tags | None) -> None:
-    """The same as `check` for the angle sensor."""
-    _check(session, pose_version(session), tags, _poses())
-
-
-def _check(session: Session, version: int, tags: Tags | None, entries: ColumnElement[bool]) -> int:
+    version, entries = (pose_version(session), OF_POSES) if row is None else (row.version, about(row))
     if tags is not None and str(version) not in tags:
         numbers = [int(tag) for tag in tags if re.fullmatch(r"\d{1,18}", tag, re.ASCII)]
         raise ChangedError(version, since(session, max(numbers, default=-1), entries))
@@ -101,11 +94,7 @@ def about(row: Versioned) -> ColumnElement[bool]:
         return and_(AuditEntry.subject == row.id, AuditEntry.action == RAN_BY)
     of_participant = AuditEntry.detail["participant"].as_string() == row.code
     decided = and_(of_participant, AuditEntry.action.in_((*MODELS, "issue token")))
-    return or_(settings_of(row.code), decided, _poses())
-
-
-def _poses() -> ColumnElement[bool]:
-    return and_(AuditEntry.subject == "rig", AuditEntry.action.in_(POSES))
+    return or_(settings_of(row.code), decided, OF_POSES)
 
 
 def _change(session: Session, place: int, entry: AuditEntry) -> dict[str, Any]:

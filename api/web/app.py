@@ -8,6 +8,7 @@ from collections.abc import AsyncIterator, Callable, Sequence
 from contextlib import asynccontextmanager
 from functools import cache
 from types import ModuleType
+from typing import Any
 
 from fastapi import APIRouter, FastAPI
 from starlette.routing import BaseRoute
@@ -28,6 +29,12 @@ class Service(FastAPI):
     def build_middleware_stack(self) -> ASGIApp:
         """Starlette's within the boundary: an unexpected error's answer has its headers, too."""
         return Boundary(super().build_middleware_stack(), self.state.context)
+
+    def openapi(self) -> dict[str, Any]:
+        """FastAPI's document, made complete once."""
+        if self.openapi_schema is None:
+            openapi.complete(super().openapi(), self.state.context.auth.cookie_name)
+        return super().openapi()
 
 
 def create_app(
@@ -73,7 +80,6 @@ def create_app(
         exception_handlers=dict.fromkeys(problems.PROBLEMS, problems.respond),
     )
     app.state.context = context
-    openapi.describe(app)
     return app
 
 

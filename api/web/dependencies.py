@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from typing import Annotated, Any
 
-from fastapi import Depends, Query, Request, Security
+from fastapi import Depends, Query, Security
 from starlette.requests import HTTPConnection
 
 from stimrig.api.people.auth import Principal, Scope
@@ -17,18 +17,13 @@ from stimrig.api.web.guards import Press, anyone_who_may_stop, if_match, require
 from stimrig.api.web.openapi import problem
 
 
-def context_of(connection: HTTPConnection) -> Context:
-    """The application's context."""
+async def context_of(connection: HTTPConnection) -> Context:
+    """The application's context; not in a worker thread: a stop waits for none of them."""
     return connection.app.state.context
 
 
-async def from_request(request: Request) -> Context:
-    """The application's context, as a dependency; not in a worker thread: a stop waits for none of them."""
-    return context_of(request)
-
-
 Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
-Ctx = Annotated[Context, Depends(from_request)]
+Ctx = Annotated[Context, Depends(context_of)]
 Anyone = Annotated[Principal, Depends(require())]
 EvenLocked = Annotated[Principal, Depends(require(even_locked=True))]
 MayStop = Annotated[Press, Depends(anyone_who_may_stop)]

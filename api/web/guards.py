@@ -110,24 +110,19 @@ def is_action(request: Request) -> bool:
     return not by_script and not request.url.path.startswith(POLLED)
 
 
-OPEN = [
-    (method, re.compile(path), table)
-    for method, path, table in (
-        ("POST", STOP, None),
-        ("POST", "/v1/tests", None),
-        ("GET", "/v1/sequences", None),
-        ("GET", "/v1/participants/([^/]+)/(?:model|tracking)", str),
-        ("POST", "/v1/models/([^/]+)/prediction", Model),
-        ("POST", "/v1/models/([^/]+)/widths", Model),
-        ("GET", "/v1/tests/([^/]+)", Test),
-        ("WS", "/v1/tests/([^/]+)/live", Test),
-        ("GET", "/v1/recordings/([^/]+)(?:/csv)?", Recording),
-    )
-]
-"""Method, path, and the table in whose row the participant stands; str: the path names it; None: the body does, or
-nothing.
-
-Of the models it is the approved one, and what was tracked from it under the approval that holds."""
+OPEN = (
+    f"POST {STOP}",
+    "POST /v1/tests",
+    "GET /v1/sequences",
+    "GET /v1/participants/(?P<code>[^/]+)/(?:model|tracking)",
+    "POST /v1/models/(?P<model>[^/]+)/prediction",
+    "POST /v1/models/(?P<model>[^/]+)/widths",
+    "GET /v1/tests/(?P<test>[^/]+)",
+    "WS /v1/tests/(?P<test>[^/]+)/live",
+    "GET /v1/recordings/(?P<recording>[^/]+)(?:/csv)?",
+)
+"""What a controller's key opens of its participant: of the models the approved one and what was tracked from it under
+the approval that holds, of recordings those of tests."""
 
 
 def refuse_outside(registry: Versions, principal: Principal, method: str, path: str) -> None:
@@ -138,7 +133,7 @@ def refuse_outside(registry: Versions, principal: Principal, method: str, path: 
     """
     if principal.participant is None:
         return
-    if not _opens(registry, principal.participant, method, path):
+    if not _opens(registry, principal.participant, f"{method} {path}"):
         raise outside(principal.participant)
     row: Participant = registry.store.get(Participant, principal.participant)
     if stored_site((principal.plan or {}).get("site")) != site_of(row):
@@ -146,21 +141,17 @@ def refuse_outside(registry: Versions, principal: Principal, method: str, path: 
         raise ApiError(403, "other-site", "This key is of another site", detail)
 
 
-def _opens(registry: Versions, participant: str, method: str, path: str) -> bool:
-    for own_method, pattern, table in OPEN:
-        match = pattern.fullmatch(path)
-        if method != own_method or match is None:
-            continue
-        if table is None:
-            return True
-        if table is str:
-            return match[1] == participant
-        if table is Model:
-            return _approved(registry, participant, match[1])
-        row = registry.store.get(table, match[1])
-        of_test = table is not Recording or (row is not None and row.test_id is not None)
-        return row is not None and row.participant == participant and of_test
-    return False
+def _opens(registry: Versions, participant: str, request: str) -> bool:
+    match = next(filter(None, (re.fullmatch(pattern, request) for pattern in OPEN)), None)
+    if match is None or not match.lastgroup:
+        return match is not None
+    key = match[match.lastgroup]
+    if match.lastgroup == "code":
+        return key == participant
+    if match.lastgroup == "model":
+        return _approved(registry, participant, key)
+    row = registry.store.get(Test if match.lastgroup == "test" else Recording, key)
+    return row is not None and row.participant == participant and (isinstance(row, Test) or row.test_id is not None)
 
 
 def _approved(registry: Versions, participant: str, model_id: str) -> bool:

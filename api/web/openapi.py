@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-from fastapi import FastAPI
-
 from stimrig.api import schemas
 from stimrig.api.sessions.live import LiveOut
 from stimrig.api.web.middleware import REFUSALS
@@ -51,29 +49,13 @@ TOO_MANY = problem("too many wrong tries, or too much at once") | {
     "headers": {"Retry-After": {"description": "s to wait", "required": True, "schema": {"type": "integer"}}}
 }
 """Of every operation that asks who comes: a guess is held to a pace, whatever it was to open."""
-
-
 CHANGED = problem("changed since: `changes` says who, when, from what to what") | {"headers": {"ETag": ETAG}}
 NO_VERSION = problem("`If-Match` is missing, or cannot be read")
 
 
-def describe(app: FastAPI) -> None:
-    """Have the application's document made complete, once."""
-    plain = app.openapi
-
-    def openapi() -> dict[str, Any]:
-        is_complete = app.openapi_schema is not None
-        document = plain()
-        if not is_complete:
-            _complete(document)
-            schemes = document["components"]["securitySchemes"]
-            schemes["session"]["name"] = app.state.context.auth.cookie_name
-        return document
-
-    app.openapi = openapi
-
-
-def _complete(document: dict[str, Any]) -> None:
+def complete(document: dict[str, Any], cookie_name: str) -> None:
+    """Add to FastAPI's document what it cannot see."""
+    document["components"]["securitySchemes"]["session"]["name"] = cookie_name
     components = document["components"]["schemas"]
     for model in (Problem, LiveOut, TrackedOut):
         schema = model.model_json_schema(ref_template="#/components/schemas/{model}")

@@ -50,17 +50,7 @@ def from_http(error: HTTPException) -> ApiError:
     return problem
 
 
-def not_to_be_kept(error: DataError) -> ApiError:
-    """422: the database takes no such value."""
-    return invalid(f"The database takes no such value: {str(error.orig).splitlines()[0]}")
-
-
-def unexpected(_error: Exception) -> ApiError:
-    """500: nothing of what went wrong is told."""
-    detail = "Nothing was lost. The service's log (logs/api.log in the data folder) says more."
-    return ApiError(500, "internal", "Something unexpected went wrong here", detail)
-
-
+LOGGED = "Nothing was lost. The service's log (logs/api.log in the data folder) says more."
 PROBLEMS: dict[type[Exception], Callable[[Any], ApiError]] = {
     ApiError: lambda error: error,
     RequestValidationError: from_validation,
@@ -68,9 +58,9 @@ PROBLEMS: dict[type[Exception], Callable[[Any], ApiError]] = {
     OperationalError: lambda _error: not_answering(),
     InterfaceError: lambda _error: not_answering(),
     PoolTimeout: lambda _error: not_answering(),
-    DataError: not_to_be_kept,
+    DataError: lambda error: invalid(f"The database takes no such value: {str(error.orig).splitlines()[0]}"),
     ClientDisconnect: lambda _error: ApiError(400, "left", "The request was not complete"),
-    Exception: unexpected,
+    Exception: lambda _error: ApiError(500, "internal", "Something unexpected went wrong here", LOGGED),
 }
 
 

@@ -126,7 +126,12 @@ def members_raised() -> set[str]:
     found: set[str] = set()
     for path in Path(api.__file__).parent.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in ("ApiError", "invalid", "from_rig"):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") in (
+                "ApiError",
+                "invalid",
+                "from_rig",
+                "out_of_reach",
+            ):
                 found |= {one.arg for one in node.keywords if one.arg}
             elif isinstance(node, ast.Subscript) and getattr(node.value, "attr", "") == "extra":
                 found |= {node.slice.value} if isinstance(node.slice, ast.Constant) else set()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any
+from typing import Any, get_args
 
 from fastapi import APIRouter, Request
 from fastapi.responses import Response
@@ -12,6 +12,7 @@ from stimrig.api.charts import trend_charts
 from stimrig.api.errors import ApiError
 from stimrig.api.local_time import clock
 from stimrig.api.models.tracking import OUTCOMES, Limits, sentences
+from stimrig.api.schemas.shared import NoteKind
 from stimrig.api.services import notes, participants
 from stimrig.api.sessions import controllers
 from stimrig.api.store.tables import Recording
@@ -21,10 +22,7 @@ from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
-environment.globals["note_kinds"] = {
-    "spasm": "Spasm", "posture": "Posture", "electrodes": "Electrodes", "side": "Side",
-    "medication": "Medication", "other": "Other",
-}  # fmt: skip
+environment.globals["note_kinds"] = {kind: kind.capitalize() for kind in get_args(NoteKind)}
 environment.globals["muscles"] = ("biceps brachii", "triceps brachii")
 """Offered where a muscle is typed; any other may be."""
 

@@ -25,7 +25,6 @@ from stimrig.api.web.dependencies import (
     ParticipantVersion,
     Tester,
     TestVersion,
-    context_of,
 )
 from stimrig.api.web.guards import refuse_outside, same_origin
 from stimrig.api.web.openapi import problem
@@ -103,13 +102,12 @@ async def enough(context: Ctx, principal: Tester, test_id: str) -> dict[str, Any
 
 
 @router.websocket("/{test_id}/live")
-async def live(socket: WebSocket, test_id: str) -> None:
+async def live(socket: WebSocket, context: Ctx, test_id: str) -> None:
     """Live signals: `history` first, then `live` about 20 a second, `state`, `link`, and `test` at every turn.
 
     The socket closes (1000) once the test has ended and its last `test` message was sent; after a `problem` with 4000
     and its status: 4401 within two seconds once its session or token is no longer valid, 4403, 4404.
     """
-    context = context_of(socket)
     await socket.accept()
     with contextlib.suppress(WebSocketDisconnect, RuntimeError):
         try:
