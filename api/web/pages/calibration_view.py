@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Mapping
 from typing import Any
 
 from fastapi import APIRouter, Request
@@ -16,7 +15,7 @@ from stimrig.api.sessions.requests import CalibrationIn
 from stimrig.api.web.dependencies import Ctx, Tester
 from stimrig.api.web.pages.limits_form import number_text
 from stimrig.api.web.pages.render import page
-from stimrig.rig.messages import Status
+from stimrig.rig.messages import Bound
 
 router = APIRouter(include_in_schema=False)
 DEFAULTS = CalibrationIn.model_validate({})
@@ -26,45 +25,31 @@ MARKS = {
     "comfort": ("As strong as is comfortable", "no pulse of today's tests will be wider"),
 }
 LAST = {"sensory": "sensory_pulse_width_us", "motor": "motor_pulse_width_us", "comfort": "max_pulse_width_us"}
-FINE_US = (1.0, 25.0)
-"""The narrowest and the widest fine step where the rig has not said."""
+FINE = Bound(lo=1.0, hi=25.0, unit="µs", owner="any rig's")
+"""The fine step where the rig has not said what it takes."""
 
 
 @router.get("/participants/{code}/calibration")
 async def show(request: Request, context: Ctx, _principal: Tester, code: str) -> Response:
     """Show where the calibration stands, or the form that begins one."""
     row = await asyncio.to_thread(participants.find, context, code)
+    standing: dict[str, Any] | None = None
     try:
-        standing: dict[str, Any] | None = await calibrations.standing(context, code)
+        standing = await calibrations.standing(context, code)
     except ApiError as error:
         if error.status != 404:
             raise
-        standing = None
-    status = context.rig.status
-    finished = status.calibrated if status and standing is None else None
-    waits = finished if finished is not None and finished.participant == code else None
-    low_us, high_us = fine_range(status)
-    texts = {"current_ma": number_text(row.profile["current_ma"]), "step_us": number_text(DEFAULTS.step_us)}
+    status, profile = context.rig.status, row.profile
+    finished, bounds = (status.calibrated, status.limits) if status else (None, {})
+    waits = finished if standing is None and finished is not None and finished.participant == code else None
+    fine = bounds.get("calibration_step_us", FINE)
+    texts = {"current_ma": number_text(profile["current_ma"]), "step_us": number_text(DEFAULTS.step_us)}
     help_texts = {
-        "current_ma": profiles.range_help("current_ma", status.limits if status else {}),
-        "step_us": f"{low_us:g} to {high_us:g} µs",
+        "current_ma": profiles.range_help("current_ma", bounds),
+        "step_us": f"{fine.lo:g} to {fine.hi:g} µs",
     }
+    last = {name: profile[field] for name, field in LAST.items()} if profile.get(LAST["sensory"]) is not None else {}
     return page(
-        request, "calibration.html", participant=row, calibration=standing, waits=waits, marks=MARKS,
-        last=last(row.profile), texts=texts, help=help_texts,
+        request, "calibration.html", participant=row, calibration=standing, waits=waits, marks=MARKS, last=last,
+        texts=texts, help=help_texts,
     )  # fmt: skip
-
-
-def last(profile: Mapping[str, Any]) -> dict[str, float]:
-    """Return the marks of the last calibration, µs; empty where there is none."""
-    if profile.get("sensory_pulse_width_us") is None:
-        return {}
-    return {name: profile[field] for name, field in LAST.items()}
-
-
-def fine_range(status: Status | None) -> tuple[float, float]:
-    """Return the narrowest and the widest fine step of this rig, µs."""
-    bound = status.limits.get("calibration_step_us") if status else None
-    if bound is None or bound.lo is None or bound.hi is None:
-        return FINE_US
-    return bound.lo, bound.hi

@@ -45,15 +45,12 @@ def _gather(context: Context, row: Participant, overview: dict[str, Any]) -> dic
     )  # fmt: skip
     rows = context.store.all(Test, *conditions, order=Test.requested_utc)
     picked, next_rad = _newest_of_each(rows), overview["next_rad"]
-    held_targets = [
-        {**each, "deg": starting.allowed_deg({"target_rad": each["angle_rad"]})} for each in overview["targets"]
-    ]
     return {
         "range_rad": profiles.range_of(row.profile),
         "may_start": starting.calibrated(context, row).may_start,
         "archived": row.archived_utc is not None,
-        "held": held_targets,
-        "allowed": None if next_rad is None else starting.allowed_deg({"target_rad": next_rad}),
+        "held": [{**each, "deg": starting.allowed_deg(each["angle_rad"])} for each in overview["targets"]],
+        "allowed": starting.allowed_deg(next_rad),
         "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],
         "kinds_lacking": [kind for kind in (PASSIVE, HELD, MOVING) if not any(test.kind == kind for test in rows)],
     }

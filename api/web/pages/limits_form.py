@@ -38,7 +38,8 @@ def fields(profile: Mapping[str, Any], status: Status | None) -> list[dict[str, 
         return entries
     range_rad, calibration = profiles.range_of(profile), status.angle.calibration
     outdated = profiles.range_outdated(profile, calibration and calibration.set_at_utc)
-    texts = ["", ""] if range_rad is None or outdated else [angle_text(angle) for angle in range_rad]
+    shown_rad = (None, None) if range_rad is None or outdated else range_rad
+    texts = ["" if rad is None else number_text(round(math.degrees(rad), 2) + 0.0) for rad in shown_rad]
     within = "" if status.angle.range_rad is None else f"within {profiles.range_words(status.angle.range_rad)} (rig)"
     return entries + [
         {
@@ -49,8 +50,3 @@ def fields(profile: Mapping[str, Any], status: Status | None) -> list[dict[str, 
             zip(ANGLE_LABELS, texts, ("0° is the straight limb", within), strict=True)
         )
     ]  # fmt: skip
-
-
-def angle_text(angle_rad: float) -> str:
-    """Write an angle as a person would type it."""
-    return number_text(round(math.degrees(angle_rad), 2) + 0.0)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from fastapi import APIRouter, Request
+from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from pydantic import ValidationError
 
@@ -67,21 +67,10 @@ async def start(
 ) -> Response:  # fmt: skip
     """Preview the test that the address names, and offer to start it.
 
-    Parameters
-    ----------
-    kind : str
-        Of the test.
-    target : float, optional
-        Of an adaptive test: within how many percent both curves are to be known.
-    target_rad : float, optional
-        Of a held test: the angle; default: the next that is open.
-    model : str
-        Of a next experiment: the model whose diagnosis names it.
+    `target`: of an adaptive test: within how many percent both curves are to be known. `target_rad`: of a held test:
+    the angle; default: the next that is open. `model`: of a next experiment: whose diagnosis names it.
 
-    Raises
-    ------
-    ApiError
-        409 a test runs, or a calibration is needed first; 422 no such test; what the rig refuses.
+    Raises ApiError: 409 a test runs, or a calibration is needed first; 422 no such test; what the rig refuses.
     """
     row = await asyncio.to_thread(participants.find, context, code)
     refuse_archived(row)
@@ -92,21 +81,28 @@ async def start(
         raise ApiError(409, "calibrate-first", "Calibrate first", detail)
     labels = {name: request.query_params.get(name, "").strip() or None for name in LABEL_TITLES}
     fields = await asyncio.to_thread(fields_of_kind, context, code, kind, target, target_rad, model)
-    body = checked_test(participant=code, kind=kind, **labels, **fields)
+    try:
+        body = TestIn.model_validate({"participant": code, "kind": kind, **labels, **fields})
+    except ValidationError as error:
+        raise RequestValidationError(error.errors()) from None
     preview = await context.runner.preview(body)
-    widest_us, joint = max(preview["pulse_width_us"], default=0.0), preview.get("joint")
-    stimulates = widest_us > 0.0
-    strength = f"{current_words(row)}, {number(widest_us, 0, 'µs')}"
+    joint, reach = preview.get("joint"), preview.get("reach")
+    widest_us = max(preview["pulse_width_us"], default=0.0)
+    current, warnings = current_words(row), []
+    if widest_us > 0.0 and standing.state != "valid":
+        warnings.append(f"{code} is not calibrated: {NOBODY}.")
+    if reach and not reach["reachable"]:
+        warnings.append(reach["words"])
     return page(
         request,
         "start.html",
         participant=row,
         title=f"Start the {words(body.kind, 'kind')} of {code}?",
-        button=f"Start now: {strength if stimulates else 'no stimulation'}",
+        button=f"Start now: {f'{current}, {widest_us:.0f} µs' if widest_us > 0.0 else 'no stimulation'}",
         rows=[*rows(context, row, preview, standing, principal), *label_rows(vars(body))],
-        warnings=[*(warnings(row, standing) if stimulates else []), *out_of_reach(preview)],
-        stimulates=stimulates,
-        at_deg=allowed_deg(joint) if joint else None,
+        warnings=warnings,
+        stimulates=widest_us > 0.0,
+        at_deg=allowed_deg(joint["target_rad"]) if joint else None,
         plan_hash=preview["plan_hash"],
         minutes=VALID_S / 60,
         back=f"/models/{model}" if model else f"/participants/{code}{'/joint' if joint else ''}",
@@ -134,50 +130,22 @@ def fields_of_kind(
     return {}
 
 
-def checked_test(**fields: Any) -> TestIn:
-    """Return the request of a test. Raises ApiError (422): in one sentence, what does not hold."""
-    try:
-        return TestIn.model_validate(fields)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise invalid(f"{' '.join(map(str, first['loc']))}: {first['msg']}. Nothing was started.") from None
-
-
-def warnings(row: Participant, standing: Calibrated) -> list[str]:
-    """Say what deserves a second look."""
-    return [] if standing.state == "valid" else [f"{row.code} is not calibrated: {NOBODY}."]
-
-
-def out_of_reach(preview: dict[str, Any]) -> list[str]:
-    """Say that a test which stops itself will probably not reach its target, with what it can."""
-    reach = preview.get("reach")
-    return [] if reach is None or reach["reachable"] else [reach["words"]]
-
-
 def rows(
     context: Context, row: Participant, preview: dict[str, Any], standing: Calibrated, principal: Principal
 ) -> list[Row]:
     """List what a person has to know before pressing the button."""
-    widths_us, torque_time = preview["pulse_width_us"], preview.get("torque_time_nms")
-    pulses, widest_us = sum(width > 0 for width in widths_us), max(widths_us, default=0.0)
-    phase = "charge of one phase" if pulses == 1 else "charge of one phase, all pulses together"
-    dose = f"{pulses} pulse{'' if pulses == 1 else 's'}, {dose_words(preview['charge_uc'])} ({phase})"
-    if torque_time is not None:
-        dose += f", about {number(torque_time, 0, 'N·m·s')} of torque"
-    long, more = number(preview["duration_s"], 0, "s"), []
-    if joint := preview.get("joint"):
-        long, dose, more = joint_rows(joint, row.profile, long, dose)
-    elif bounds := preview.get("bounds"):
-        reach = preview["reach"]
-        long = f"at most {number(bounds['max_duration_s'], 0, 's')}"
-        dose = f"at most {number(bounds['max_torque_time_nms'], 0, 'N·m·s')} of torque"
-        more = [("Stops once known within", number(preview["target"]["curve_percent"], 1, "%"))]
-        more += [("Expected", reach["words"])] if reach["reachable"] else []
-    widest = number(row.profile["max_pulse_width_us"], 0, "µs")
+    profile, widest_us = row.profile, max(preview["pulse_width_us"], default=0.0)
+    if "joint" in preview:
+        long, dose, more = joint_words(preview, profile)
+    elif "bounds" in preview:
+        long, dose, more = adaptive_words(preview)
+    else:
+        long, dose, more = f"{preview['duration_s']:.0f} s", dose_of(preview), []
+    widest = f"{widest_us:.0f} µs, comfort maximum {profile['max_pulse_width_us']:.0f} µs"
     current = [
         ("Side and muscle", site_words(site_of(row))),
         ("Current of every pulse", current_words(row)),
-        ("Widest pulse", f"{number(widest_us, 0, 'µs')}, comfort maximum {widest}"),
+        ("Widest pulse", widest),
     ]
     return [
         ("Who", row.code),
@@ -185,41 +153,54 @@ def rows(
         *more,
         ("How long", long),
         ("Dose", dose),
-        ("Stops at", number(row.profile["max_torque_nm"], 1, "N·m")),
+        ("Stops at", f"{profile['max_torque_nm']:.1f} N·m"),
         *([("Calibration", standing.words)] if widest_us > 0.0 else []),
         ("Run by", principal.name),
         ("Rig", rig_words(context)),
     ]
 
 
-def allowed_deg(joint: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Angles between which a held test starts, °; None of another one."""
-    if joint["target_rad"] is None:
-        return None
-    middle, half = math.degrees(joint["target_rad"]), math.degrees(joint.get("tolerance_rad", profiles.TOLERANCE_RAD))
-    return round(middle - half, 2), round(middle + half, 2)
+def dose_of(preview: dict[str, Any]) -> str:
+    """Write pulses, charge, and torque where a model expects some."""
+    pulses, torque_time = sum(width > 0 for width in preview["pulse_width_us"]), preview["torque_time_nms"]
+    phase = "charge of one phase" if pulses == 1 else "charge of one phase, all pulses together"
+    dose = f"{pulses} pulse{'' if pulses == 1 else 's'}, {dose_words(preview['charge_uc'])} ({phase})"
+    return dose if torque_time is None else f"{dose}, about {torque_time:.0f} N·m·s of torque"
 
 
-def joint_rows(
-    joint: Mapping[str, Any], profile: Mapping[str, Any], long: str, dose: str
-) -> tuple[str, str, list[Row]]:
+def adaptive_words(preview: dict[str, Any]) -> tuple[str, str, list[Row]]:
+    """Say how long a test takes that stops itself, at what dose, and what it is expected to reach."""
+    bounds, reach = preview["bounds"], preview["reach"]
+    more = [("Stops once known within", f"{preview['target']['curve_percent']:.1f} %")]
+    more += [("Expected", reach["words"])] if reach["reachable"] else []
+    dose = f"at most {bounds['max_torque_time_nms']:.0f} N·m·s of torque"
+    return f"at most {bounds['max_duration_s']:.0f} s", dose, more
+
+
+def joint_words(preview: dict[str, Any], profile: dict[str, Any]) -> tuple[str, str, list[Row]]:
     """Say how long a guided test of a joint takes, at what dose, and list the rows about the angle."""
+    joint, doses, dose = preview["joint"], preview["joint"]["doses"], dose_of(preview)
     range_words = profiles.range_words(profiles.range_of(profile) or (0, 0))
-    more = [("Joint angles", f"{range_words}; beyond them the test stops")]
+    more, expected = [("Joint angles", f"{range_words}; beyond them the test stops")], doses["moving"]
+    long = f"at most {number(joint['longest_s'], 0, 's')}; ends by itself once enough was seen"
     if joint["kind"] == HELD:
         more.insert(0, ("Hold at", degrees(joint["target_rad"])))
-        expected = joint["doses"]["held_each"]
-    else:
-        long = f"at most {number(joint['longest_s'], 0, 's')}; ends by itself once enough was seen"
-        expected = joint["doses"]["moving"]
+        long, expected = f"{preview['duration_s']:.0f} s", doses["held_each"]
     if joint["kind"] == PASSIVE:
-        return long, "none: no current flows", more
-    if joint["known"]:
-        dose = f"about {number(expected, 1, 'N·m·s')} of torque"
-    elif joint["doses"]["paper"] > 0:
-        percent = number(100 * expected / joint["doses"]["paper"], 0, "%")
-        dose = f"about {percent} of the pre-session test's"
+        dose = "none: no current flows"
+    elif joint["known"]:
+        dose = f"about {expected:.1f} N·m·s of torque"
+    elif doses["paper"] > 0:
+        dose = f"about {100 * expected / doses['paper']:.0f} % of the pre-session test's"
     return long, dose, more
+
+
+def allowed_deg(target_rad: float | None) -> tuple[float, float] | None:
+    """Angles between which a held test starts, °; None of another one."""
+    if target_rad is None:
+        return None
+    middle, half = math.degrees(target_rad), math.degrees(profiles.TOLERANCE_RAD)
+    return round(middle - half, 2), round(middle + half, 2)
 
 
 def current_words(row: Participant) -> str:
@@ -232,7 +213,7 @@ def rig_words(context: Context) -> str:
     status = context.rig.status
     if status is None or not context.rig.connected:
         return "cannot be reached"
-    stimulator = status.stimulator
-    parts = [str(stimulator.get("device") or "stimulator unknown").upper(), str(stimulator.get("firmware") or "")]
-    described = f"{' '.join(part for part in parts if part)}, {status.state}"
-    return f"{described}, emulated: no person is connected" if context.settings.emulated else described
+    device, firmware = (str(status.stimulator.get(name) or "") for name in ("device", "firmware"))
+    described = f"{device.upper() or 'STIMULATOR UNKNOWN'} {firmware}".strip()
+    emulated = ", emulated: no person is connected" if context.settings.emulated else ""
+    return f"{described}, {status.state}{emulated}"
