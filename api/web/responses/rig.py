@@ -21,15 +21,10 @@ from stimrig.rig.messages import (
 
 
 class DeviceOut(Document):
-    """A device of the rig: what it is and how it is connected."""
+    """A device of the rig, and how it is connected."""
 
     device: str = ""
-
-
-class StimulatorOut(DeviceOut):
-    """The stimulator."""
-
-    shortest_us: float | None = Field(default=None, description="no narrower pulse is sent, µs")
+    shortest_us: float | None = Field(default=None, description="of the stimulator: no narrower pulse is sent, µs")
 
 
 class RigHealth(Document):
@@ -42,7 +37,7 @@ class RigHealth(Document):
 
 
 class RigOut(RigHealth):
-    """What is known of the rig, and how old it is."""
+    """The newest state of the rig, and its age."""
 
     reason: str = Field(description="why it is latched, uncertain or disconnected")
     latch: str = Field("", description="names the last stop; a re-arm sends it as `If-Match`, as the `ETag` has it")
@@ -52,7 +47,7 @@ class RigOut(RigHealth):
     segment: str | None = None
     elapsed_s: float = Field(0.0, description="of the test that runs, s")
     duration_s: float = Field(0.0, description="of the test that runs, s")
-    stimulator: StimulatorOut = Field(StimulatorOut(), description="device, id, firmware, port")
+    stimulator: DeviceOut = Field(DeviceOut(), description="device, id, firmware, port")
     load_cell: DeviceOut = Field(DeviceOut(), description="device, measured sample rate, bus")
     torque_nm: float | None = Field(None, description="newest torque, N·m")
     torque_age_s: float | None = Field(None, description="its age, s")
@@ -85,7 +80,7 @@ class SequencesOut(Document):
 
 
 class PlannedOut(Document):
-    """What a test will take."""
+    """Duration and dose of a test."""
 
     duration_s: float = Field(0.0, description="s")
     charge_uc: float = Field(0.0, description="charge of one phase, summed over the pulses, µC")
@@ -102,7 +97,7 @@ class PreviewOut(PlannedOut):
 
 
 class TestSummary(Document):
-    """What was recorded; empty until the test has ended."""
+    """The recording; empty until the test has ended."""
 
     __test__ = False
     duration_s: float | None = Field(None, description="s")
@@ -118,7 +113,7 @@ class TestSummary(Document):
 
 
 class WorkOut(Document):
-    """How far the identification is."""
+    """Progress of the identification."""
 
     verb: str = Field("fit", description="`fit`: the first model; `carry`: the structure of the last approved one")
     progress: float = Field(0.0, description="share that is done, 0 to 1")
@@ -127,7 +122,7 @@ class WorkOut(Document):
 
 
 class KnowledgeOut(Document):
-    """What is known of the muscle by now."""
+    """The muscle as it is known by now."""
 
     plateau_nm: float
     curve_percent: float = Field(description="largest half-width of the curve's band, % of the plateau")
@@ -219,7 +214,7 @@ class UploadOut(Document):
 
 
 class HealthOut(Document):
-    """Whether the service does its work."""
+    """Health of the service."""
 
     status: Literal["ok", "degraded"]
     database: Literal["ok"]
@@ -237,7 +232,7 @@ class StretchOut(Document):
 
 
 class CoverageOut(Document):
-    """What a movement has shown: cells of angle and velocity. Rows: fast and slow extension, still, slow and fast
+    """Cells of angle and velocity that a movement has covered. Rows: fast and slow extension, still, slow and fast
     flexion."""
 
     angle_edges_rad: list[float] = Field(description="of the columns, rad")
@@ -291,21 +286,14 @@ class TargetOut(Document):
     test_id: str | None
 
 
-class NewestOut(Document):
-    """Ids of today's newest tests that ended well."""
-
-    passive: str | None
-    moving: str | None
-
-
 class JointOverviewOut(Document):
-    """What is open of today's guided tests of a joint."""
+    """Today's guided tests of a joint that are still open."""
 
     sensor: AngleStatus
     range_rad: list[float] | None = Field(description="the participant's; null: nobody has set it")
     targets: list[TargetOut] = Field(description="angles to hold, 3 to 5; none without a range, or with a small one")
     next_rad: float | None = Field(description="the next one that is open")
-    tests: NewestOut
+    tests: dict[Literal["passive", "moving"], str | None] = Field(description="today's newest that ended well")
     doses: DosesOut | None = Field(description="null without a sensor or a range")
     known: bool = Field(description="whether `doses` are N·m·s: a model is approved")
     share_of_paper: float | None = Field(description="of the paper's torque-time that all of them take, 0 to 1")

@@ -32,7 +32,7 @@ def rig(context: Ctx, _principal: LiveReader, response: Response) -> dict[str, A
 
 @router.get("/sequences", **describe_answer(SequencesOut))
 async def sequences(context: Ctx, _principal: Anyone) -> dict[str, Any]:
-    """What a test can be made of: this rig's sequences with their settings, units and ranges; and the default test."""
+    """List this rig's sequences with their settings, units and ranges, its protocols, and the default test."""
     return await context.rig.ask(SequencesRequest())
 
 

@@ -34,7 +34,7 @@ from stimrig.rig.messages import Extended
 
 log = logging.getLogger("stimrig.live")
 LOOK_S = 1.0
-"""How often a live channel looks whether its session or token is still valid."""
+"""Interval at which a live channel checks that its session or token is still valid."""
 GOODBYE_S = 2.0
 """So long it waits for a client that reads nothing to hear why it is closed."""
 router = APIRouter(prefix="/v1/tests", tags=["tests"], responses=PROBLEM)
