@@ -5,6 +5,7 @@ Imported by the worker and the command line only.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Sequence
 from datetime import datetime
 from pathlib import Path
@@ -153,6 +154,23 @@ def write_table(record: Any, columns: dict[str, Any], out: Path) -> dict[str, An
             cells = [f"{value:.8g}" for value in row]
             file.write(",".join([f"{seconds:.6f}", *cells[: len(columns)], segment, *cells[len(columns) :]]) + "\n")
     return {"rows": len(segments)}
+
+
+def samples_sha256(record: Any) -> str:
+    """Return a digest of the torque with the digits of `export_csv`: the same for each file of the same samples."""
+    return hashlib.sha256("\n".join(f"{value:.8g}" for value in record.torque_nm.tolist()).encode()).hexdigest()
+
+
+def samples(progress: Progress, paths: Sequence[str]) -> dict[str, Any]:
+    """Return the digest of each recording's samples; empty where it cannot be read."""
+    digests = []
+    for number, path in enumerate(paths):
+        progress(number / len(paths), "comparing with stored recordings")
+        try:
+            digests.append(samples_sha256(identify.read(Path(path))))
+        except (identify.IdentifyError, OSError):
+            digests.append("")
+    return {"digests": digests}
 
 
 def find_recording(progress: Progress, folder: str, test_id: str) -> dict[str, Any]:

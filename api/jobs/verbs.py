@@ -12,9 +12,10 @@ from typing import Any
 import numpy as np
 
 from stimrig import identify
+from stimrig.api import record_files
 from stimrig.api.jobs import adaptive, tracking
 from stimrig.api.jobs.curves import comparison, page_curves, recorded
-from stimrig.api.record_files import Progress, export_csv, find_recording, joined, plain_csv
+from stimrig.api.record_files import Progress
 from stimrig.api.structure import held_by
 from stimrig.identify.json_text import json_value
 
@@ -51,6 +52,7 @@ def fit(
         "model": model.to_dict(),
         "notes": list(record.notes),
         "of": record.source.participant,
+        "samples_sha256": record_files.samples_sha256(record),
     }
 
 
@@ -201,11 +203,11 @@ def warm(progress: Progress) -> dict[str, Any]:
     return {}
 
 
-VERBS: dict[str, Callable[..., dict[str, Any]]] = {"curves": page_curves, "join": joined} | {
+VERBS: dict[str, Callable[..., dict[str, Any]]] = {"curves": page_curves, "join": record_files.joined} | {
     verb.__name__: verb
     for verb in (
-        fit, carry, comparison, diagnosis, effects, warm, forecast, invert, export_csv, plain_csv, find_recording,
-        recorded, adaptive.adaptive_outlook, adaptive.adaptive_begin, adaptive.adaptive_advise, tracking.track,
-        tracking.track_warm,
+        fit, carry, comparison, diagnosis, effects, warm, forecast, invert, recorded, record_files.export_csv,
+        record_files.plain_csv, record_files.find_recording, record_files.samples, adaptive.adaptive_outlook,
+        adaptive.adaptive_begin, adaptive.adaptive_advise, tracking.track, tracking.track_warm,
     )
 }  # fmt: skip

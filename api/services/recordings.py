@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import hashlib
 import secrets
-from collections.abc import Iterator, Sequence
+from collections.abc import AsyncIterable, Iterator, Sequence
 from pathlib import Path
+
+from sqlalchemy import or_, update
 
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import carried_structure
@@ -18,7 +19,12 @@ from stimrig.api.services.context import Context
 from stimrig.api.store import audit, locking, uploads
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import Model, Recording
+from stimrig.api.whole_file import sha256_of
 from stimrig.identify.records import HDF5_MAGIC, PARQUET_MAGIC
+
+MAGIC = {HDF5_MAGIC: ".h5", b"MATLAB ": ".mat", PARQUET_MAGIC: ".parquet"}
+AT_ONCE = 500
+"""Recordings whose samples one job reads."""
 
 
 def find(context: Context, recording_id: str) -> tuple[Recording, Path]:
@@ -32,54 +38,94 @@ def find(context: Context, recording_id: str) -> tuple[Recording, Path]:
     return row, path
 
 
+async def spool(context: Context, chunks: AsyncIterable[bytes], suffix: str) -> Path:
+    """Write an upload to the disk as it comes; return the place that it gets once it is taken in.
+
+    `suffix`: of the file; empty: as its first bytes say. Raises ApiError: 422 it is empty.
+    """
+    part = uploads.part_of(context.settings.recordings_dir / f"{uploads.PREFIX}{secrets.token_hex(8)}")
+    start = b""
+    try:
+        with part.open("wb") as file:
+            async for chunk in chunks:
+                start = start if len(start) >= 16 else start + chunk[:16]
+                await asyncio.to_thread(file.write, chunk)
+        if not start:
+            raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
+        suffix = suffix or next((kind for magic, kind in MAGIC.items() if start.startswith(magic)), ".csv")
+        return uploads.whole_of(part.replace(part.with_suffix(suffix)))
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+
+
 async def take_in(
     context: Context,
     code: str,
-    data: bytes,
+    whole: Path,
     principal: Principal,
     tags: Tags,
     columns: Sequence[str] = (),
     of: str = "",
 ) -> tuple[Recording, Model, list[str]]:
-    """Keep a recording of another tool and identify a model from it; what was assumed.
+    """Keep a spooled recording of another tool and identify a model from it; return what was assumed.
 
     Where `columns` are mapped, what is kept is the record as a CSV file of ours, with the SHA-256 of what was sent.
 
     Raises ApiError: 422 it cannot be read or fitted; 409 it is another participant's than `of` says. Nothing is kept of
     it.
     """
-    whole = await asyncio.to_thread(_write, context, data, ".csv" if columns else _suffix(data))
     part = uploads.part_of(whole)
     try:
-        assumed, data = await _rename_columns(context, part, columns, data)
         with _about_the_upload(part):
+            assumed = await _rename_columns(context, part, columns) if columns else []
             fitted = await context.analyses.run("fit", data=str(part))
-        of = await asyncio.to_thread(_other_owner, context, code, principal, fitted.get("of") or "", data, of)
+        new = Recording(id=whole.stem, participant=code, test_id=None, path=str(whole), origin="upload")
+        new.file_sha256 = await asyncio.to_thread(sha256_of, part)
+        new.samples_sha256 = fitted.get("samples_sha256") or ""
+        new.warnings = [note for note in (*assumed, *fitted["notes"]) if note]
+        await _read_samples(context)
+        of = await asyncio.to_thread(_other_owner, context, new, principal, fitted.get("of") or "", of)
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
-    warnings = [note for note in (*assumed, *fitted["notes"]) if note]
-    row = await asyncio.shield(
-        asyncio.to_thread(_store, context, code, whole, data, principal.name, warnings, of, tags)
-    )
+    row = await asyncio.shield(asyncio.to_thread(_store, context, new, principal.name, of, tags))
     plain = await asyncio.to_thread(context.versions.add, fitted["json"], code, row.id, principal.name)
-    return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), warnings
+    return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), new.warnings
 
 
-def _other_owner(context: Context, code: str, principal: Principal, stated_owner: str, data: bytes, of: str) -> str:
+async def _read_samples(context: Context) -> None:
+    """Store a digest of the samples of each recording that has none yet: those of the rig, and joined ones."""
+    rows = await asyncio.to_thread(context.store.all, Recording, Recording.samples_sha256.is_(None))
+    for first in range(0, len(rows), AT_ONCE):
+        some = rows[first : first + AT_ONCE]
+        found = await context.pool.submit("samples", paths=[row.path for row in some]).result
+
+        def store(some: Sequence[Recording] = some, digests: Sequence[str] = found["digests"]) -> None:
+            with context.store.write() as session:
+                for row, digest in zip(some, digests, strict=True):
+                    session.execute(update(Recording).where(Recording.id == row.id).values(samples_sha256=digest))
+
+        await asyncio.to_thread(store)
+
+
+def _other_owner(context: Context, new: Recording, principal: Principal, stated_owner: str, of: str) -> str:
     """Return the other participant that the recording belongs to, as confirmed with `of`; empty: none.
 
     Raises ApiError: 409 the file or the database names another participant, and that is not confirmed.
     """
-    same = Recording.file_sha256 == hashlib.sha256(data).hexdigest()
-    owner = stated_owner or next(
-        iter(context.store.all(Recording.participant, same, order=Recording.created_utc)), code
-    )
+    code, why, owner = new.participant, "The file says that it is a recording of", stated_owner
+    if not owner:
+        same = Recording.file_sha256 == new.file_sha256
+        if new.samples_sha256:
+            same = or_(same, Recording.samples_sha256 == new.samples_sha256)
+        why = "The same samples are stored as a recording of"
+        owner = next(iter(context.store.all(Recording.participant, same, order=Recording.created_utc)), code)
     if owner == code or (owner == of and principal.may(Scope.APPROVE_MODEL)):
         return "" if owner == code else owner
     detail = (
-        f"The file says that it is a recording of {owner}, not of {code}. Nothing of it was kept. Who may approve "
-        f"models can take it for {code} all the same: send it again with of={owner}."
+        f"{why} {owner}, not of {code}. Nothing of it was kept. Who may approve models can take it for {code} all the "
+        f"same: send it again with of={owner}."
     )
     title, more = "This is another participant's recording", {}
     if principal.may(Scope.APPROVE_MODEL):
@@ -88,18 +134,15 @@ def _other_owner(context: Context, code: str, principal: Principal, stated_owner
     raise ApiError(409, "other-participant", title, detail, of=owner, **more)
 
 
-async def _rename_columns(context: Context, path: Path, columns: Sequence[str], data: bytes) -> tuple[list[str], bytes]:
-    """Return what was assumed, and the bytes to keep: the upload, or the CSV table converted from it."""
-    if not columns:
-        return [], data
-    out = path.with_suffix(uploads.PLAIN)
+async def _rename_columns(context: Context, path: Path, columns: Sequence[str]) -> list[str]:
+    """Replace an upload by the CSV table converted from it; return what was assumed."""
+    out = path.with_suffix(".plain")
     try:
-        with _about_the_upload(path):
-            table = await context.pool.submit("plain_csv", data=str(path), out=str(out), columns=list(columns)).result
+        table = await context.pool.submit("plain_csv", data=str(path), out=str(out), columns=list(columns)).result
         await asyncio.to_thread(out.replace, path)
     finally:
         out.unlink(missing_ok=True)
-    return table["notes"], await asyncio.to_thread(path.read_bytes)
+    return table["notes"]
 
 
 @contextlib.contextmanager
@@ -109,35 +152,20 @@ def _about_the_upload(path: Path) -> Iterator[None]:
         yield
     except ApiError as error:
         if error.code == "worker-died":
-            detail = f"{error.detail.partition('. ')[0]}. Is the file damaged? Nothing of it was kept."
-            raise ApiError(422, "data", "The upload cannot be read", detail) from error
+            error.detail = f"{error.detail.partition('. ')[0].rstrip('.')}. Nothing of the upload was kept."
+            if error.status == 500:  # it crashed by itself
+                raise ApiError(422, "data", "The upload cannot be read", error.detail) from error
         error.detail = error.detail.replace(str(path), "the upload").replace(path.name, "the upload")
         if "place" in error.extra:
             error.extra["place"] = error.extra["place"].replace(str(path), "the upload")
         raise
 
 
-def _suffix(data: bytes) -> str:
-    kinds = {HDF5_MAGIC: ".h5", b"MATLAB ": ".mat", PARQUET_MAGIC: ".parquet"}
-    return next((suffix for magic, suffix in kinds.items() if data.startswith(magic)), ".csv")
-
-
-def _write(context: Context, data: bytes, suffix: str) -> Path:
-    path = context.settings.recordings_dir / f"{uploads.PREFIX}{secrets.token_hex(8)}{suffix}"
-    uploads.part_of(path).write_bytes(data)
-    return path
-
-
-def _store(
-    context: Context, code: str, path: Path, data: bytes, by: str, warnings: list[str], of: str, tags: Tags
-) -> Recording:
-    now = context.clock.utc()
-    row = Recording(id=path.stem, participant=code, test_id=None, path=str(path), origin="upload", created_utc=now)
-    row.file_sha256 = hashlib.sha256(data).hexdigest()
-    row.warnings = warnings
-    detail = {"participant": code, "sha256": row.file_sha256, **({"of": of} if of else {})}
-    with uploads.taken_in(path), context.store.write() as session:
-        participant = participants.within(session, code)
+def _store(context: Context, row: Recording, by: str, of: str, tags: Tags) -> Recording:
+    row.created_utc = now = context.clock.utc()
+    detail = {"participant": row.participant, "sha256": row.file_sha256, **({"of": of} if of else {})}
+    with uploads.taken_in(Path(row.path)), context.store.write() as session:
+        participant = participants.within(session, row.participant)
         locking.check(session, participant, tags)
         row.site = list(site_of(participant))
         session.add(row)

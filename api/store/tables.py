@@ -89,6 +89,8 @@ class Recording(Table):
     test_id: Mapped[str | None] = mapped_column(index=True)
     path: Mapped[str]
     file_sha256: Mapped[str]
+    samples_sha256: Mapped[str | None]
+    """Of the measured samples, the same in each format (`record_files.samples_sha256`); empty: they cannot be read."""
     origin: Mapped[str] = mapped_column(default="rig")
     created_utc: Mapped[str]
     warnings: Mapped[list[str] | None]

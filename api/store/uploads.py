@@ -17,9 +17,7 @@ if TYPE_CHECKING:
 
 PREFIX, JOINED = "upload-", "joined-"
 PARTS = "parts"
-PLAIN = ".plain"
-"""Suffix of another tool's table while it is converted."""
-SUFFIXES = (".csv", ".h5", ".mat", ".parquet", PLAIN)
+SUFFIXES = (".csv", ".h5", ".mat", ".parquet")
 MAX_LISTED = 10
 log = logging.getLogger("stimrig.uploads")
 
@@ -27,6 +25,11 @@ log = logging.getLogger("stimrig.uploads")
 def part_of(whole: Path) -> Path:
     """Return the place of a file until the database names it; the name is the same, for models and messages hold it."""
     return whole.parent / PARTS / whole.name
+
+
+def whole_of(part: Path) -> Path:
+    """Return the place of a file once the database names it."""
+    return part.parent.parent / part.name
 
 
 @contextlib.contextmanager
@@ -50,23 +53,19 @@ def settle(folder: Path, store: Store) -> None:
 
     named = {Path(path).name for path in store.all(Recording.path)}
     for part in _ours(folder / PARTS):
-        whole = folder / part.name
-        if part.name in named and not whole.exists():
-            part.replace(whole)
+        if part.name in named and not whole_of(part).exists():
+            part.replace(whole_of(part))
             log.warning("moved to its place what the database names already: %s", part.name)
         else:
             part.unlink(missing_ok=True)
             log.warning("removed what had not been taken in: %s", part.name)
-    if unnamed := [path.name for path in _ours(folder) if path.name not in named]:
+    unnamed = [path.name for path in _ours(folder) if path.suffix in SUFFIXES and path.name not in named]
+    if unnamed:
         more = f" and {len(unnamed) - MAX_LISTED} more" if len(unnamed) > MAX_LISTED else ""
         names = ", ".join(unnamed[:MAX_LISTED]) + more
         log.warning("the database does not name %s; nothing of it was deleted. Is it the right database?", names)
 
 
 def _ours(folder: Path) -> list[Path]:
-    return [
-        path
-        for path in sorted(folder.iterdir())
-        if path.name.startswith((PREFIX, JOINED)) and path.suffix in SUFFIXES
-        if path.is_file() and not path.is_symlink()
-    ]
+    paths = sorted(path for path in folder.iterdir() if path.name.startswith((PREFIX, JOINED)))
+    return [path for path in paths if path.is_file() and not path.is_symlink()]

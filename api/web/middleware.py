@@ -7,6 +7,7 @@ import json
 import logging
 import re
 import secrets
+from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -52,9 +53,8 @@ DATA = {  # should a browser be led to show it
 
 BODY_BYTES, BODY_S, UPLOAD_S = 1_000_000, 20.0, 300.0
 """Enough for the longest list of pulse widths; uploads have a bound of their own."""
-MOST_PREVIEWS = 4
-"""In work at the same time: their bodies are long, their answers longer; further ones are refused before they are
-read."""
+MOST_PREVIEWS, MOST_UPLOADS = 4, 8
+"""In work at the same time: bodies and answers are long; further ones are refused before they are read."""
 DEEPEST = 16
 """Brackets within one another: a test's segment's settings take six."""
 SHORT = 16_384
@@ -80,7 +80,7 @@ class Boundary:
 
     def __init__(self, app: ASGIApp, context: Any) -> None:
         self.app, self.context = app, context
-        self._previews = 0
+        self._in_work = Counter[str]()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -97,16 +97,17 @@ class Boundary:
                 add_headers(MutableHeaders(scope=message))
             await send(message)
 
-        if scope["path"].rstrip("/") != PREVIEW:
+        path = scope["path"].rstrip("/")
+        what = "previews" if path == PREVIEW else "uploads" if path.endswith(UPLOAD) else ""
+        most = {"previews": MOST_PREVIEWS, "uploads": MOST_UPLOADS}.get(what)
+        if most is not None and self._in_work[what] >= most:
+            await crowded(what, most, path)(scope, receive, send_more)
+            return
+        self._in_work[what] += 1
+        try:
             await self.app(scope, self._bounded(scope, receive), send_more)
-        elif self._previews >= MOST_PREVIEWS:
-            await crowded()(scope, receive, send_more)
-        else:
-            self._previews += 1
-            try:
-                await self.app(scope, self._bounded(scope, receive), send_more)
-            finally:
-                self._previews -= 1
+        finally:
+            self._in_work[what] -= 1
 
     async def _look_again(self) -> None:
         try:
@@ -160,11 +161,12 @@ def add_headers(headers: MutableHeaders) -> None:
         headers.add_vary_header("Cookie")
 
 
-def crowded() -> JSONResponse:
-    """503: others' previews are in work."""
-    detail = f"{MOST_PREVIEWS} previews are being worked out already. Try again in a second."
-    problem = ApiError(503, "crowded", "Too many previews at once", detail)
-    return JSONResponse(problem.body(PREVIEW), 503, media_type="application/problem+json", headers={"Retry-After": "1"})
+def crowded(what: str, most: int, path: str) -> JSONResponse:
+    """503: others' previews or uploads are in work."""
+    wait_s = "1" if what == "previews" else "30"
+    detail = f"{most} {what} are in work already. Try again in {wait_s} s."
+    body = ApiError(503, "crowded", f"Too many {what} at once", detail).body(path)
+    return JSONResponse(body, 503, media_type="application/problem+json", headers={"Retry-After": wait_s})
 
 
 def refuse_unsound(body: bytes) -> None:

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from stimrig.api.jobs import curves as real_curves
-from stimrig.api.record_files import find_recording, plain_csv
+from stimrig.api.record_files import find_recording, plain_csv, samples
 from stimrig.identify.errors import BadRequest
 from tests.api.made_up_joint import joint
 
@@ -333,6 +333,7 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     verb.__name__: verb
     for verb in (
         fit, carry, comparison, curves, diagnosis, adaptive_outlook, adaptive_begin, adaptive_advise, track, forecast,
-        invert, join, effects, export_csv, busy, plain_csv, find_recording, real_curves.recorded, hostile,
+        invert, join, effects, export_csv, busy, plain_csv, find_recording, samples, real_curves.recorded,
+        hostile,
     )
 } | dict.fromkeys(("warm", "track_warm"), nothing)  # fmt: skip

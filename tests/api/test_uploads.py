@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -10,31 +10,78 @@ from unittest.mock import Mock
 import httpx
 import pytest
 
+import stimrig
+from stimrig.api.export.record_file import write_record
 from stimrig.api.record_files import find_recording
-from tests.api.conftest import REAL, STUB, Service, run_service, serving
+from stimrig.api.store.tables import Recording
+from stimrig.api.web import middleware
+from stimrig.identify.records.record import Source
+from tests.api.conftest import REAL, STUB, run_service, serving, soon
 from tests.api.test_problems import problem
 from tests.api.thread_worker import PROCESS
 from tests.harness import hostile_shapes
+from tests.harness.cohort_records import Session, write
 
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture
-def deadly(tmp_path: Path, short_dir: Path) -> Iterator[Service]:
-    """A service whose workers crash at every upload, as libhdf5 might."""
-    with serving(tmp_path, short_dir, PROCESS, workers=1) as (service, _):
+UPLOAD = "/v1/participants/P017/recordings"
+
+
+@pytest.mark.parametrize(("dies", "status", "says"), [("crash", 422, "SIGSEGV"), ("killed", 503, "memory runs short")])
+def test_an_upload_that_a_worker_dies_of_is_refused_in_one_line(
+    tmp_path: Path, short_dir: Path, dies: str, status: int, says: str
+) -> None:
+    """It crashes as libhdf5 might, which is the file's fault; or the system kills it, which need not be."""
+    with serving(tmp_path, short_dir, PROCESS, workers=1) as (service, client):
         submit = service.context.pool.submit
-        service.context.pool.submit = lambda _verb, **_given: submit("hostile", data="crash")
-        yield service
-
-
-def test_an_upload_that_a_worker_dies_of_is_refused_in_one_line(deadly: Service) -> None:
-    with deadly.client() as client:
+        service.context.pool.submit = lambda _verb, **_given: submit("hostile", data=dies)
         client.post("/v1/participants", json={"code": "P017"})
-        found = problem(client.post("/v1/participants/P017/recordings", content=b"x"), 422)
-    assert found["title"] == "The upload cannot be read" and "SIGSEGV" in found["detail"]
-    assert str(deadly.data) not in found["detail"]
-    assert not list((deadly.data / "recordings").rglob("upload-*"))
+        found = problem(client.post(UPLOAD, content=b"x"), status)
+        assert says in found["detail"] and str(service.data) not in found["detail"]
+        assert found["detail"].endswith("Nothing of the upload was kept.")
+        assert not list((service.data / "recordings").rglob("upload-*"))
+
+
+def test_the_same_samples_in_any_format_are_another_participants(tmp_path: Path, short_dir: Path) -> None:
+    sealed = write(tmp_path / "s.h5", Session("P017"))
+    with serving(tmp_path, short_dir, REAL, workers=1) as (service, client):
+        for code in ("P017", "P018"):
+            assert client.post("/v1/participants", json={"code": code}).is_success
+        mine = client.post(UPLOAD, content=sealed.read_bytes()).json()["recording_id"]
+        with service.context.store.write() as session:  # as a recording of the rig, which was not read yet
+            session.get(Recording, mine).samples_sha256 = None
+        contents = [client.get(f"/v1/recordings/{mine}/csv").content]
+        for kind in ("csv", "mat", "parquet"):
+            write_record(replace(stimrig.read(sealed), source=Source()), tmp_path / f"r.{kind}", kind)
+            contents.append((tmp_path / f"r.{kind}").read_bytes())
+        for content in contents:
+            refused = client.post("/v1/participants/P018/recordings", content=content)
+            assert problem(refused, 409)["of"] == "P017", refused.text
+        assert client.post(UPLOAD, content=contents[0]).status_code == 201, "the person's own"
+        assert client.post("/v1/participants/P018/recordings", content=contents[0], params={"of": "P017"}).is_success
+
+
+def test_an_upload_whose_client_leaves_is_given_up(tmp_path: Path, short_dir: Path) -> None:
+    with serving(tmp_path, short_dir, STUB, workers=1) as (service, client):
+        client.post("/v1/participants", json={"code": "P017"})
+        (slow := tmp_path / "recordings" / "parts" / "fitting-slowly").touch()
+        for _ in range(2):  # one is fitted, one waits
+            with pytest.raises(httpx.ReadTimeout):
+                client.post(UPLOAD, content=b"a,b\n", timeout=1.0)
+        pool = service.context.pool
+        soon(lambda: not pool.queue and not pool.workers[0].job)
+        soon(lambda: not list((tmp_path / "recordings").rglob("upload-*")))
+        slow.unlink()
+        assert client.post(UPLOAD, content=b"a,b\n").status_code == 201
+
+
+def test_too_many_uploads_at_once_are_refused_before_they_are_read(
+    shared_client: httpx.Client, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(middleware, "MOST_UPLOADS", 0)
+    refused = shared_client.post(UPLOAD, content=b"a,b\n")
+    assert problem(refused, 503)["type"] == "/problems/crowded" and refused.headers["retry-after"] == "30"
 
 
 def test_no_path_of_this_machine_is_told_of_an_upload(tmp_path: Path, short_dir: Path) -> None:

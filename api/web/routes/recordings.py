@@ -10,9 +10,9 @@ from fastapi import APIRouter, Query, Request, Response
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
-from stimrig.api.errors import ApiError
 from stimrig.api.services import participants, recordings
 from stimrig.api.web.dependencies import PROBLEM, Confirm, Ctx, ModelReader, ParticipantVersion, Tester
+from stimrig.api.web.leaving import while_connected
 from stimrig.api.web.openapi import problem
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.rig import UploadOut
@@ -44,15 +44,15 @@ def recording(context: Ctx, _principal: ModelReader, recording_id: str) -> FileR
 
 
 @router.get("/recordings/{recording_id}/csv", response_class=FileResponse, responses={200: CSV, 410: GONE})
-async def recording_csv(context: Ctx, _principal: ModelReader, recording_id: str) -> FileResponse:
+async def recording_csv(context: Ctx, _principal: ModelReader, recording_id: str, request: Request) -> FileResponse:
     """The recording as CSV, one row a sample: what other tools read, and what can be uploaded again."""
     _row, source = await asyncio.to_thread(recordings.find, context, recording_id)
     name = f"{recording_id}.csv"
     out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
     gone = BackgroundTask(out.unlink, missing_ok=True)
     try:
-        await context.pool.submit("export_csv", data=str(source), out=str(out)).result
-    except ApiError:
+        await while_connected(request, context.analyses.run("export_csv", data=str(source), out=str(out)))
+    except BaseException:
         out.unlink(missing_ok=True)
         raise
     return FileResponse(out, media_type="text/csv", filename=name, background=gone)
@@ -78,14 +78,14 @@ async def upload(
     """Upload a recording of another tool (CSV, MAT, Parquet or HDF5 as the body) and identify a model from it.
 
     `map` says what a column is called there and its unit, once for each column: `map=torque_nm=Drehmoment:Nm`.
-    What was assumed is told in `warnings`. A recording that says that it is another participant's is refused, but with
-    `of`, by who may approve models; the audit trail keeps both codes.
+    What was assumed is told in `warnings`. A recording that says that it is another participant's, or whose samples are
+    stored as one of theirs in any format, is refused, but with `of`, by who may approve models; the audit trail keeps
+    both codes. The work is given up when the client leaves.
     """
     await asyncio.to_thread(participants.find, context, code)
-    data = await request.body()  # `stimrig.api.web.middleware` bounds it
-    if not data:
-        raise ApiError(422, "empty", "The upload is empty", "Send a CSV, MAT, Parquet or HDF5 file as the body.")
-    row, model, warnings = await recordings.take_in(context, code, data, principal, tags, columns, of or confirm)
+    whole = await recordings.spool(context, request.stream(), ".csv" if columns else "")
+    taking = recordings.take_in(context, code, whole, principal, tags, columns, of or confirm)
+    row, model, warnings = await while_connected(request, taking)
     response.headers["Location"] = f"/v1/recordings/{row.id}"
     version = await asyncio.to_thread(context.versions.document, model)
     return {"recording_id": row.id, "model": version, "warnings": warnings}
