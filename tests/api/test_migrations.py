@@ -70,6 +70,8 @@ def test_a_new_database_holds_the_tables_of_today(tmp_path: Path) -> None:
         assert compare_metadata(MigrationContext.configure(connection), Table.metadata) == []
     store.close()
     assert not (tmp_path / migrations.BEFORE).exists()
+    columns = [column for table in Table.metadata.sorted_tables for column in table.columns]
+    assert not [column for column in columns if getattr(column.type, "length", None)], "as SQLite holds none to it"
 
 
 def test_an_upgrade_keeps_the_rows_and_a_copy_of_the_database_as_it_was(database: Path, revisions: Path) -> None:

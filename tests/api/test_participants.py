@@ -9,7 +9,6 @@ import httpx
 import pytest
 from sqlalchemy import event
 
-from stimrig.api.models.stored_model import followed
 from stimrig.api.store.tables import Participant
 from tests.api.conftest import Service, run_test, shared_service, signed_in, soon, wait_done
 
@@ -30,8 +29,14 @@ def archive(http: httpx.Client, code: str, archived: bool = True) -> httpx.Respo
     return http.put(f"/v1/participants/{code}/archived", json={"archived": archived})
 
 
-def test_an_archived_participant_is_left_alone_until_it_is_taken_out(http: httpx.Client) -> None:
-    make(http, "A1")
+def test_an_archived_participant_is_left_alone_until_it_is_taken_out(service: Service, http: httpx.Client) -> None:
+    make(http, "A1", side="left")
+    service.rig.speed = 2.0
+    test = http.post("/v1/tests", json={"participant": "A1"}).json()
+    for refused in (archive(http, "A1"), http.put("/v1/participants/A1/muscle", json={"side": "right"})):
+        assert refused.status_code == 409 and refused.json()["type"] == "/problems/participant-busy", "in a test"
+    service.rig.speed = 60.0
+    assert wait_done(http, test["id"])["side"] == "left"
     assert archive(http, "A1").json()["archived_utc"]
     for path, body in (("/v1/tests", {"participant": "A1"}), ("/v1/participants/A1/calibration", {})):
         refused = http.post(path, json=body)
@@ -45,20 +50,6 @@ def test_an_archived_participant_is_left_alone_until_it_is_taken_out(http: httpx
     assert trail == ["create participant", "archive", "unarchive"]
     seen = {"If-Match": http.get("/v1/participants/A1").headers["etag"]}
     assert http.put("/v1/participants/nobody/archived", json={"archived": True}, headers=seen).status_code == 404
-
-
-def test_nobody_is_archived_in_the_middle_of_a_test(service: Service, http: httpx.Client) -> None:
-    make(http, "A2", side="left")
-    service.rig.speed = 2.0
-    test = http.post("/v1/tests", json={"participant": "A2"}).json()
-    for refused in (
-        archive(http, "A2"),
-        http.put("/v1/participants/A2/muscle", json={"side": "right"}),
-    ):
-        assert refused.status_code == 409 and refused.json()["type"] == "/problems/participant-busy"
-    service.rig.speed = 60.0
-    assert wait_done(http, test["id"])["side"] == "left"
-    assert archive(http, "A2").status_code == 200
 
 
 def test_the_list_is_searched_and_most_recent_first(http: httpx.Client) -> None:
@@ -184,42 +175,18 @@ def test_now_is_where_the_running_test_stands(service: Service, client: httpx.Cl
     assert elapsed_s - 0.01 <= note["at_s"] <= after["summary"]["duration_s"]
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"text": "electrode 2 moved"},
-        {"kind": "other"},
-        {"kind": "other", "text": " "},
-        {"kind": "nonsense"},
-        {"kind": "spasm", "text": "x" * 501},
-        {"kind": "spasm", "text": "x" * 100_000},
-        {"kind": "spasm", "text": "two\nlines"},
-        {"kind": "spasm", "text": "a\u202eb"},
-        {"kind": "spasm", "text": "a\u200bb"},
-        {"kind": "spasm", "text": "a\x00b"},
-        {"kind": "spasm", "text": 3},
-        {"kind": "spasm", "more": 1},
-    ],
-    ids=lambda fields: repr(fields)[:40],
-)
+@pytest.mark.parametrize("fields", [
+    {"text": "electrode 2 moved"}, {"kind": "other"}, {"kind": "other", "text": " "}, {"kind": "nonsense"},
+    {"kind": "spasm", "text": "x" * 100_000}, {"kind": "spasm", "text": "two\nlines"},
+    {"kind": "spasm", "text": "a\u202eb"}, {"kind": "spasm", "text": "a\u200bb"}, {"kind": "spasm", "text": "a\x00b"},
+    {"kind": "spasm", "text": 3}, {"kind": "spasm", "more": 1},
+], ids=lambda fields: repr(fields)[:40])  # fmt: skip
 def test_what_is_no_note_is_refused(made: tuple[httpx.Client, dict[str, Any]], fields: dict[str, Any]) -> None:
     http, _test = made
     before = len(http.get("/v1/participants/N1/notes").json())
     answer = http.post("/v1/participants/N1/notes", json=fields)
     assert answer.status_code == 422 and len(answer.text) < 2000, answer.text[:500]
     assert len(http.get("/v1/participants/N1/notes").json()) == before
-
-
-# ---- A note's kind is chosen; which fit is shown
-
-
-def test_new_pulses_come_first() -> None:
-    both = {"fit_percent": 98.5, "ceiling_percent": 99.0, "held_out_fit_percent": 97.9}
-    assert (followed(both).percent, followed(both).where) == (97.9, "On held-out pulses (not used for fitting)")
-    crossed = {**both, "held_out_by": "cross-validation"}
-    assert followed(crossed).where == "On parts of the recording that were left out in turn"
-    alone = followed({**both, "held_out_fit_percent": None})
-    assert (alone.percent, alone.ceiling_percent, alone.where) == (98.5, 99.0, "On the pulses that it was fitted to")
 
 
 def test_every_page_shows_the_same_fit(service: Service, client: httpx.Client) -> None:
