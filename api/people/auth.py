@@ -315,36 +315,33 @@ def outside(participant: str | None) -> ApiError:
     return ApiError(403, "outside-key", "This key does not open it", detail)
 
 
-FLUSH_S = 15.0
-"""Interval at which times of last actions are stored; a killed process loses at most that much."""
+RECORD_S = 15.0
+"""An action is not written down where the last one was so short a time ago: few pages wait for the disk."""
 
 
 class IdleLock:
     """Locks idle sessions, which then need the password again.
 
     Only a person's actions count, as `stimrig.api.web.guards` tells them from what scripts ask for by themselves, and a
-    live view of a running test. Times of actions are kept in memory and written down now and then, so that no page
-    waits for the disk; a lock holds over a restart.
-
-    `after_min`: a session locks after so many minutes without an action; 0: never by itself.
+    live view of a running test. `after_min`: a session locks after so many minutes without one; 0: never by itself.
     """
 
     def __init__(self, store: Store, clock: Clock, after_min: float) -> None:
         self.store, self.clock, self.after_s = store, clock, after_min * 60
-        self._acted: dict[str, float] = {}
-        self._lock = threading.Lock()
 
     def locked(self, row: PageSession) -> bool:
         """Return whether this session is locked."""
-        if row.locked_unix_s is not None:
-            return True
-        last_s = max(row.acted_unix_s or row.created_unix_s, self._acted.get(row.hash, 0.0))
-        return bool(self.after_s) and self.clock.unix_s() - last_s > self.after_s
+        return row.locked_unix_s is not None or 0 < self.after_s < self._idle_s(row)
 
-    def acted(self, session_hash: str) -> None:
+    def _idle_s(self, row: PageSession) -> float:
+        return self.clock.unix_s() - (row.acted_unix_s or row.created_unix_s)
+
+    def acted(self, row: PageSession) -> None:
         """Record a person's action in a session that is not locked."""
-        with self._lock:
-            self._acted[session_hash] = self.clock.unix_s()
+        if self._idle_s(row) > RECORD_S:
+            with self.store.write() as session:
+                if (now := session.get(PageSession, row.hash)) is not None:
+                    now.acted_unix_s = self.clock.unix_s()
 
     def change(self, session_hash: str, lock: bool, by: str) -> None:
         """Lock a session now, or unlock it, as the person is back."""
@@ -353,15 +350,3 @@ class IdleLock:
             if row is not None:
                 row.locked_unix_s, row.acted_unix_s = now_s if lock else None, now_s
                 audit.write(session, self.clock.utc(), by, "lock" if lock else "unlock", "page")
-
-    def flush(self) -> None:
-        """Write the times of the last actions down."""
-        with self._lock:
-            acted = dict(self._acted)
-        if not acted:
-            return
-        with self.store.write() as session:
-            for row in session.scalars(select(PageSession).where(PageSession.hash.in_(acted))):
-                row.acted_unix_s = max(row.acted_unix_s or 0.0, acted[row.hash])
-        with self._lock:  # what came meanwhile stays for the next time
-            self._acted = {key: at_s for key, at_s in self._acted.items() if acted.get(key) != at_s}

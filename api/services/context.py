@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import functools
-import logging
 import shutil
 import time
 from collections.abc import Callable, Coroutine
 from typing import Any, Concatenate, ParamSpec, TypeVar
-
-from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api import owner_only
 from stimrig.api.clock import Clock, set_zone
@@ -22,7 +18,7 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.people.accounts import People
-from stimrig.api.people.auth import FLUSH_S, Auth, IdleLock
+from stimrig.api.people.auth import Auth, IdleLock
 from stimrig.api.people.pace import Guesses
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.runner import Runner
@@ -32,7 +28,6 @@ from stimrig.api.settings import Settings
 from stimrig.api.store import Store, uploads
 from stimrig.api.store.service_lock import KEEP_S, ServiceLock
 
-log = logging.getLogger("stimrig.api")
 P = ParamSpec("P")
 T = TypeVar("T")
 
@@ -68,10 +63,10 @@ class Context:
         trials = Trials(self.rig, self.tracked, tracker)
         self.runner = Runner(self.analyses, self.rig, self.stops, trials, adviser, self.limits_lock)
         self.jobs = Jobs(self.pool)
-        self._tasks: list[asyncio.Task[None]] = []
+        self._renewing: asyncio.Task[None] | None = None
 
     async def open(self) -> None:
-        """Connect, warm the workers, take up what a restart left open; begin the regular work."""
+        """Connect, warm the workers, take up what a restart left open."""
         await asyncio.to_thread(uploads.settle, self.settings.recordings_dir, self.store)
         self.rig.start()
         self.pool.warm()
@@ -80,30 +75,22 @@ class Context:
                 break
             await asyncio.sleep(0.05)
         await self.runner.resume()
-        regular = ((FLUSH_S, self.auth.idle.flush), (KEEP_S, self.lock.renew))
-        self._tasks = [asyncio.create_task(_repeat(every_s, work)) for every_s, work in regular]
+        self._renewing = asyncio.create_task(self._renew())
+
+    async def _renew(self) -> None:
+        while True:
+            await asyncio.sleep(KEEP_S)
+            await asyncio.to_thread(self.lock.renew)
 
     async def close(self) -> None:
         """Release all resources."""
         for part in (self.runner, self.stops, self.jobs, self.pool, self.rig):
             await part.close()
-        for task in self._tasks:
-            task.cancel()
-        with contextlib.suppress(SQLAlchemyError):
-            await asyncio.to_thread(self.auth.idle.flush)
+        if self._renewing is not None:
+            self._renewing.cancel()
         self.auth.close()
         self.store.close()
         self.lock.release()
-
-
-async def _repeat(every_s: float, work: Callable[[], object]) -> None:
-    """Do the work in a thread, at this interval; an error is logged."""
-    while True:
-        await asyncio.sleep(every_s)
-        try:
-            await asyncio.to_thread(work)
-        except (SQLAlchemyError, OSError):
-            log.exception("regular work failed; it is done again at the next interval")
 
 
 def build(settings: Settings, worker: Callable[..., Worker] = Worker, lock: ServiceLock | None = None) -> Context:

@@ -76,12 +76,12 @@ def require(scope: Scope | None = None, *, even_locked: bool = False) -> Callabl
 async def identified(request: Request) -> Principal:
     """Authenticate a request; a person's own action restarts the idle time of the session."""
     context = request.app.state.context
-    auth, principal = context.auth, await context.auth.authenticate(request, bound=True)
+    principal = await context.auth.authenticate(request, bound=True)
     if principal.participant is not None:
         await asyncio.to_thread(refuse_outside, context.versions, principal, request.method, request.url.path)
     request.state.principal = principal
     if principal.page_session is not None and is_action(request):
-        auth.idle.acted(principal.page_session.hash)
+        await asyncio.to_thread(context.auth.idle.acted, principal.page_session)
     if wants_html(request) or not request.url.path.startswith("/v1/"):
         # before anything of the page is read: what it shows is not older
         request.state.version = await asyncio.to_thread(_page_version, context.store, request)

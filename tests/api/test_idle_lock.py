@@ -179,16 +179,14 @@ def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
             assert locked(http)
 
 
-def test_actions_are_written_down_for_a_restart(service: Service, clock: SetClock) -> None:
+def test_an_action_is_written_down(service: Service, clock: SetClock) -> None:
     context = service.context
-    idle = IdleLock(context.store, clock, 10)
     with signed_in(service) as http:
         row = context.auth.cookie(http.cookies[context.auth.cookie_name]).page_session
         clock.unix += 500
-        idle.acted(row.hash)
-        idle.flush()
+        context.auth.idle.acted(row)
         kept = context.store.get(type(row), row.hash)
         for later_s, expected in ((500, False), (200, True)):
             clock.unix += later_s
-            assert IdleLock(context.store, clock, 10).locked(kept) is expected
+            assert context.auth.idle.locked(kept) is expected
         assert not IdleLock(context.store, clock, 0).locked(kept), "0: never"

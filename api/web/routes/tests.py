@@ -133,7 +133,7 @@ def _admit(socket: WebSocket, context: Context) -> Principal:
     if principal.csrf is not None:
         same_origin(socket)
     if principal.page_session is not None:
-        context.auth.idle.acted(principal.page_session.hash)
+        context.auth.idle.acted(principal.page_session)
     return principal
 
 
