@@ -205,9 +205,10 @@ SAID: dict[str, Any] = {
 
 
 class World:
-    """Clock, rig and adviser in one: the time is that of the newest event. An answer of None never comes."""
+    """Clock, rig and adviser in one: the time is that of the newest event. An answer of None never comes, one that is
+    late after the boundary."""
 
-    path = None
+    path, laid = None, 30
 
     def __init__(self, *answers: Any, refusal: ApiError | None = None) -> None:
         self.now_s, self.answers, self.refusal = 0.0, list(answers), refusal
@@ -234,16 +235,18 @@ class World:
             await asyncio.Event().wait()
         if isinstance(answer, ApiError):
             raise answer
-        while answer.get("late") and not self.requests:
+        while answer.get("late") and self.laid == 30:
             await asyncio.sleep(0)
         return answer
 
     async def events(self, _path: object, test_id: str) -> AsyncGenerator[LiveEvent, None]:
         while self.now_s < FIRST_S:
             self.now_s += 0.02
+            self.laid = 30 if self.now_s < FIRST_S - 0.05 else 50
             yield LiveEvent(
                 test_id=test_id, segment="opening", elapsed_s=self.now_s, duration_s=45.0, zero_s=0.0, torque="",
-                torque_age_s=0.0, lost_samples=0, dropped_pulses=0, laid=30, boundary_s=FIRST_S,
+                torque_age_s=0.0, lost_samples=0, dropped_pulses=0, laid=self.laid,
+                boundary_s=FIRST_S + (self.laid - 30),
                 outcomes=PulseOutcomes(
                     index=[4], pulse_width_us=[0.0], written_time_s=[None], acknowledged_time_s=[None], status=[2]
                 ),
@@ -269,32 +272,26 @@ def followed(world: World, monkeypatch: pytest.MonkeyPatch, rate_hz: float = 40.
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 40.0])
-def test_the_early_answer_is_sent_before_the_rig_decides(monkeypatch: pytest.MonkeyPatch, rate_hz: float) -> None:
+def test_the_answer_is_sent_at_once_and_before_the_rig_decides(monkeypatch: pytest.MonkeyPatch, rate_hz: float) -> None:
     world = World(SAID)
     assert followed(world, monkeypatch, rate_hz).problem == ""
     [(at_s, request)] = world.requests
     assert isinstance(request, ExtendRequest) and request.after == 30
-    decided_s = FIRST_S - m.AHEAD / rate_hz
-    assert decided_s - adaptive_follower.SEND_S - 0.03 < at_s < decided_s
+    assert at_s == pytest.approx(FIRST_S - m.AHEAD / rate_hz - adaptive_follower.ASK_S, abs=0.03)
 
 
-def test_the_newest_answer_is_sent_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    world = World(SAID, {**SAID, "segments": [{**NEXT, "name": "ramp 2"}]})
-    followed(world, monkeypatch)
-    [(at_s, request)] = world.requests
-    assert request.segments[0].name == "ramp 2"
-    assert at_s == pytest.approx(FIRST_S - m.AHEAD / 40.0 - adaptive_follower.LATE_S, abs=0.03)
+def test_an_answer_for_a_boundary_that_has_passed_is_noted_and_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+    world = World({**SAID, "late": True})
+    status = followed(world, monkeypatch)
+    assert [row["late"] for row in status.decisions] == [True] and world.requests == []
 
 
 def test_the_end_is_told_with_what_it_was_decided_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A later answer that knows less, and would go on, comes when the test is being ended."""
-    known, less = ({"curve_percent": percent, "step_percent": 1.0} for percent in (1.5, 2.5))
-    enough = {**SAID, "kind": "enough", "segments": [], "knowledge": known}
-    world = World(enough, {**SAID, "knowledge": less, "late": True})
+    known = {"curve_percent": 1.5, "step_percent": 1.0}
+    world = World({**SAID, "kind": "enough", "segments": [], "knowledge": known})
     status = followed(world, monkeypatch)
-    assert len(world.asked) == 2 and [type(request) for _, request in world.requests] == [EnoughRequest]
-    assert (status.ended, status.knowledge) == ("known-enough", known)
-    assert [row["late"] for row in status.decisions] == [False, True]
+    assert [type(request) for _, request in world.requests] == [EnoughRequest]
+    assert (status.ended, status.knowledge, len(world.asked)) == ("known-enough", known, 1)
 
 
 def test_the_adviser_is_told_what_became_of_all_pulses(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -310,7 +307,7 @@ def test_no_question_is_asked_before_the_record_is_long_enough(
     monkeypatch: pytest.MonkeyPatch, rate_hz: float, least_s: float
 ) -> None:
     """Of slow pulses the last whole one may have begun long ago; the answer would be the first look once more."""
-    monkeypatch.setattr(adaptive_follower, "EARLY_S", 2.0)
+    monkeypatch.setattr(adaptive_follower, "ASK_S", 2.0)
     world = World(SAID)
     followed(world, monkeypatch, rate_hz)
     assert world.asked[0]["measured_s"] == pytest.approx(least_s, abs=0.03)
