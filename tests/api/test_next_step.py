@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import html
 import re
 from typing import Any
@@ -13,12 +12,12 @@ import pytest
 from stimrig.api.sessions import controllers
 from stimrig.api.store.tables import Model, Test
 from stimrig.api.web.pages import next_view
-from stimrig.api.web.pages.next_view import Situation, Today, next_step
+from stimrig.api.web.pages.next_view import Situation, next_step
 from tests.api.conftest import Service, run_test, signed_in, wait_done
 
-READY, DONE, POOR = Today("M1", "usable"), Today("M1", "usable", decided=True), Today("M1", "not usable")
+READY, POOR, REJECTED = {"undecided": "M1"}, {"last_model": "poor"}, {"last_model": "rejected"}
 RUNS = {"test": "T1", "state": "running", "rig": "running", "holder": "P1"}
-SERVED = {"model": DONE, "served_until": "23:59"}
+SERVED = {"served_until": "23:59"}
 TRIAL = {**SERVED, "of": "trial"}
 TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     # what is so; then: kind, a part of the words, where the button leads ("form": it is a form's own; "": no button)
@@ -30,7 +29,7 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({"rig": "calibrating", "holder": "P2"}, "wait", "in use for P2", ""),
     # a test under way, whatever else there is
     (RUNS, "running", "The test is running", "/tests/T1"),
-    ({**RUNS, "model": READY}, "running", "The test is running", "/tests/T1"),
+    ({**RUNS, **READY}, "running", "The test is running", "/tests/T1"),
     ({**RUNS, "rig": "stopping"}, "running", "is being stopped", "/tests/T1"),
     ({**RUNS, "rig": "unreachable"}, "running", "last heard of", "/tests/T1"),
     ({**RUNS, "rig": "silent"}, "running", "last heard of", "/tests/T1"),
@@ -42,12 +41,11 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({"rig": "running", "holder": "P2"}, "wait", "in use for P2", ""),
     ({"rig": "running"}, "wait", "is in use. Wait", ""),
     # a model waits for a decision
-    ({"model": READY}, "look", "The model is ready. Look at it, then approve or reject", "/models/M1"),
-    ({"model": READY, "rig": "latched"}, "look", "then approve or reject", "/models/M1"),
-    ({"model": READY, "state": "stopped"}, "look", "was stopped. The model is ready", "/models/M1"),
-    ({"model": READY, "served_until": "23:59"}, "look", "then approve or reject", "/models/M1"),
-    ({"model": READY, "of": "joint", "state": "completed"}, "look", "The model is ready.", "/models/M1"),
-    ({"model": dataclasses.replace(READY, verdict="usable with care")}, "look", "Look at it", "/models/M1"),
+    (READY, "look", "The model is ready. Look at it, then approve or reject", "/models/M1"),
+    ({**READY, "rig": "latched"}, "look", "then approve or reject", "/models/M1"),
+    ({**READY, "state": "stopped"}, "look", "was stopped. The model is ready", "/models/M1"),
+    ({**READY, "served_until": "23:59"}, "look", "then approve or reject", "/models/M1"),
+    ({**READY, "of": "joint", "state": "completed"}, "look", "The model is ready.", "/models/M1"),
     # the controller has one
     (SERVED, "done", "Done. The controller has today's model until 23:59", "/"),
     ({**SERVED, "lacks_key": "mine"}, "done", "Today's model is approved until 23:59, but no controller has a key",
@@ -58,7 +56,7 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({**SERVED, "rig": "latched"}, "rearm", "until 23:59. The rig has stopped and needs a re-arm", ""),
     ({**SERVED, "rig": "silent"}, "wait", "until 23:59. The rig does not answer", ""),
     ({**SERVED, "rig": "disconnected"}, "wait", "until 23:59. A device is not connected", ""),
-    ({**SERVED, "model": POOR}, "done", "until 23:59", "/"),
+    ({**SERVED, **POOR}, "done", "until 23:59", "/"),
     ({**SERVED, "state": "stopped"}, "done", "The last test was stopped. The controller has", "/"),
     ({**TRIAL, "state": "completed"}, "done", "Done. The controller has", "/"),
     ({**TRIAL, "state": "stopped"}, "done", "The last trial was stopped. The controller has", "/"),
@@ -69,15 +67,14 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({**SERVED, "needs_test": True, "rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({**SERVED, "of": "joint", "state": "completed"}, "joint", "Go on with", "/participants/P1/joint"),
     # nothing to serve
-    ({"model": DONE, "needs_test": True}, "test", "Start the pre-session test", "form"),
-    ({"model": DONE}, "test", "Start the pre-session test", "form"),
+    ({"needs_test": True}, "test", "Start the pre-session test", "form"),
     ({"of": "trial", "state": "stopped"}, "test", "trial was stopped. Calibrated. Start", "form"),
     ({"of": "joint", "state": "completed"}, "joint", "Go on with the tests of the joint", "/participants/P1/joint"),
     ({"of": "joint", "state": "stopped"}, "joint", "was stopped. Go on with", "/participants/P1/joint"),
     ({"of": "joint", "state": "stopped", "calibration": "none"}, "calibrate", "was stopped. Calibrate", "form"),
-    ({"model": POOR}, "again", "is not usable. Test again", "form"),
-    ({"model": POOR, "calibration": "expired"}, "calibrate", "not usable. The last", "form"),
-    ({"rejected": True}, "again", "was rejected. Test again", "form"),
+    (POOR, "again", "is not usable. Test again", "form"),
+    ({**POOR, "calibration": "expired"}, "calibrate", "not usable. The last", "form"),
+    (REJECTED, "again", "was rejected. Test again", "form"),
     ({"state": "stopped"}, "again", "was stopped. Test again", "form"),
     ({"state": "stopped", "rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({"state": "fault"}, "again", "ended by a fault", "form"),
@@ -88,7 +85,7 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({"rig": "uncertain"}, "rearm", "needs a re-arm", ""),
     ({"archived_since": "today"}, "archived", "In the archive since today", "form"),
     ({"archived_since": "today", "rig": "latched"}, "archived", "no test starts", "form"),
-    ({"archived_since": "today", "model": READY}, "archived", "no test starts", "form"),
+    ({"archived_since": "today", **READY}, "archived", "no test starts", "form"),
     ({"archived_since": "today", **RUNS}, "running", "is running", "/tests/T1"),
     ({"rig": "disconnected"}, "wait", "not connected", ""),
     ({"rig": "unreachable"}, "wait", "does not answer", ""),
