@@ -7,7 +7,6 @@ stays beside them as the technical term.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from stimrig.api.models.stored_model import followed
@@ -25,8 +24,7 @@ class Gate(NamedTuple):
     test: str = "the limb held still and relaxed"  # test again with, for a model that is not usable
 
 
-@dataclass(frozen=True)
-class Finding:
+class Finding(NamedTuple):
     """A failed check in a clinician's words and in those of `identify`."""
 
     gate: str
@@ -36,8 +34,7 @@ class Finding:
     severe: bool
 
 
-@dataclass(frozen=True)
-class Advice:
+class Advice(NamedTuple):
     """The sentence at the top of a model's page, and its button."""
 
     act: Act
@@ -120,34 +117,28 @@ GATES: dict[str, Gate] = {
 }
 """Each check of `stimrig.identify.estimation.quality`, and `stored_model.without_evidence`, which never refuses."""
 
-USABLE_ADVICE: dict[str, str] = {
-    "unsure": "Usable: approve it. Whether something is missing, this recording cannot tell.",
-    "unexplained": "Usable: approve it. Some error is left that is not explained.",
-    "missing": "Usable: approve it. An effect is possibly missing.",
+STILL_USABLE = {
+    "unsure": " Whether something is missing, this recording cannot tell.",
+    "unexplained": " Some error is left that is not explained.",
+    "missing": " An effect is possibly missing.",
 }
-"""Advice on a usable model by the kind of its diagnosis, where that names no likely effect."""
+"""What is said of a usable model by the kind of its diagnosis, where that names no likely effect."""
 
 
 def findings(document: dict[str, Any]) -> list[Finding]:
     """List the failed checks, those that make a model not usable first; empty for models without stored checks."""
     gates = (document.get("quality") or {}).get("gates", {})
-    failed = [(name, gate) for name, gate in gates.items() if not gate["passed"]]
-    failed.sort(key=lambda pair: (pair[1]["severity"] != "refuse", pair[0] != "evidence"))
-    return [
+    failed = [
         Finding(name, GATES[name].problem, GATES[name].risk, gate["says"], gate["severity"] == "refuse")
-        for name, gate in failed
-    ]
+        for name, gate in gates.items() if not gate["passed"]
+    ]  # fmt: skip
+    return sorted(failed, key=lambda finding: (not finding.severe, finding.gate != "evidence"))
 
 
 def advice(
-    verdict: str,
-    failed: Sequence[Finding],
-    missing: Sequence[str],
-    kind: str | None = "nothing",
-    *,
-    diagnosing: bool = False,
-    experiment: bool = False,
-) -> Advice:
+    verdict: str, failed: Sequence[Finding], missing: Sequence[str], kind: str | None = "nothing", *,
+    diagnosing: bool = False, experiment: bool = False,
+) -> Advice:  # fmt: skip
     """Say what to do with a model, from its verdict and its diagnosis.
 
     Parameters
@@ -168,27 +159,27 @@ def advice(
     effects = " and ".join(f"“{name}”" for name in missing)
     add: Act = "add" if len(missing) == 1 else "improve"
     worst = GATES[failed[0].gate] if failed else None
-    if diagnosing and verdict in ("usable", "usable with care"):
-        return Advice("wait", "Wait: what is missing in the model is still being looked for.")
-    if verdict == "usable":
-        if missing:
-            return Advice(add, f"Usable, and better with {effects}: add that first.")
-        return Advice("approve", USABLE_ADVICE.get(kind or "", "Usable: approve it."))
-    if verdict == "usable with care":
-        if missing:
-            return Advice(add, f"Usable with care: add {effects} first.")
-        words = f"Usable with care: {worst.inspect if worst else 'look at where the error sits first'}."
-        if kind in ("nothing", "unsure") and not (failed and failed[0].gate == "evidence"):
-            return Advice("approve", words)
-        if experiment:
-            return Advice("experiment", "Usable with care: play the next experiment first.")
-        return Advice("look", words)
     if verdict == "not usable":
         if missing and all(finding.gate in ("gap", "ceiling") for finding in failed if finding.severe):
             return Advice(add, f"Not usable as it is: add {effects}, or test again.")
         condition = worst.test if worst else "electrodes, fixture and load cell checked"
         return Advice("test", f"Not usable: test again with {condition}.")
-    return Advice("fit", "There is no verdict on this model: test again, or fit the recording again.")
+    if verdict not in ("usable", "usable with care"):
+        return Advice("fit", "There is no verdict on this model: test again, or fit the recording again.")
+    if diagnosing:
+        return Advice("wait", "Wait: what is missing in the model is still being looked for.")
+    if verdict == "usable":
+        if missing:
+            return Advice(add, f"Usable, and better with {effects}: add that first.")
+        return Advice("approve", f"Usable: approve it.{STILL_USABLE.get(kind or '', '')}")
+    if missing:
+        return Advice(add, f"Usable with care: add {effects} first.")
+    words = f"Usable with care: {worst.inspect if worst else 'look at where the error sits first'}."
+    if kind in ("nothing", "unsure") and not (failed and failed[0].gate == "evidence"):
+        return Advice("approve", words)
+    if experiment:
+        return Advice("experiment", "Usable with care: play the next experiment first.")
+    return Advice("look", words)
 
 
 def risks(document: dict[str, Any], failed: Sequence[Finding]) -> list[str]:
@@ -210,7 +201,6 @@ def fit_sentence(fit: dict[str, Any]) -> str:
         return ""
     if figure.percent <= 0.0:
         return f"{figure.where} the model does not follow the torque at all."
-    reached = f"{figure.where} the fit is {figure.percent:.1f} %"
-    if figure.ceiling_percent is None:
-        return f"{reached}."
-    return f"{reached}; the noise allows about {figure.ceiling_percent:.1f} %."
+    ceiling = figure.ceiling_percent
+    allowed = "" if ceiling is None else f"; the noise allows about {ceiling:.1f} %"
+    return f"{figure.where} the fit is {figure.percent:.1f} %{allowed}."
