@@ -8,7 +8,7 @@ from typing import Any
 
 from stimrig.rig.messages import LABEL_TITLES
 
-WORDS: dict[str, dict[str | None, str]] = {
+WORDS: dict[str, dict[str, str]] = {
     "segment": {
         "rest": "Rest",
         "prbs": "Random pulses",
@@ -22,12 +22,6 @@ WORDS: dict[str, dict[str | None, str]] = {
         "widths": "Levels held at random",
         "levels": "Levels held at random",
     },
-    "verdict": {
-        "usable": "usable",
-        "usable with care": "usable with care",
-        "not usable": "not usable",
-        "unknown": "unknown",
-    },
     "kind": {
         "pre-session": "pre-session test",
         "next-experiment": "next experiment",
@@ -36,15 +30,6 @@ WORDS: dict[str, dict[str | None, str]] = {
         "passive": "passive movement",
         "held": "held-angle test",
         "moving": "movement under stimulation",
-    },
-    "title": {
-        "pre-session": "Pre-session test",
-        "next-experiment": "Pre-session test",
-        "sequence": "Pre-session test",
-        "adaptive": "Test that stops itself",
-        "passive": "Passive movement",
-        "held": "Held angle",
-        "moving": "Movement under stimulation",
     },
     "end": {
         "known-enough": "Enough is known",
@@ -69,13 +54,12 @@ WORDS: dict[str, dict[str | None, str]] = {
         "failed": "no model",
         "refused": "not started",
     },
-    "decision": {"approved": "approved", "rejected": "rejected", None: "not decided yet"},
 }
 
 
-def words(name: str | None, kind: str) -> str:
+def words(name: str, kind: str) -> str:
     """Return the word for a name of a kind of `WORDS`; an unknown name as it is."""
-    return str(WORDS[kind].get(name, name))
+    return WORDS[kind].get(name, name)
 
 
 def segment_words(name: str | None) -> str:
@@ -92,19 +76,13 @@ def label_rows(test: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 def missing_words(missing: Sequence[Mapping[str, Any]] | None) -> list[str]:
     """Say what is still to be done with the joint, a sentence for each range of angles."""
-    return [_range_words(each) for each in missing or ()]
-
-
-def _range_words(each: Mapping[str, Any]) -> str:
-    low, high = (degrees(each[name]) for name in ("from_rad", "to_rad"))
-    bends, slow = each["direction"] == "flexion", each["speed"] == "slow"
-    if bends and slow:
-        return f"Bend slowly from {low} to {high}."
-    if bends:
-        return f"Bend faster from {low} to {high}."
-    if slow:
-        return f"Straighten slowly from {high} to {low}."
-    return f"Straighten faster from {high} to {low}."
+    sentences = []
+    for each in missing or ():
+        low, high = (degrees(each[name]) for name in ("from_rad", "to_rad"))
+        how = "slowly" if each["speed"] == "slow" else "faster"
+        bends = each["direction"] == "flexion"
+        sentences.append(f"Bend {how} from {low} to {high}." if bends else f"Straighten {how} from {high} to {low}.")
+    return sentences
 
 
 def degrees(angle_rad: float | None) -> str:
