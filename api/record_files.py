@@ -1,4 +1,4 @@
-"""Recordings as files: several read as the parts of one record, joined, written as CSV, found again.
+"""Recordings as files: several read as one record, written as CSV, found again.
 
 Imported by the worker and the command line only.
 """
@@ -14,7 +14,6 @@ from typing import Any
 from stimrig import identify
 from stimrig.api.whole_file import sha256_of
 from stimrig.identify.records import HDF5_MAGIC
-from stimrig.identify.records.cells import quoted
 from stimrig.identify.records.join import join, write_joined
 
 Progress = Callable[[float, str], None]
@@ -46,51 +45,27 @@ def read(
     BadRecord
         A file cannot be read or lacks a column, or they do not go together: names the file.
     """
-    called = name or (lambda number: str(paths[number]))
+    called = [name(number) if name else str(path) for number, path in enumerate(paths)]
     records = [identify.read(path, map=columns) for path in paths]
     report = note or (lambda _words: None)
-    for number, record in enumerate(records):
+    for record, place in zip(records, called, strict=True):
         for words in record.notes:
-            report(f"{called(number)}: {words}")
-    check_columns(records, needs, called)
+            report(f"{place}: {words}")
+        if lacking := [column for column in needs if getattr(record, column) is None]:
+            message = f"it has no {', '.join(lacking)}, which an effect of the model needs"
+            fix = "Leave it out, or record it anew on a rig with an angle sensor."
+            raise identify.BadRecord(message, place=place, fix=fix)
     if len(records) == 1:
         return records[0]
-    for words in _dropped(records, called):
-        report(words)
+    for column in JOINT:
+        lacking = [place for record, place in zip(records, called, strict=True) if getattr(record, column) is None]
+        if 0 < len(lacking) < len(records):
+            report(f"{', '.join(lacking)}: no {column}, so it is left out of the joined record")
     try:
         return join(records, [begun(path) for path in paths])
     except identify.BadRecord as error:
-        raise _name_file(error, len(records), called) from error
-
-
-def _name_file(error: Any, count: int, called: Callable[[int], str]) -> Any:
-    """The same error, the file called by its name and not by its number."""
-    numbers = {f"recording {number + 1}": number for number in range(count)}
-    if error.place not in numbers:
-        return error
-    return identify.BadRecord(error.message, place=called(numbers[error.place]), fix=error.fix)
-
-
-def check_columns(records: Sequence[Any], needs: Sequence[str], called: Callable[[int], str]) -> None:
-    """Refuse a record that lacks a column which the model needs. Raises BadRecord, which names the record."""
-    for number, record in enumerate(records):
-        lacking = [column for column in needs if getattr(record, column) is None]
-        if lacking:
-            raise identify.BadRecord(
-                f"it has no {', '.join(lacking)}, which an effect of the model needs",
-                place=called(number),
-                fix="Leave it out, or record it anew on a rig with an angle sensor.",
-            )
-
-
-def _dropped(records: Sequence[Any], called: Callable[[int], str]) -> list[str]:
-    """List the columns that are dropped since some of the parts lack them."""
-    messages = []
-    for column in JOINT:
-        lacking = [called(number) for number, record in enumerate(records) if getattr(record, column) is None]
-        if 0 < len(lacking) < len(records):
-            messages.append(f"{', '.join(lacking)}: no {column}, so it is left out of the joined record")
-    return messages
+        numbers = {f"recording {number}": place for number, place in enumerate(called, start=1)}
+        raise identify.BadRecord(error.message, place=numbers.get(error.place, error.place), fix=error.fix) from error
 
 
 def begun(path: Path) -> float | None:
@@ -117,47 +92,17 @@ def joined(parts: Sequence[str], out: str, progress: Progress, needs: Sequence[s
     return {"file_sha256": sha256_of(Path(out))}
 
 
-def plain_csv(data: str, progress: Progress, out: str, columns: list[str]) -> dict[str, Any]:
-    """A table or MAT file of another tool as a CSV file in our own layout, by what `--map` says of its columns."""
+def plain_csv(data: str, progress: Progress, out: str, columns: Sequence[str] = ()) -> dict[str, Any]:
+    """A recording, or a table of another tool by what `--map` says of its columns, as CSV in our own layout."""
     progress(0.1, "reading the recording")
-    record = identify.read(Path(data), map=columns)
+    record = identify.read(Path(data), map=list(columns) or None)
     progress(0.7, "writing")
     write_joined(record, Path(out))
     return {"notes": list(record.notes), "of": record.source.participant}
 
 
-def export_csv(data: str, progress: Progress, out: str) -> dict[str, Any]:
-    """A recording as a CSV file in the layout that `identify.read` takes in (docs/recording.md's times and widths)."""
-    progress(0.1, "reading the recording")
-    record = identify.read(Path(data))
-    if len(record.parts) > 1:
-        progress(0.7, "writing")
-        write_joined(record, Path(out))
-        return {"rows": int(record.time_s.size)}
-    if abs(record.pulse_rate_hz - 40.0) > 1e-6:
-        message = f"{record.pulse_rate_hz:g} pulses/s; a CSV file would be read as 40"
-        raise identify.BadRecord(message, fix="Take the HDF5 file.")
-    progress(0.7, "writing")
-    columns = {"pulse_width_us": record.pulse_width_us, "torque_nm": record.torque_nm}
-    return write_table(record, columns, Path(out))
-
-
-def write_table(record: Any, columns: dict[str, Any], out: Path) -> dict[str, Any]:
-    """Write times, these columns, the segments' names and the record's further columns; how many rows."""
-    also = record.columns()
-    quoted_names = [quoted(name) for name in record.segment_names]
-    segments = [quoted_names[index] for index in record.segment.tolist()]
-    values = [column.tolist() for column in (record.time_s, *columns.values(), *also.values())]
-    with out.open("w", encoding="utf-8", newline="") as file:
-        file.write(",".join(["time_s", *columns, "segment", *also]) + "\n")
-        for seconds, *row, segment in zip(*values, segments, strict=True):
-            cells = [f"{value:.8g}" for value in row]
-            file.write(",".join([f"{seconds:.6f}", *cells[: len(columns)], segment, *cells[len(columns) :]]) + "\n")
-    return {"rows": len(segments)}
-
-
 def samples_sha256(record: Any) -> str:
-    """Return a digest of the torque with the digits of `export_csv`: the same for each file of the same samples."""
+    """Return a digest of the torque with eight digits: the same for each file of the same samples."""
     return hashlib.sha256("\n".join(f"{value:.8g}" for value in record.torque_nm.tolist()).encode()).hexdigest()
 
 

@@ -8,23 +8,34 @@ import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
-from typing import IO
 
 
 @contextlib.contextmanager
-def whole_file(path: Path) -> Iterator[IO[bytes]]:
-    """Write a file beside its place and rename it once it is on the disk: a reader has the earlier one or this one."""
-    part = path.with_name(f".{path.name}.new")
+def whole_path(path: Path) -> Iterator[Path]:
+    """A place to write a file at: what is written takes the file's place once all of it is on the disk, or not at all.
+
+    A pipe, a device and the like are written directly. Raises OSError, with this file's name.
+    """
+    target = Path(os.path.realpath(path))
+    if target.exists() and not target.is_file():
+        yield target
+        return
+    aside = target.with_name(f".{target.name}.new{target.suffix}")
     try:
-        with part.open("wb") as file:
-            yield file
-            file.flush()
-            os.fsync(file.fileno())
-        part.replace(path)
+        yield aside
+        to_disk(aside)
+        if target.exists():
+            shutil.copymode(target, aside)
+        aside.replace(target)
+    except OSError as error:
+        if error.filename in (None, aside, str(aside)):
+            error.filename = str(path)
+        raise
     finally:
-        part.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            aside.unlink(missing_ok=True)
     with contextlib.suppress(OSError):  # not every file system can sync a directory
-        to_disk(path.parent)
+        to_disk(target.parent)
 
 
 def to_disk(path: Path) -> None:
@@ -34,26 +45,6 @@ def to_disk(path: Path) -> None:
         os.fsync(opened)
     finally:
         os.close(opened)
-
-
-@contextlib.contextmanager
-def whole_path(path: Path) -> Iterator[Path]:
-    """A place to write a file at: what is written takes the file's place once all of it is there, or not at all.
-
-    A pipe, a device and the like are written directly. Raises OSError.
-    """
-    target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():
-        yield target
-        return
-    aside = target.with_name(f".{target.name}.new{target.suffix}")
-    try:
-        yield aside
-        if target.exists():
-            shutil.copymode(target, aside)
-        aside.replace(target)
-    finally:
-        aside.unlink(missing_ok=True)
 
 
 def sha256_of(path: Path) -> str:

@@ -225,15 +225,18 @@ class Model(Summarised):
         named = ", ".join(str(effect["id"]) for effect in self.effects) or "no effects"
         width_us, torque_nm = self.recruitment.table()
         top_us = float(width_us[np.argmax(np.abs(torque_nm))])
-        plateau = self.figures()["plateau_nm"]
-        largest = estimate(plateau["value"], plateau["sd"], "N·m")
+        marks = self.figures()
+        low, largest, high = (
+            estimate(marks[name]["value"], marks[name]["sd"], marks[name]["unit"])
+            for name in ("threshold_us", "plateau_nm", "saturation_us")
+        )
         rows = [
             ("fit", fit_words(fit)),
             (held_out_label(fit), fit_words(fit, "held_out_")),
             ("noise", f"{quantity(self.noise.white_sd_nm, 'N·m')} white, sd of a sample"),
             ("repetition", repetition_words(fit)),
             ("dynamics", self._dynamics()),
-            ("recruitment", f"largest {largest}, at {quantity(top_us, 'µs')}"),
+            ("recruitment", f"largest {largest}, at {quantity(top_us, 'µs')}; 5 % of it at {low}, 95 % at {high}"),
             ("baseline", estimate(self.baseline_nm, self._sd("baseline_nm"), "N·m")),
             *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in self.effects],
         ]
@@ -241,8 +244,9 @@ class Model(Summarised):
             widths, rates = _span(known["pulse_width_us"], "µs"), _span(known["pulse_rate_hz"], "pulses/s")
             rows.append(("valid for", f"{widths}, {rates}"))
         if self.quality:
-            first = self.quality.get("reasons", [])[:1]
-            rows.append(("quality", ": ".join([str(self.quality.get("verdict", "")), *first])))
+            reasons = [f"{self.quality.get('verdict', '')}: {self.quality.get('words', '')}"]
+            reasons += self.quality.get("reasons", [])[1:]
+            rows += [("quality", reasons[0]), *(("", reason) for reason in reasons[1:])]
         rows.append(("made", f"{self.created} from {self.data.get('name') or 'a record without a name'}"))
         unseen = f"{held_out_label(fit)} {quantity(fit.get('held_out_fit_percent'), '%')}"
         figures = f"fit {quantity(fit.get('fit_percent'), '%')}, {unseen}"

@@ -299,6 +299,7 @@ def _read_row(row: Row) -> str:
         f"{torque(row, 'held_out_rms_after_nm')}"
     )
     for name, entry in list(row["parameters"].items())[:MOST_PARAMETERS]:
-        text += f"; {name} {estimate(entry['value'], entry['sd'], entry['unit'])}"
+        direction = f" {entry['direction']}" if entry.get("direction") else ""
+        text += f"; {name} {estimate(entry['value'], entry['sd'], entry['unit'])}{direction}"
     others = ", ".join(row["confused_with"])
     return f"{text}; this record cannot separate it from {others}" if others else text

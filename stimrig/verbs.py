@@ -126,9 +126,10 @@ def export(
     Report
         How many were written, and where.
     """
-    from stimrig.api.cli.commands.export import exported
+    from stimrig.api.export.folder import export_records
 
-    return Report("export", exported([str(place) for place in data], Path(output), format, select, no_dates, list(map)))
+    places = [str(place) for place in data]
+    return Report("export", export_records(places, Path(output), format, select, list(map), dates=not no_dates))
 
 
 def recover(journal: str | Path, folder: str | Path | None = None) -> Report:

@@ -15,7 +15,6 @@ from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.structure import held_by
 from stimrig.identify.records.join import LEAST_SAMPLES, samples_between
-from stimrig.identify.records.record import Source
 
 
 def plan_experiment(data: Sequence[Path], participant: str | None) -> dict[str, Any]:
@@ -29,8 +28,17 @@ def plan_experiment(data: Sequence[Path], participant: str | None) -> dict[str, 
     """
     record = load_record(data)
     sources = record.source.parts or (record.source,)
-    owner = _owner(sources, data, participant)
-    currents_ma = sorted({source.current_ma for source in sources if source.current_ma is not None})
+    files = data if len(sources) == len(data) else [data[0]] * len(sources)  # a joined file has several sources
+    for file, source in zip(files, sources, strict=True):
+        if not (source.participant or participant):
+            raise InputError(f"{file} does not say whose it is. Give --participant.")
+        if source.current_ma is None:  # a table that others wrote, or that was joined
+            fix = "Give the rig's own recordings (HDF5), each by itself."
+            raise InputError(f"{file} does not say with what current it was made. {fix}")
+    owners = sorted({source.participant for source in sources} - {""} | ({participant} if participant else set()))
+    currents_ma = sorted({source.current_ma for source in sources})
+    if len(owners) > 1:
+        raise InputError(f"these recordings, or they and --participant, are of several people: {', '.join(owners)}.")
     if len(currents_ma) > 1:
         made_with = " and ".join(f"{current:g} mA" for current in currents_ma)
         raise InputError(f"these recordings were made with {made_with}. Give those of one current.")
@@ -39,16 +47,13 @@ def plan_experiment(data: Sequence[Path], participant: str | None) -> dict[str, 
         raise InputError(
             f"{data[0]}: sampled at {record.sample_rate_hz:.4g} Hz; a further one is joined from {lowest_rate} on."
         )
-    if any(source.current_ma is None for source in sources):  # a table that others wrote, or that was joined
-        fix = "Give the rig's own recordings (HDF5), each by itself."
-        raise InputError(f"{data[0]} does not say with what current it was made. {fix}")
     with progress_bar() as progress:
         explained = identify.explain(record, progress)
     experiment = identify.next_experiment(explained.diagnosis) or identify.next_experiment(explained.left)
     if experiment is None:
         raise InputError(f"{data[0]}: no experiment is asked for: nothing is left to decide. Leave out --decide.")
     return {
-        "participant": owner,
+        "participant": owners[0],
         "kind": "next-experiment",
         "segments": [dict(segment) for segment in experiment.segments],
         "pulse_rate_hz": record.pulse_rate_hz,
@@ -56,22 +61,7 @@ def plan_experiment(data: Sequence[Path], participant: str | None) -> dict[str, 
     }
 
 
-def _owner(sources: Sequence[Source], data: Sequence[Path], participant: str | None) -> str:
-    owners = {source.participant for source in sources} - {""}
-    if len(owners) > 1:
-        raise InputError(f"these recordings are of several people: {', '.join(sorted(owners))}.")
-    if participant is None and not all(source.participant for source in sources):
-        silent = [file for file, source in zip(data, sources, strict=False) if not source.participant]
-        which = silent[0] if len(sources) == len(data) else data[0]  # a joined file has several
-        raise InputError(f"{which} does not say whose it is. Give --participant.")
-    owner = next(iter(owners), participant)
-    assert owner is not None
-    if participant not in (None, owner):
-        raise InputError(f"{data[0]} is a recording of {owner}; --participant is {participant}.")
-    return owner
-
-
-def check_participant(client: Client, code: str, recorded_ma: float | None) -> None:
+def check_participant(client: Client, code: str, recorded_ma: float) -> None:
     """Check, before anything is played, that the participant is known and has the recordings' current.
 
     Raises InputError: somebody who has recordings would be made anew, with default limits; or the current is another
@@ -82,18 +72,20 @@ def check_participant(client: Client, code: str, recorded_ma: float | None) -> N
     except NotFound as error:
         fix = "their limits are not known here. Give the --data folder or --url of the recording, or set them first."
         raise InputError(f"there is no participant {code}: {fix}") from error
-    if recorded_ma not in (None, now_ma):
+    if recorded_ma != now_ma:
         now = f"{code} is now stimulated with {now_ma:g} mA"
         raise InputError(f"the recording was made with {recorded_ma:g} mA, {now}: they cannot be joined.")
 
 
-def diagnose_together(data: Sequence[Path], recording: bytes) -> dict[str, Any]:
-    """Diagnose the recordings and a new one together; `remaining` is what is missing once that is added."""
+def diagnose_together(data: Sequence[Path], recording: bytes) -> tuple[identify.Explanation, dict[str, Any]]:
+    """Explain the recordings and a new one together; and return its keys of `--json`.
+
+    `left` is what is missing once all that the diagnosis names is added.
+    """
     with tempfile.TemporaryDirectory() as folder, progress_bar() as progress:
         new = Path(folder) / "recording.h5"
         new.write_bytes(recording)
         record = load_record([*data, new])
         explained = identify.explain(record, progress)
-    structure = held_by(explained.improvement.models[-1], record)
-    remaining = {"structure": structure, **explained.left.to_dict()}
-    return {"structure": [], **explained.diagnosis.to_dict(), "left": remaining}
+    left = {"structure": held_by(explained.improvement.models[-1], record), **explained.left.to_dict()}
+    return explained, {"structure": [], **explained.diagnosis.to_dict(), "left": left}

@@ -5,11 +5,6 @@ from __future__ import annotations
 import os
 
 INTERRUPTED = 130
-PAGE = frozenset({
-    "alembic", "argon2", "can", "cantools", "fastapi", "fastapi_offline",
-    "multipart", "prometheus_client", "pydantic_settings", "serial", "sqlalchemy", "starlette", "uvicorn",
-})  # fmt: skip
-"""Modules that the extra `page` brings: identification works without them."""
 
 
 def exit_interrupted(*_: object) -> None:

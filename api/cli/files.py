@@ -1,10 +1,10 @@
-"""Read what verbs are given; write what they make with -o and --html, and programs with `stimrig.save`."""
+"""Read the files that verbs are given; write what they make with -o and --html, and programs with `stimrig.save`."""
 
 from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,38 +16,26 @@ from stimrig.api.whole_file import whole_path
 LARGEST_MODEL_BYTES = 32 * 2**20
 
 
-def load_model(path: Path, usage: str = "") -> Any:
-    """Read a model; `usage`: of a verb that takes it before a recording.
-
-    Raises InputError: the file cannot be read, or holds no model.
-    """
+def load_model(path: Path) -> identify.Model:
+    """Read a model. Raises OSError; InputError: the file holds no model."""
     if path.suffix.lower() == ".mat":
         raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
+    with path.open("rb") as file:
+        text = file.read(LARGEST_MODEL_BYTES)
     try:
-        with path.open("rb") as file:
-            return identify.Model.from_json(file.read(LARGEST_MODEL_BYTES))
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}. Give a file written by `stimrig fit -o`.") from error
+        return identify.Model.from_json(text)
     except identify.IdentifyError as error:
-        with contextlib.suppress(identify.IdentifyError):
-            identify.read(path)
-            fix = f"The model comes first: stimrig {usage}." if usage else "Give a file written by `stimrig fit -o`."
-            raise InputError(f"{path}: this is a recording, not a model. {fix}") from error
         raise InputError(f"{path}: {error}") from error
 
 
 def load_record(data: Sequence[Path], columns: list[str] | None = None, effects: Sequence[str] = ()) -> Any:
     """Read a record from its file, or from several as one; what was assumed goes to standard error.
 
-    Raises InputError: a file is named twice. IdentifyError: one cannot be read, they do not go together, or one lacks
-    what one of the `effects` needs.
+    Raises IdentifyError: one cannot be read, they do not go together, or one lacks what one of the `effects` needs.
     """
     from stimrig.api import record_files
     from stimrig.identify import effects as library
 
-    twice = [path for number, path in enumerate(data) if path in data[:number]]
-    if twice:
-        raise InputError(f"{twice[0]}: named twice. Name each recording once.")
     needs: dict[str, None] = {}
     for effect in effects if len(data) > 1 else ():
         with contextlib.suppress(identify.IdentifyError):  # of an unknown one the fit says so
@@ -73,35 +61,19 @@ def short(data: Sequence[Path]) -> str:
     return ", ".join(path.name for path in data)
 
 
-@contextlib.contextmanager
-def writing(path: Path) -> Iterator[Path]:
-    """Yield a place to write a file at, which is then whole or as it was. Raises InputError: it cannot be written."""
-    try:
-        with whole_path(path) as place:
-            yield place
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}. Give a file in a folder that can be written.") from error
+def write(path: Path | None, content: str | bytes | identify.Model) -> None:
+    """Write a file, if one is asked for: a text, or a model as MODEL.json or, where the name ends in .mat, as MAT."""
+    if path is None:
+        return
+    with whole_path(path) as place:
+        if not isinstance(content, identify.Model):
+            place.write_bytes(content.encode() if isinstance(content, str) else content)
+        elif path.suffix.lower() == ".mat":
+            from stimrig.identify import plain_mat
 
-
-def write(path: Path, content: str | bytes) -> None:
-    """Write a file. Raises InputError: it cannot be written."""
-    with writing(path) as place:
-        place.write_bytes(content.encode() if isinstance(content, str) else content)
-
-
-def write_model(path: Path, model: Any) -> None:
-    """Write a model: as MODEL.json, or where the name ends in .mat as a MAT file. Raises InputError."""
-    with writing(path) as place:
-        _write_model(place, model)
-
-
-def _write_model(path: Path, model: Any) -> None:
-    from stimrig.identify import plain_mat
-
-    if path.suffix.lower() == ".mat":
-        plain_mat.write(path, model.to_dict())
-    else:
-        path.write_text(model.to_json(), "utf-8", newline="")
+            plain_mat.write(place, content.to_dict())
+        else:
+            place.write_text(content.to_json(), "utf-8", newline="")
 
 
 def save(what: Any, path: str | Path, record: identify.Record | None = None) -> Path:
@@ -136,23 +108,24 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
 
     path = Path(path)
     kind = path.suffix.lower()
-    with whole_path(path) as place:
-        if kind == ".html":
-            place.write_text(report(what, record, path.stem), "utf-8", newline="")
-        elif isinstance(what, identify.Model) and kind in (".json", ".mat"):
-            _write_model(place, what)
-        elif isinstance(what, identify.Record) and kind[1:] in WRITERS:
+    if kind == ".html":
+        write(path, html_report(what, record, path.stem))
+    elif isinstance(what, identify.Model) and kind in (".json", ".mat"):
+        write(path, what)
+    elif isinstance(what, identify.Record) and kind[1:] in WRITERS:
+        with whole_path(path) as place:
             write_record(what, place, kind[1:])
-        elif isinstance(what, Inversion) and kind == ".csv":
-            place.write_text(inverted.table(what.to_dict()), "utf-8", newline="")
-        else:
-            fix = "A model is .json, .mat or .html, an explanation .html, a record .csv, .mat or .parquet, an "
-            fix += "inversion .csv."
-            raise identify.BadRequest(f"no {kind or 'such'} file of a {type(what).__name__}", place=str(path), fix=fix)
+    elif isinstance(what, Inversion) and kind == ".csv":
+        write(path, inverted.table(what.to_dict()))
+    else:
+        fix = (
+            "A model is .json, .mat or .html, an explanation .html, a record .csv, .mat or .parquet, an inversion .csv."
+        )
+        raise identify.BadRequest(f"no {kind or 'such'} file of a {type(what).__name__}", place=str(path), fix=fix)
     return path
 
 
-def report(what: Any, record: identify.Record | None, name: str, compared: identify.Comparison | None = None) -> str:
+def html_report(what: Any, record: identify.Record | None, name: str) -> str:
     """Write a model or an explanation beside its record as one HTML file that works offline."""
     from stimrig.api.jobs.curves import curves, rounded
     from stimrig.api.web.pages.report_file import comparison_html
@@ -161,7 +134,7 @@ def report(what: Any, record: identify.Record | None, name: str, compared: ident
     if record is not None and isinstance(what, identify.Explanation):
         return story_page(story_of(record, what, held_by(what.improvement.models[0], record)), name)
     if record is not None and isinstance(what, identify.Model):
-        comparison = rounded((compared or identify.compare(what, record)).to_dict())
+        comparison = rounded(identify.compare(what, record).to_dict())
         return comparison_html(what.to_dict(), json_value(curves(what, record)), name, comparison=comparison)
     fix = "save(model, 'report.html', record); of what `explain` gives, too."
     raise identify.BadRequest("a report is of a model or an explanation, beside its record", place=name, fix=fix)
@@ -181,10 +154,9 @@ def story_of(record: Any, explained: Any, structure: Sequence[str]) -> dict[str,
         for model, compared in ((models[0], explained.before), (models[-1], explained.after))
     )
     after = after if len(models) > 1 else before
-    final_structure = held_by(models[-1], record)
     diagnoses = (
         with_experiment(record, explained.diagnosis, structure),
-        with_experiment(record, explained.left, final_structure),
+        with_experiment(record, explained.left, held_by(models[-1], record)),
     )
     improvement, left_open = explained.improvement.to_dict(), only_open(vars(explained.left)) or {}
     # the last diagnosis describes what is left open

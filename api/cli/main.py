@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import ast
-import contextlib
 import gc
 import importlib
 import os
@@ -23,7 +22,7 @@ import typer
 from typer.exceptions import TyperException
 
 from stimrig.api.cli import commands
-from stimrig.api.cli.errors import INTERRUPTED, PAGE, CommandError, exit_interrupted
+from stimrig.api.cli.errors import INTERRUPTED, CommandError, exit_interrupted
 from stimrig.api.client.errors import Forbidden, Invalid, NotFound, ServiceError, Unauthorized, Unreachable
 from stimrig.api.errors import ApiError, SettingsError
 from stimrig.api.version import software_version
@@ -31,7 +30,6 @@ from stimrig.identify.errors import IdentifyError
 
 COMPUTES = {"compare", "diagnose", "explain", "export", "fit", "improve", "invert", "predict", "table1"}
 """Verbs that only compute: they hold no device, and Ctrl-C may end them whatever they are in."""
-PACKAGE = Path(__file__).resolve().parents[1]
 GRACE_S = 0.7
 """For what is to be tidied up after Ctrl-C."""
 interrupted = threading.Event()
@@ -56,19 +54,12 @@ def build(verb: str = "") -> typer.Typer:
 
 
 def _overview() -> typer.Typer:
-    """Make the command line as its help lists it: what each verb does, read from its file and not loaded."""
-    app, groups = _empty(), {}
+    """Make the command line as its help lists it: the first line of each verb's file, which is read and not loaded."""
+    app = _empty()
     for name in VERBS:
-        tree = ast.parse((Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8"))
-        does = {node.name: ast.get_docstring(node) for node in tree.body if isinstance(node, ast.FunctionDef)}
-        if name in does:
-            app.command(name, help=does[name])(lambda: None)
-        else:
-            calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call)]
-            group = next(call for call in calls if ast.unparse(call.func) == "typer.Typer")
-            groups[name] = next(ast.literal_eval(word.value) for word in group.keywords if word.arg == "help")
-    for name, words in groups.items():  # verbs with verbs of their own stand behind the others
-        app.command(name, help=words)(lambda: None)
+        text = (Path(commands.__path__[0]) / f"{name}.py").read_text("utf-8")
+        words = (ast.get_docstring(ast.parse(text)) or "").partition("\n")[0].partition(": ")[2]
+        app.command(name, help=words[:1].upper() + words[1:])(lambda: None)
     return app
 
 
@@ -99,12 +90,12 @@ def _options(
 ) -> None: ...
 
 
-def main(arguments: list[str] | None = None) -> None:
+def main(arguments: list[str]) -> None:
     """Run a verb and leave with its exit code."""
     # The libraries allocate half a million permanent objects; collecting garbage among them, repeatedly and at exit,
     # takes longer than a fit.
     gc.set_threshold(50_000)
-    computes = COMPUTES.intersection(sys.argv[1:2] if arguments is None else arguments[:1])
+    computes = COMPUTES.intersection(arguments[:1])
     signal.signal(signal.SIGINT, _interrupt if computes else signal.default_int_handler)
     code = run(arguments)
     signal.signal(signal.SIGINT, exit_interrupted)
@@ -114,13 +105,11 @@ def main(arguments: list[str] | None = None) -> None:
     sys.exit(code)
 
 
-def run(arguments: list[str] | None = None) -> int:
+def run(arguments: list[str]) -> int:
     """Run a verb; return its exit code."""
     # Matrices of a fit are small: a second BLAS thread only waits for the first, and on a busy machine for long.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    _keep_compiled()
-    words = arguments if arguments is not None else sys.argv[1:]
-    verb = next((word for word in words if word[:1] != "-"), "")
+    verb = next((word for word in arguments if word[:1] != "-"), "")
     try:
         code = (build(verb) if verb in VERBS else _overview())(arguments, standalone_mode=False)
         sys.stdout.flush()
@@ -134,20 +123,11 @@ def run(arguments: list[str] | None = None) -> int:
         if isinstance(error, KeyboardInterrupt | typer.Abort) or interrupted.is_set():  # a library may have changed it
             print("stimrig: interrupted", file=sys.stderr)
             return INTERRUPTED
-        name = f"stimrig {verb}" if verb in VERBS else "stimrig"
-        line, code = _explain(name, words, error)
-        print(line, file=sys.stderr)
+        words, code = _explain(verb, arguments, error)
+        if not words.startswith("Usage:"):  # the help itself, where no verb was given
+            words = f"stimrig{f' {verb}' if verb in VERBS else ''}: {' '.join(words.split())}"
+        print(words, file=sys.stderr)
         return code
-
-
-def _keep_compiled() -> None:
-    """Use this user's cache for numba, also in workers, where the installation belongs to another user."""
-    if "NUMBA_CACHE_DIR" in os.environ or os.access(PACKAGE, os.W_OK):
-        return
-    with contextlib.suppress(OSError, RuntimeError):  # no home: `stimrig doctor` tells what follows
-        place = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "stimrig" / "numba"
-        place.mkdir(parents=True, exist_ok=True)
-        os.environ["NUMBA_CACHE_DIR"] = str(place)
 
 
 def _interrupt(*_: object) -> None:
@@ -160,28 +140,29 @@ def _interrupt(*_: object) -> None:
     raise KeyboardInterrupt
 
 
-def _explain(name: str, words: list[str], error: BaseException) -> tuple[str, int]:
-    """Return the error's line, and the exit code it stands for."""
+def _explain(verb: str, arguments: list[str], error: BaseException) -> tuple[str, int]:
+    """Return what an error says to the person, and the exit code it stands for."""
     if isinstance(error, TyperException):
-        message = error.format_message().strip()
-        if not message or message.startswith("Usage:"):  # no verb was given: the help itself, not in one line
-            return message, 2
-        return f"{name}: {flat(message)} (see {name} --help)", 2
-    if isinstance(error, CommandError | IdentifyError | ApiError | SettingsError):
+        words = error.format_message().strip()
+        if not words or words.startswith("Usage:"):
+            return words or "Usage: stimrig --help lists the verbs", 2
+        return f"{words} (see stimrig {verb} --help)", 2
+    if isinstance(error, CommandError):
+        return str(error), error.exit_code
+    if isinstance(error, ApiError | SettingsError):
+        return str(error), 2
+    if isinstance(error, IdentifyError):
         # the files of the command line, where it is of what they hold and names none of them
-        files = [word for word in words if word[:1] != "-" and Path(word).is_file()]
-        about = f"{', '.join(files)}: " if isinstance(error, IdentifyError) and not error.place and files else ""
-        return f"{name}: {flat(f'{about}{error}')}", error.exit_code if isinstance(error, CommandError) else 2
+        files = [word for word in arguments if word[:1] != "-" and Path(word).is_file()]
+        return f"{', '.join(files)}: {error}" if files and not error.place else str(error), 2
     if isinstance(error, ServiceError):
         at_fault = isinstance(error, INPUT_AT_FAULT) or error.code == "rig-disconnected"
-        return f"{name}: {flat(str(error))}", 2 if at_fault else 1
-    if isinstance(error, ModuleNotFoundError) and (error.name or "").partition(".")[0] in PAGE:
-        return f"{name}: needs rig, service and page: pip install 'stimrig[page]' ({error.name} is missing)", 2
+        return str(error), 2 if at_fault else 1
+    if isinstance(error, ModuleNotFoundError) and not (error.name or "").startswith("stimrig"):
+        extra = "cohort" if verb == "cohort" else "page"
+        return f"needs more packages: pip install 'stimrig[{extra}]' ({error.name} is missing)", 2
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{error.filename}: {error.strerror}. Give a file that can be read, or a place that can be written.", 2
     log = Path(tempfile.gettempdir()) / f"stimrig-error-{os.getpid()}.log"
     log.write_text("".join(traceback.format_exception(error)))
-    return f"{name}: unexpected: {type(error).__name__}: {flat(str(error))} (log: {log})", 1
-
-
-def flat(text: str) -> str:
-    """Write text on one line."""
-    return " ".join(text.split())
+    return f"unexpected: {type(error).__name__}: {error} (log: {log})", 1

@@ -30,12 +30,11 @@ from stimrig.api.cli.errors import LaunchError
 from stimrig.api.settings import Settings
 from stimrig.api.store.service_lock import INHERITED, HeldError, reserve
 
-READY_S, END_S = 60.0, 6.0
-SEAL_S = 35.0
+READY_S, END_S, SEAL_S = 60.0, 6.0, 35.0
 """The rig may still have a test to seal."""
-RESTART_S = (0.2, 0.5, 1.0, 2.0, 5.0)
+RESTART_S, LASTING_S = (0.2, 0.5, 1.0, 2.0, 5.0), 60.0
+"""Pauses before the starts in a row of a process that lives shorter than the second."""
 LAST_BYTES = 100_000
-"""So much of a log's end is read for a process's last words."""
 ENDINGS = (signal.SIGTERM, signal.SIGINT)
 LIBC = ctypes.CDLL(None, use_errno=True)
 PR_SET_PDEATHSIG = 1
@@ -116,18 +115,18 @@ class Child:
         return LaunchError(words, 2) if code == 2 else LaunchError(f"{self.name}: {words} (log: {self.log})")
 
     def last_words(self) -> str:
-        """Return the last line of its log that is meant for people; empty where there is none, or no log any more."""
+        """Return the last line that it wrote, if it says why it ended: one for people, or an error of its log."""
         try:
             with self.log.open("rb") as log:
                 log.seek(max(self._log_start, log.seek(0, os.SEEK_END) - LAST_BYTES))
-                lines = [line.strip() for line in log.read().decode(errors="replace").splitlines() if line.strip()]
-            plain = [line for line in lines if not line.startswith("{")]
-            return plain[-1] if plain else str(json.loads(lines[-1])["message"])
-        except (OSError, ValueError, KeyError, IndexError):  # a line is cut off where the disk is full
+                line = log.read().decode(errors="replace").strip().rpartition("\n")[2].strip()
+            entry = json.loads(line) if line.startswith("{") else {"level": "error", "message": line}
+            return str(entry["message"]) if entry["level"] in ("error", "critical") else ""
+        except (OSError, ValueError, KeyError, RecursionError):  # a line is cut off where the disk is full
             return ""
 
     def alive(self) -> bool:
-        """Tell whether it runs."""
+        """Return whether it runs."""
         return self.process is not None and self.process.poll() is None
 
     def end(self, limit_s: float = END_S) -> None:
@@ -142,6 +141,19 @@ class Child:
             self.process.wait()
         if self.process.stdout is not None:
             self.process.stdout.close()
+
+    def restart(self) -> str:
+        """Start it again, and return what happened. Raises LaunchError: it does not stay up."""
+        if time.monotonic() - self.started_s > LASTING_S:
+            self.restarts = 0
+        if self.restarts >= len(RESTART_S):
+            raise self.failure()
+        time.sleep(RESTART_S[self.restarts])
+        self.restarts += 1
+        words = self.last_words()
+        self.end()
+        self.start()
+        return f"{self.name} had ended ({words or 'without a message'}) and was started again"
 
 
 def _first_line(process: subprocess.Popen[bytes]) -> str:
@@ -185,15 +197,22 @@ class Services:
     def __enter__(self) -> Services:
         self._handlers = on_endings(raise_once)
         try:
-            self.start()
+            self._start()
         except BaseException:
             self.__exit__()
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
+        """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""
         on_endings(signal.SIG_IGN)
-        self.stop()
+        self.rig.end(SEAL_S)
+        self.api.end()
+        if self.emulator is not None:
+            self.emulator.end()
+        if self._folder_lock is not None:
+            os.close(self._folder_lock)
+        shutil.rmtree(self.runtime, ignore_errors=True)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
 
@@ -207,32 +226,29 @@ class Services:
         """The address of the service."""
         return str(self.api.ready["url"])
 
-    def start(self) -> None:
+    def _start(self) -> None:
         """Start everything, the devices first, once the data folder is locked.
 
         Raises LaunchError: another service runs on the data, or a process does not come up.
         """
-        data = str(self.settings.data_dir.absolute())
+        data, rig_file = str(self.settings.data_dir.absolute()), self.settings.rig_file
         try:
             self._folder_lock = reserve(self.settings)
         except HeldError as error:
             raise LaunchError(str(error), 2) from error
         for child in filter(None, (self.emulator, self.rig, self.api)):  # all hold it, until the last has ended
             child.inherits = (self._folder_lock,)
+        devices = ["--config", str(rig_file)]
         if self.emulator is not None:
-            self.emulator.start()
+            devices = ["--emulator-json", json.dumps(self.emulator.start())]
         if not self.attached:
-            devices = ["--config", str(self.settings.rig_file)]
-            if self.emulator is not None:
-                devices = ["--emulator-json", json.dumps(self.emulator.ready)]
             self.rig.command += [*devices, "--socket", str(self.socket), "--data", data]
             try:
                 self.rig.start()
             except LaunchError as error:
-                place = str(self.settings.rig_file)
-                if error.exit_code != 2 or self.settings.rig_file is None or place in str(error):
+                if error.exit_code != 2 or rig_file is None or str(rig_file) in str(error):
                     raise
-                raise LaunchError(f"{place}: {error}", 2) from error
+                raise LaunchError(f"{rig_file}: {error}", 2) from error
         self.api.environment = {
             INHERITED: str(self._folder_lock),
             "STIMRIG_DATA_DIR": data,
@@ -253,27 +269,4 @@ class Services:
         if self.emulator is not None and not self.emulator.alive():
             raise self.emulator.failure()
         ours = (self.api,) if self.attached else (self.rig, self.api)
-        return [_restart(child) for child in ours if not child.alive()]
-
-    def stop(self) -> None:
-        """End what was started here: the rig first, since it stops stimulation; the service hears its test's end."""
-        self.rig.end(SEAL_S)
-        self.api.end()
-        if self.emulator is not None:
-            self.emulator.end()
-        if self._folder_lock is not None:
-            os.close(self._folder_lock)
-        shutil.rmtree(self.runtime, ignore_errors=True)
-
-
-def _restart(child: Child) -> str:
-    if time.monotonic() - child.started_s > 60:
-        child.restarts = 0
-    if child.restarts >= len(RESTART_S):
-        raise child.failure()
-    time.sleep(RESTART_S[child.restarts])
-    child.restarts += 1
-    words = child.last_words()
-    child.end()
-    child.start()
-    return f"{child.name} had ended ({words or 'without a message'}) and was started again"
+        return [child.restart() for child in ours if not child.alive()]

@@ -24,7 +24,7 @@ from stimrig.api.cohort.errors import CohortError, InterruptedRunError
 from stimrig.api.cohort.record import LEFT_OUT, Row
 from stimrig.api.cohort.sources import Entry
 from stimrig.api.cohort.task import Task
-from stimrig.api.whole_file import whole_file
+from stimrig.api.whole_file import whole_path
 
 PART_ROWS = 500
 PART_S = 10.0
@@ -184,7 +184,7 @@ class Results:
         about = {"format": table.FORMAT, "options": json.dumps(self.task.options())}
         schema = table.SCHEMA.with_metadata(about)
         try:
-            with whole_file(file) as place, pq.ParquetWriter(place, schema, compression="zstd") as writer:
+            with whole_path(file) as place, pq.ParquetWriter(place, schema, compression="zstd") as writer:
                 for rows in tables:
                     writer.write_table(rows)
         except OSError as error:

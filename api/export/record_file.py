@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import io
 from pathlib import Path
 
@@ -30,15 +31,10 @@ def write_mat(record: Record, path: Path) -> None:
 
 
 def write_parquet(record: Record, path: Path) -> None:
-    """Write one table; the metadata of each field hold its unit, those of the table the pulse rate.
+    """Write one table; the metadata of each field hold its unit, those of the table the pulse rate."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
 
-    Raises BadRequest: pyarrow is missing.
-    """
-    try:
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-    except ImportError:
-        raise BadRequest("Parquet needs pyarrow", place=str(path), fix="Install it: pip install pyarrow.") from None
     samples = record.samples()
     fields = [pa.field(name, pa.float64(), metadata={"unit": SHOWN.get(name, ("1",))[0]}) for name in samples]
     arrays = [pa.array(np.asarray(column, float)) for column in samples.values()]
@@ -53,11 +49,20 @@ WRITERS = {"csv": write_joined, "mat": write_mat, "parquet": write_parquet}
 """The writer of each format; the format is also the end of the file's name."""
 
 
+def check_format(format: str) -> None:
+    """Raise BadRequest: there is no such format, or pyarrow is missing."""
+    if format not in WRITERS:
+        raise BadRequest("no such format", place=f"format {format}", fix=f"Give one of {', '.join(WRITERS)}.")
+    if format == "parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise BadRequest("Parquet needs pyarrow", place="format parquet", fix="Install it: pip install pyarrow.")
+
+
 def write_record(record: Record, path: Path, format: str) -> None:
     """Write a record in a format of `WRITERS`.
 
-    Raises BadRequest: it is a joined record, whose parts only CSV can hold; pyarrow is missing.
+    Raises BadRequest: as `check_format`, or it is a joined record, whose parts only CSV can hold.
     """
+    check_format(format)
     if len(record.parts) > 1 and format != "csv":
         message = f"it is joined of {len(record.parts)} recordings, which {format} cannot hold"
         raise BadRequest(message, place=str(path), fix="Write it as CSV.")

@@ -206,8 +206,8 @@ def warm(progress: Progress) -> dict[str, Any]:
 VERBS: dict[str, Callable[..., dict[str, Any]]] = {"curves": page_curves, "join": record_files.joined} | {
     verb.__name__: verb
     for verb in (
-        fit, carry, comparison, diagnosis, effects, warm, forecast, invert, recorded, record_files.export_csv,
-        record_files.plain_csv, record_files.find_recording, record_files.samples, adaptive.adaptive_outlook,
-        adaptive.adaptive_begin, adaptive.adaptive_advise, tracking.track, tracking.track_warm,
+        fit, carry, comparison, diagnosis, effects, warm, forecast, invert, recorded, record_files.plain_csv,
+        record_files.find_recording, record_files.samples, adaptive.adaptive_outlook, adaptive.adaptive_begin,
+        adaptive.adaptive_advise, tracking.track, tracking.track_warm,
     )
 }  # fmt: skip

@@ -296,11 +296,6 @@ def effects(progress: Progress) -> dict[str, Any]:
     return {"effects": [{"id": name, **words, **lists, **flags} for name in names]}
 
 
-def export_csv(progress: Progress, out: str, **_: Any) -> dict[str, Any]:
-    Path(out).write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0.0,0.0,rest\n")
-    return {"rows": 1}
-
-
 def busy(progress: Progress, seconds: float) -> dict[str, Any]:
     state.pause(seconds)
     return {}
@@ -333,7 +328,6 @@ VERBS: dict[str, Callable[..., dict[str, Any]]] = {
     verb.__name__: verb
     for verb in (
         fit, carry, comparison, curves, diagnosis, adaptive_outlook, adaptive_begin, adaptive_advise, track, forecast,
-        invert, join, effects, export_csv, busy, plain_csv, find_recording, samples, real_curves.recorded,
-        hostile,
+        invert, join, effects, busy, plain_csv, find_recording, samples, real_curves.recorded, hostile,
     )
 } | dict.fromkeys(("warm", "track_warm"), nothing)  # fmt: skip

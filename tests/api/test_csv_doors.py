@@ -54,7 +54,7 @@ def test_a_recording(tmp_path: Path) -> None:
     """Somebody's own file goes in with formulas; what is handed out has none, and is read as the same segments."""
     rows = (f"{k / 100:.2f},{k % 7},{-k / 1000},{HOSTILE[k // 40]}\n" for k in range(40 * len(HOSTILE)))
     (tmp_path / "in.csv").write_text("time_s,pulse_width_us,torque_nm,segment\n" + "".join(rows))
-    record_files.export_csv(str(tmp_path / "in.csv"), lambda *_: None, str(tmp_path / "out.csv"))
+    record_files.plain_csv(str(tmp_path / "in.csv"), lambda *_: None, str(tmp_path / "out.csv"))
     texts_of(tmp_path / "out.csv", "segment")
     given, back = identify.read(tmp_path / "in.csv"), identify.read(tmp_path / "out.csv")
     assert back.segment_names == given.segment_names

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -53,14 +54,15 @@ def test_the_page_asks_for_it_at_the_rate_of_the_recording() -> None:
     assert starting.fields_of_kind(context, OWNER, "next-experiment", None, None, "M1") == {"joins": "M1", **known}
 
 
-class Recordings:
-    """Files that are read, with the sources that they name; what is played is kept, and answered by a recording."""
+class Rig:
+    """Files that are read, with the sources that they name; and a service: what is played is kept."""
 
     def __init__(self) -> None:
         self.loaded: list[list[Path]] = []
         self.played: list[dict[str, Any]] = []
-        self.source, self.rate_hz = Source(participant=OWNER, current_ma=16.0), 400.0
-        self.open = True
+        self.improved: list[str] = []
+        self.source, self.rate_hz, self.open = Source(participant=OWNER, current_ma=16.0), 400.0, True
+        self.known, self.fails, self.adaptive = True, False, {}
 
     def load(self, data: list[Path]) -> Any:
         self.loaded.append(list(data))
@@ -74,77 +76,9 @@ class Recordings:
         """Of the first model nothing is open, of the last one something is."""
         return SimpleNamespace(segments=DECIDING["segments"]) if self.open and diagnosis.to_dict is dict else None
 
-    def play(self, _rig: object, _data: object, _emulate: str, participant: str, request: Any) -> dict[str, Any]:
+    def run_test(self, _client: Any, participant: str, *_: Any, **request: Any) -> dict[str, Any]:
         self.played.append({"participant": participant, **request})
-        return {"test": {}, "model": {}, "recording": b"second"}
-
-
-@pytest.fixture
-def recordings(monkeypatch: pytest.MonkeyPatch) -> Recordings:
-    made = Recordings()
-    monkeypatch.setattr(deciding, "load_record", made.load)
-    monkeypatch.setattr(deciding, "held_by", lambda *_: [])
-    monkeypatch.setattr(verb, "on_own_services", made.play)
-    for name in ("explain", "next_experiment"):
-        monkeypatch.setattr(deciding.identify, name, getattr(made, name), raising=False)
-    return made
-
-
-def test_the_verb_asks_for_it_and_diagnoses_both_together(
-    recordings: Recordings, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    first, output, told, diagnose = tmp_path / "first.h5", tmp_path / "second.h5", [], deciding.diagnose_together
-    monkeypatch.setattr(verb, "say_json", told.append)
-
-    def diagnose_together(*given: Any) -> Any:
-        assert output.read_bytes() == b"second", "written before the long work that may fail"
-        return diagnose(*given)
-
-    monkeypatch.setattr(deciding, "diagnose_together", diagnose_together)
-    verb.test(decide=[first], output=output, as_json=True)
-    assert recordings.played == [
-        {"participant": OWNER, "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0,
-         "recorded_ma": 16.0}
-    ]  # fmt: skip
-    assert recordings.loaded[0] == [first] and recordings.loaded[1][0] == first and len(recordings.loaded[1]) == 2
-    assert told[0]["diagnosis"]["verdict"] == "nothing_missing" and told[0]["diagnosis"]["left"]["structure"] == []
-    assert "recording" not in told[0]
-
-
-@pytest.mark.parametrize(
-    ("sources", "rate_hz", "options", "said"),
-    [
-        ([OWNER], 400.0, {"participant": "P2"}, "a recording of P1; --participant is P2"),
-        ([""], 400.0, {}, "does not say whose it is. Give --participant"),
-        ([OWNER, "P2"], 400.0, {}, "of several people: P1, P2"),
-        ([OWNER, ""], 400.0, {}, "second.csv does not say whose it is"),
-        ([OWNER], 30.0, {}, "joined from 50 Hz on"),
-        ([OWNER], 400.0, {}, "does not say with what current it was made"),
-        (["", ""], 400.0, {"participant": OWNER}, "does not say with what current it was made"),
-        ([(OWNER, 16.0), (OWNER, 20.0)], 400.0, {}, "made with 16 mA and 20 mA"),
-        ([(OWNER, 16.0)], 400.0, {}, "nothing is left to decide"),
-        ([(OWNER, 16.0)], 400.0, {"adaptive": True}, "leave out --adaptive"),
-        ([(OWNER, 16.0)], 400.0, {"output": Path("/dev/null/second.h5")}, "in a folder that can be written"),
-        ([(OWNER, 16.0)], 400.0, {"output": Path("/")}, "in a folder that can be written"),
-    ],
-)
-def test_nobody_is_stimulated_where_it_is_not_theirs_cannot_be_joined_or_decides_nothing(
-    sources: list[Any], rate_hz: float, options: dict[str, Any], said: str, tmp_path: Path, recordings: Recordings
-) -> None:
-    recordings.open, recordings.rate_hz = False, rate_hz
-    named = [source if isinstance(source, tuple) else (source, None) for source in sources]
-    recordings.source = Source(parts=tuple(Source(participant=who, current_ma=ma) for who, ma in named))
-    with pytest.raises(InputError, match=said):
-        verb.test(decide=[tmp_path / "first.h5", tmp_path / "second.csv"], **options)
-    assert recordings.played == []
-
-
-class Answers:
-    """Stands for a client of the service."""
-
-    def __init__(self, known: bool = True, fails: bool = False) -> None:
-        self.known, self.fails = known, fails
-        self.improved: list[str] = []
+        return {"model_id": "plain", "recording_id": "r1", "adaptive": self.adaptive}
 
     def participant(self, _code: str) -> dict[str, Any]:
         if not self.known:
@@ -157,42 +91,85 @@ class Answers:
             raise ServiceError("", "failed")
         return {"id": "best"}
 
-    model_file, recording = staticmethod(str), staticmethod(bytes)
+    def model_file(self, model_id: str) -> str:
+        return model_id
+
+    def recording(self, _recording_id: str) -> bytes:
+        return b"second"
+
+
+@pytest.fixture
+def rig(monkeypatch: pytest.MonkeyPatch) -> Rig:
+    made = Rig()
+    monkeypatch.setattr(deciding, "load_record", made.load)
+    monkeypatch.setattr(deciding, "held_by", lambda *_: [])
+    monkeypatch.setattr(verb, "service", lambda *_: nullcontext((made, list)))
+    monkeypatch.setattr(verb, "run_test", made.run_test)
+    monkeypatch.setattr(verb, "report_test", str)
+    for name in ("explain", "next_experiment"):
+        monkeypatch.setattr(deciding.identify, name, getattr(made, name), raising=False)
+    return made
+
+
+def test_the_verb_asks_for_it_and_diagnoses_both_together(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    first, output, diagnose = tmp_path / "first.h5", tmp_path / "second.h5", deciding.diagnose_together
+
+    def diagnose_together(*given: Any) -> Any:
+        assert output.read_bytes() == b"second", "written before the long work that may fail"
+        return diagnose(*given)
+
+    monkeypatch.setattr(deciding, "diagnose_together", diagnose_together)
+    verb.test(decide=[first], output=output, as_json=True)
+    assert rig.played == [
+        {"participant": OWNER, "kind": "next-experiment", "segments": DECIDING["segments"], "pulse_rate_hz": 25.0}
+    ]
+    assert rig.loaded[0] == [first] and rig.loaded[1][0] == first and len(rig.loaded[1]) == 2
+    told = json.loads(capsys.readouterr().out)
+    assert told["diagnosis"]["verdict"] == "nothing_missing" and told["diagnosis"]["left"]["structure"] == []
+    assert "recording" not in told
 
 
 @pytest.mark.parametrize(
-    ("recorded_ma", "known", "said"),
+    ("sources", "more", "options", "said"),
     [
-        (16.0, True, None), (None, True, None),
-        (20.0, True, "made with 20 mA, P1 is now stimulated with 16 mA"),
-        (16.0, False, "no participant P1: their limits are not known here"),
+        ([(OWNER, 16.0)], {}, {"participant": "P2"}, "of several people: P1, P2"),
+        ([("", 16.0)], {}, {}, "does not say whose it is. Give --participant"),
+        ([(OWNER, 16.0), ("P2", 16.0)], {}, {}, "of several people: P1, P2"),
+        ([(OWNER, 16.0), ("", 16.0)], {}, {}, "second.csv does not say whose it is"),
+        ([(OWNER, 16.0)], {"rate_hz": 30.0}, {}, "joined from 50 Hz on"),
+        ([(OWNER, None)], {}, {}, "does not say with what current it was made"),
+        ([("", None)] * 2, {}, {"participant": OWNER}, "first.h5 does not say with what current it was made"),
+        ([(OWNER, 16.0), (OWNER, 20.0)], {}, {}, "made with 16 mA and 20 mA"),
+        ([(OWNER, 16.0)], {"open": False}, {}, "nothing is left to decide"),
+        ([(OWNER, 16.0)], {}, {"adaptive": True}, "three kinds of test"),
+        ([(OWNER, 16.0)], {}, {"output": Path("/dev/null/second.h5")}, "/dev/null"),
+        ([(OWNER, 16.0)], {}, {"output": Path("/")}, "in a folder that can be written"),
+        ([(OWNER, 20.0)], {}, {}, "made with 20 mA, P1 is now stimulated with 16 mA"),
+        ([(OWNER, 16.0)], {"known": False}, {}, "no participant P1: their limits are not known here"),
     ],
-)  # fmt: skip
-def test_nobody_is_made_anew_or_stimulated_with_another_current_for_a_recording(
-    recorded_ma: float | None, known: bool, said: str | None, monkeypatch: pytest.MonkeyPatch
+)
+def test_nobody_is_stimulated_where_it_is_not_theirs_cannot_be_joined_or_decides_nothing(
+    sources: list[Any], more: dict[str, Any], options: dict[str, Any], said: str, tmp_path: Path, rig: Rig
 ) -> None:
-    started: list[dict[str, Any]] = []
-    monkeypatch.setattr(verb, "Client", lambda *_: nullcontext(Answers(known)))
-    monkeypatch.setattr(
-        verb, "run_test", lambda *_, **more: started.append(more) or {"model_id": "", "recording_id": 0}
-    )
-    with pytest.raises(InputError, match=said) if said else nullcontext():
-        verb.through("url", "token", OWNER, request={"kind": "next-experiment", "recorded_ma": recorded_ma})
-    assert started == ([] if said else [{"kind": "next-experiment"}])
+    vars(rig).update(more)
+    rig.source = Source(parts=tuple(Source(participant=who, current_ma=ma) for who, ma in sources))
+    with pytest.raises((InputError, OSError), match=said):
+        verb.test(decide=[tmp_path / "first.h5", tmp_path / "second.csv"], **options)
+    assert rig.played == []
 
 
 @pytest.mark.parametrize(
     ("problem", "fails", "model"), [("", False, "plain"), ("misfit", False, "best"), ("misfit", True, "plain")]
 )
 def test_where_an_adaptive_tests_structure_does_not_fit_the_best_model_is_given(
-    problem: str, fails: bool, model: str, monkeypatch: pytest.MonkeyPatch
+    problem: str, fails: bool, model: str, rig: Rig
 ) -> None:
-    service = Answers(fails=fails)
-    document = {"model_id": "plain", "recording_id": 0, "adaptive": {"problem": problem}}
-    monkeypatch.setattr(verb, "Client", lambda *_: nullcontext(service))
-    monkeypatch.setattr(verb, "run_test", lambda *_, **__: document)
-    assert verb.through("url", "token", "P1")["model"] == model
-    assert service.improved == (["plain"] if problem else [])
+    rig.adaptive, rig.fails = {"problem": problem}, fails
+    client: Any = rig
+    assert verb.play(client, "P1", {})["model"] == model
+    assert rig.improved == (["plain"] if problem else [])
 
 
 SITE = ("right", "biceps brachii", None)

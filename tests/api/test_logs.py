@@ -90,13 +90,13 @@ def test_an_error_of_the_database_names_no_participant(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("log", "words"),
     [
-        (None, ""), ("", ""), ('{"message": "all went well"}\n', "all went well"),
-        ("rig: no room\n", "rig: no room"),
+        (None, ""), ("", ""), ("rig: no room\n", "rig: no room"), ('rig: no\n{"level": "info", "message": "x"}\n', ""),
+        ('{"level": "info", "message": "all went well"}\n', ""), ('{"level": "error", "message": "gone"}\n', "gone"),
         ('{"time": "2026-11-23T08:0', ""), ('{"level": "info"}\n', ""), ("{" * 100_000, ""),
         ("x" * 3 * LAST_BYTES + "\nrig: gone\n", "rig: gone"),
     ],
 )  # fmt: skip
-def test_the_last_words_of_a_process_are_found_whatever_its_log_is(tmp_path: Path, log: str | None, words: str) -> None:
+def test_the_last_words_of_a_process_are_its_own_last_line(tmp_path: Path, log: str | None, words: str) -> None:
     if log is not None:
         (tmp_path / "rig.log").write_text(log)
     assert Child("rig", [], tmp_path / "rig.log").last_words() == words

@@ -10,8 +10,7 @@ import pytest
 
 from bench.muscles.physics_records import record_of_physics
 from stimrig import identify
-from stimrig.api.cli.commands.effects import effects
-from stimrig.api.cli.errors import InputError
+from stimrig.api.cli import main
 from stimrig.identify.effects import own_file
 from tests.harness.carried_sessions import as_record
 
@@ -37,34 +36,30 @@ def with_gate(path: Path, **changes: object) -> Path:
     return path
 
 
-def test_what_was_found_becomes_a_file_that_loads(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    target = tmp_path / "mine.py"
-    effects(export=with_gate(tmp_path / "MODEL.json"), name="mine", output=target)
-    assert str(target) in capsys.readouterr().out
+def test_what_was_found_becomes_a_file_that_loads(tmp_path: Path) -> None:
+    model, target = with_gate(tmp_path / "MODEL.json"), tmp_path / "mine.py"
+    words = ["effects", "--export", str(model), "--name", "mine", "-o", str(target)]
+    assert main.run(words) == 0
     (form,) = own_file.effect_of(target).forms
     assert [p.start[0] for p in form.parameters] == [0.02, 3.0, -0.5]
-
-
-def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
-    target = tmp_path / "mine.py"
     target.write_text("mine", "utf-8")
-    with pytest.raises(InputError, match=r"mine\.py: File exists"):
-        effects(export=with_gate(tmp_path / "MODEL.json"), name="mine", output=target)
-    assert target.read_text("utf-8") == "mine"
+    assert main.run(words) == 2 and target.read_text("utf-8") == "mine", "a file that is there is kept"
 
 
 @pytest.mark.parametrize(
     ("changes", "asked", "said"),
     [
-        ({}, {"effect": "free_ways"}, "no free effect 'free_ways' in it. It has free_gate"),
-        ({}, {"name": "Not a name"}, "no name for an effect"),
-        ({}, {"name": "fatigue"}, "an effect is called so already"),
-        ({"parameters": {"gate_s": 0.02, "bend": 3.0, "gate_rate": -0.5}}, {}, "gate_s"),
-        ({"id": "nobody_knows"}, {}, "no free effect"),
+        ({}, ["--effect", "free_ways"], "no free effect 'free_ways' in it. It has free_gate"),
+        ({}, ["--name", "Not a name"], "no name for an effect"),
+        ({}, ["--name", "fatigue"], "an effect is called so already"),
+        ({"parameters": {"gate_s": 0.02, "bend": 3.0, "gate_rate": -0.5}}, [], "gate_s"),
+        ({"id": "nobody_knows"}, [], "no free effect"),
     ],
 )
-def test_bad_input_costs_one_line(tmp_path: Path, changes: dict, asked: dict, said: str) -> None:
-    given = {"name": "mine", "output": tmp_path / "mine.py"} | asked
-    with pytest.raises(InputError) as told:
-        effects(export=with_gate(tmp_path / "MODEL.json", **changes), **given)
-    assert said in str(told.value) and "\n" not in str(told.value)
+def test_bad_input_costs_one_line(
+    tmp_path: Path, changes: dict, asked: list[str], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    model = with_gate(tmp_path / "MODEL.json", **changes)
+    assert main.run(["effects", "--export", str(model), "-o", str(tmp_path / "mine.py"), *asked]) == 2
+    told = capsys.readouterr().err
+    assert said in told and told.count("\n") == 1 and not (tmp_path / "mine.py").exists()

@@ -60,8 +60,8 @@ def test_commands_do_what_they_are_said_to(tmp_path: Path, monkeypatch: pytest.M
             assert program == "stimrig"
             if words[0] == "test" and "--emulate" in words:
                 with monkeypatch.context() as patch:
-                    patch.setattr(test_verb, "on_own_services", played := Mock(side_effect=InputError("not now")))
-                    assert main.run(words) == 2 and played.call_args.args[2] == words[words.index("--emulate") + 1]
+                    patch.setattr(test_verb, "service", played := Mock(side_effect=InputError("not now")))
+                    assert main.run(words) == 2 and played.call_args.args[3] == words[words.index("--emulate") + 1]
                 shutil.copy("out/first.h5", words[words.index("-o") + 1])
                 continue
             if words[0] in ("test", "emulate"):  # they do not come back into this process

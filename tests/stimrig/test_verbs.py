@@ -117,7 +117,7 @@ def cohort_fits(at: Path, new: Path) -> None:
 def exports(at: Path, new: Path) -> None:
     found = stimrig.export([at / "record.csv"], new / "mat", format="mat")
     assert (found["records"], found["format"]) == (1, "mat")
-    with pytest.raises(InputError, match="no such format"):
+    with pytest.raises(BadRequest, match="no such format"):
         stimrig.export([at / "record.csv"], new / "fhir", format="fhir")
 
 

@@ -5,11 +5,12 @@ from __future__ import annotations
 import inspect
 import re
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from typer.main import get_command
 
 import stimrig
+from stimrig.api.cli.commands.cohort import Verb
 from stimrig.api.cli.main import build
 
 PAGE = Path(__file__).parents[2] / "docs" / "python.md"
@@ -32,6 +33,7 @@ def verbs() -> dict[str, Any]:
     found: dict[str, Any] = {}
     for name, command in sorted(get_command(build()).commands.items()):  # pyright: ignore[reportAttributeAccessIssue]
         below = {} if name in COMMAND_ONLY else getattr(command, "commands", {})
+        below = dict.fromkeys(get_args(Verb), command) if name == "cohort" else below
         found |= {f"{name} {verb}": one for verb, one in below.items()} or {name: command}
     return found
 

@@ -17,8 +17,8 @@ from sqlalchemy.engine import make_url
 
 from stimrig.api.cli.commands.audit import DataDir, settings_of
 from stimrig.api.cli.errors import CommandError, InputError
-from stimrig.api.cli.options import Json
-from stimrig.api.cli.terminal import say, say_json
+from stimrig.api.cli.options import Json, RigData
+from stimrig.api.cli.terminal import report
 from stimrig.api.store.copies import copy_database
 from stimrig.api.store.database import sqlite_file
 from stimrig.api.whole_file import sha256_of, to_disk
@@ -29,7 +29,7 @@ DATABASE, SUMS = "api/stimrig.db", "SHA256SUMS"
 def backup(
     to: Annotated[Path, typer.Argument(help="folder for backups, best on another disk", metavar="FOLDER")],
     data: DataDir = None,
-    rig_data: Annotated[Path | None, typer.Option(help="the rig's data folder, where it has one of its own")] = None,
+    rig_data: RigData = None,
     as_json: Json = False,
 ) -> None:
     """Copy database, recordings and journals into a new folder below FOLDER, and check it; also while a test runs."""
@@ -50,17 +50,14 @@ def backup(
         to_disk(partial / SUMS)
         partial.rename(created)
         to_disk(to)
-    except (OSError, sqlite3.Error, CommandError) as error:
+    except (OSError, sqlite3.Error) as error:
         shutil.rmtree(partial, ignore_errors=True)
         raise CommandError(f"{error}. No backup was made.") from error
     size = sum((created / name).stat().st_size for name in sums)
-    if as_json:
-        content = {"files": len(sums), "bytes": size, "database": database is not None, "damaged": damaged}
-        say_json({"backup": str(created)} | content)
-    else:
-        say(f"{created}: {len(sums)} files, {size / 1e6:.1f} MB; `sha256sum --check {SUMS}` checks them again")
-        if database is None:
-            say("The database is not in it. Before each backup of the files make a dump: pg_dump --format=custom")
+    document = {"backup": str(created), "files": len(sums), "bytes": size, "database": database is not None}
+    words = f"{created}: {len(sums)} files, {size / 1e6:.1f} MB; `sha256sum --check {SUMS}` checks them again"
+    dump = "The database is not in it. Before each backup of the files make a dump: pg_dump --format=custom"
+    report(document | {"damaged": damaged}, as_json, words, *([dump] if database is None else []))
     if damaged:
         raise CommandError(f"{'; '.join(damaged)}. All else is saved. Restore the recording from an earlier backup.")
 

@@ -3,22 +3,21 @@
 from __future__ import annotations
 
 import json
-import os
 import secrets
 import time
-from collections.abc import Callable
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
+from stimrig import identify
 from stimrig.api.cli.commands.test import run_test
 from stimrig.api.cli.errors import CommandError
-from stimrig.api.cli.options import Emulate, Json
+from stimrig.api.cli.options import Emulate, Json, set_options
 from stimrig.api.cli.reports import report_test
-from stimrig.api.cli.supervisor import Child, Services
-from stimrig.api.cli.terminal import number, say, say_json
+from stimrig.api.cli.supervisor import Services
+from stimrig.api.cli.terminal import report, say_aside
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
 
@@ -31,45 +30,28 @@ def demo(
     as_json: Json = False,
 ) -> None:
     """One whole pre-session test on the emulated rig: serial line, CAN bus, REST, model, approval, fetch."""
+    from stimrig.api.web.pages.report_file import comparison_html
+
     began = time.monotonic()
-    print_step: Callable[..., None] = (lambda *_: None) if as_json else say
     folder = data or Path("var") / "demo" / datetime.now().strftime("%Y%m%d-%H%M%S")
-    token = secrets.token_urlsafe(32)
-    print_step("starting the emulated rig, the rig process and the service")
-    with Services(Settings(data_dir=folder, port=0, rig_file=None), emulate.split(), token) as services:
-        result = play(services, token, print_step)
-    result["files"] = write_files(folder, result)
-    result["seconds"] = round(time.monotonic() - began, 1)
-    if as_json:
-        say_json(result)
-        return
-    shares = ", ".join(f"{name} {number(share, 1)} %" for name, share in result["cpu_percent"].items())
-    say("", *report_test(result["test"], result["model"]), f"processor      {shares} of a core during the test")
-    say("", *[f"{name:14} {path}" for name, path in result["files"].items()])
-    say(f"{'done in':14} {result['seconds']} s")
-
-
-def play(services: Services, token: str, print_step: Callable[..., None]) -> dict[str, Any]:
-    """Go the whole path, over HTTP only."""
-    children = [child for child in (services.emulator, services.rig) if child is not None]
-    with Client(services.url, token) as client:
-        print_step(f"service at {services.url}; participant {PARTICIPANT}; the test runs in real time")
-        before, began = [_processor_s(child) for child in children], time.monotonic()
+    settings, token = Settings(**set_options(data_dir=folder, port=0) | {"rig_file": None}), secrets.token_urlsafe(32)
+    say_aside("starting the emulated rig, the rig process and the service")
+    with Services(settings, emulate.split(), token) as services, Client(services.url, token) as client:
+        say_aside(f"service at {services.url}; participant {PARTICIPANT}; the test runs in real time")
         test = run_test(client, PARTICIPANT, services.watch)
-        percent = [100 / (time.monotonic() - began) * (_processor_s(child) - used)
-                   for child, used in zip(children, before, strict=True)]  # fmt: skip
-        print_step("approving the model; fetching it as the controller (ETag, then 304)")
+        say_aside("approving the model; fetching it as the controller (ETag, then 304)")
         model = approve_and_fetch(client, test["model_id"])
-        curves = client.curves(test["model_id"]).to_dict()
-    shares = {child.name: round(share, 1) for child, share in zip(children, percent, strict=True)}
-    return {"test": test, "model": model, "curves": curves, "cpu_percent": shares}
-
-
-def _processor_s(child: Child) -> float:
-    """Return the processor time used so far, s."""
-    assert child.process is not None
-    fields = Path(f"/proc/{child.process.pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+        page = comparison_html(model, client.curves(test["model_id"]).to_dict(), test["id"], test)
+    (recording,) = (folder / "recordings").glob(f"*{test['id']}*.h5")
+    (folder / "MODEL.json").write_text(json.dumps(model, indent=1, ensure_ascii=False))
+    (folder / "report.html").write_text(page)
+    places = {"recording": recording, "model": folder / "MODEL.json", "report": folder / "report.html"}
+    files = {name: str(path.absolute()) for name, path in (places | {"logs": folder / "logs"}).items()}
+    seconds = round(time.monotonic() - began, 1)
+    document = {"test": test, "model": model, "files": files, "seconds": seconds}
+    listed = [f"{name:10} {path}" for name, path in files.items()]
+    shown = identify.Model.from_dict(model)
+    report(document, as_json, report_test(test), "", shown, "", *listed, f"done in {seconds} s")
 
 
 def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
@@ -86,15 +68,3 @@ def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:
     if second.changed:
         raise CommandError("the service sent the model a second time, although nothing had changed")
     return first.document
-
-
-def write_files(folder: Path, result: dict[str, Any]) -> dict[str, str]:
-    """Write the model, and a report with charts, beside the recording; return where each file is."""
-    from stimrig.api.web.pages.report_file import comparison_html
-
-    model, report, test = folder / "MODEL.json", folder / "report.html", result["test"]
-    model.write_text(json.dumps(result["model"], indent=1, ensure_ascii=False))
-    report.write_text(comparison_html(result["model"], result.pop("curves"), test["id"], test))
-    recording = next((folder / "recordings").glob(f"*{test['id']}*.h5"), folder / "recordings")
-    files = {"recording": recording, "model": model, "report": report, "logs": folder / "logs"}
-    return {name: str(path.absolute()) for name, path in files.items()}

@@ -1,4 +1,4 @@
-"""`stimrig effects`: the library."""
+"""`stimrig effects`: the library of effects; a free effect of a model as a file of one's own."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from stimrig import identify
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.files import load_model
 from stimrig.api.cli.options import Json
-from stimrig.api.cli.terminal import say, say_json
+from stimrig.api.cli.terminal import report
 
 
 def effects(
@@ -27,27 +26,23 @@ def effects(
 
     With --export, what a free effect of a model was found to be is written as an effect that you edit and name.
     """
-    if export is not None:
-        path = output or Path(f"{name}.py")
-        _write(path, _own_text(export, effect, name))
-        say_json({"written": str(path)}) if as_json else say(
-            f"{path}: edit it, then set STIMRIG_EFFECTS_DIR to its folder"
-        )
+    from stimrig.identify.effects import library
+
+    if export is None:
+        entries = library()
+        report({"effects": entries}, as_json, *("\n".join([*effect_lines(entry), ""]) for entry in entries))
         return
-    from stimrig.identify import effects as library
-
-    entries = library.library()
-    if as_json:
-        say_json({"effects": entries})
-        return
-    for entry in entries:
-        say(*effect_lines(entry), "")
+    text, path = own_text(export, effect, name), output or Path(f"{name}.py")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("x", encoding="utf-8") as file:
+        file.write(text)
+    report({"written": str(path)}, as_json, f"{path}: edit it, then set STIMRIG_EFFECTS_DIR to its folder")
 
 
-def _own_text(path: Path, wanted: str | None, name: str) -> str:
+def own_text(path: Path, wanted: str | None, name: str) -> str:
     """Return the text of an effect's file.
 
-    Raises InputError: the model has no such free effect, or the name is none or taken.
+    Raises InputError: the model has no such free effect, or the name is taken. BadEffect: the name is none.
     """
     from stimrig.identify.effects import known_form, own_file, registry
 
@@ -61,40 +56,27 @@ def _own_text(path: Path, wanted: str | None, name: str) -> str:
         raise InputError(f"{path}: no free effect{f' {wanted!r}' if wanted else ''} in it. It has {names}.")
     estimates = matches[-1]["parameters"]
     try:
-        values = {
-            p.name: (float(estimates[p.name]["value"]), float(estimates[p.name]["sd"])) for p in known[1].parameters
-        }
-        return own_file.text_of(*known, values, name)
+        rows = {p.name: estimates[p.name] for p in known[1].parameters}
+        values = {p: (float(row["value"]), float(row["sd"])) for p, row in rows.items()}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: {known[0].id} lacks a value or an sd: {error}. Fit the record again.") from error
-    except identify.IdentifyError as error:
-        raise InputError(str(error)) from error
-
-
-def _write(path: Path, text: str) -> None:
-    """A new file. Raises InputError: it is there, or cannot be written."""
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        raise InputError(f"{path}: {error.strerror}. Give another file with -o.") from error
+    return own_file.text_of(*known, values, name)
 
 
 def effect_lines(entry: dict[str, Any]) -> list[str]:
-    """One effect for people."""
+    """Write one effect for people."""
     lines = [str(entry["id"])]
     for key, value in entry.items():
-        if key == "id" or not value:
-            continue
         if key == "parameters":
-            for parameter in value:
-                facts = {name: fact for name, fact in parameter.items() if name != "name" and fact is not None}
-                words = ", ".join(f"{name.replace('_', ' ')} {fact}" for name, fact in facts.items())
-                lines.append(f"  {parameter['name']}: {words}")
+            lines += [f"  {row['name']}: {_facts(row)}" for row in value]
         elif key == "forms":
-            lines += [f"  {'form':14} {form['name']}: {form['equation']}" for form in value]
-        else:
-            text = ", ".join(str(item) for item in value) if isinstance(value, list | tuple) else str(value)
+            lines += [f"  form           {form['name']}: {form['equation']}" for form in value]
+        elif value and key != "id":
+            text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
             lines.append(f"  {key.replace('_', ' '):14} {text}")
     return lines
+
+
+def _facts(row: dict[str, Any]) -> str:
+    facts = {key: fact for key, fact in row.items() if key != "name" and fact is not None}
+    return ", ".join(f"{key.replace('_', ' ')} {fact}" for key, fact in facts.items())

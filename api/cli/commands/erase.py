@@ -17,8 +17,8 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.cli.commands.audit import DataDir, open_store, settings_of
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.options import Json
-from stimrig.api.cli.terminal import say, say_json
+from stimrig.api.cli.options import Json, RigData
+from stimrig.api.cli.terminal import report
 from stimrig.api.clock import Clock
 from stimrig.api.store import Store, audit, migrations
 from stimrig.api.store.service_lock import HeldError, ServiceLock
@@ -32,7 +32,7 @@ def erase(
     code: Annotated[str, typer.Argument(help="the participant's code")],
     reason: Annotated[str, typer.Option(help="why, for the audit trail: no name, no code")] = "on request",
     data: DataDir = None,
-    rig_data: Annotated[Path | None, typer.Option(help="the rig's data folder, where it has one of its own")] = None,
+    rig_data: RigData = None,
     yes: Annotated[bool, typer.Option("--yes", help="do not ask before deleting")] = False,
     as_json: Json = False,
 ) -> None:
@@ -61,10 +61,8 @@ def erase(
             counts = {table.name: len(keys) for table, keys in rows.items() if keys}
             audit.erase(session, names, clock.utc(), by, reason=reason, rows=counts)
         store.compact()
-    if as_json:
-        say_json({"rows": counts, "files": len(files)})
-    else:
-        say(f"deleted: {len(files)} files, {', '.join(f'{count} {name}' for name, count in counts.items())}", ELSEWHERE)
+    words = f"deleted: {len(files)} files, {', '.join(f'{count} {name}' for name, count in counts.items())}"
+    report({"rows": counts, "files": len(files)}, as_json, words, ELSEWHERE)
 
 
 def find_files(store: Store, code: str, folders: list[Path], now_utc: str) -> list[Path]:

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
 from stimrig import identify
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.files import load_model, load_record, write_model
+from stimrig.api.cli.files import load_model, load_record, write
 from stimrig.api.cli.options import ColumnMap, Json, SeveralData, names
-from stimrig.api.cli.reports import carried_lines, model_report
-from stimrig.api.cli.terminal import say, say_json
+from stimrig.api.cli.terminal import report
 from stimrig.api.progress_bar import progress_bar
 
 METHOD = "maximum-likelihood"
@@ -55,7 +54,7 @@ def fit(
         raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
     earlier = None if carry is None else load_model(carry)
     record = load_record(data, columns, names(effects))
-    finding: dict[str, Any] | None = None
+    carried = None
     with progress_bar() as progress:
         if earlier is None:
             model = identify.fit(
@@ -63,11 +62,6 @@ def fit(
             )
         else:
             carried = identify.carry(record, earlier, progress)
-            finding = carried.finding()
-            model = carried.model.with_(extra=carried.model.extra | {"carried": finding})
-    if output is not None:
-        write_model(output, model)
-    if as_json:
-        say_json(model.to_dict())
-        return
-    say(*model_report(model.to_dict()), *carried_lines(finding), *([f"written to     {output}"] if output else []))
+            model = carried.model.with_(extra=carried.model.extra | {"carried": carried.finding()})
+    write(output, model)
+    report(model.to_dict(), as_json, model, *filter(None, [carried]), files=[output])

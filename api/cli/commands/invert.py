@@ -7,10 +7,9 @@ from typing import Annotated
 
 import typer
 
-from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.files import load_model, write
 from stimrig.api.cli.options import Json, ModelFile
-from stimrig.api.cli.terminal import number, percent, say, say_json, table
+from stimrig.api.cli.terminal import report
 
 
 def invert(
@@ -30,29 +29,11 @@ def invert(
 ) -> None:
     """Pulse widths whose predicted torque follows a reference best, and what of it is out of reach."""
     from stimrig.api.models import inverted
-    from stimrig.identify.errors import IdentifyError
     from stimrig.identify.inversion import invert as widths_for
     from stimrig.identify.inversion.reference import read_reference
 
-    model = load_model(model_json, "invert MODEL.json REFERENCE.csv -o FILE")
-    try:
-        content = reference.read_bytes()
-    except OSError as error:
-        raise InputError(f"{reference}: {error.strerror}. Give a CSV file with time_s,torque_nm.") from error
-    try:
-        wanted = read_reference(content, str(reference), model.pulse_rate_hz)
-        inversion = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us, shortest_us=shortest_us).to_dict()
-    except IdentifyError as error:
-        raise InputError(str(error)) from error
-    write(output, inverted.table(inversion))
-    if as_json:
-        say_json({"output": str(output), **inversion})
-        return
-    fit = percent(inversion["fit_percent"])
-    say(f"{output}: {len(inversion['pulse_width_us'])} pulses, fit {fit} where it can be reached")
-    if inversion["unreachable"]:
-        rows = [
-            [f"{row['begin_s']:.2f}", f"{row['end_s']:.2f}", number(row["shortfall_nm"], 3), row["reason"]]
-            for row in inversion["unreachable"]
-        ]
-        say(*table(["begin (s)", "end (s)", "lacks (N·m)", "reason"], rows))
+    model = load_model(model_json)
+    wanted = read_reference(reference.read_bytes(), str(reference), model.pulse_rate_hz)
+    inversion = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us, shortest_us=shortest_us)
+    write(output, inverted.table(inversion.to_dict()))
+    report({"output": str(output), **inversion.to_dict()}, as_json, inversion, files=[output])

@@ -8,9 +8,10 @@ from typing import Annotated
 import typer
 
 from stimrig import identify
-from stimrig.api.cli.files import load_model, load_record, writing
+from stimrig.api.cli.files import load_model, load_record
 from stimrig.api.cli.options import ColumnMap, Data, Json, ModelFile
-from stimrig.api.cli.terminal import number, percent, say, say_json
+from stimrig.api.cli.terminal import report
+from stimrig.api.whole_file import whole_path
 
 
 def predict(
@@ -25,19 +26,20 @@ def predict(
 
     from stimrig.identify import plain_mat
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
+    from stimrig.identify.summary import fit_words
 
-    model = load_model(model_json, "predict MODEL.json DATA -o FILE")
+    model = load_model(model_json)
     record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))
     rows = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
-    with writing(output) as place:
+    with whole_path(output) as place:
         if output.suffix.lower() == ".mat":
             plain_mat.write(place, rows)
         else:
             np.savetxt(place, np.column_stack(list(rows.values())), "%.9g", ",", header=",".join(rows), comments="")
-    reached = best_fit_percent(record.torque_nm, predicted)
-    rms_nm = float(np.sqrt(np.mean((record.torque_nm - predicted) ** 2)))
-    if as_json:
-        say_json({"output": str(output), "rows": len(predicted), "fit_percent": reached, "rms_nm": rms_nm})
-        return
-    say(f"{output}: {len(predicted)} rows, fit {percent(reached)} over the whole record, rms {number(rms_nm, 4)} N·m")
+    figures = {
+        "fit_percent": best_fit_percent(record.torque_nm, predicted),
+        "rms_nm": float(np.sqrt(np.mean((record.torque_nm - predicted) ** 2))),
+    }
+    words = f"{len(predicted)} rows, {fit_words(figures)} over the whole record"
+    report({"output": str(output), "rows": len(predicted), **figures}, as_json, words, files=[output])

@@ -9,25 +9,18 @@ import subprocess
 import sys
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import typer
 
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.options import Json
 from stimrig.api.cli.supervisor import die_with_parent
-from stimrig.api.cli.terminal import say, say_json
+from stimrig.api.cli.terminal import report
 
 
-def register(app: typer.Typer) -> None:
-    """Add the verb."""
-    verbs = typer.Typer(no_args_is_help=True, help="Check a rig's wiring.")
-    verbs.command("check")(check)
-    verbs.callback()(lambda: None)
-    app.add_typer(verbs, name="rig")
-
-
-def check(
+def rig(
+    _action: Annotated[Literal["check"], typer.Argument(metavar="check", show_default=False)],
     rig: Annotated[Path | None, typer.Option(help="rig file (TOML)", metavar="FILE")] = None,
     emulator_json: Annotated[
         str | None, typer.Option(help="line of `stimrig emulate`, or a file with it", metavar="LINE")
@@ -51,16 +44,16 @@ def check(
         signal.signal(signal.SIGINT, before)
     if not ended.stdout:  # it has said why
         raise typer.Exit(max(ended.returncode, 1))
-    report = json.loads(ended.stdout)
-    say_json(report) if as_json else say(*summary(report))
+    document = json.loads(ended.stdout)
+    report(document, as_json, *summary(document))
     raise typer.Exit(ended.returncode)
 
 
-def summary(report: dict[str, Any]) -> list[str]:
+def summary(document: dict[str, Any]) -> list[str]:
     """Write the report for people: the verdict, and each fault with its remedy."""
-    lines = [report["verdict"]]
-    for step in report["steps"]:
+    lines = [document["verdict"]]
+    for step in document["steps"]:
         if step["outcome"] == "failed":
             lines += [f"{step['name']}: {step['figure']}: {step['cause']}", f"  -> {step['remedy']}"]
-    undone = [step["name"] for step in report["steps"] if step["outcome"] == "not done"]
+    undone = [step["name"] for step in document["steps"] if step["outcome"] == "not done"]
     return [*lines, *([f"not done: {', '.join(undone)}"] if undone else [])]

@@ -15,6 +15,9 @@ from stimrig.api.cli.options import DataDir, RigFile, set_options
 from stimrig.api.cli.stop_key import StopKey, at_rig
 from stimrig.api.cli.supervisor import Services
 from stimrig.api.cli.terminal import say
+from stimrig.api.clock import Clock
+from stimrig.api.errors import ApiError
+from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.settings import Settings
 from stimrig.rig.messages import Status
 
@@ -31,10 +34,16 @@ def serve(
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
     settings = Settings(**set_options(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
-    attached = rig_status(settings, emulate) if settings.rig_socket else None
-    services = Services(settings, emulate.split(), attach=settings.rig_socket)
+    attached = settings.rig_socket
+    if attached is not None:
+        rig_status(attached)
+        if settings.rig_file is not None or emulate.strip():
+            other = "--emulate" if settings.rig_file is None else f"--rig {settings.rig_file}"
+            fix = "give one of them (STIMRIG_RIG_SOCKET and STIMRIG_RIG_FILE count, too)."
+            raise InputError(f"--rig-socket {attached} attaches to a rig that runs, {other} starts one: {fix}")
+    services = Services(settings, emulate.split(), attach=attached)
     with contextlib.suppress(KeyboardInterrupt), services:
-        say(*welcome(services, attached))
+        say(*welcome(services, rig_status(services.socket)))
         try:
             with StopKey(at_rig(services.socket), say) as key:
                 if key.watched:
@@ -47,50 +56,30 @@ def serve(
             say("stopping" + ("; the rig goes on by itself" if attached else ""))
 
 
-def rig_status(settings: Settings, emulate: str) -> Status:
-    """Ask the rig that runs already for its state.
-
-    Raises InputError: a rig to be started was named, too, or none listens at the socket.
-    """
-    from stimrig.api.clock import Clock
-    from stimrig.api.errors import ApiError
-    from stimrig.api.sessions.rig_client import RigClient
-
-    place = settings.rig_socket
-    if settings.rig_file is not None or emulate.strip():
-        other = f"--rig {settings.rig_file}" if settings.rig_file is not None else "--emulate"
-        raise InputError(
-            f"--rig-socket {place} attaches to a rig that runs, {other} starts one: give one of them "
-            "(STIMRIG_RIG_SOCKET and STIMRIG_RIG_FILE count, too)."
-        )
+def rig_status(socket: Path) -> Status:
+    """Ask the rig at a socket for its state. Raises InputError: none answers there."""
     try:
-        return asyncio.run(RigClient(place, Clock()).fresh_status())
+        return asyncio.run(RigClient(socket, Clock()).fresh_status())
     except ApiError as error:
         raise InputError(
-            f"--rig-socket {place}: no rig answers there ({error.detail}) Start it first: "
-            f"python -m stimrig.rig --config RIG.toml --data DIR --socket {place}"
+            f"--rig-socket {socket}: no rig answers there ({error.detail}) Start it first: "
+            f"python -m stimrig.rig --config RIG.toml --data DIR --socket {socket}"
         ) from error
 
 
-def welcome(services: Services, attached: Status | None) -> list[str]:
+def welcome(services: Services, rig: Status) -> list[str]:
     """Write where the service is, how to get in, and what keeps the rig from working, if anything does."""
     settings, url, new_token = services.settings, services.url, services.api.ready["drawn_token"]
     devices = f"rig file {settings.rig_file}" if settings.rig_file else "the emulated rig"
-    if attached:
-        devices, state = f"the rig at {settings.rig_socket}", attached.state
-        why = attached.reason or "it is busy"
-    else:
-        state, why = services.rig.ready.get("state", "ready"), services.rig.last_words()
+    devices = f"the rig at {settings.rig_socket}" if services.attached else devices
     lines = [f"stimrig serves {url}/ with {devices}; data and logs in {settings.data_dir.absolute()}"]
     if new_token:
-        lines += [
-            f"first administrator's token, shown this once: {new_token}",
-            f"sign in: {url}/sign-in#token={new_token}",
-        ]
+        lines += [f"first administrator's token, shown this once: {new_token}"]
+        lines += [f"sign in: {url}/sign-in#token={new_token}"]
     elif settings.admin_token:
         lines += ["the administrator's token is the one in STIMRIG_ADMIN_TOKEN"]
     else:
         lines += ["sign in with a token issued before (set STIMRIG_ADMIN_TOKEN to replace a lost one)"]
     if services.emulator is not None:
-        lines += [f"the emulator's control line: {services.emulator.ready.get('control')}"]
-    return [*lines, *([] if state == "ready" else [f"the rig is {state}: {why}"])]
+        lines += [f"the emulator's control line: {services.emulator.ready['control']}"]
+    return [*lines, *([] if rig.state == "ready" else [f"the rig is {rig.state}: {rig.reason or 'it is busy'}"])]

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 import typer
 
 from stimrig.api.cli.options import Json
-from stimrig.api.cli.terminal import number, say, say_json, table
+from stimrig.api.cli.terminal import report
 from stimrig.api.progress_bar import progress_bar
 
 
@@ -20,13 +20,12 @@ def table1(
 
     with progress_bar() as progress:
         result = paper.table1(trials, progress)
-    say_json(result) if as_json else say(*lines(result))
+    further = [f"{key}: {value}" for key, value in result.items() if key != "rows"]
+    report(result, as_json, *lines(result["rows"]), "", *further)
 
 
-def lines(result: dict[str, Any]) -> list[str]:
-    """The table for people."""
-    rows = result["rows"]
-    header = list(rows[0])
-    body = [[str(row[key]) if isinstance(row[key], str) else number(row[key]) for key in header] for row in rows]
-    rest = [f"{key}: {value}" for key, value in result.items() if key != "rows"]
-    return [*table(header, body), "", *rest]
+def lines(rows: list[dict[str, Any]]) -> list[str]:
+    """Write the rows below their names, aligned."""
+    cells = [list(rows[0]), *([f"{v:.2f}" if isinstance(v, float) else str(v) for v in row.values()] for row in rows)]
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    return ["  ".join(map(str.ljust, row, widths)).rstrip() for row in cells]

@@ -4,32 +4,34 @@ from __future__ import annotations
 
 import contextlib
 import inspect
-import math
 import os
 import secrets
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from threading import Event
 from typing import Annotated, Any
 
 import typer
 
+from stimrig import identify
 from stimrig.api.cli import deciding
-from stimrig.api.cli.commands.diagnose import diagnosis_lines
 from stimrig.api.cli.errors import CommandError, InputError
-from stimrig.api.cli.files import writing
-from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, set_options
+from stimrig.api.cli.files import write
+from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, names, set_options
 from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
 from stimrig.api.cli.supervisor import Services
-from stimrig.api.cli.terminal import CLEAR_LINE, number, say, say_aside, say_json
+from stimrig.api.cli.terminal import CLEAR_LINE, report, say_aside
 from stimrig.api.client.errors import ServiceError, Unreachable
 from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
 from stimrig.api.settings import Settings
 from stimrig.api.web.responses.rig import TestOut
 from stimrig.rig.messages import LABEL_TITLES, Labels
+
+Events = Callable[[], list[str]]
+"""What has happened to the processes of the service since the last call."""
 
 
 def test(
@@ -77,42 +79,33 @@ def test(
 
     With --adaptive each segment is chosen by what is known so far, and the test stops once enough is known.
     """
-    bounds = set_options(max_duration_s=max_time, max_torque_time_nm_s=max_torque_time, anyway=anyway or None)
-    request = kind_of_test(adaptive, protocol, target, bounds) | set_options(**labels)
-    if decide and (adaptive or protocol is not None):
-        raise InputError("--decide plays what the diagnosis asks for; leave out --adaptive and --protocol.")
-    token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
+    bounds = set_options(
+        target=target_of(target), max_duration_s=max_time, max_torque_time_nm_s=max_torque_time, anyway=anyway or None
+    )
+    if bounds and not adaptive:
+        raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
+    if (adaptive, protocol is not None, bool(decide)).count(True) > 1:
+        raise InputError("--adaptive, --protocol and --decide are three kinds of test. Give one of them.")
     check_output(output)
-    if url and not token:
-        raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
+    request = set_options(protocol=protocol, kind="adaptive" if adaptive else None, **bounds, **labels)
     if decide:
         request |= deciding.plan_experiment(decide, participant)
-    code = request.pop("participant", participant or "TEST")
-    if url and token:
-        over = Event()
-        with StopKey(at_service(url, token, over.is_set), say_aside) as key:
-            announce(key)
-            result = through(url, token, code, over=over.set, request=request)
-    else:
-        result = on_own_services(rig, data, emulate, code, request)
+    over = Event()
+    with service(url, rig, data, emulate, over) as (client, events):
+        code = request.pop("participant", participant or "TEST")
+        result = play(client, code, request, events, over.set)
     recording = result.pop("recording")
-    if output is not None:  # first, so that a later error cannot lose the recording
-        with writing(output) as place:
-            place.write_bytes(recording)
+    write(output, recording)  # first, so that a later error cannot lose the recording
+    lines: list[object] = [report_test(result["test"])]
     if decide:
-        result["diagnosis"] = deciding.diagnose_together(decide, recording)
-    if as_json:
-        say_json(result)
-        return
-    say(*report_test(result["test"], None if decide else result["model"]))
-    if decide:
-        say("", "both together", "", *diagnosis_lines(result["diagnosis"]), "")
-        if result["diagnosis"]["left"]["structure"]:
-            say("with what was added", "", *diagnosis_lines(result["diagnosis"]["left"]), "")
-    say(f"recording      {output or result['test']['recording_url']}")
+        explained, result["diagnosis"] = deciding.diagnose_together(decide, recording)
+        lines += ["", "Both together", explained]
+    elif not as_json:
+        lines += ["", identify.Model.from_dict(result["model"])]
+    report(result, as_json, *lines, f"recording: {output or result['test']['recording_url']}")
 
 
-def take_labels(verb: Any) -> None:
+def _take_labels(verb: Any) -> None:
     """Make an option of each label that a person types, in the place of the verb's keywords."""
     *parameters, _labels = inspect.signature(verb, eval_str=True).parameters.values()
     for name in LABEL_TITLES:
@@ -122,151 +115,116 @@ def take_labels(verb: Any) -> None:
     verb.__signature__ = inspect.Signature(parameters)
 
 
-take_labels(test)
+_take_labels(test)
 
 
 def check_output(output: Path | None) -> None:
-    """Check that the recording can be written: a folder that is not there would be found after the test.
-
-    Raises InputError: it cannot.
-    """
+    """Check before the test that the recording can be written after it. Raises InputError, OSError."""
     if output is None:
         return
-    try:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{output}: {error.strerror}. Give a file in a folder that can be written.") from error
+    output.parent.mkdir(parents=True, exist_ok=True)
     if output.is_dir() or not os.access(output if output.exists() else output.parent, os.W_OK):
         raise InputError(f"{output}: give a file in a folder that can be written.")
 
 
-def kind_of_test(adaptive: bool, protocol: str | None, target: str, bounds: dict[str, Any]) -> dict[str, Any]:
-    """Return what the service is asked for beside the participant.
-
-    Raises InputError: an option of adaptive tests without --adaptive, one of fixed tests with it, or what is no number.
-    """
-    if not adaptive:
-        if bounds or target:
-            raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
-        return set_options(protocol=protocol)
-    if protocol is not None:
-        raise InputError("--protocol is for a fixed test; leave it out, or leave out --adaptive.")
-    for option, name in (("--max-time", "max_duration_s"), ("--max-torque-time", "max_torque_time_nm_s")):
-        if not 0 < bounds.get(name, 1.0) < math.inf:
-            raise InputError(f"{option} {bounds[name]:g}: give a number above 0.")
-    return {"kind": "adaptive", **bounds, **({"target": target_of(target)} if target else {})}
-
-
-def target_of(text: str) -> dict[str, float]:
+def target_of(text: str) -> dict[str, float] | None:
     """Read a target as it is typed: one number for both curves, or two. Raises InputError: it is none."""
     try:
-        values = [float(part) for part in text.split(",")]
+        values = [float(part) for part in names(text)]
     except ValueError:
-        values = []
-    if len(values) not in (1, 2) or not all(0 < value < math.inf for value in values):
+        values = [0.0] * 3
+    if len(values) > 2:
         raise InputError(f"--target {text}: give one number, as 2, or two, as 2,3: % of the curve and step response.")
-    return {"curve_percent": values[0], "step_percent": values[-1]}
+    return {"curve_percent": values[0], "step_percent": values[-1]} if values else None
 
 
-def announce(key: StopKey) -> None:
-    """Say that a key stops, where one does."""
-    if key.watched:
-        say_aside("any key stops the test")
+@contextlib.contextmanager
+def service(
+    url: str, rig: Path | None, data: Path | None, emulate: str, over: Event
+) -> Iterator[tuple[Client, Events]]:
+    """Yield a client of the service at `url`, else of one started here, and its events; any key stops the rig.
 
-
-def on_own_services(
-    rig: Path | None, data: Path | None, emulate: str, participant: str, request: dict[str, Any]
-) -> dict[str, Any]:
-    """Start rig and service for this one test."""
-    settings, token, over = Settings(**set_options(rig_file=rig, data_dir=data)), secrets.token_urlsafe(32), Event()
-    settings.port = 0
-    with (
-        Services(settings, emulate.split(), token) as services,
-        StopKey(at_rig(services.socket, over.is_set), say_aside) as key,
-    ):
-        announce(key)
-        return through(services.url, token, participant, services.watch, over.set, request)
-
-
-def through(
-    url: str,
-    token: str,
-    participant: str,
-    events: Callable[[], list[str]] = list,
-    over: Callable[[], object] = list,
-    request: dict[str, Any] | None = None,
-) -> dict[str, Any]:
-    """Run the test through a service; `events` and `over` as in `run_test`.
-
-    Raises InputError: as `deciding.check_participant`, where the request has `recorded_ma`. ServiceError: the service
-    cannot be reached, or the test did not end in a model.
+    Once `over` is set nothing is played any more: a key then stops only what plays.
     """
-    more = dict(request or {})
-    with Client(url, token) as client:
-        if "recorded_ma" in more:  # it is no request of the service: nobody is made anew for a recording
-            deciding.check_participant(client, participant, more.pop("recorded_ma"))
-        document = run_test(client, participant, events, over, **more)
-        best = document["model_id"]
-        if (document.get("adaptive") or {}).get("problem"):
-            say_aside("  the structure leaves an error: adding what explains it")
-            with contextlib.suppress(ServiceError), progress_bar() as progress:  # the plain model is there all the same
-                best = client.improve(best, progress)["id"]
-        model = client.model_file(best)
-        return {"test": document, "model": model, "recording": client.recording(document["recording_id"])}
+    with contextlib.ExitStack() as stack:
+        if url:
+            token = os.environ.get("STIMRIG_TOKEN") or os.environ.get("STIMRIG_ADMIN_TOKEN")
+            if not token:
+                raise InputError(f"--url {url} needs a token in STIMRIG_TOKEN.")
+            events, stop = list, at_service(url, token, over.is_set)
+        else:
+            settings, token = Settings(**set_options(rig_file=rig, data_dir=data, port=0)), secrets.token_urlsafe(32)
+            services = stack.enter_context(Services(settings, emulate.split(), token))
+            url, events, stop = services.url, services.watch, at_rig(services.socket, over.is_set)
+        if stack.enter_context(StopKey(stop, say_aside)).watched:
+            say_aside("any key stops the test")
+        yield stack.enter_context(Client(url, token)), events
+
+
+def play(
+    client: Client,
+    participant: str,
+    request: dict[str, Any],
+    events: Events = list,
+    over: Callable[[], object] = list,
+) -> dict[str, Any]:
+    """Run a test; return its document, its best model and its recording. `events` and `over` as in `run_test`.
+
+    Raises InputError: as `deciding.check_participant`, where the request has `recorded_ma`. CommandError, ServiceError.
+    """
+    if "recorded_ma" in request:  # it is no request of the service: nobody is made anew for a recording
+        deciding.check_participant(client, participant, request.pop("recorded_ma"))
+    document = run_test(client, participant, events, over, **request)
+    best = document["model_id"]
+    if (document.get("adaptive") or {}).get("problem"):
+        say_aside("  the structure leaves an error: adding what explains it")
+        with contextlib.suppress(ServiceError), progress_bar() as progress:  # the plain model is there all the same
+            best = client.improve(best, progress)["id"]
+    return {"test": document, "model": client.model_file(best), "recording": client.recording(document["recording_id"])}
 
 
 def run_test(
-    client: Client,
-    participant: str,
-    events: Callable[[], list[str]] = list,
-    over: Callable[[], object] = list,
-    **more: Any,
+    client: Client, participant: str, events: Events = list, over: Callable[[], object] = list, **request: Any
 ) -> dict[str, Any]:
-    """Run a test, the default pre-session test unless `more` says otherwise, and show its progress.
+    """Run a test, the default pre-session test unless `request` says otherwise, and show its progress.
 
-    The participant is made unless it is there. `events` says which processes of the service have ended; one is enough
-    to give up. `over` is called as soon as nothing of the test is played any more.
+    The participant is made unless it is there. `events`: one is enough to give up. `over` is called as soon as nothing
+    of the test is played any more.
 
     Raises CommandError: a process has ended. Raises ServiceError: the test was refused, or did not complete.
     """
-    show = Progress()
+    shown = ""
 
     def watch(test: TestOut) -> None:
+        nonlocal shown
         for event in events():
             raise CommandError(event)
         if test.state not in ("requested", "running"):
             over()
-        show(test)
+        segment, words = _progress(test)
+        if sys.stderr.isatty():
+            words, end = (test.state, "\n") if test.done else (words, "")
+            print(f"{CLEAR_LINE}  {words}", end=end, file=sys.stderr, flush=True)
+        elif segment != shown and not test.done:
+            print(f"  {words}", file=sys.stderr, flush=True)
+        shown = segment
 
     client.ensure_participant(participant)
     try:
-        return client.run_test(participant, watch, **more).to_dict()
+        return client.run_test(participant, watch, **request).to_dict()
     except Unreachable as error:
         for event in events():
             raise CommandError(event) from error
         raise
 
 
-class Progress:
-    """A progress line: on a terminal in place, elsewhere a line a segment."""
-
-    def __init__(self) -> None:
-        self.terminal, self.last = sys.stderr.isatty(), ""
-
-    def __call__(self, test: TestOut) -> None:
-        """Show where the test stands."""
-        if test.state == "identifying":
-            segment = (test.identification or {}).get("text") or "identifying"
-            words = f"identification: {segment}"
-        elif test.adaptive and test.state == "running":
-            segment = test.adaptive["problem"] or test.adaptive["words"] or "a first look at the muscle"
-            words = f"{test.elapsed_s:4.1f} s  {number(test.adaptive['torque_time_nm_s'], 1)} N·m·s  {segment}"
-        else:
-            segment = test.segment or test.state
-            words = f"{segment:10} {100 * test.progress:3.0f} %  {test.time_left_s:4.0f} s left"
-        if self.terminal:
-            words, end = (test.state, "\n") if test.done else (words, "")
-            print(f"{CLEAR_LINE}  {words}", end=end, file=sys.stderr, flush=True)
-        elif segment != self.last and not test.done:
-            print(f"  {words}", file=sys.stderr, flush=True)
-        self.last = segment
+def _progress(test: TestOut) -> tuple[str, str]:
+    """Return the part of the test that goes on, and a line of how far it is."""
+    if test.state == "identifying":
+        segment = (test.identification or {}).get("text") or "identifying"
+        return segment, f"identification: {segment}"
+    if test.adaptive and test.state == "running":
+        segment = test.adaptive["problem"] or test.adaptive["words"] or "a first look at the muscle"
+        return segment, f"{test.elapsed_s:4.1f} s  {test.adaptive['torque_time_nm_s'] or 0.0:.1f} N·m·s  {segment}"
+    segment = test.segment or test.state
+    return segment, f"{segment:10} {100 * test.progress:3.0f} %  {test.time_left_s:4.0f} s left"

@@ -51,7 +51,7 @@ async def recording_csv(context: Ctx, _principal: ModelReader, recording_id: str
     out = context.settings.exports_dir / f"{secrets.token_hex(8)}.csv"
     gone = BackgroundTask(out.unlink, missing_ok=True)
     try:
-        await while_connected(request, context.analyses.run("export_csv", data=str(source), out=str(out)))
+        await while_connected(request, context.analyses.run("plain_csv", data=str(source), out=str(out)))
     except BaseException:
         out.unlink(missing_ok=True)
         raise

@@ -40,7 +40,7 @@ def add_slowly(self, row):
     return status
 
 results.Results.add = add_slowly
-main()
+main(sys.argv[1:])
 """
 """Every row to the disk at once; after the third it waits as long as the last word says, s."""
 
@@ -120,7 +120,7 @@ def test_reports(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     words = ["cohort", "fit", str(write(tmp_path / "a.h5", Session())), "-o", output, "--workers", "1"]
     assert main.run(words) == 0
     out = capsys.readouterr().out
-    assert "1 with a result" in out and output in out
+    assert "ok           1" in out and output in out
     assert main.run([*words, "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert unmet("cohort", report) == [] and report["done_before"] == 1
