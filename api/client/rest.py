@@ -206,10 +206,6 @@ class Client(Connection):
         """End a running adaptive test well, at the next pulse; its recording is identified like any other."""
         return self.post(f"/v1/tests/{test_id}/enough")
 
-    def keep_plain(self, test_id: str) -> TestOut:
-        """End the fit of last session's structure after a test: the plain model is offered. Refused when none runs."""
-        return self._request_as(TestOut, "POST", f"/tests/{test_id}/keep-plain")
-
     def recording(self, recording_id: str) -> bytes:
         """The raw recording (HDF5), as it was sealed."""
         return self.request("GET", f"/v1/recordings/{recording_id}").content

@@ -210,14 +210,6 @@ class Lifecycle:
         await asyncio.to_thread(self.update, row.id, model_id=model.id)
         return model
 
-    def keep_plain(self, test_id: str) -> bool:
-        """End the fit of the last session's structure after a test; return whether one was under way."""
-        job = self.jobs.get(test_id)
-        if job is None or job.kind != "carry":
-            return False
-        self.analyses.pool.cancel(job)
-        return True
-
     async def close(self) -> None:
         """End what goes on in the background."""
         await self._tasks.close()

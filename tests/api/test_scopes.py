@@ -80,7 +80,6 @@ POST   /v1/participants/x/calibration/finish               run-test       428
 POST   /v1/participants/x/calibration/discard              run-test       428
 DELETE /v1/participants/x/keys/x                           run-test       404
 POST   /v1/tests                                           run-test       428
-POST   /v1/tests/x/keep-plain                              run-test       404
 POST   /v1/tests/x/enough                                  run-test       404
 POST   /v1/preview                                         run-test       422
 POST   /v1/models/x/effects                                run-test       422

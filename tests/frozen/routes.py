@@ -236,7 +236,6 @@ def tests(day: Day) -> None:
         day.ask("POST", "/v1/tests", {"participant": "P1", "kind": "adaptive", **more})
     day.service.rig.speed = 600.0
     day.ask("PUT", "/v1/tests/{test_first}/ran-by", {"ran_by": "Ben"})
-    day.ask("POST", "/v1/tests/{test_first}/keep-plain")
     day.ask("POST", "/v1/tests/{test_first}/enough")
 
 

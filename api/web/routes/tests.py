@@ -84,16 +84,6 @@ def set_ran_by(
     return context.runner.document(row)
 
 
-@router.post("/{test_id}/keep-plain", **describe_answer(TestOut))
-async def keep_plain(context: Ctx, _principal: Tester, test_id: str) -> dict[str, Any]:
-    """End the fit of the last approved model's structure after a test: the plain model is offered."""
-    row = await asyncio.to_thread(tests.find, context, test_id)
-    if not context.runner.lifecycle.keep_plain(test_id):
-        detail = f"{test_id} is {row.state}. This can be ended only while the last session's structure is fitted."
-        raise ApiError(409, "nothing-carried", "No structure is being carried over", detail)
-    return await asyncio.to_thread(context.runner.document, row)
-
-
 @router.post("/{test_id}/enough", **describe_answer(Extended))
 async def enough(context: Ctx, principal: Tester, test_id: str) -> dict[str, Any]:
     """End a running adaptive, passive or moving test well, at the next pulse: what was measured is used."""

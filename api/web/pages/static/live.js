@@ -96,7 +96,8 @@ function showTest(test, words) {
     say("left", job?.time_left_s ? `${Math.ceil(job.time_left_s)} s` : "–");
     say("segment", "the model is being fitted"); byId("segment").title = words.work; byId("progress").value = job ? job.progress : 0;
   }
-  hide("keep-plain", !(identifying && job?.verb === "carry"));
+  hide("plain-model", !(identifying && job?.verb === "carry"));
+  if (test.model_id) byId("plain-model").querySelector("a").href = "/models/" + test.model_id;
   if (test.reason) { say("reason", words.reason); hide("reason", false); }
   const next = test.model_id ? "/models/" + test.model_id : test.joint && test.state === "completed" ? `/participants/${test.participant}/joint` : location.pathname;
   if (test.done && wasOpen) leave(next);
