@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import importlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -30,47 +31,30 @@ def track(
     reference_torque_nm: Sequence[float] | None = None,
     between: Sequence[str] = (),
 ) -> dict[str, Any]:
-    """Follow one trial.
+    """Follow the trial of a recording, `data`, from the approved MODEL.json.
 
-    Parameters
-    ----------
-    data : str
-        The recording.
-    model_json : str
-        The approved MODEL.json.
-    bounds : mapping of str to (float, float)
-        Least and most that a person allowed, of each quantity that may move; in the model for the next trial the
-        others stay.
-    state : dict, optional
-        What was expected after the last trial that was followed.
-    missed : int
-        Trials since then that were not followed: what is known has become less certain by them.
-    earlier : sequence of sequences of dict
-        The levels of the trials of this person's earlier sessions: how fast they change from trial to trial.
-    reference_torque_nm : sequence of float, optional
-        What the controller wanted, one value for each pulse, N·m.
-    between : sequence of str
-        Recordings of what the muscle did since `state`, oldest first; without one, since the begin of the approved
-        model's test. They are read only if the model has effects with slow states, such as fatigue.
+    `bounds`: least and most that a person allowed, of each quantity that may move in the model; `state`: what was
+    expected after the last trial that was followed; `missed`: trials since then, by which that is less certain;
+    `earlier`: levels of the trials of earlier sessions, which say how fast they change; `reference_torque_nm`: what the
+    controller wanted, one value for each pulse, N·m; `between`: recordings of what the muscle did since `state`, or
+    since the begin of the approved model's test, oldest first, for effects with slow states, such as fatigue.
 
-    Returns
-    -------
-    dict
-        `error_percent`, None without a reference; `step` and the text of the `model` for the next trial, or the
-        `reason` why the trial was not followed.
+    Returns `error_percent`, None without a reference; `step` and the text of the `model` for the next trial, or the
+    `reason` why the trial was not followed.
     """
-    from stimrig.identify.tracking import State, begin, follow, learn_rates, model_for_next
+    from stimrig.identify.tracking import State, begin, follow, learn_rates, model_for_next, passed, slow_forms
 
     progress(0.1, "reading the recording")
     record = dated(Path(data))
     error = error_percent(record, reference_torque_nm)
     try:
-        model = second_order(identify.Model.from_json(model_json))
-        rates = learn_rates(earlier)
+        model, rates = second_order(model_json), learn_rates(earlier)
         before = begin(model, rates) if state is None else State.from_dict(state)
         for _ in range(min(missed, MOST_MISSED)):
             before = before.ahead(rates)
-        before = worked(model, before, between)
+        for path in between if slow_forms(model) else ():
+            with contextlib.suppress(identify.IdentifyError, OSError):  # one that cannot be read is left out
+                before = passed(model, before, dated(Path(path)))
         step = follow(model, before, record, rates)
         moved = model_for_next(model, step, bounds)
     except identify.IdentifyError as problem:
@@ -88,20 +72,11 @@ def dated(path: Path) -> Any:
     return replace(record, parts=(replace(part, own_s=float(record.time_s[0]), begun_s=begun(path)),))
 
 
-def worked(model: Any, state: Any, between: Sequence[str]) -> Any:
-    """Carry the state through what the muscle did in these recordings; one that cannot be read is left out."""
-    from stimrig.identify.tracking import passed, slow_forms
-
-    for path in between if slow_forms(model) else ():
-        with contextlib.suppress(identify.IdentifyError, OSError):
-            state = passed(model, state, dated(Path(path)))
-    return state
-
-
-def second_order(model: Any) -> Any:
+def second_order(model_json: str) -> Any:
     """Return the model. Raises BadModel: its dynamics are not of second order, so it cannot be followed."""
     from stimrig.identify.dynamics.linear import SecondOrder
 
+    model = identify.Model.from_json(model_json)
     if not isinstance(model.linear, SecondOrder):
         message = "a model whose dynamics are not of second order cannot be tracked"
         raise identify.BadModel(message, fix="Fit with maximum-likelihood.")
@@ -115,38 +90,33 @@ def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> f
     """
     reference = np.asarray(reference_torque_nm or [], float)
     size_nm = float(np.sqrt(np.mean(reference**2))) if reference.size else 0.0
-    if not size_nm > 0.0:
-        return None
     time_s, torque_nm = record.time_s, record.torque_nm
-    begun = np.flatnonzero(record.pulse_width_us > 0.0)
-    rest = slice(0, begun[0] if begun.size else time_s.size)
-    known = time_s[rest].size > 1 and time_s[rest][-1] - time_s[rest][0] >= SETTLED_S
-    offset_nm = float(np.mean(torque_nm[rest])) if known else 0.0
     period = np.floor(time_s * record.pulse_rate_hz + 1e-6).astype(int)
     inside = (period >= 0) & (period < reference.size) & np.isfinite(torque_nm)
     count = np.bincount(period[inside], minlength=reference.size)
-    mean_nm = np.bincount(period[inside], torque_nm[inside], reference.size)[count > 0] / count[count > 0]
-    if not mean_nm.size:
+    if not size_nm > 0.0 or not count.any():
         return None
-    return float(100.0 * np.sqrt(np.mean((reference[count > 0] - (mean_nm - offset_nm)) ** 2)) / size_nm)
+    pulses = np.flatnonzero(record.pulse_width_us > 0.0)
+    rest = slice(0, pulses[0] if pulses.size else time_s.size)
+    known = time_s[rest].size > 1 and time_s[rest][-1] - time_s[rest][0] >= SETTLED_S
+    offset_nm = float(np.mean(torque_nm[rest])) if known else 0.0
+    measured = count > 0
+    mean_nm = np.bincount(period[inside], torque_nm[inside], reference.size)[measured] / count[measured]
+    return float(100.0 * np.sqrt(np.mean((reference[measured] - (mean_nm - offset_nm)) ** 2)) / size_nm)
 
 
 def track_warm(progress: Progress, model_json: str) -> dict[str, Any]:
     """Load all that `track` needs, and follow two seconds of the model's own torque: then a trial waits for nothing."""
-    import importlib
-
     from stimrig.identify.tracking import follow, model_for_next
 
     progress(0.1, "loading")
     importlib.import_module("h5py")
     with contextlib.suppress(identify.IdentifyError):  # what cannot be followed is said after the first trial
-        model = second_order(identify.Model.from_json(model_json))
-        widest_us = float(model.recruitment.basis.largest_us)
+        model = second_order(model_json)
         time_s = np.arange(800) / 400.0
-        widths_us = np.where((time_s > 0.5) & (time_s < 1.2), 0.7 * widest_us, 0.0)
+        widths_us = np.where((time_s > 0.5) & (time_s < 1.2), 0.7 * model.recruitment.basis.largest_us, 0.0)
         rate = {"pulse_rate_hz": model.pulse_rate_hz}
         empty = identify.Record.from_arrays(time_s, widths_us, np.zeros(time_s.size), **rate)
-        torque_nm = identify.predict(model, empty)
-        step = follow(model, None, identify.Record.from_arrays(time_s, widths_us, torque_nm, **rate))
+        step = follow(model, None, empty.with_torque(identify.predict(model, empty)))
         model_for_next(model, step).to_json(None)
     return {}
