@@ -51,7 +51,7 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
         **asdict(conclusion),
         "words": conclusion.words + mostly,
         "missing": [card(entry, library, diagnosis.get("base") or {}) for entry in missing],
-        "free": [{**entry, "id": entry["effect"], "parameters": _labelled(entry, library)} for entry in free],
+        "free": [free_card(entry, library, entry["name"]) for entry in free],
         "to_add": [entry["effect"] for entry in to_add],
         "likely": [name_of(entry["effect"], library) for entry in to_add if is_likely(entry)],
         "structure": effects_words(diagnosis.get("structure") or []) or "plain",
@@ -126,38 +126,47 @@ def card(entry: Mapping[str, Any], library: Mapping[str, Any], base: Mapping[str
         before_nm, own_nm = entry.get(f"{prefix}rms_before_nm"), base.get(f"{prefix}rms_nm")
         if before_nm is not None and (own_nm is None or abs(before_nm - own_nm) <= OWN_SHARE * own_nm):
             errors.append((label, before_nm, entry[f"{prefix}rms_after_nm"]))
-    rivals = [name_of(rival, library) for rival in entry.get("confused_with") or []]
+    name, rivals = entry.get("name") or name_of(entry["effect"], library), entry.get("confused_with") or []
+    signature, part = known.get("signature"), PARTS.get(known.get("part") or "")
+    notes = [
+        signature and f"What it looks like in the error: {signature}",
+        entry.get("objection"),
+        rivals and worded(entry.get("next_experiment") or ""),
+        part and f"In the paper's Fig. 2 it stands in {part}.",
+    ]
     return {
-        **dict.fromkeys(("plain", "equation", "objection"), ""),
+        "plain": "",
+        "equation": "",
         **entry,
         "id": entry["effect"],
-        "name": entry.get("name") or name_of(entry["effect"], library),
+        "name": name,
+        "heading": f"The missing effect: {name}",
         "sure_words": "" if chance is None else f"{sure(chance)} missing · {probability(chance)}",
-        "signature": known.get("signature"),
+        "notes": [words for words in notes if words],
         "source": known.get("source"),
-        "part": PARTS.get(known.get("part") or ""),
-        "next_experiment": worded(entry.get("next_experiment") or ""),
-        "rivals": [f"{name[:1].lower()}{name[1:]}" for name in rivals],
+        "rivals": [name[:1].lower() + name[1:] for name in (name_of(rival, library) for rival in rivals)],
         "errors": errors,
         "parameters": _labelled(entry, library),
     }
 
 
+def free_card(entry: Mapping[str, Any], library: Mapping[str, Any], heading: str) -> dict[str, Any]:
+    """Describe a free effect, of a diagnosis or of a model."""
+    about = "A free effect: it describes what no effect of the library explains, and names no cause."
+    parameters, plain = _labelled(entry, library), f"{entry['words']} {entry.get('left_out') or ''}".strip()
+    shown = {"heading": heading, "plain": plain, "notes": [about], "source": None, "parameters": parameters}
+    return {"equation": "", **entry, **shown, "id": entry["effect"]}
+
+
 def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
     """Describe the free effects of a model as `view` does those of a diagnosis."""
-    return [
-        {
-            "id": effect["id"],
-            "name": effect_words(effect["id"]),
-            "equation": effect.get("equation") or "",
-            **effect["shape"],
-            "axis": effect["shape"]["effect"],
-            "left_out": "",
-            "parameters": _labelled({"effect": effect["id"], "parameters": effect["parameters"]}, {}),
-        }
-        for effect in document.get("effects") or []
-        if effect.get("shape")
-    ]
+    cards = []
+    for effect in document.get("effects") or []:
+        if shape := effect.get("shape"):
+            own = {"effect": effect["id"], "name": effect_words(effect["id"]), "axis": shape["effect"]}
+            entry = {**shape, **own, **{key: effect[key] for key in ("equation", "parameters") if key in effect}}
+            cards.append(free_card(entry, {}, f"In this model: {own['name']}"))
+    return cards
 
 
 def _labelled(entry: Mapping[str, Any], library: Mapping[str, Any]) -> dict[str, Any]:

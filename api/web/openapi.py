@@ -11,7 +11,7 @@ from stimrig.api.web.responses.base import Problem
 from stimrig.api.web.responses.models import TrackedOut
 
 PROBLEM_CONTENT = {"application/problem+json": {"schema": {"$ref": "#/components/schemas/Problem"}}}
-EXTENDED = ("Comparison", "Diagnosis", "Improvement")
+EXTENDED = ("Comparison", "Diagnosis", "Improvement", "Inversion")
 """Answers that hold to a published schema, and say more."""
 EMBEDDED = ("model", "effects", *map(str.lower, EXTENDED))
 DESCRIPTION = """

@@ -11,10 +11,10 @@ from stimrig.api.web.responses.base import Document, Problem, SegmentOut
 
 
 class ParameterOut(Document):
-    """An estimate: value and standard deviation in its unit."""
+    """An estimate."""
 
-    value: float | None
-    sd: float | None
+    value: float | None = Field(description="in `unit`; null: not known, or not defined")
+    sd: float | None = Field(description="standard deviation from the noise of the record; null: not known")
     unit: str = ""
 
 
@@ -146,33 +146,11 @@ class PredictionOut(Document):
     torque_nm: list[float] = Field(description="mean torque in each pulse's period, N·m")
 
 
-class Unreachable(Document):
-    """Where a reference cannot be followed."""
-
-    begin_s: float = Field(description="from the first pulse, s")
-    end_s: float
-    reason: str = Field(
-        description="above-plateau, below-zero, rises-too-fast, falls-too-fast, under-threshold, not-followed"
-    )
-    shortfall_nm: float = Field(description="the largest difference in it, N·m")
-
-
 class InversionOut(Document):
-    """Pulse widths for a reference torque."""
+    """Pulse widths for a reference torque: the schema `inversion`, and the limits that were held to."""
 
     model_id: str
-    pulse_rate_hz: float
-    duration_s: float
-    reference_torque_nm: list[float] = Field(description="mean in each pulse's period, N·m")
-    angle_rad: list[float] | None = Field(None, description="mean in each pulse's period, where one was given, rad")
     pulse_width_us: list[float] = Field(description="one for each pulse, µs")
-    predicted_torque_nm: list[float] = Field(description="mean in each pulse's period, N·m above rest")
-    unreachable: list[Unreachable]
-    fit_percent: float | None = Field(description="where it can be reached, %; null where the reference is level")
-    whole_fit_percent: float | None = Field(description="of all of it, %")
-    tolerance_nm: float = Field(
-        description="a smaller difference counts as reached: 2 % of the largest torque of the model there, N·m"
-    )
     max_pulse_width_us: float | None = Field(description="that was held to, µs")
     max_rise_us: float | None = Field(description="from pulse to pulse that was held to, µs")
     shortest_pulse_us: float | None = Field(
@@ -181,16 +159,13 @@ class InversionOut(Document):
     segments: list[SegmentOut] = Field(description="a rest, the trial, a rest: for `POST /v1/tests`, kind `sequence`")
 
 
-class TrendFigureOut(Document):
+class TrendFigureOut(ParameterOut):
     """A figure of a session."""
 
-    value: float | None = Field(description="in `unit`; null: not known, or not defined")
-    sd: float | None = Field(description="standard deviation from the noise of the record; null: not known")
     uncertainty: float | None = Field(
         description="standard deviation with what repeated tests of an unchanged muscle differ by; those of two "
         "sessions add up, as squares, to that of their difference"
     )
-    unit: str
 
 
 class TrendNoteOut(Document):
