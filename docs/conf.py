@@ -73,15 +73,15 @@ def prepare(app: Any, docname: str, source: list[str]) -> None:
     """Fill in what a page asks to be made, and make of a link to a folder one to its README, or only its words."""
     page = Path(app.srcdir, docname).parent
 
-    def of_folder(found: re.Match[str]) -> str:
-        folder = page / found[2]
+    def of_folder(match: re.Match[str]) -> str:
+        folder = page / match[2]
         if not folder.is_dir():
-            return found[0]
+            return match[0]
         inside = (folder / "README.md").exists() and (ROOT / "docs") in folder.resolve().parents
-        return f"[{found[1]}]({found[2]}/README.md)" if inside else found[1]
+        return f"[{match[1]}]({match[2]}/README.md)" if inside else match[1]
 
-    made = re.sub(r"<!-- made: ([a-z_]+) -->", lambda found: getattr(generators, found[1])(), source[0])
-    source[0] = LINK.sub(of_folder, made)
+    text = re.sub(r"<!-- made: ([a-z_]+) -->", lambda match: getattr(generators, match[1])(), source[0])
+    source[0] = LINK.sub(of_folder, text)
 
 
 def tell_fields(_app: Any, what: str, _name: str, thing: Any, _options: Any, lines: list[str]) -> None:
@@ -92,10 +92,10 @@ def tell_fields(_app: Any, what: str, _name: str, thing: Any, _options: Any, lin
 
 def list_outside(app: Any, failed: Exception | None) -> None:
     """Write every address of another host that a page links to into one file, for who wants to try them."""
-    found: set[str] = set()
+    addresses: set[str] = set()
     for page in Path(app.outdir).rglob("*.html") if failed is None else ():
-        found |= set(re.findall(r'href="(https?://[^"#]+)', page.read_text("utf-8")))
-    Path(app.outdir, "outside.txt").write_text("\n".join(sorted(found)) + "\n")
+        addresses |= set(re.findall(r'href="(https?://[^"#]+)', page.read_text("utf-8")))
+    Path(app.outdir, "outside.txt").write_text("\n".join(sorted(addresses)) + "\n")
 
 
 def setup(app: Any) -> None:

@@ -26,38 +26,38 @@ ROOMS = (
 @cache
 def public() -> dict[str, Any]:
     """Every public function and class by the name under which it is imported, each once."""
-    found: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     for place in (*MODULES, *ROOMS):
         module = importlib.import_module(place)
-        own = [name for name, one in vars(module).items() if getattr(one, "__module__", "") == place]
-        for name in getattr(module, "__all__", own):
-            one = getattr(module, name)
-            one = identify.effects.library if one is importlib.import_module("stimrig.effects") else one
-            ours = str(getattr(one, "__module__", "")).startswith("stimrig") and name[0] != "_"
-            if ours and (inspect.isfunction(one) or inspect.isclass(one)) and one not in found.values():
-                found[f"{place}.{name}"] = one
-    return found
+        public_names = [name for name, member in vars(module).items() if getattr(member, "__module__", "") == place]
+        for name in getattr(module, "__all__", public_names):
+            member = getattr(module, name)
+            member = identify.effects.library if member is importlib.import_module("stimrig.effects") else member
+            ours = str(getattr(member, "__module__", "")).startswith("stimrig") and name[0] != "_"
+            if ours and (inspect.isfunction(member) or inspect.isclass(member)) and member not in by_name.values():
+                by_name[f"{place}.{name}"] = member
+    return by_name
 
 
-def family(one: type) -> list[type]:
+def family(cls: type) -> list[type]:
     """A class and those of ours that it is made of, the first one last."""
-    return [parent for parent in reversed(one.__mro__) if parent.__module__.startswith("stimrig")]
+    return [parent for parent in reversed(cls.__mro__) if parent.__module__.startswith("stimrig")]
 
 
-def members(one: type) -> dict[str, Any]:
+def members(cls: type) -> dict[str, Any]:
     """Public methods and properties of a class, inherited ones included."""
-    found: dict[str, Any] = {}
-    for name, value in (item for parent in family(one) for item in vars(parent).items() if item[0][0] != "_"):
+    by_name: dict[str, Any] = {}
+    for name, value in (item for parent in family(cls) for item in vars(parent).items() if item[0][0] != "_"):
         bare = getattr(value, "__func__", value)
         if inspect.isfunction(bare) or isinstance(value, property | cached_property):
-            found[name] = bare
-    return found
+            by_name[name] = bare
+    return by_name
 
 
-def attributes(one: type) -> list[str]:
+def attributes(cls: type) -> list[str]:
     """The public fields of a class as a section of numpydoc's, with what stands beside each in the code."""
-    told: dict[str, list[str]] = {}
-    for parent in family(one):
+    sections: dict[str, list[str]] = {}
+    for parent in family(cls):
         source = textwrap.dedent(inspect.getsource(parent))
         (tree,) = ast.parse(source).body
         assert isinstance(tree, ast.ClassDef)
@@ -66,30 +66,30 @@ def attributes(one: type) -> list[str]:
                 below = after.value if isinstance(after, ast.Expr) and isinstance(after.value, ast.Constant) else None
                 comment = source.splitlines()[(node.end_lineno or 0) - 1].partition("  # ")[2]
                 words = str(below.value) if below else comment
-                told[name] = [f"{name} : {ast.unparse(node.annotation)}", textwrap.indent(words, "    "), ""]
-    rows = "\n".join(line for lines in told.values() for line in lines).splitlines()
+                sections[name] = [f"{name} : {ast.unparse(node.annotation)}", textwrap.indent(words, "    "), ""]
+    rows = "\n".join(line for lines in sections.values() for line in lines).splitlines()
     return ["", "Attributes", "----------", *rows] if rows else []
 
 
 @cache
 def links() -> dict[str, str]:
     """Words of a Parameters section that become links."""
-    return {name.rpartition(".")[2]: name for name, one in reversed(public().items()) if inspect.isclass(one)}
+    return {name.rpartition(".")[2]: name for name, member in reversed(public().items()) if inspect.isclass(member)}
 
 
 def python(places: tuple[str, ...] = MODULES) -> str:
     """The reference of modules: a heading, its first words, its names."""
     parts = []
     for place in places:
-        told = []
-        for name, one in public().items():
+        lines = []
+        for name, member in public().items():
             if name.rpartition(".")[0] == place:
-                kind = "class" if inspect.isclass(one) else "function"
-                kind = "exception" if inspect.isclass(one) and issubclass(one, Exception) else kind
-                methods = members(one) if inspect.isclass(one) else {}
-                told += [f".. auto{kind}:: {name}", *([f"   :members: {', '.join(methods)}"] if methods else []), ""]
+                kind = "class" if inspect.isclass(member) else "function"
+                kind = "exception" if inspect.isclass(member) and issubclass(member, Exception) else kind
+                methods = members(member) if inspect.isclass(member) else {}
+                lines += [f".. auto{kind}:: {name}", *([f"   :members: {', '.join(methods)}"] if methods else []), ""]
         words = str(importlib.import_module(place).__doc__).partition("\n\n")[0]
-        parts += [f"## {place}", "", words, "", "```{eval-rst}", *told, "```", ""] if told else []
+        parts += [f"## {place}", "", words, "", "```{eval-rst}", *lines, "```", ""] if lines else []
     return "\n".join(parts)
 
 
@@ -105,12 +105,12 @@ def command_line() -> str:
 
     from stimrig.api.cli.main import build
 
-    def told(name: str, command: Any) -> Iterator[str]:
+    def describe(name: str, command: Any) -> Iterator[str]:
         yield f"## {name}\n\n```text\n{command.get_help(Context(command, info_name=name))}\n```\n"
-        for word, one in sorted(getattr(command, "commands", {}).items()):
-            yield from told(f"{name} {word}", one)
+        for word, subcommand in sorted(getattr(command, "commands", {}).items()):
+            yield from describe(f"{name} {word}", subcommand)
 
-    return "\n".join(told("stimrig", get_command(build())))
+    return "\n".join(describe("stimrig", get_command(build())))
 
 
 @cache
@@ -150,21 +150,21 @@ def rest_routes() -> str:
     """Every operation: what it does, its scope, what it takes, what it answers."""
     parts = []
     for path, methods in sorted(document()["paths"].items()):
-        for method, found in methods.items():
-            bodies = found.get("requestBody", {}).get("content", {}).items()
+        for method, operation in methods.items():
+            bodies = operation.get("requestBody", {}).get("content", {}).items()
             rows = [
                 (f"`{p['name']}` ({p['in']})", p["schema"], p.get("description", ""))
-                for p in found.get("parameters", [])
+                for p in operation.get("parameters", [])
             ]
             rows += [(f"body ({kind})", body.get("schema", {}), "") for kind, body in bodies]
             done = [
-                (f"{code} {kind}", body.get("schema", {}), one["description"])
-                for code, one in found["responses"].items() if code < "4"
-                for kind, body in (one.get("content") or {"": {"schema": {"type": "nothing"}}}).items()
+                (f"{code} {kind}", body.get("schema", {}), response["description"])
+                for code, response in operation["responses"].items() if code < "4"
+                for kind, body in (response.get("content") or {"": {"schema": {"type": "nothing"}}}).items()
             ]  # fmt: skip
-            refused = ", ".join(sorted(code for code in found["responses"] if code >= "4"))
-            told = found.get("description") or found.get("summary", "")
-            parts += [f"## {method.upper()} {path}", told, table("takes", rows), table("answers", done)]
+            refused = ", ".join(sorted(code for code in operation["responses"] if code >= "4"))
+            description = operation.get("description") or operation.get("summary", "")
+            parts += [f"## {method.upper()} {path}", description, table("takes", rows), table("answers", done)]
             parts += [f"Refusals: {refused}."] if refused else []
     return "\n\n".join(parts)
 
@@ -176,7 +176,8 @@ def rest_models() -> str:
         needed = schema.get("required", [])
         keys = schema.get("properties", {}).items()
         rows = [
-            (f"`{key}`{'' if key in needed else ' (optional)'}", one, one.get("description", "")) for key, one in keys
+            (f"`{key}`{'' if key in needed else ' (optional)'}", value, value.get("description", ""))
+            for key, value in keys
         ]
         parts += [f"### {name}", schema.get("description", ""), table("key", rows)]
     return "\n\n".join(parts)

@@ -72,7 +72,7 @@ class AngleSensor:
         self.counter += 1
         self.clock.taken()
         for hook in self.frame_hooks:
-            frames = [changed for one in frames for changed in hook(one)]
+            frames = [changed for frame in frames for changed in hook(frame)]
         for frame in frames:
             self._send(frame)
 

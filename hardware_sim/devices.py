@@ -59,10 +59,14 @@ class Devices:
         self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
         muscle = self.limb or muscle
         self.encoder = Encoder(self.limb.angle_deg, settings) if self.limb else None
-        own = settings.angle == "own"
-        self.load_cell = LoadCell(muscle, settings, epoch_us, self.encoder.read if self.encoder and not own else None)
+        own_bus = settings.angle == "own"
+        self.load_cell = LoadCell(
+            muscle, settings, epoch_us, self.encoder.read if self.encoder and not own_bus else None
+        )
         self.angle_sensor = (
-            AngleSensor(self.encoder, self.load_cell.add_frame, settings, epoch_us) if self.encoder and own else None
+            AngleSensor(self.encoder, self.load_cell.add_frame, settings, epoch_us)
+            if self.encoder and own_bus
+            else None
         )
         self.timeline.followers.append(self._sample_until)
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
@@ -101,14 +105,14 @@ class Devices:
 
     def take_bytes(self) -> list[tuple[float, bytes]]:
         """What the stimulator has written since the last call, each with the emulated time at which it did."""
-        taken, self._bytes = self._bytes, []
-        return taken
+        data, self._bytes = self._bytes, []
+        return data
 
     def take_frames(self) -> list[Frame]:
         """The frames of load cell and angle sensor since the last call, in the order in which they were sent."""
         self._collect_frames()
-        taken, self._frames = self._frames, []
-        return taken
+        frames, self._frames = self._frames, []
+        return frames
 
     def plug_stimulator(self, plugged: bool = True) -> None:
         """Connect the stimulator, or pull its cable; the device itself goes on."""

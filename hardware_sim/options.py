@@ -49,11 +49,11 @@ def parse(arguments: Sequence[str] | None = None, prog: str = "stimrig emulate")
 
 def settings(options: argparse.Namespace, patient: str) -> Settings:
     """The checked settings of these options. Raises SettingsError: a number is out of its range."""
-    given = {one.name: getattr(options, one.name) for one in fields(Settings) if hasattr(options, one.name)}
+    values = {field.name: getattr(options, field.name) for field in fields(Settings) if hasattr(options, field.name)}
     if options.noise_seed is None:
-        given["noise_seed"] = secrets.randbelow(2**31)
-    given |= {"patient": patient, "cell": _cell_kind(options), "sync": not options.no_sync}
-    return Settings(**given)
+        values["noise_seed"] = secrets.randbelow(2**31)
+    values |= {"patient": patient, "cell": _cell_kind(options), "sync": not options.no_sync}
+    return Settings(**values)
 
 
 def _cell_kind(options: argparse.Namespace) -> str:
@@ -66,21 +66,21 @@ def _cell_kind(options: argparse.Namespace) -> str:
 
 
 def _who(group: argparse._ArgumentGroup) -> None:
-    who = group.add_mutually_exclusive_group()
-    who.add_argument(
+    exclusive = group.add_mutually_exclusive_group()
+    exclusive.add_argument(
         "--patient",
         default=DEFAULTS.patient,
         metavar="NAME|FILE",
         help=f"{', '.join(NAMES)}, or a TOML or JSON file with 'patient' and a table 'parameters' "
         "(default: %(default)s)",
     )
-    who.add_argument(
+    exclusive.add_argument(
         "--hidden",
         type=int,
         metavar="SEED",
         help="a patient with a hidden effect, drawn by SEED; with --arm another one, whose joint matters",
     )
-    who.add_argument("--reveal", type=int, metavar="SEED", help="print what --hidden SEED hides, and exit")
+    exclusive.add_argument("--reveal", type=int, metavar="SEED", help="print what --hidden SEED hides, and exit")
 
 
 def _devices(group: argparse._ArgumentGroup) -> None:

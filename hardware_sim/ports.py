@@ -58,8 +58,8 @@ class PseudoTerminal:
         if not self.is_open:
             return
         settings = termios.tcgetattr(self._slave)
-        seen, self._seen_speed = self._seen_speed, settings[OUTPUT_SPEED]
-        if self._seen_speed != self._own_speed and (settled or seen == self._seen_speed):
+        previous, self._seen_speed = self._seen_speed, settings[OUTPUT_SPEED]
+        if self._seen_speed != self._own_speed and (settled or previous == self._seen_speed):
             settings[INPUT_SPEED] = settings[OUTPUT_SPEED] = self._own_speed
             termios.tcsetattr(self._slave, termios.TCSANOW, settings)
 

@@ -30,9 +30,9 @@ class Noise:
         """Noise of the next `count` samples, at least one."""
         while len(self._block) < count:
             self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist() + self._block
-        taken = self._block[: -count - 1 : -1]
+        values = self._block[: -count - 1 : -1]
         del self._block[-count:]
-        return taken
+        return values
 
 
 class SampleClock:

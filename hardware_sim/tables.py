@@ -13,7 +13,7 @@ from stimrig.hardware_sim.errors import HardwareSimError, SettingsError
 Kind = TypeVar("Kind")
 
 
-def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[str, Any]:
+def read_table(path: Path, error: type[HardwareSimError], content: str) -> dict[str, Any]:
     """The table that a file holds.
 
     `error`: what is raised where it cannot be read, is neither TOML nor JSON, or holds something else; names the file.
@@ -28,7 +28,7 @@ def read_table(path: Path, error: type[HardwareSimError], holds: str) -> dict[st
     except (ValueError, RecursionError) as reason:  # a ValueError of either decoder names line and column
         raise error(f"{path}: not valid {'JSON' if is_json else 'TOML'}: {reason}") from None
     if not isinstance(described, dict):
-        raise error(f"{path}: must hold {holds}")
+        raise error(f"{path}: must hold {content}")
     return described
 
 

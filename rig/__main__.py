@@ -24,7 +24,7 @@ from pathlib import Path
 from stimrig.rig import config as configuration
 from stimrig.rig import devices, logs
 from stimrig.rig.adapters.machine import LocalMachine
-from stimrig.rig.adapters.server import Ask, Server
+from stimrig.rig.adapters.server import Server, Submit
 from stimrig.rig.clock import MonotonicClock
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.errors import RigError
@@ -41,13 +41,15 @@ class Notifier:
     def __init__(self, environment: Mapping[str, str] = os.environ) -> None:
         address = environment.get("NOTIFY_SOCKET", "")
         self._address = "\0" + address[1:] if address.startswith("@") else address  # @: an abstract socket
-        meant = environment.get("WATCHDOG_PID", str(os.getpid())) == str(os.getpid())  # else it was a parent's
-        self.watched = bool(address) and meant and environment.get("WATCHDOG_USEC", "").isdigit()
+        is_for_this_process = environment.get("WATCHDOG_PID", str(os.getpid())) == str(
+            os.getpid()
+        )  # else it was a parent's
+        self.watched = bool(address) and is_for_this_process and environment.get("WATCHDOG_USEC", "").isdigit()
         self._complained = False
 
     def ready(self) -> None:
         """The socket answers and both devices have been tried."""
-        self._tell("READY=1")
+        self._send("READY=1")
 
     def alive(self, trouble: str | None) -> None:
         """Feed the watchdog if all is well; else report what is wrong, and let the watchdog expire.
@@ -56,19 +58,19 @@ class Notifier:
         """
         if trouble is None:
             if self._complained:
-                self._tell("STATUS=")
+                self._send("STATUS=")
             self._complained = False
             if self.watched:
-                self._tell("WATCHDOG=1")
+                self._send("WATCHDOG=1")
         elif not self._complained:
             self._complained = True
-            self._tell(f"STATUS=not fed: {trouble}")
+            self._send(f"STATUS=not fed: {trouble}")
 
     def stopping(self) -> None:
         """The rig stops stimulation and seals the recording."""
-        self._tell("STOPPING=1")
+        self._send("STOPPING=1")
 
-    def _tell(self, words: str) -> None:
+    def _send(self, words: str) -> None:
         if not self._address:
             return
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as line:
@@ -141,36 +143,36 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
     if not config.require_calibration:
         log.warning("require_calibration is false: tests start without a calibration; connect no person to this rig")
     machine = LocalMachine(MonotonicClock(config.clock_speed))
-    ask = machine.driver.ask
+    submit = machine.driver.submit
     rig = Rig(config, machine, server.publish)
-    await asyncio.wrap_future(ask(rig.open))
-    await server.start(rig, ask, config.socket)
+    await asyncio.wrap_future(submit(rig.open))
+    await server.start(rig, submit, config.socket)
     print(json.dumps({"socket": str(config.socket), "state": rig.status().state}), flush=True)
     notifier.ready()
-    with StopKey(lambda: ask(lambda: _stop_by_key(rig))) as key:
+    with StopKey(lambda: submit(lambda: _stop_by_key(rig))) as key:
         if key.watched:
             log.info("any key in this terminal stops stimulation; Ctrl-C ends the rig")
         while not stop.is_set() and parent in (None, os.getppid()):
-            notifier.alive(await _trouble(rig, ask))
+            notifier.alive(await _trouble(rig, submit))
             with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(stop.wait(), BEAT_PERIOD_S)
     log.info("asked to end")
     notifier.stopping()
-    await asyncio.wrap_future(ask(rig.close))
+    await asyncio.wrap_future(submit(rig.close))
     await server.close()
     machine.driver.end()
     for path in (config.socket, stop_socket(config.socket)):
         path.unlink(missing_ok=True)
 
 
-async def _trouble(rig: Rig, ask: Ask) -> str | None:
+async def _trouble(rig: Rig, submit: Submit) -> str | None:
     """What `Rig.trouble` finds, or that the rig's own thread does not answer. Then the watchdog is not fed."""
 
-    async def found() -> str | None:
+    async def check() -> str | None:
         return rig.trouble()
 
     try:
-        return await asyncio.wait_for(asyncio.wrap_future(ask(found)), HUNG_S)
+        return await asyncio.wait_for(asyncio.wrap_future(submit(check)), HUNG_S)
     except TimeoutError:
         return f"the rig's thread hangs: no answer for {HUNG_S:g} s"
 

@@ -72,7 +72,7 @@ def counted_rate_hz(samples: NDArray[Any]) -> float:
 class Fit(NamedTuple):
     """The line from the cell's clock to the test's, the points that it leads through, and the line below all of them.
 
-    `sure` says whether the edges certainly belong to their pulses.
+    `reliable`: the edges certainly belong to their pulses.
     """
 
     line: Line
@@ -80,7 +80,7 @@ class Fit(NamedTuple):
     host_s: Array
     envelope: Line
     method: Method
-    sure: bool
+    reliable: bool
 
 
 def fit(
@@ -122,11 +122,11 @@ def align(
     """
     if len(cell_s) < 2:
         return host_s.copy(), Alignment("regression", float("nan"), 0.0, 0.0)
-    found = fit(cell_s, host_s, sync, written_s, sample_rate_hz)
-    line, error_s = found.line, found.line.error_s
-    misfit_s = misfit(line, found.cell_s, found.host_s)
-    if found.method == "sync":
-        coarse_s = 0.0 if found.sure else misfit(found.envelope, *earliest(cell_s, host_s))
+    fitted = fit(cell_s, host_s, sync, written_s, sample_rate_hz)
+    line, error_s = fitted.line, fitted.line.error_s
+    misfit_s = misfit(line, fitted.cell_s, fitted.host_s)
+    if fitted.method == "sync":
+        coarse_s = 0.0 if fitted.reliable else misfit(fitted.envelope, *earliest(cell_s, host_s))
         if coarse_s > COARSE_MISFIT_S:  # then edges may have been matched to the wrong pulses
             misfit_s = max(misfit_s, coarse_s)
         # Pulses are often synchronous with the samples, so a pulse's position in its sample does not average out.
@@ -134,7 +134,7 @@ def align(
     error_s = float(np.hypot(error_s, misfit_s))
     time_s = line.at(cell_s)
     delay_ms = float(np.median(host_s - time_s)) * 1e3
-    return time_s, Alignment(found.method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
+    return time_s, Alignment(fitted.method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
 
 
 def robust_line(cell_s: Array, host_s: Array) -> Line:
@@ -208,7 +208,7 @@ def rising_edges(cell_s: Array, sync: NDArray[np.uint8], sample_rate_hz: float) 
 
 
 def paired(edge_s: Array, written_s: Array, envelope: Line) -> tuple[Array, Array, bool] | None:
-    """Pairs (cell's time of a pulse, host's time of writing it), and whether the match is sure; None: no sync."""
+    """Pairs (cell's time of a pulse, host's time of writing it), and whether the match is reliable; None: no sync."""
     if len(written_s) < MIN_EDGES or len(edge_s) == 0:
         return None
     if len(edge_s) == len(written_s) and _in_step(edge_s, written_s):

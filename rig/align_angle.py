@@ -28,7 +28,7 @@ from stimrig.rig.signals import ANGLE_SAMPLE, TRUSTED
 Numbers = NDArray[np.int64]
 
 LIVE_WINDOW_S = 0.05
-LEAST = 3
+MIN_SAMPLES = 3
 """Samples for a slope at once."""
 WINDOW_S = 0.06
 METHOD = "local quadratic over 60 ms, centred"
@@ -41,7 +41,7 @@ class LiveSlope:
 
     def __init__(self, rate_hz: float) -> None:
         self._rate_hz = rate_hz
-        self._width = max(LEAST - 1, round(LIVE_WINDOW_S * rate_hz))
+        self._width = max(MIN_SAMPLES - 1, round(LIVE_WINDOW_S * rate_hz))
         self.forget()
 
     def forget(self) -> None:
@@ -61,9 +61,9 @@ class LiveSlope:
         x = np.where(inside, x - ((x * inside).sum(axis=1) / count)[:, None], 0.0)
         spread = (x * x).sum(axis=1)
         rise = (x * np.where(inside, values[None, :], 0.0)).sum(axis=1)
-        kept = numbers >= numbers[-1] - self._width
-        self._number, self._value = numbers[kept], values[kept]
-        return np.divide(rise, spread, out=np.full(len(number), np.nan), where=count >= LEAST)
+        recent = numbers >= numbers[-1] - self._width
+        self._number, self._value = numbers[recent], values[recent]
+        return np.divide(rise, spread, out=np.full(len(number), np.nan), where=count >= MIN_SAMPLES)
 
 
 def centred(angle_rad: Array, number: Numbers, rate_hz: float) -> Array:
@@ -74,12 +74,12 @@ def centred(angle_rad: Array, number: Numbers, rate_hz: float) -> Array:
     if not len(number):
         return np.empty(0)
     ends = np.flatnonzero(np.diff(number) > max(1.0, LONGEST_GAP_S * rate_hz)) + 1
-    found = np.zeros(len(number))
+    centred = np.zeros(len(number))
     for part in np.split(np.arange(len(number)), ends):
         at = number[part] - number[part[0]]
         even_rad = np.interp(np.arange(at[-1] + 1), at, angle_rad[part])
-        found[part] = _slopes(even_rad, max(1, round(0.5 * WINDOW_S * rate_hz)))[at] * rate_hz
-    return found
+        centred[part] = _slopes(even_rad, max(1, round(0.5 * WINDOW_S * rate_hz)))[at] * rate_hz
+    return centred
 
 
 def _slopes(value: Array, half: int) -> Array:
@@ -121,7 +121,7 @@ class Reference:
     error_ms: float  # of `time_s`
 
 
-def beside(
+def align_angle(
     samples: NDArray[Any], rate_hz: float, torque: Reference, of_the_cell: bool, one_bus: bool
 ) -> tuple[Array, Alignment]:
     """Time of each angle sample on the test's clock.
@@ -148,15 +148,17 @@ def beside(
         time_s = line.at(sensor_s) + off_s
         time_s[which] = known_s
         return time_s, _attributes("cell", torque.error_ms, host_s, time_s, line.rate)
-    found, error_s, method = (one_bus and _align_order(samples, sensor_s, torque)) or _align_arrival(host_s, sensor_s)
+    estimate, error_s, method = (one_bus and _align_order(samples, sensor_s, torque)) or _align_arrival(
+        host_s, sensor_s
+    )
     if one_bus and _stamped(samples) and _stamped(torque.samples):
         line, stamps_error_s = _align_stamps(samples["stamp_s"], sensor_s, torque)
         ends_s = sensor_s[[0, -1]]
-        if np.max(np.abs(line.at(ends_s) - found.at(ends_s))) <= max(ONE_CLOCK_S, error_s):
-            found, error_s, method = line, stamps_error_s, "stamps"
-    time_s = found.at(sensor_s)
+        if np.max(np.abs(line.at(ends_s) - estimate.at(ends_s))) <= max(ONE_CLOCK_S, error_s):
+            estimate, error_s, method = line, stamps_error_s, "stamps"
+    time_s = estimate.at(sensor_s)
     error_ms = float(np.hypot(torque.error_ms, error_s * 1e3))
-    return time_s, _attributes(method, error_ms, host_s, time_s, found.rate)
+    return time_s, _attributes(method, error_ms, host_s, time_s, estimate.rate)
 
 
 def _attributes(method: Method, error_ms: float, host_s: Array, time_s: Array, rate: float) -> Alignment:
@@ -214,11 +216,14 @@ def _fitted(sensor_s: Array, time_s: Array, period_s: float) -> Line:
     line = align.robust_line(sensor_s, time_s)
     for _ in range(2):  # the first line may be off by a drift of some periods over a test
         residual_s = time_s - line.at(sensor_s)
-        kept = np.abs(residual_s) <= max(3 * period_s, 4 * float(np.median(np.abs(residual_s))))
-        x_s, y_s = sensor_s[kept] - line.centre_s, (time_s - sensor_s)[kept]
+        inliers = np.abs(residual_s) <= max(3 * period_s, 4 * float(np.median(np.abs(residual_s))))
+        x_s, y_s = sensor_s[inliers] - line.centre_s, (time_s - sensor_s)[inliers]
         slope, offset_s = np.polynomial.polynomial.polyfit(x_s, y_s, 1)[::-1]
         line = Line(
-            float(offset_s), 1 + float(slope), line.centre_s, float(np.std(residual_s[kept]) / np.sqrt(kept.sum()))
+            float(offset_s),
+            1 + float(slope),
+            line.centre_s,
+            float(np.std(residual_s[inliers]) / np.sqrt(inliers.sum())),
         )
     return line
 
@@ -246,12 +251,16 @@ def read_angles(
     `torque`: the test's torque samples, aligned. `end_s`: end of the recording on the test's clock, s.
     """
     blocks = [np.frombuffer(payload, ANGLE_SAMPLE) for kind, payload in contents.blocks if kind == Kind.ANGLE]
-    told = header.get("angle") or {}
-    if not blocks and not told:
+    described = header.get("angle") or {}
+    if not blocks and not described:
         return {}, {}
     samples = np.concatenate(blocks) if blocks else np.empty(0, ANGLE_SAMPLE)
-    rate_hz = float(told.get("sample_rate_hz") or (len(samples) > 1 and counted_rate_hz(samples)) or LIKELY_RATE_HZ)
-    time_s, alignment = beside(samples, rate_hz, torque, bool(told.get("of_the_cell")), bool(told.get("one_bus")))
+    rate_hz = float(
+        described.get("sample_rate_hz") or (len(samples) > 1 and counted_rate_hz(samples)) or LIKELY_RATE_HZ
+    )
+    time_s, alignment = align_angle(
+        samples, rate_hz, torque, bool(described.get("of_the_cell")), bool(described.get("one_bus"))
+    )
     number = _numbers(samples, time_s, rate_hz)
     inside = (time_s >= 0) & (time_s < end_s) & _believable(samples)
     # a sensor that started again may overlap itself
@@ -276,7 +285,7 @@ def read_angles(
         "velocity_method": METHOD,
         "velocity_delay_s": 0.0,
         "velocity_window_s": WINDOW_S,
-        "calibration": json.dumps(told.get("calibration")),
+        "calibration": json.dumps(described.get("calibration")),
     }
 
 

@@ -133,23 +133,23 @@ def seal(recording: Recording, folder: Path, disk: Disk) -> Sealed:
     data = to_bytes(recording)
     try:
         disk.replace(path, data)
-        found = disk.read(path)
+        written = disk.read(path)
     except OSError as error:
         raise RecordingError(
             f"{path}: {error.strerror}; the journal is kept; free some disk space and re-arm"
         ) from None
     content = content_sha256(recording.columns)
-    if verify(path, io.BytesIO(found)) != content:
+    if verify(path, io.BytesIO(written)) != content:
         raise RecordingError(f"{path}: reads back differently from what was written; the journal is kept")
     return Sealed(path, hashlib.sha256(data).hexdigest(), content, recording)
 
 
-def _numbers(found: object) -> h5py.Dataset:
-    if not isinstance(found, h5py.Dataset):
+def _numbers(item: object) -> h5py.Dataset:
+    if not isinstance(item, h5py.Dataset):
         raise TypeError("a group stands in a dataset's place")
-    if found.dtype.kind not in "biuf":
-        raise TypeError(f"{found.name} holds no numbers")
-    return found
+    if item.dtype.kind not in "biuf":
+        raise TypeError(f"{item.name} holds no numbers")
+    return item
 
 
 def verify(path: Path, file: io.BytesIO | None = None) -> str:
@@ -159,8 +159,8 @@ def verify(path: Path, file: io.BytesIO | None = None) -> str:
     """
     try:
         with h5py.File(file or path, "r") as opened:
-            found = layout(["angle/"] if "angle" in opened else [])
-            datasets = {p: _numbers(opened[p]) for p, _, _ in found}
+            expected = layout(["angle/"] if "angle" in opened else [])
+            datasets = {p: _numbers(opened[p]) for p, _, _ in expected}
             if sum(dataset.nbytes for dataset in datasets.values()) > MOST_BYTES:
                 raise ValueError(f"it has more than {MOST_BYTES:.0e} bytes of values; no test is so long")
             columns = {p: np.asarray(dataset) for p, dataset in datasets.items()}

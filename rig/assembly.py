@@ -76,7 +76,7 @@ def _assembled(contents: JournalContents, outcome: str, reason: str) -> Recordin
     end_s = float(end["time_s"]) - t0_s
     played_s = min(end_s, float(end.get("stimulation_end_s", end["time_s"])) - t0_s) if begun else 0.0
     pulses = _Pulses(planned, float(header["current_ma"]), t0_s)
-    pulses.take(contents)
+    pulses.add(contents)
     columns = pulses.columns(rate_hz, played_s, contents.blocks_missing > 0, notes)
     written_s = columns["pulses/written_time_s"]
     pulse_times = np.sort(written_s[np.isfinite(written_s)])
@@ -195,7 +195,7 @@ class _Pulses:
         self._status = np.where(planned == 0, PulseStatus.REST, PulseStatus.DROPPED).astype(np.uint8)
         self._intended, self._mentioned = np.zeros(n, bool), np.zeros(n, bool)
 
-    def take(self, contents: JournalContents) -> None:
+    def add(self, contents: JournalContents) -> None:
         for kind, payload in contents.blocks:
             if kind not in (Kind.INTENT, Kind.WRITTEN, Kind.SKIPPED, Kind.ACKED):
                 continue
@@ -228,7 +228,7 @@ class _Pulses:
         # the sender may be interrupted between its write and its reading of the clock; the ack came after the write
         acked_s = np.where(np.isfinite(self._written_s), self._acked_s, np.nan)
         self._sent_us[self._status == PulseStatus.REST] = 0.0
-        found: dict[str, NDArray[Any]] = {
+        columns: dict[str, NDArray[Any]] = {
             "pulses/planned_time_s": np.arange(n) / rate_hz,
             "pulses/pulse_width_us": self._planned.astype(np.float64),
             "pulses/sent_pulse_width_us": self._sent_us,
@@ -237,7 +237,7 @@ class _Pulses:
             "pulses/acknowledged_time_s": self._acked_s,
             "pulses/status": self._status,
         }
-        return {path: column[:reached] for path, column in found.items()}
+        return {path: column[:reached] for path, column in columns.items()}
 
     def _without_intent(self, notes: list[str]) -> None:
         """Pulses that were sent but have no intent: use their planned values."""
@@ -313,7 +313,7 @@ def read_intents(contents: JournalContents) -> list[Intent]:
 
 
 def laid_blocks(contents: JournalContents) -> list[LaidBlock]:
-    return [LaidBlock.from_bytes(payload) for kind, payload in contents.blocks if kind == Kind.LAID]
+    return [LaidBlock.from_bytes(payload) for kind, payload in contents.blocks if kind == Kind.EXTENSION]
 
 
 def planned_pulses(contents: JournalContents, header: dict[str, Any], notes: list[str]) -> tuple[Floats, list[Segment]]:
@@ -339,14 +339,14 @@ def planned_pulses(contents: JournalContents, header: dict[str, Any], notes: lis
 def _growth(contents: JournalContents) -> Iterator[tuple[int, LaidBlock | None]]:
     """Pulses up to which all stayed as it was, and what was laid after them; None: only the end was written."""
     for kind, payload in contents.blocks:
-        if kind == Kind.LAID:
+        if kind == Kind.EXTENSION:
             block = LaidBlock.from_bytes(payload)
             yield block.segment.start, block
         elif kind == Kind.EVENT and (event := json.loads(payload))["event"] == "ended":
             yield event["index"], None
 
 
-def _filled(widths_us: Floats, sent_us: Floats, end: int, notes: list[str], told: bool) -> Floats:
+def _filled(widths_us: Floats, sent_us: Floats, end: int, notes: list[str], noted: bool) -> Floats:
     """The widths up to pulse `end`; what is missing is taken from what was sent, 0 where nothing was."""
     missing = end - len(widths_us)
     if missing <= 0:
@@ -354,7 +354,7 @@ def _filled(widths_us: Floats, sent_us: Floats, end: int, notes: list[str], told
     found_us = np.zeros(missing)
     known_us = sent_us[len(widths_us) : end]
     found_us[: len(known_us)] = known_us
-    if not told:
+    if not noted:
         notes.append(
             f"which segments pulses {len(widths_us) + 1} to {end} belonged to is lost: the widths that were sent are "
             "used as planned widths"
@@ -366,9 +366,9 @@ def _sent(contents: JournalContents) -> Floats:
     """Widths by the intents, up to the last pulse of which any block speaks, µs."""
     known = [journal.SKIPPED.unpack(p)[0] for k, p in contents.blocks if k in (Kind.WRITTEN, Kind.SKIPPED)]
     known += [journal.ACKED.unpack_from(p)[0] for k, p in contents.blocks if k == Kind.ACKED]
-    asked = read_intents(contents)
-    known += [intent[0] for intent in asked]
+    intents = read_intents(contents)
+    known += [intent[0] for intent in intents]
     widths_us = np.zeros(max(known, default=-1) + 1)
-    for index, _, _, width_us, _ in asked:
+    for index, _, _, width_us, _ in intents:
         widths_us[index] = width_us
     return widths_us

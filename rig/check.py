@@ -54,7 +54,7 @@ ENDS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 POLL_S = 0.1  # a signal that another thread has taken is noticed after so long
 TTY, NET = Path("/sys/class/tty"), Path("/sys/class/net")
 
-Ask = Callable[[str], bool]
+Question = Callable[[str], bool]
 
 
 class Step(NamedTuple):
@@ -121,16 +121,16 @@ ENDINGS = {
 class RigCheck:
     """The steps of a check on one rig.
 
-    `ask`: asks the person, in a thread of its own; `folder`: of the pulse's journal, never the rig's own data folder.
+    `question`: asks the person, in a thread of its own. `folder`: for the pulse's journal, never the rig's own folder.
     """
 
-    def __init__(self, config: RigConfig, machine: Machine, ask: Ask, folder: Path, emulated: bool) -> None:
-        self.config, self.machine, self.ask = config, machine, ask
+    def __init__(self, config: RigConfig, machine: Machine, question: Question, folder: Path, emulated: bool) -> None:
+        self.config, self.machine, self.question = config, machine, question
         self.tasks = machine.tasks
         limits = config.limits.model_copy(update={"rest_between_tests_s": None})  # a resistor does not tire
-        own = {"data_dir": folder, "require_calibration": False, "limits": limits}
-        self.rig = Rig(config.model_copy(update=own), machine, lambda _: None)
-        self.rest_nm, self.heard = 0.0, np.empty(0, SAMPLE)
+        changes = {"data_dir": folder, "require_calibration": False, "limits": limits}
+        self.rig = Rig(config.model_copy(update=changes), machine, lambda _: None)
+        self.rest_nm, self.samples = 0.0, np.empty(0, SAMPLE)
         slack = EMULATED_SLACK if emulated else 1
         self.most_lost, self.most_rate_off = slack * MOST_LOST, slack * MOST_RATE_OFF
 
@@ -148,8 +148,8 @@ class RigCheck:
         looks |= {"test pulse": self.check_pulse}
         steps, halted = list[Step](), ""
         try:
-            for name, look in looks.items():
-                step = Step(name, "not done", halted) if halted else await self._done(name, look)
+            for name, check in looks.items():
+                step = Step(name, "not done", halted) if halted else await self._done(name, check)
                 halted = halted or (f"{name}: {FAULTS[step.fault][0]}" if step.outcome == "failed" else "")
                 steps.append(step)
                 report_step(step)
@@ -158,9 +158,9 @@ class RigCheck:
                 await self.rig.close()
         return steps
 
-    async def _done(self, name: str, look: Callable[[], Awaitable[Step]]) -> Step:
+    async def _done(self, name: str, check: Callable[[], Awaitable[Step]]) -> Step:
         try:
-            return (await look())._replace(name=name)
+            return (await check())._replace(name=name)
         except Fault as fault:
             return Step(name, "failed", *fault.args[1:], fault=fault.args[0])
         except NotDone as why:
@@ -170,7 +170,7 @@ class RigCheck:
 
     async def confirm(self, question: str) -> None:
         """Raise NotDone where the person does not say yes."""
-        if not await self.tasks.work(self.ask, question):
+        if not await self.tasks.work(self.question, question):
             raise NotDone("nobody said yes")
 
     async def listen(self, duration_s: float) -> NDArray[Any]:
@@ -188,14 +188,16 @@ class RigCheck:
         status, receiver = self.rig.status(), self.rig.pair.receiver
         if status.state != "ready" or receiver is None:
             raise Fault("stimulator" if status.reason.startswith("stimulator") else "adapter", status.reason, "answers")
-        self.receiver, who = receiver, status.stimulator
-        return passed(" ".join(str(who[key]) for key in ("device", "id", "firmware") if who.get(key)), "answers")
+        self.receiver, stimulator = receiver, status.stimulator
+        return passed(
+            " ".join(str(stimulator[key]) for key in ("device", "id", "firmware") if stimulator.get(key)), "answers"
+        )
 
     async def check_frames(self) -> Step:
         receiver, counts = self.receiver, self.receiver.counts
         await self.tasks.sleep(LISTEN_S)
-        self.heard = np.concatenate([self.heard, *receiver.live])
-        count, bound = len(self.heard), f"at most {100 * self.most_lost:g} % lost, no errors of the bus"
+        self.samples = np.concatenate([self.samples, *receiver.live])
+        count, bound = len(self.samples), f"at most {100 * self.most_lost:g} % lost, no errors of the bus"
         figure = f"{count} samples, {counts.lost_samples} lost, {counts.error_frames} errors of the bus"
         faults = {
             "termination": counts.error_frames > max(1.0, self.most_lost * count),
@@ -205,12 +207,12 @@ class RigCheck:
         if count < 10 or self.rig.status().state == "disconnected":
             faults = {"bit_rate": counts.error_frames > 0, "wrong_dbc": counts.malformed_frames > 0}
             faults |= {"counter_stuck": counts.duplicate_samples > 10, "cell_silent": True}
-        for fault in (fault for fault, found in faults.items() if found):
+        for fault in (fault for fault, present in faults.items() if present):
             raise Fault(fault, figure, bound)
         return passed(figure, bound)
 
     async def check_rate(self) -> Step:
-        nominal_hz, rate_hz = self.receiver.nominal_rate_hz, measure_rate(self.heard, self.receiver.nominal_rate_hz)
+        nominal_hz, rate_hz = self.receiver.nominal_rate_hz, measure_rate(self.samples, self.receiver.nominal_rate_hz)
         figure, bound = f"{rate_hz:.1f} samples/s", f"{nominal_hz:g} samples/s within {100 * self.most_rate_off:g} %"
         if not (abs(rate_hz / nominal_hz - 1) <= self.most_rate_off):
             raise Fault("sample_rate", figure, bound)
@@ -264,14 +266,14 @@ class RigCheck:
         if playing is not None:
             await self.tasks.wait(math.inf, playing.done)
         assert gate is not None and rig.finished is not None
-        pulses = [one for one in gate.done if one.status != PulseStatus.REST]
+        pulses = [pulse for pulse in gate.done if pulse.status != PulseStatus.REST]
         sync = np.concatenate([np.empty(0, "u1"), *(block["sync"] for block in receiver.live)])
         edges, reason = int(np.sum((sync[1:] == 1) & (sync[:-1] != 1))), rig.finished.reason
         figure = f"one pulse: {reason or f'{edges} edges of the sync line'}"
         if rig.finished.outcome != "completed":
             raise Fault(next((fault for words, fault in ENDINGS.items() if words in reason), "refused"), figure)
-        if [one.status for one in pulses] != [PulseStatus.ACKNOWLEDGED]:
-            raise Fault("unanswered", f"{figure}; {', '.join(one.status.name for one in pulses)}")
+        if [pulse.status for pulse in pulses] != [PulseStatus.ACKNOWLEDGED]:
+            raise Fault("unanswered", f"{figure}; {', '.join(pulse.status.name for pulse in pulses)}")
         if self.config.load_cell.model_dump().get("sync") and edges != 1:
             raise Fault("sync", figure, "1 edge")
         after_ms = 1e3 * (pulses[0].acknowledged_s - pulses[0].written_s)
@@ -303,11 +305,11 @@ def measure_rate(samples: NDArray[Any], nominal_hz: float) -> float:
     return float((number[last] - number[first]) / (samples["host_time_s"][last] - samples["host_time_s"][first]))
 
 
-def passed_if_positive(what: str, value: float, least: float, unit: str) -> Step:
+def passed_if_positive(what: str, value: float, minimum: float, unit: str) -> Step:
     """Return the step of a sign. Raises Fault: the value is negative, or less than `least`."""
-    figure, bound = f"{value:+.2f} {unit}", f"at least +{least:g} {unit}"
-    if not (value >= least):
-        raise Fault(f"{what}_sign" if value <= -least else f"{what}_unmoved", figure, bound)
+    figure, bound = f"{value:+.2f} {unit}", f"at least +{minimum:g} {unit}"
+    if not (value >= minimum):
+        raise Fault(f"{what}_sign" if value <= -minimum else f"{what}_unmoved", figure, bound)
     return passed(figure, bound)
 
 
@@ -329,9 +331,9 @@ def report(steps: list[Step], emulated: bool, devices: dict[str, Any]) -> dict[s
 def check_ports(config: RigConfig) -> Step:
     """Compare the rig file's ports and CAN interfaces with what the system shows; nothing is opened."""
     settings = {kind: device.model_dump() for kind, device in config.devices().items() if kind != "angle_sensor"}
-    buses = {kind: one.get("bus") or {} for kind, one in settings.items()}
+    buses = {kind: device.get("bus") or {} for kind, device in settings.items()}
     slcan = {kind: bus["channel"].partition("@")[0] for kind, bus in buses.items() if bus.get("interface") == "slcan"}
-    ports = {kind: one["port"] for kind, one in settings.items() if one.get("port")} | slcan
+    ports = {kind: device["port"] for kind, device in settings.items() if device.get("port")} | slcan
     links = [str(bus["channel"]) for bus in buses.values() if bus.get("interface") == "socketcan"]
     for kind, port in ports.items():
         if not Path(port).exists():
@@ -359,12 +361,12 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--no-questions", action="store_true", help="what needs a person is not done")
     options = parser.parse_args(arguments)
     logging.basicConfig(level=logging.CRITICAL)
-    before = {one: signal.signal(one, _end) for one in ENDS}  # each stops the stimulator first
+    before = {number: signal.signal(number, _end) for number in ENDS}  # each stops the stimulator first
     try:
         config = configuration.chosen(options, data_dir=options.data, socket=Path("check.sock"))
-        ask = (lambda _: False) if options.no_questions else ask_at_terminal
+        question = (lambda _: False) if options.no_questions else ask_at_terminal
         with exclusive(config.data_dir):
-            found = check(config, ask, emulated=options.config is None)
+            result = check(config, question, emulated=options.config is None)
     except RigError as error:
         print(f"check: {error}", file=sys.stderr)
         return 2
@@ -372,27 +374,27 @@ def main(arguments: list[str] | None = None) -> int:
         print("check: interrupted; the stimulator was stopped", file=sys.stderr)
         return INTERRUPTED
     finally:
-        for one, handler in before.items():
-            signal.signal(one, handler)
-    print(json.dumps(found, ensure_ascii=False, default=str))
-    return 0 if found["verdict"] == "sound" else 1
+        for number, handler in before.items():
+            signal.signal(number, handler)
+    print(json.dumps(result, ensure_ascii=False, default=str))
+    return 0 if result["verdict"] == "sound" else 1
 
 
-def check(config: RigConfig, ask: Ask, emulated: bool) -> dict[str, Any]:
+def check(config: RigConfig, question: Question, emulated: bool) -> dict[str, Any]:
     """Check the rig of a rig file. After Ctrl-C the rig is stopped and closed before this ends."""
     print_step(ports := check_ports(config))
     if ports.outcome == "failed":
         return report([ports], emulated, {})
     machine = LocalMachine(MonotonicClock(config.clock_speed))
     with tempfile.TemporaryDirectory(prefix="stimrig-check-") as folder:
-        checking = RigCheck(config, machine, ask, Path(folder), emulated)
+        checking = RigCheck(config, machine, question, Path(folder), emulated)
         try:
-            asked = machine.driver.ask(lambda: checking.run(print_step))
-            while not wait([asked], POLL_S).done:
+            running = machine.driver.submit(lambda: checking.run(print_step))
+            while not wait([running], POLL_S).done:
                 pass
-            return report([ports, *asked.result()], emulated, checking.rig.pair.identity)
+            return report([ports, *running.result()], emulated, checking.rig.pair.identity)
         except KeyboardInterrupt:
-            if not wait([machine.driver.ask(checking.rig.close)], CLOSED_WITHIN_S).done:
+            if not wait([machine.driver.submit(checking.rig.close)], CLOSED_WITHIN_S).done:
                 raise RigError("interrupted, and no sign that the stimulator has stopped: switch it off") from None
             raise
         finally:
@@ -424,8 +426,8 @@ def print_step(step: Step) -> None:
 
 def _end(*_: object) -> None:
     """Let the first signal end the check; none that follows it cuts the stop short."""
-    for one in ENDS:
-        signal.signal(one, lambda *_: None)
+    for number in ENDS:
+        signal.signal(number, lambda *_: None)
     raise KeyboardInterrupt
 
 

@@ -83,8 +83,8 @@ class RigConfig(_Table):
 
     def devices(self) -> dict[Kind, DeviceSettings]:
         """The settings of each device that this rig has, in the order in which they are opened."""
-        found: dict[Kind, DeviceSettings] = {"stimulator": self.stimulator, "load_cell": self.load_cell}
-        return found if self.angle_sensor is None else {**found, "angle_sensor": self.angle_sensor}
+        devices: dict[Kind, DeviceSettings] = {"stimulator": self.stimulator, "load_cell": self.load_cell}
+        return devices if self.angle_sensor is None else {**devices, "angle_sensor": self.angle_sensor}
 
 
 EMULATOR_ONLY = "clock_speed"
@@ -203,7 +203,9 @@ def check(content: dict[str, Any], place: str, **overrides: Any) -> RigConfig:
     for kind in ("stimulator", "load_cell"):
         content[kind] = _device(kind, content.get(kind), place)
     if content.get("angle_sensor") is not None:
-        content["angle_sensor"] = _device("angle_sensor", content["angle_sensor"], place).beside(content["load_cell"])
+        content["angle_sensor"] = _device("angle_sensor", content["angle_sensor"], place).with_cell(
+            content["load_cell"]
+        )
     try:
         config = RigConfig.model_validate(content)
         config.limits.table()

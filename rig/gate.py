@@ -147,9 +147,9 @@ class Gate:
         now_s = self._clock.now_s()
         if not (now_s <= latest_s):
             return self._skip(journal, index, PulseStatus.DROPPED)
-        held = self._too_close(now_s)
-        if held:
-            return self._skip(journal, index, PulseStatus.DROPPED, held)
+        too_close = self._too_close(now_s)
+        if too_close:
+            return self._skip(journal, index, PulseStatus.DROPPED, too_close)
         refusal = self._too_much(now_s, verdict.charge_uc)
         if refusal is not None:
             return self._skip(journal, index, PulseStatus.REFUSED, str(refusal))

@@ -62,7 +62,7 @@ class Kind(IntEnum):
     EVENT = 9
     END = 10
     SPACER = 11
-    LAID = 12
+    EXTENSION = 12
     ANGLE = 13
 
 
@@ -80,7 +80,7 @@ class LaidBlock:
         return {**self.segment._asdict(), "sequence": self.sequence, "settings": self.settings, "time_s": self.time_s}
 
     def to_bytes(self) -> bytes:
-        """Payload of a `Kind.LAID` block."""
+        """Payload of a `Kind.EXTENSION` block."""
         described = json.dumps(self.described()).encode()
         return _LENGTH.pack(len(described)) + described + self.pulse_width_us.astype("<f8").tobytes()
 
@@ -185,30 +185,30 @@ def parse(path: Path, data: bytes) -> JournalContents:
     """
     start = len(MAGIC)
     damaged = sum(a != b for a, b in zip(data[:start], MAGIC, strict=False)) if len(data) > start else 0
-    found, end, between = whole_blocks(data, start)
-    if not found and not data.startswith(MAGIC):
+    blocks, end, between = whole_blocks(data, start)
+    if not blocks and not data.startswith(MAGIC):
         raise RecordingError(f"journal {path}: is not a journal, or its start was overwritten")
     missing, expected = 0, 0
-    for _, number, _ in found:
+    for _, number, _ in blocks:
         missing += (number - expected) & 0xFFFF
         expected = number + 1
     damaged += between + max(0, len(data) - end)
-    return JournalContents(path, [(kind, payload) for kind, _, payload in found], damaged, missing)
+    return JournalContents(path, [(kind, payload) for kind, _, payload in blocks], damaged, missing)
 
 
 def whole_blocks(data: bytes, at: int) -> tuple[list[tuple[Kind, int, bytes]], int, int]:
     """The whole blocks from a place on: kind, number and payload of each; the end of the last; bytes between them."""
-    found, end, damaged = [], at, 0
+    blocks, end, damaged = [], at, 0
     while 0 <= at < len(data):
         block = block_at(data, at)
         if block is None:
             at = data.find(MARK, at + 1)
             continue
         *content, after = block
-        found.append(tuple(content))
+        blocks.append(tuple(content))
         damaged += at - end
         at = end = after
-    return found, end, damaged
+    return blocks, end, damaged
 
 
 def block_at(data: bytes, at: int) -> tuple[Kind, int, bytes, int] | None:

@@ -38,4 +38,4 @@ def configure(process: str, level: int = logging.INFO) -> None:
     logging.captureWarnings(True)
     log = logging.getLogger("rig")
     sys.excepthook = lambda kind, error, trace: log.critical("ended by an error", exc_info=(kind, error, trace))
-    threading.excepthook = lambda told: log.critical("a thread ended by an error", exc_info=told.exc_value)
+    threading.excepthook = lambda failure: log.critical("a thread ended by an error", exc_info=failure.exc_value)

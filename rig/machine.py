@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from stimrig.rig.tasks import Tasks
 
-Told = Callable[[str], None]
+OnMessage = Callable[[str], None]
 """Called with a reason, in the tasks' own thread."""
 B = TypeVar("B")
 
@@ -20,7 +20,7 @@ B = TypeVar("B")
 class Port(Protocol):
     """A serial port. What it calls, it calls in the tasks' own thread."""
 
-    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: Told) -> None:
+    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: OnMessage) -> None:
         """Open it and begin to read; blocks for a moment.
 
         `on_bytes`: called with what was read, and when (rig clock, s); `on_lost`: called once if the port is gone.
@@ -58,8 +58,8 @@ class Listener(NamedTuple):
     decode: Callable[[Sequence[Frame], int, int], Any]
     """Pure; makes a block of frames. Its arguments: the frames, and how many damaged and error frames came with
     them."""
-    take: Callable[[Any], None]  # gets each block, in the tasks' own thread
-    lost: Told  # called once with the reason when the bus is gone
+    handle: Callable[[Any], None]  # gets each block, in the tasks' own thread
+    lost: OnMessage  # called once with the reason when the bus is gone
     gather_s: float  # real seconds for which frames are gathered after the first one
 
 
@@ -73,7 +73,7 @@ class Bus(Protocol):
         """Hand frames to it from now on."""
         ...
 
-    def leave(self, listener: Listener) -> None:
+    def detach(self, listener: Listener) -> None:
         """Hand no more frames to it."""
         ...
 

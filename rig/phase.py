@@ -110,7 +110,7 @@ class Phase:
             return Phase("latched", reason)
         if self.state == "disconnected":
             return Phase("latched", reason, lost=self.reason)
-        earlier = (one for one in self.reason.split(BEFORE) if one not in ("", reason))
+        earlier = (part for part in self.reason.split(BEFORE) if part not in ("", reason))
         all_reasons = BEFORE.join((reason, *earlier))[:LONGEST_REASON]
         state = "stopping" if self.state in ("arming", "running") else self.state
         return replace(self, state=state, reason=all_reasons, latch=self.busy)

@@ -249,14 +249,14 @@ def preview(test: PlannedTest, recruitment: RecruitmentTable | None = None) -> P
 
 def library() -> Sequences:
     """All sequences with their settings as a plan gives them, all protocols, and the default test."""
-    found = sequences.described()
-    for sequence in found:
+    entries = sequences.described()
+    for sequence in entries:
         width = sequence.settings["properties"].get(MAX_WIDTH_SETTING)
         if width is not None:
             del width["default"]
             width["description"] += "; left out: the comfort maximum, or the test's own limit if that is lower"
     described = [_protocol(name, words) for name, words in protocols.described().items()]
-    return Sequences(sequences=found, protocols=described, default=protocols.segments(protocols.DEFAULT, 0.0))
+    return Sequences(sequences=entries, protocols=described, default=protocols.segments(protocols.DEFAULT, 0.0))
 
 
 def _protocol(protocol_id: str, words: str) -> ProtocolInfo:

@@ -33,11 +33,11 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         with _nobody_writes(options.journal):
-            found = recover(options.journal, options.output or _folder_of(options.journal))
+            result = recover(options.journal, options.output or _folder_of(options.journal))
     except RigError as error:
         print(f"recover: {error}", file=sys.stderr)
         return 2
-    print(json.dumps(found, ensure_ascii=False) if options.json else _words(found))
+    print(json.dumps(result, ensure_ascii=False) if options.json else _words(result))
     return 0
 
 
@@ -56,12 +56,12 @@ def recover(path: Path, folder: Path) -> dict[str, Any]:
     if not known:
         archive.seal(recording, folder, Files())
     columns, attributes = recording.columns, recording.attributes
-    felt = np.isin(columns["pulses/status"], (0, 4, 5))
+    may_be_felt = np.isin(columns["pulses/status"], (0, 4, 5))
     return {
         "recording": str(target),
         "was_there": known,
         **{name: attributes[name] for name in ("recording_id", "test_id", "participant", "outcome", "reason")},
-        "pulses": int(np.sum(felt)),
+        "pulses": int(np.sum(may_be_felt)),
         "unacknowledged": int(np.sum(columns["pulses/status"] == 4)),
         "samples": len(columns["torque/time_s"]),
         "damaged_bytes": attributes["journal_damaged_bytes"],
@@ -96,13 +96,14 @@ def _folder_of(path: Path) -> Path:
     return recordings if path.parent.name == "journals" and recordings.is_dir() else path.parent
 
 
-def _words(found: dict[str, Any]) -> str:
+def _words(result: dict[str, Any]) -> str:
     lines = [
-        f"{'already sealed' if found['was_there'] else 'sealed'}: {found['recording']}",
-        f"test {found['test_id']} of participant {found['participant']}, {found['outcome']}: {found['reason'] or '-'}",
-        f"{found['pulses']} pulses ({found['unacknowledged']} not acknowledged), {found['samples']} torque samples",
+        f"{'already sealed' if result['was_there'] else 'sealed'}: {result['recording']}",
+        f"test {result['test_id']} of participant {result['participant']}, {result['outcome']}: "
+        f"{result['reason'] or '-'}",
+        f"{result['pulses']} pulses ({result['unacknowledged']} not acknowledged), {result['samples']} torque samples",
     ]
-    return "\n".join([*lines, *([f"note: {found['note']}"] if found["note"] else [])])
+    return "\n".join([*lines, *([f"note: {result['note']}"] if result["note"] else [])])
 
 
 if __name__ == "__main__":

@@ -48,8 +48,8 @@ class Layout:
         return len(self.pulse_width_us)
 
     def cut(self, end: int) -> Layout:
-        kept = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
-        return Layout(self.pulse_width_us[:end], self.jumps[:end], tuple(kept))
+        segments = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
+        return Layout(self.pulse_width_us[:end], self.jumps[:end], tuple(segments))
 
     def add_piece(self, piece: Piece, by: LaidBy) -> Layout:
         end = len(self) + len(piece.pulse_width_us)
@@ -78,10 +78,10 @@ class Score:
         self._patience_s = 0.0 if self.adaptive is None else self.adaptive.patience_s
         at_start = test.pieces[:1] if self.adaptive else test.pieces
         self._fixed = deque(test.pieces[len(at_start) :])
-        self.laid = Layout(plan.NOTHING, np.empty(0, bool), ())
+        self.queue = Layout(plan.NOTHING, np.empty(0, bool), ())
         for piece in at_start:
-            self.laid = self.laid.add_piece(piece, "plan")
-        self.decided = len(self.laid)
+            self.queue = self.queue.add_piece(piece, "plan")
+        self.decided = len(self.queue)
         """Pulses that are laid, without the rest behind them that only waits for a client."""
         self._reached = -1
         self._end_at: int | None = None
@@ -90,12 +90,12 @@ class Score:
 
     @property
     def duration_s(self) -> float:
-        return len(self.laid) / self.plan.pulse_rate_hz
+        return len(self.queue) / self.plan.pulse_rate_hz
 
     def segment_at(self, time_s: float) -> str | None:
         """Name of the segment at a time on the test's clock, None outside."""
         index = int(np.floor(time_s * self.plan.pulse_rate_hz + 1e-9))
-        return next((s.name for s in self.laid.segments if s.start <= index < s.end), None)
+        return next((s.name for s in self.queue.segments if s.start <= index < s.end), None)
 
     def pulse(self, index: int, torque_time_nms: float) -> float | None:
         """Width of the next pulse, µs; None after the last. Only the sender asks, in order.
@@ -107,10 +107,10 @@ class Score:
             bound_nms = self.adaptive.max_torque_time_nms
             if not (torque_time_nms < bound_nms):
                 self._end("torque_time", f"torque-time {torque_time_nms:.1f} of {bound_nms:g} N·m·s", cut=index)
-            elif index + AHEAD > len(self.laid) and not self.ended_by:
+            elif index + AHEAD > len(self.queue) and not self.ended_by:
                 self._go_on()
         self._reached = index
-        return float(self.laid.pulse_width_us[index]) if index < len(self.laid) else None
+        return float(self.queue.pulse_width_us[index]) if index < len(self.queue) else None
 
     async def extend(self, after: int, chosen: Sequence[SegmentPlan]) -> None:
         """Lay segments behind everything that is laid: all of them, or none.
@@ -144,12 +144,12 @@ class Score:
             raise BusyError("extend: another extension is being checked; send one after the other")
         self._checking = True
         try:
-            built = await self._tasks.work(self._built_and_checked, self.laid, chosen)
+            built = await self._tasks.work(self._built_and_checked, self.queue, chosen)
         finally:
             self._checking = False
         self._may_grow(after)  # the test went on meanwhile
         for piece in built:
-            self._lay(piece, "extension")
+            self._append(piece, "extension")
         self._patience_s = self.adaptive.patience_s if self.adaptive else 0.0
 
     def enough(self, by: str, at_once: bool) -> None:
@@ -161,24 +161,24 @@ class Score:
             raise PlanError("enough: this test has a fixed plan; stop it, or let it play to its end")
         self._may_change()
         handed = self._reached + 1  # a segment whose first pulse is handed out to wait does not play yet
-        playing = next((s.end for s in self.laid.segments if s.end >= self._reached), len(self.laid))
+        playing = next((s.end for s in self.queue.segments if s.end >= self._reached), len(self.queue))
         self._end("enough", by, handed if at_once else max(handed, playing))
 
     def shut(self) -> None:
         """From now on every request is refused."""
         self._shut = True
 
-    def left(self, torque_time_nms: float) -> Extended:
+    def progress(self, torque_time_nms: float) -> Extended:
         """What is laid, and what the bounds leave of an adaptive test."""
         assert self.adaptive is not None
-        laid, rate_hz = self.laid, self.plan.pulse_rate_hz
-        charge_uc = float(np.sum(laid.pulse_width_us)) * self.plan.profile.current_ma * 1e-3
+        queue, rate_hz = self.queue, self.plan.pulse_rate_hz
+        charge_uc = float(np.sum(queue.pulse_width_us)) * self.plan.profile.current_ma * 1e-3
         return Extended(
             test_id=self.plan.test_id,
             laid=self.decided,
             boundary_s=self.decided / rate_hz,
             ended_by=self.ended_by,
-            duration_left_s=max(0.0, self.longest_s - len(laid) / rate_hz),
+            duration_left_s=max(0.0, self.longest_s - len(queue) / rate_hz),
             charge_left_uc=max(0.0, self._table["charge_per_test_uc"].hi - charge_uc),
             torque_time_left_nms=max(0.0, self.adaptive.max_torque_time_nms - torque_time_nms),
         )
@@ -194,24 +194,24 @@ class Score:
         if after != self.decided:
             raise TooLateError(f"extend.after: {after}, but {self.decided} pulses are laid; look again, then decide")
 
-    def _built_and_checked(self, laid: Layout, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
+    def _built_and_checked(self, queue: Layout, chosen: Sequence[SegmentPlan]) -> tuple[Piece, ...]:
         """Behind what is laid; changes nothing, since it runs beside the sender."""
-        before = len(laid)
-        most = min(MAX_EXTENSION_SEGMENTS, plan.MAX_SEGMENTS - len(laid.segments) - len(self._fixed) - 1)
-        if not (1 <= len(chosen) <= most):
-            raise PlanError(f"extend.segments: {len(chosen)} segments; give at most {max(most, 0)}")
+        before = len(queue)
+        max_segments = min(MAX_EXTENSION_SEGMENTS, plan.MAX_SEGMENTS - len(queue.segments) - len(self._fixed) - 1)
+        if not (1 <= len(chosen) <= max_segments):
+            raise PlanError(f"extend.segments: {len(chosen)} segments; give at most {max(max_segments, 0)}")
         for number, segment in enumerate(chosen, start=1):
             if not (1 <= len(segment.name) <= MAX_NAME and segment.name.isprintable()):
                 raise PlanError(f"extend.segments: name {number} must have 1 to {MAX_NAME} printable characters")
         longest_s = before / self.plan.pulse_rate_hz + MAX_EXTENSION_S
         table = tightened(self._table, "duration_s", longest_s, f"at most {MAX_EXTENSION_S:g} s an extension")
         built = plan.build_pieces(chosen, self.plan, table["duration_s"], before)
-        self._check(laid, built)
+        self._check(queue, built)
         return built
 
-    def _check(self, laid: Layout, added: Sequence[Piece]) -> None:
+    def _check(self, queue: Layout, added: Sequence[Piece]) -> None:
         """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
-        before_us = laid.pulse_width_us
+        before_us = queue.pulse_width_us
         plan.check_pieces(added, self.plan, self._table, before_us)
         whole_us = np.concatenate([before_us, *(piece.pulse_width_us for piece in added)])
         rate_hz = self.plan.pulse_rate_hz
@@ -224,19 +224,19 @@ class Score:
             piece = Piece(WAIT, np.zeros(max(1, round(WAIT_S * self.plan.pulse_rate_hz))), jumps=False)
             self._patience_s -= len(piece.pulse_width_us) / self.plan.pulse_rate_hz
             with contextlib.suppress(RefusedError):  # no room for it: nor, perhaps, for the fixed plan's next segment
-                self._check(self.laid, [piece])
-                self._lay(piece, "wait")
+                self._check(self.queue, [piece])
+                self._append(piece, "wait")
                 return
         if not self._fixed:
-            self._end("plan", "the fixed plan is played", len(self.laid))
+            self._end("plan", "the fixed plan is played", len(self.queue))
             return
         piece = self._fixed.popleft()
         try:
-            self._check(self.laid, [piece])
+            self._check(self.queue, [piece])
         except RefusedError as error:
-            self._end("limit", f"next of the fixed plan: {error}", len(self.laid))
+            self._end("limit", f"next of the fixed plan: {error}", len(self.queue))
         else:
-            self._lay(piece, "plan")
+            self._append(piece, "plan")
 
     def _end(self, by: str, reason: str, cut: int) -> None:
         """Keep what is laid before pulse `cut`, and rest after it; nothing if the test rests by then anyway."""
@@ -244,15 +244,15 @@ class Score:
             return
         event = {"event": "ended", "by": by, "reason": reason, "index": cut, "time_s": self._clock.now_s()}
         self._journal.append_json(Kind.EVENT, event)
-        kept = self.laid.cut(cut)
-        missing = plan.safe_end(kept.pulse_width_us, self.plan.pulse_rate_hz)
-        if missing or len(kept) < len(self.laid):
-            self._lay(Piece(SAFE_END, np.zeros(missing), jumps=False), "end", kept)
-        self.ended_by, self._end_at = by, len(kept)
+        remaining = self.queue.cut(cut)
+        missing = plan.safe_end(remaining.pulse_width_us, self.plan.pulse_rate_hz)
+        if missing or len(remaining) < len(self.queue):
+            self._append(Piece(SAFE_END, np.zeros(missing), jumps=False), "end", remaining)
+        self.ended_by, self._end_at = by, len(remaining)
 
-    def _lay(self, piece: Piece, by: LaidBy, before: Layout | None = None) -> None:
+    def _append(self, piece: Piece, by: LaidBy, before: Layout | None = None) -> None:
         """Write a piece to the journal, then show it to the sender."""
-        before = self.laid if before is None else before
+        before = self.queue if before is None else before
         following = before.add_piece(piece, by) if len(piece.pulse_width_us) else before
         block = LaidBlock(
             Segment(piece.of.name, len(before), len(following), by),
@@ -261,7 +261,7 @@ class Score:
             self._clock.now_s(),
             piece.pulse_width_us,
         )
-        self._journal.append(Kind.LAID, block.to_bytes())
-        self.laid, self._checked = following, 0
+        self._journal.append(Kind.EXTENSION, block.to_bytes())
+        self.queue, self._checked = following, 0
         if by != "wait":
             self.decided = len(following)

@@ -163,15 +163,15 @@ class Tasks:
 
     async def work(self, action: Callable[..., T], *arguments: Any) -> T:
         """Have something done that takes long; gives what it returns, raises what it raises."""
-        done, found = Signal(), list[tuple[Any, BaseException | None]]()
+        done, outcomes = Signal(), list[tuple[Any, BaseException | None]]()
 
         def outcome(result: Any, error: BaseException | None) -> None:
-            found.append((result, error))
+            outcomes.append((result, error))
             done.set()
 
         self._worker(lambda: action(*arguments), outcome)
         await self.wait(math.inf, done)
-        result, error = found[0]
+        result, error = outcomes[0]
         if error is not None:
             raise error
         return result
@@ -198,18 +198,18 @@ class Turn:
     """One at a time: `async with turn:`. Who comes later waits, in order."""
 
     def __init__(self, tasks: Tasks) -> None:
-        self._tasks, self._held = tasks, False
+        self._tasks, self._locked = tasks, False
         self._queue: deque[Signal] = deque()
 
     async def __aenter__(self) -> None:
-        if self._held:
+        if self._locked:
             mine = Signal()
             self._queue.append(mine)
             await self._tasks.wait(math.inf, mine)
-        self._held = True
+        self._locked = True
 
     async def __aexit__(self, *_: object) -> None:
         if self._queue:
             self._queue.popleft().set()  # it stays held, for the next one
         else:
-            self._held = False
+            self._locked = False

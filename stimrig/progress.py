@@ -13,8 +13,8 @@ from typing import Any
 from stimrig import identify
 from stimrig.api.progress_bar import progress_bar
 
-Tell = Callable[[float, str], None]
-Progress = Tell | bool
+Callback = Callable[[float, str], None]
+Progress = Callback | bool
 
 
 def fit(
@@ -43,8 +43,8 @@ def fit(
     **options
         Of the method.
     """
-    with _telling(progress) as tell:
-        return identify.fit(record, method, effects, fit_on, tell, **options)
+    with _telling(progress) as report:
+        return identify.fit(record, method, effects, fit_on, report, **options)
 
 
 def carry(record: identify.Record, model: identify.Model, progress: Progress = True) -> identify.Carried:
@@ -60,8 +60,8 @@ def carry(record: identify.Record, model: identify.Model, progress: Progress = T
         True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
         line of text.
     """
-    with _telling(progress) as tell:
-        return identify.carry(record, model, tell)
+    with _telling(progress) as report:
+        return identify.carry(record, model, report)
 
 
 def diagnose(
@@ -79,8 +79,8 @@ def diagnose(
         True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
         line of text.
     """
-    with _telling(progress) as tell:
-        return identify.diagnose(record, model, tell)
+    with _telling(progress) as report:
+        return identify.diagnose(record, model, report)
 
 
 def improve(
@@ -106,8 +106,8 @@ def improve(
     model : Model, optional
         To begin with; default: the plain one.
     """
-    with _telling(progress) as tell:
-        return identify.improve(record, tell, max_effects, force, model)
+    with _telling(progress) as report:
+        return identify.improve(record, report, max_effects, force, model)
 
 
 def explain(
@@ -125,14 +125,14 @@ def explain(
         True: a bar, if it takes longer than a second; False: none; or called with a share of 0 to 1 and a
         line of text.
     """
-    with _telling(progress) as tell:
-        return identify.explain(record, tell, model)
+    with _telling(progress) as report:
+        return identify.explain(record, report, model)
 
 
 @contextmanager
-def _telling(progress: Progress) -> Iterator[Tell]:
+def _telling(progress: Progress) -> Iterator[Callback]:
     if callable(progress):
         yield progress
     else:
-        with progress_bar(progress) as tell:
-            yield tell
+        with progress_bar(progress) as report:
+            yield report

@@ -24,17 +24,17 @@ class Report(Result):
     """What a verb reports: `report["records"]` and others, the keys of its `--json` (`stimrig.schema(verb)`)."""
 
     verb: str
-    found: Mapping[str, Any]
+    document: Mapping[str, Any]
 
     def __getitem__(self, key: str) -> Any:
-        return self.found[key]
+        return self.document[key]
 
     def to_dict(self) -> dict[str, Any]:
         """The keys of `--json`."""
-        return dict(self.found)
+        return dict(self.document)
 
     def _sheet(self) -> Sheet:
-        rows = [(name, value if isinstance(value, str) else json.dumps(value)) for name, value in self.found.items()]
+        rows = [(name, value if isinstance(value, str) else json.dumps(value)) for name, value in self.document.items()]
         return Sheet(f"stimrig {self.verb}", tuple(rows[:10]))
 
 

@@ -178,9 +178,9 @@ def _uneven_legs(
             speed = rad_s * math.exp(0.15 * uneven * float(rng.standard_normal()))
             way_rad = (goal_rad - at_rad) / PIECES
             for piece in range(1, PIECES + 1):
-                own = speed * math.exp(0.12 * uneven * float(rng.standard_normal()))
+                leg_speed = speed * math.exp(0.12 * uneven * float(rng.standard_normal()))
                 rest_s = pause_s * math.exp(0.5 * uneven * float(rng.standard_normal())) if piece == PIECES else 0.0
-                yield Leg(at_rad + piece * way_rad, own, rest_s)
+                yield Leg(at_rad + piece * way_rad, leg_speed, rest_s)
             at_rad = goal_rad
 
 

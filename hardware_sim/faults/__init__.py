@@ -81,10 +81,13 @@ def replaced(owner: object, attribute: str, value: object) -> Undo:
 
 
 def sometimes(
-    target: Target, probability: float, change: Callable[[Any], Any], keep: Callable[[Any], Any] = lambda what: what
+    target: Target,
+    probability: float,
+    change: Callable[[Any], Any],
+    otherwise: Callable[[Any], Any] = lambda what: what,
 ) -> Any:
-    """A hook that gives `change(what)` with this probability, else `keep(what)`."""
-    return lambda what, *_: change(what) if target.random.random() < probability else keep(what)
+    """A hook that gives `change(what)` with this probability, else `otherwise(what)`."""
+    return lambda what, *_: change(what) if target.random.random() < probability else otherwise(what)
 
 
 def frames_sometimes(target: Target, probability: float, change: Callable[[Frame], Iterable[Frame]]) -> Any:

@@ -53,13 +53,13 @@ def frames_duplicated(target: Target, probability: float = 0.1) -> Undo:
 @fault
 def frames_out_of_order(target: Target, probability: float = 0.1) -> Undo:
     """At random a frame comes after the one that follows it."""
-    held: list[Frame] = []
+    delayed: list[Frame] = []
 
     def swap(frame: Frame) -> Iterable[Frame]:
-        if held:
-            return (frame, held.pop())
+        if delayed:
+            return (frame, delayed.pop())
         if target.random.random() < probability:
-            held.append(frame)
+            delayed.append(frame)
             return ()
         return (frame,)
 
@@ -211,13 +211,13 @@ def torque_noisy(target: Target, sd_nm: float = 1.0) -> Undo:
 def counter_stuck(target: Target) -> Undo:
     """The counter stands still; the readings go on."""
     stands_at = target.load_cell.counter
-    return _repacked(target, lambda one: one._replace(counter=stands_at))
+    return _repacked(target, lambda sample: sample._replace(counter=stands_at))
 
 
 @fault
 def sync_unwired(target: Target) -> Undo:
     """The stimulator's sync line does not reach the cell."""
-    return _repacked(target, lambda one: one._replace(sync=False))
+    return _repacked(target, lambda sample: sample._replace(sync=False))
 
 
 @fault
@@ -242,7 +242,7 @@ def _repacked(target: Target, change: Callable[[Sample], Sample]) -> Undo:
     """The cell's frames are made of changed samples."""
     cell = target.load_cell.cell
     pack = cell.encode
-    return replaced(cell, "encode", lambda samples: pack([change(one) for one in samples]))
+    return replaced(cell, "encode", lambda samples: pack([change(sample) for sample in samples]))
 
 
 def _error_instead(frame: Frame) -> Frame:

@@ -104,14 +104,14 @@ class Chain:
 
         `lingering` is added to what `x` recruits.
         """
-        one = self._one
-        one[0, 0], one[1, 0], one[2, 0], one[3, 0] = x, pulse, *joint
+        column = self._one
+        column[0, 0], column[1, 0], column[2, 0], column[3, 0] = x, pulse, *joint
         if at_step is not None:
             self._steps = at_step
         self._c[LINGERING] = lingering
-        _run(*self._stages, one[0], one[1], one[2], one[3], self._steps, one[4])
+        _run(*self._stages, column[0], column[1], column[2], column[3], self._steps, column[4])
         self._steps += 1.0
-        return float(one[4, 0])
+        return float(column[4, 0])
 
     @property
     def recruited(self) -> float:
@@ -130,10 +130,10 @@ class Chain:
 def combine(base: Base, hidden: list[tuple[Formulation, float]]) -> list[Stage]:
     """The base's stages together with those of the effects. Raises NotSuited: two effects replace the same stage."""
     stages = [stage for formulation, magnitude in hidden for stage in formulation.build(magnitude)]
-    taken = [stage.slot for stage in stages if stage.slot in _REPLACED]
-    if len(set(taken)) < len(taken):
+    replaced_slots = [stage.slot for stage in stages if stage.slot in _REPLACED]
+    if len(set(replaced_slots)) < len(replaced_slots):
         raise NotSuited("both effects replace the same stage")
-    return [stage for stage in base.stages() if stage.slot not in taken] + stages
+    return [stage for stage in base.stages() if stage.slot not in replaced_slots] + stages
 
 
 def split(stages: list[Stage]) -> tuple[list[Stage], list[Stage]]:

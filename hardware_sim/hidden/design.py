@@ -52,11 +52,11 @@ class Design:
     def fine(self, step_s: float) -> tuple[Floats, Floats, Floats, Floats]:
         """Width, pulse, angle and velocity at every step. Torque at step k depends on widths before k."""
         count = round(self.duration_s / step_s)
-        held = np.floor((np.arange(count) - 1) * (step_s * PULSES_PER_S) + 1e-9).astype(int)
-        held = np.minimum(held, self.width_us.size - 1)
-        width = np.where(held >= 0, self.width_us[np.maximum(held, 0)], 0.0)
+        index = np.floor((np.arange(count) - 1) * (step_s * PULSES_PER_S) + 1e-9).astype(int)
+        index = np.minimum(index, self.width_us.size - 1)
+        width = np.where(index >= 0, self.width_us[np.maximum(index, 0)], 0.0)
         pulse = np.zeros(count)
-        pulse[1:] = (np.diff(held) > 0) & (width[1:] > 0.0)
+        pulse[1:] = (np.diff(index) > 0) & (width[1:] > 0.0)
         angle, velocity = self.joint(np.arange(count, dtype=np.float64) * step_s)
         return width, pulse, angle, velocity
 

@@ -116,7 +116,7 @@ class HiddenMuscle:
         """
         self._late -= steps
         begin = math.ceil(at - 1e-6) + 1.0
-        self._lingering = [one for one in self._lingering if one[1] > self._done - REMEMBERED_STEPS]
+        self._lingering = [pulse for pulse in self._lingering if pulse[1] > self._done - REMEMBERED_STEPS]
         self._lingering.append((begin, begin + steps, self._muscle.recruited))
 
     def _run_to(self, step: int) -> None:

@@ -357,9 +357,9 @@ def _variable_line(x, p, s, c):
     i = int(s[0])
     a = min(max(c[ACTIVATION], 0.0), 1.0)
     late = p[0] * (a if p[1] > 0.0 else 1.0 - a)
-    ahead = min(int(late / c[STEP_S] + 0.5), 900)
+    steps = min(int(late / c[STEP_S] + 0.5), 900)
     furthest = min(int(p[0] / c[STEP_S]) + 2, 950)
-    for k in range(ahead, furthest + 1):
+    for k in range(steps, furthest + 1):
         s[1 + (i + k) % size] = x
     out = s[1 + i % size]
     s[0] = (i + 1) % size

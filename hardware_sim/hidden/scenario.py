@@ -43,22 +43,24 @@ class Scenario:
 
     def stages(self) -> list[Stage]:
         """All stages of the muscle."""
-        return combine(self.base, [(one.formulation, one.magnitude) for one in self.hidden])
+        return combine(self.base, [(effect.formulation, effect.magnitude) for effect in self.hidden])
 
     def truth(self, noise_sd_nm: float) -> dict[str, Any]:
         """What is hidden, as plain values."""
         return {
-            "effects": [one.effect for one in self.hidden],
-            "formulation": [one.formulation.name for one in self.hidden],
-            "source": [one.formulation.source for one in self.hidden],
+            "effects": [effect.effect for effect in self.hidden],
+            "formulation": [effect.formulation.name for effect in self.hidden],
+            "source": [effect.formulation.source for effect in self.hidden],
             "strength": self.hidden[0].strength if self.hidden else "none",
             "parameters": {
-                one.effect: jsonable({one.formulation.magnitude_name: one.magnitude, **one.formulation.parameters})
-                for one in self.hidden
+                effect.effect: jsonable(
+                    {effect.formulation.magnitude_name: effect.magnitude, **effect.formulation.parameters}
+                )
+                for effect in self.hidden
             },
-            "outside_library": any(one.effect not in EFFECTS for one in self.hidden),
-            "excess": {one.effect: jsonable(one.excess) for one in self.hidden},
-            "excess_over_noise": [round(one.excess["counted_nm"] / noise_sd_nm, 3) for one in self.hidden],
+            "outside_library": any(effect.effect not in EFFECTS for effect in self.hidden),
+            "excess": {effect.effect: jsonable(effect.excess) for effect in self.hidden},
+            "excess_over_noise": [round(effect.excess["counted_nm"] / noise_sd_nm, 3) for effect in self.hidden],
             "base": jsonable(self.base.describe()),
         }
 
@@ -100,7 +102,7 @@ def draw_scenario(
             hidden = tuple(
                 _draw_effect(rng, name, effect, strength, noise_sd_nm, base, sequence, seed) for name, effect in effects
             )
-            combine(base, [(one.formulation, one.magnitude) for one in hidden])
+            combine(base, [(effect.formulation, effect.magnitude) for effect in hidden])
         except NotSuited:
             continue
         return Scenario(base, hidden, sequence)

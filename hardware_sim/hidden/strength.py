@@ -34,12 +34,12 @@ def _knots(base: Base, count: int = 40) -> Floats:
     rising = np.maximum.accumulate(base.table_nm[: u.size]) + 1e-6 * u
     by_rise = np.interp(np.linspace(0.0, 1.0, count // 2), rising / rising[-1], u)
     inner = np.unique(np.round(np.concatenate([np.linspace(0.0, top, count // 2), by_rise]), 1))
-    keep = [inner[0]]
+    kept_knots = [inner[0]]
     for knot in inner[1:]:
-        if knot - keep[-1] >= 1.0:
-            keep.append(knot)
-    keep[-1] = top
-    return np.concatenate([[0.0] * 3, keep, [top] * 3])
+        if knot - kept_knots[-1] >= 1.0:
+            kept_knots.append(knot)
+    kept_knots[-1] = top
+    return np.concatenate([[0.0] * 3, kept_knots, [top] * 3])
 
 
 def _filter(t_omega_s: float, zeta: float, step_s: float) -> tuple[Floats, Floats]:
@@ -123,8 +123,8 @@ class EffectFreeFit:
     def fit(self, torque_nm: Floats) -> Floats:
         """Residual of the best effect-free model over all rows, free run, N·m."""
         train = ~self.held_out
-        own = np.log([self.base.t_omega_s, self.base.zeta])
-        starts = [own] if np.array_equal(own, self._start) else [self._start, own]
+        start = np.log([self.base.t_omega_s, self.base.zeta])
+        starts = [start] if np.array_equal(start, self._start) else [self._start, start]
         results = [
             least_squares(
                 lambda theta: (torque_nm - self._predict(theta, torque_nm))[train],
@@ -146,12 +146,12 @@ class EffectFreeFit:
 def excess_nm(counted: Counted, residual_nm: Floats, held_out: np.ndarray) -> dict[str, float]:
     """Root mean squares of the residual: training rows, held-out rows, all rows, and the one that counts."""
     rms = lambda rows: float(np.sqrt(np.mean(rows**2))) if rows.size else float("nan")  # noqa: E731
-    training, held, everywhere = rms(residual_nm[~held_out]), rms(residual_nm[held_out]), rms(residual_nm)
+    training, held_out_rms, everywhere = rms(residual_nm[~held_out]), rms(residual_nm[held_out]), rms(residual_nm)
     if counted == "all" or not held_out.any():
         counts = everywhere
     else:
-        counts = {"training": training, "larger": max(training, held)}.get(counted, held)
-    return {"training_nm": training, "held_out_nm": held, "all_nm": everywhere, "counted_nm": counts}
+        counts = {"training": training, "larger": max(training, held_out_rms)}.get(counted, held_out_rms)
+    return {"training_nm": training, "held_out_nm": held_out_rms, "all_nm": everywhere, "counted_nm": counts}
 
 
 @dataclass
@@ -165,8 +165,8 @@ class _Excess:
 
     def __post_init__(self) -> None:
         self._effect_free_fit = EffectFreeFit(self.base, self.design.width_us, self.design.held_out)
-        self._without, found = self._residual(self.base.stages())
-        self.own_nm = found["counted_nm"]  # what the fit leaves without any effect
+        self._without, fit = self._residual(self.base.stages())
+        self.own_nm = fit["counted_nm"]  # what the fit leaves without any effect
 
     def _residual(self, stages: list[Stage]) -> tuple[Floats, dict[str, float]]:
         torque = simulate(self.base, stages, self.design, STEP_S)
@@ -177,11 +177,11 @@ class _Excess:
 
     def at(self, magnitude: float) -> dict[str, float]:
         """Excess in N·m; the error without the effect is taken out of `counted_nm`."""
-        torque, found = self._residual(combine(self.base, [(self.formulation, magnitude)]))
-        counted = float(np.sqrt(max(found["counted_nm"] ** 2 - self.own_nm**2, 1e-18)))
+        torque, fit = self._residual(combine(self.base, [(self.formulation, magnitude)]))
+        counted = float(np.sqrt(max(fit["counted_nm"] ** 2 - self.own_nm**2, 1e-18)))
         if self.counted == "added":
             counted = float(np.std(torque - self._without))
-        return found | {"counted_nm": counted}
+        return fit | {"counted_nm": counted}
 
 
 def find_magnitude(
@@ -208,11 +208,11 @@ def find_magnitude(
     low, at_low = high * 1e-3, target_nm * 1e-3
     magnitude = high * target_nm / at_high
     for tries in range(12):
-        found = excess.at(magnitude)
-        shown_nm = found["counted_nm"]
+        excess_now = excess.at(magnitude)
+        shown_nm = excess_now["counted_nm"]
         close = abs(np.log(shown_nm / target_nm)) < (0.1 if tries < 6 else 1.0)
         if close and band_nm[0] * 1.03 < shown_nm < band_nm[1] * 0.97:
-            return magnitude, found
+            return magnitude, excess_now
         if shown_nm > target_nm:
             high, at_high = magnitude, shown_nm
         else:

@@ -64,7 +64,7 @@ class Plain(Cell):
         last = samples[-1]
         if len(samples) == 1:
             return TORQUE.pack(last.torque_nm, last.counter & 0xFFFF, SYNC_BIT if last.sync else 0, 0)
-        counts = (_counts(one.torque_nm, self.COUNTS_PER_NM, nothing=-32767) for one in samples)
+        counts = (_counts(sample.torque_nm, self.COUNTS_PER_NM, nothing=-32767) for sample in samples)
         return self.PACKED.pack(*counts, last.counter // self.samples_per_frame & 0xFFFF)
 
 

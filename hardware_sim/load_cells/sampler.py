@@ -105,14 +105,14 @@ class LoadCell:
         if not self.cell.running:
             self._held.clear()
             return
-        frames, held, full = [], self._held, self.cell.samples_per_frame
+        frames, waiting, full = [], self._held, self.cell.samples_per_frame
         for sample in samples:
-            held.append(sample)
-            if len(held) >= full:
-                frames.append(self.cell.encode(held))
-                held.clear()
+            waiting.append(sample)
+            if len(waiting) >= full:
+                frames.append(self.cell.encode(waiting))
+                waiting.clear()
         for hook in self.frame_hooks:
-            frames = [changed for one in frames for changed in hook(one)]
+            frames = [changed for frame in frames for changed in hook(frame)]
         self._frames += frames
 
 
@@ -120,8 +120,8 @@ def _make_cell(settings: Settings) -> Cell:
     """The cell's electronics. Raises SettingsError: it has no frame of so many samples."""
     kind = pick(CELLS, "load cell", settings.cell)
     if settings.samples_per_frame not in kind.layouts:
-        takes = " or ".join(map(str, kind.layouts))
+        allowed = " or ".join(map(str, kind.layouts))
         raise SettingsError(
-            f"--samples-per-frame must be {takes} with --cell {settings.cell}, not {settings.samples_per_frame}"
+            f"--samples-per-frame must be {allowed} with --cell {settings.cell}, not {settings.samples_per_frame}"
         )
     return kind(settings.samples_per_frame)

@@ -35,19 +35,19 @@ def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
     Raises PatientError: there is no such patient, or it has no such parameter, or a value is not a finite number or out
     of range.
     """
-    given = parameters or {}
+    values = parameters or {}
     if name not in PATIENTS:
         raise PatientError(f"patient '{name}' is neither a file nor one of {', '.join(NAMES)}")
     kind, muscle = PATIENTS[name]
     known: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(kind)}
-    for key, value in given.items():
+    for key, value in values.items():
         if key not in known:
             raise PatientError(f"patient '{name}' has no parameter '{key}'; it has {', '.join(known)}")
         if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
             raise PatientError(f"parameter '{key}' must be a finite number, not {value!r}")
         if key.endswith(("_s", "_ma", "_us")) and known[key] > 0 and not value > 0:  # a shift may have either sign
             raise PatientError(f"parameter '{key}' must be above zero, not {value!r}")
-    return muscle(kind(**given))
+    return muscle(kind(**values))
 
 
 def from_file(path: Path) -> Muscle:

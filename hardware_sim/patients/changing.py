@@ -178,8 +178,8 @@ class ChangingMuscle(HeldPulses):
         stores = self._fatigue.level, self._potentiation.level, self._slowing.level
         return (self._y, self._dy, *stores)
 
-    def _return_to(self, kept: tuple[float, ...]) -> None:
-        self._y, self._dy, self._fatigue.level, self._potentiation.level, self._slowing.level = kept
+    def _return_to(self, state: tuple[float, ...]) -> None:
+        self._y, self._dy, self._fatigue.level, self._potentiation.level, self._slowing.level = state
 
     def _step_to(self, time_s: float, input_nm: float) -> None:
         dt, use = max(time_s - self._time_s, 0.0), _use(self._recruited) if input_nm else 0.0

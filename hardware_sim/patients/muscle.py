@@ -74,8 +74,8 @@ class HeldPulses:
         """The state, for `_return_to`."""
         return self._y, self._dy
 
-    def _return_to(self, kept: Any) -> None:
-        self._y, self._dy = kept
+    def _return_to(self, state: Any) -> None:
+        self._y, self._dy = state
 
     def _advance(self, time_s: float) -> None:
         if self._time_s < self._hold_end_s:

@@ -314,8 +314,8 @@ class P24(Firmware):
             answer(HIGH_VOLTAGE)
         else:
             flowed = self._board.electrodes.fire(self._board.timeline.now_s, points, (connector, channel), "low level")
-            seen = max(abs(current_ma) for _, current_ma in points) >= ELECTRODE_DETECTION_MA
-            result = ELECTRODE if seen and not flowed else OK
+            is_detected = max(abs(current_ma) for _, current_ma in points) >= ELECTRODE_DETECTION_MA
+            result = ELECTRODE if is_detected and not flowed else OK
             self._later(sum(width for width, _ in points) * 1e-6, lambda: answer(result))
 
     @staticmethod

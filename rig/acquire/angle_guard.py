@@ -89,11 +89,11 @@ class AngleGuard:
         """What only the whole test shows, and must make it a fault."""
         return self._ending(self._rate.fault_at_end())
 
-    def _ending(self, found: str | None) -> str | None:
+    def _ending(self, fault: str | None) -> str | None:
         """What was found, if this test needs the sensor; else it is noted."""
-        if found is not None and not self.needed:
-            self._note(found)
-        return found if self.needed else None
+        if fault is not None and not self.needed:
+            self._note(fault)
+        return fault if self.needed else None
 
     def _stale(self, stood_s: float = 0.0) -> str | None:
         if self._receiver is None:
@@ -116,16 +116,16 @@ class AngleGuard:
     def _wrong(self, samples: NDArray[Any]) -> str | None:
         """What is wrong with this block; None: nothing."""
         angle_rad, now_s = samples["angle_rad"], float(samples["host_time_s"][-1])
-        found = (
+        fault = (
             _unreliable(samples)
             or self._jumped(samples)
             or self._outside(angle_rad)
             or self._away(angle_rad)
-            or self._stands(angle_rad, now_s)
+            or self._frozen(angle_rad, now_s)
             or self._rate.fault(len(samples), int(samples["counter"][-1]), now_s)
         )
         self._last = float(angle_rad[-1]), int(samples["counter"][-1]), now_s
-        return found
+        return fault
 
     def _jumped(self, samples: NDArray[Any]) -> str | None:
         """More than the limit between two samples; what could have happened while samples were missing is allowed."""
@@ -163,7 +163,7 @@ class AngleGuard:
             f"{degrees(target_rad)} ± {degrees(most_rad)}"
         )
 
-    def _stands(self, angle_rad: NDArray[np.float64], now_s: float) -> str | None:
+    def _frozen(self, angle_rad: NDArray[np.float64], now_s: float) -> str | None:
         still_s = None if self._wanted is None or self._is_held else self._wanted.still_s
         if still_s is None or not self._moving:
             return None
@@ -186,8 +186,8 @@ def _unreliable(samples: NDArray[Any]) -> str | None:
 
 
 def _worded(receiver: AngleReceiver) -> str:
-    found = receiver.problem or "angle sensor: no angle arrives; check its cable and supply"
-    return found if found.startswith("angle sensor") else f"angle sensor: {found}"
+    problem = receiver.problem or "angle sensor: no angle arrives; check its cable and supply"
+    return problem if problem.startswith("angle sensor") else f"angle sensor: {problem}"
 
 
 def outside(angle_rad: float, bound: Limit) -> str:

@@ -50,7 +50,7 @@ class AngleReceiver(Stream):
         """How much later the newest sample came than the promptest one, by its number, rig seconds."""
         self._prompt: tuple[float, float] | None = None
         self._behind = 0
-        self._anew = False
+        self._restarted = False
         """Whether the next sample is the first one since it was opened."""
         self._slope = LiveSlope(sensor.sample_rate_hz)
         self._recent: deque[NDArray[Any]] = deque()
@@ -81,8 +81,8 @@ class AngleReceiver(Stream):
         return samples
 
     def _placed(self, samples: NDArray[Any]) -> NDArray[Any]:
-        if self._anew:  # one that was without power counts from zero: its numbers go on where the clock is
-            self._anew = False
+        if self._restarted:  # one that was without power counts from zero: its numbers go on where the clock is
+            self._restarted = False
             self._count_on(float(samples["host_time_s"][0]))
         before = self.counts.disordered_samples
         placed = super()._placed(samples)
@@ -92,7 +92,7 @@ class AngleReceiver(Stream):
             self._on_fault(f"{NAME}: its counter went back; it was without power, or what it sent comes once more")
         return placed
 
-    def _keep(self, samples: NDArray[Any]) -> None:
+    def _store(self, samples: NDArray[Any]) -> None:
         samples = self._scaled(samples)
         self._write(Kind.ANGLE, samples)
         self.problem = ""
@@ -121,7 +121,7 @@ class AngleReceiver(Stream):
     async def _keep_open(self) -> None:
         while not self._closing.is_set():
             try:
-                self._anew = True
+                self._restarted = True
                 self.identity = await self.open()
             except DeviceError as error:
                 self._gone(str(error))

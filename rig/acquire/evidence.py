@@ -27,16 +27,16 @@ ATTEMPTS = 2
 
 async def stop_device(gate: Gate) -> tuple[bool, str | None, str]:
     """Stop and ask: (whether the device reports that it cannot stimulate, its state, what went wrong). Never raises."""
-    said = ""
+    error_text = ""
     for _ in range(ATTEMPTS):  # the first answer may have been damaged on the line
         try:
             await gate.stop()
             safe, state = await gate.state()
         except DeviceError as error:
-            said = str(error)
+            error_text = str(error)
             continue
         return safe, state, ""
-    return False, None, "; ".join(part for part in (said, gate.still_possible()) if part)
+    return False, None, "; ".join(part for part in (error_text, gate.still_possible()) if part)
 
 
 async def watch_decay(

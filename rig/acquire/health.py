@@ -98,9 +98,9 @@ class Health:
         self._gate, self._receiver, self._disk, self._clock, self._watch = gate, receiver, disk, clock, watch
         self._angle = angle
 
-    def doubt(self) -> tuple[str, float] | None:
+    def suspicion(self) -> tuple[str, float] | None:
         """Why the first pulse may not come yet, and for how long it may be waited for; see `Receiver.doubt`."""
-        return self._receiver.doubt(self._watch.stuck_torque_s, self._watch.unmoved_torque_s)
+        return self._receiver.suspicion(self._watch.stuck_torque_s, self._watch.unmoved_torque_s)
 
     def fault(self, stood_s: float = 0.0) -> str | None:
         """What is wrong, in words; None: all checks pass.

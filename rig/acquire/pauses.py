@@ -61,7 +61,7 @@ class Pauses:
         if due_s < self.until_s:
             return None
         stood_s = self._since(due_s)
-        if stood_s <= BLOCKED_S and self._health.fault() is None and not (first and self._health.doubt()):
+        if stood_s <= BLOCKED_S and self._health.fault() is None and not (first and self._health.suspicion()):
             return None
         return self._too_much(stood_s, due_s) or await self._sit_out(stood_s, due_s, t0_s, first)
 
@@ -71,14 +71,19 @@ class Pauses:
         The stimulator is asked beside it: who stops waits for no answer of it.
         """
         longest_s, cause = stood_s, self._machine.blocked_by(stood_s)
-        asked = self._tasks.spawn(self._gate.changed(), "stimulator after a pause")
+        changing = self._tasks.spawn(self._gate.changed(), "stimulator after a pause")
         while True:
-            doubt = self._health.doubt() if first else None
-            if asked.done.is_set() and self._receiver.settled() and doubt is None and self._health.fault() is None:
+            suspicion = self._health.suspicion() if first else None
+            if (
+                changing.done.is_set()
+                and self._receiver.settled()
+                and suspicion is None
+                and self._health.fault() is None
+            ):
                 break
             waited_s = self._since(due_s)
-            if doubt is not None and waited_s >= min(doubt[1], LONGEST_S + RECOVERY_S):
-                return doubt[0]
+            if suspicion is not None and waited_s >= min(suspicion[1], LONGEST_S + RECOVERY_S):
+                return suspicion[0]
             if waited_s > LONGEST_S + RECOVERY_S:
                 return self._health.fault() or "not everything was in order again soon after the computer was blocked"
             looked_s = self._clock.now_s()
@@ -89,7 +94,7 @@ class Pauses:
                 longest_s = max(longest_s, again_s)
                 if (wrong := self._too_much(again_s, due_s)) is not None:
                     return wrong
-        if (wrong := asked.result) is None:
+        if (wrong := changing.result) is None:
             self.until_s = self._clock.now_s()
             pause = Pause(at_s=due_s - t0_s, for_s=self.until_s - due_s, blocked_s=longest_s, cause=cause)
             self.all.append(pause)

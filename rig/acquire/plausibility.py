@@ -41,13 +41,13 @@ class RateCheck:
         self._longest_s = 0.0
         self._last_s: float | None = None
         self._count = 0
-        self._anew = False
+        self._restarted = False
         self._from_s: float | None = None
         self._prompt: list[tuple[float, int]] = []
 
     def begin(self) -> None:
         """Start the measurement again, since an old backlog may have been read. From any thread."""
-        self._anew = True
+        self._restarted = True
 
     def fault(self, count: int, number: int, now_s: float) -> str | None:
         """What is wrong with the rate; None: nothing.
@@ -55,8 +55,8 @@ class RateCheck:
         `count`, `number`: of samples in this block; of its last sample, -1 if the device counts none. `now_s`: when the
         block arrived.
         """
-        if self._anew:
-            self._anew, self._from_s, self._prompt = False, None, []
+        if self._restarted:
+            self._restarted, self._from_s, self._prompt = False, None, []
         self._count += count
         self._keep_promptest(now_s, number if number >= 0 else self._count)
         from_s, third_s = self._counted_from(count, now_s), self._window_s / 3
@@ -113,11 +113,11 @@ class RateCheck:
         return min(self._prompt[low:high], key=self._delay_s, default=None)
 
     def _keep_promptest(self, now_s: float, number: int) -> None:
-        kept = self._prompt
-        if not kept or int(kept[-1][0] / BIN_S) != int(now_s / BIN_S):
-            kept.append((now_s, number))
-        elif self._delay_s((now_s, number)) < self._delay_s(kept[-1]):
-            kept[-1] = now_s, number
+        earliest = self._prompt
+        if not earliest or int(earliest[-1][0] / BIN_S) != int(now_s / BIN_S):
+            earliest.append((now_s, number))
+        elif self._delay_s((now_s, number)) < self._delay_s(earliest[-1]):
+            earliest[-1] = now_s, number
 
     def _message(self, rate_hz: float) -> str:
         return (
@@ -167,10 +167,10 @@ class PlausibilityCheck:
     def fault(self, samples: NDArray[Any]) -> str | None:
         """What is wrong with this block; None: nothing."""
         torque_nm, now_s = samples["torque_nm"], float(samples["host_time_s"][-1])
-        found = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s)
-        found = found or self.rate.fault(len(samples), int(samples["counter"][-1]), now_s)
+        fault = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s)
+        fault = fault or self.rate.fault(len(samples), int(samples["counter"][-1]), now_s)
         self._last = float(torque_nm[-1]), now_s
-        return found
+        return fault
 
     def _jumped(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm, before_s = self._last or (float(torque_nm[0]), now_s)
@@ -187,7 +187,7 @@ class PlausibilityCheck:
     def _stuck(self, torque_nm: NDArray[np.float64], now_s: float) -> str | None:
         before_nm = self._last[0] if self._last else float(torque_nm[0])
         self._first_nm = before_nm if self._first_nm is None else self._first_nm
-        at_rail = [rail.holds(torque_nm, before_nm) for rail in self._rails]
+        at_rail = [rail.contains(torque_nm, before_nm) for rail in self._rails]
         at_end = any(at_rail) and abs(torque_nm[-1] - self._first_nm) >= RAIL_LEAST_NM
         if not (torque_nm == before_nm).all():
             self._noisy += 1
@@ -211,7 +211,7 @@ class _Rail:
     def __init__(self, sign: int) -> None:
         self._sign, self._end_nm, self._visits = sign, -np.inf, 0
 
-    def holds(self, torque_nm: NDArray[np.float64], before_nm: float) -> bool:
+    def contains(self, torque_nm: NDArray[np.float64], before_nm: float) -> bool:
         """Whether the last of these samples may be saturated."""
         signed_nm = self._sign * np.concatenate(((before_nm,), torque_nm))
         most_nm = float(signed_nm.max())

@@ -123,7 +123,7 @@ class Receiver(Stream):
         means_nm = [torque for _, torque in tuple(self.recent)]
         return int(np.sum(np.abs(np.diff(means_nm)) > 1e-9))  # means of equal samples differ by rounding
 
-    def doubt(self, stuck_s: float, unmoved_s: float) -> tuple[str, float] | None:
+    def suspicion(self, stuck_s: float, unmoved_s: float) -> tuple[str, float] | None:
         """Why no pulse may come yet: what arrives may not be the torque of now; None: it is.
 
         Parameters
@@ -155,7 +155,7 @@ class Receiver(Stream):
             return f"the adapter of the load cell on {self._place} reports errors of the bus: {LOOK_AT}", SETTLE_S
         return None
 
-    def _keep(self, samples: NDArray[Any]) -> None:
+    def _store(self, samples: NDArray[Any]) -> None:
         self._remember(samples)
         self._write(Kind.TORQUE, samples)
         self._check_limits(samples["torque_nm"])

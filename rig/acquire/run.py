@@ -51,11 +51,11 @@ class Halt:
         self.reason = ""
         self.time_s = 0.0
         self._clock = clock
-        self._heard: list[Callable[[], None]] = []
+        self._listeners: list[Callable[[], None]] = []
 
     def on_set(self, action: Callable[[], None]) -> None:
         """Call `action` when halted, before anything else goes on."""
-        self._heard.append(action)
+        self._listeners.append(action)
 
     def set(self, cause: Cause, reason: str) -> bool:
         """End the test; False if it was already ending."""
@@ -64,7 +64,7 @@ class Halt:
         self.time_s = self._clock.now_s() if self.cause is None else self.time_s
         self.cause, self.reason = cause, reason
         self.signal.set()
-        for action in self._heard:
+        for action in self._listeners:
             action()
         return True
 
@@ -174,12 +174,12 @@ class TestRun:
         except Exception as error:  # a bug in this program must stop stimulation, too
             log.exception("the test failed")
             self._fault(f"internal: {type(error).__name__}: {error}")
-        found = await self._stop()
-        self.on_evidence(found)  # whoever waits for it waits for no disk
+        evidence = await self._stop()
+        self.on_evidence(evidence)  # whoever waits for it waits for no disk
         elapsed_s = max((self._clock.now_s() - began_s) / self._clock.speed, 1e-9)
         cpu_percent = 100 * (self._machine.cpu_s() - cpu_s) / elapsed_s
         await disk.end()
-        return await self._result(found, cpu_percent)
+        return await self._result(evidence, cpu_percent)
 
     def segment(self) -> str | None:
         """Name of the current segment; None before the start and after the end."""
@@ -215,12 +215,12 @@ class TestRun:
         """Wait until every sensor that this test relies on gives whole samples of now."""
         waited_s = 0.0
         while not self.halt.signal.is_set():
-            doubt, seen = health.doubt(), self._angle.fresh()
-            if doubt is None and seen and self._receiver.settled():
+            suspicion, has_angle = health.suspicion(), self._angle.fresh()
+            if suspicion is None and has_angle and self._receiver.settled():
                 return await self._open_gate()
-            if doubt is not None and waited_s >= doubt[1]:
-                self._fault(doubt[0])
-            if not seen and waited_s >= FRESH_S:
+            if suspicion is not None and waited_s >= suspicion[1]:
+                self._fault(suspicion[0])
+            if not has_angle and waited_s >= FRESH_S:
                 self._fault(self._angle.fault() or "angle sensor: no angle arrived before the test; check its cable")
             if waited_s >= SETTLE_S:
                 self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
@@ -260,11 +260,11 @@ class TestRun:
                 return
             if due_s < pauses.until_s and width_us > 0:
                 rise.begin_anew()
-            asked_us = rise.limited(width_us, bool(self.score.laid.jumps[index]))
+            asked_us = rise.limited(width_us, bool(self.score.queue.jumps[index]))
             self.gate.feed()
             self._machine.hold_until(due_s)
             status = self.gate.fire(index, Pulse(asked_us, current_ma), due_s, due_s + late_s)
-            rise.take(status, asked_us, width_us)
+            rise.add(status, asked_us, width_us)
             index += 1
         await self._tasks.wait(t0_s + index * period_s, self.halt.signal)
 
@@ -278,10 +278,10 @@ class TestRun:
         """Stop the device, ask its state, watch the torque fall, end the journal."""
         clock, cause = self._clock, self.halt.cause
         at_stop_nm = self._receiver.torque_around(AROUND_S * clock.speed)
-        safe, state, said = await stop_device(self.gate)
+        safe, state, error_text = await stop_device(self.gate)
         well = cause in (None, "withdrawn")
         if well and not safe:  # without the device's confirmation the end is a fault
-            self._fault(f"the end of stimulation is not confirmed: {said or state}")
+            self._fault(f"the end of stimulation is not confirmed: {error_text or state}")
         elif well and (wrong := self._plausibility.rate.fault_at_end() or self._angle.fault_at_end()):
             self._fault(wrong)
         cause = self.halt.cause
@@ -295,7 +295,7 @@ class TestRun:
         self._end_journal(cause, planned_end_s if cause is None else now_s)
         return StopEvidence(
             confirmed=safe and falling,
-            detail="; ".join(part for part in (f"device: {state or 'did not answer'}", said, words) if part),
+            detail="; ".join(part for part in (f"device: {state or 'did not answer'}", error_text, words) if part),
             last_pulse_age_s=None if last_s is None else now_s - last_s,
             pulse_may_follow=self.gate.on_its_way is not None,
             device_state=state,
@@ -323,7 +323,7 @@ class TestRun:
                 self.journal.append_json(Kind.EVENT, event)
             self.journal.append_json(Kind.END, content)
 
-    async def _result(self, found: StopEvidence, cpu_percent: float) -> RunResult:
+    async def _result(self, evidence: StopEvidence, cpu_percent: float) -> RunResult:
         await self._tasks.work(self.journal.close)
         gate, speed, angle = self.gate, self._clock.speed, self._angle_counts
         summary: dict[str, Any] = {
@@ -339,14 +339,14 @@ class TestRun:
             "torque_peak_nm": self._receiver.peak_nm,
             "ended_by": self.ended_by,
             "cpu_percent": round(cpu_percent, 2),
-            "stop": found.model_dump(),
+            "stop": evidence.model_dump(),
         }
         if angle is not None:
             counts = asdict(angle)
             summary["angle"] = {name: counts[name] for name in ("samples", "lost_samples", "duplicate_samples")}
         reason = self.halt.reason if self._outcome != "completed" else ""
         last_s, last_unix_s = gate.last_pulse_s, self._receiver.last_unix_s
-        return RunResult(self._outcome, reason, found, summary, self._rise_nm(), last_s, last_unix_s)
+        return RunResult(self._outcome, reason, evidence, summary, self._rise_nm(), last_s, last_unix_s)
 
     def _rise_nm(self) -> float | None:
         """Largest change of the torque from rest since the first pulse, N·m; None if that is not known."""
@@ -380,7 +380,7 @@ class Rise:
         """A planned width, or as much of it as may follow the last pulse."""
         return width_us if jumps and not self._climb else min(width_us, self._felt_us + self._most_us)
 
-    def take(self, status: PulseStatus, asked_us: float, width_us: float) -> None:
+    def add(self, status: PulseStatus, asked_us: float, width_us: float) -> None:
         """What became of a pulse. One that the device would make too short counts as none."""
         self._missed = self._missed + 1 if status is PulseStatus.DROPPED else 0
         if self._missed >= self._most_missed:

@@ -76,10 +76,10 @@ class CounterUnwrapper:
         half = self._modulus // 2
         counter = self._last + ((steps_from(self._last, raw) + half) % self._modulus - half).cumsum()
         newest = np.maximum.accumulate(np.concatenate(((self._last,), counter)))
-        keep = counter > newest[:-1]
+        is_new = counter > newest[:-1]
         repeats = int(np.count_nonzero(counter == newest[:-1]))
         self._last = int(newest[-1])
-        return counter, keep, repeats, len(raw) - int(np.count_nonzero(keep)) - repeats
+        return counter, is_new, repeats, len(raw) - int(np.count_nonzero(is_new)) - repeats
 
 
 def steps_from(before: float, values: NDArray[Any]) -> NDArray[Any]:
@@ -183,7 +183,7 @@ class Stream:
             return None
         return (rate[-1][1] - rate[0][1]) / (rate[-1][0] - rate[0][0])
 
-    def take(self, block: Block) -> None:
+    def add(self, block: Block) -> None:
         """Process one block from the device: unwrap, record, check."""
         self.counts.malformed_frames += block.malformed
         self.counts.error_frames += block.error_frames
@@ -194,9 +194,9 @@ class Stream:
         samples = self._placed(block.samples)
         if len(samples):
             self._time(samples)
-            self._keep(samples)
+            self._store(samples)
 
-    def _keep(self, samples: NDArray[Any]) -> None:
+    def _store(self, samples: NDArray[Any]) -> None:
         """Record and check samples that have their place."""
         raise NotImplementedError
 
@@ -237,11 +237,11 @@ class Stream:
         """The samples with unwrapped counters, without repeated and late ones; counts the lost ones."""
         if self._unwrapper is None:
             return self._in_order(samples)
-        counter, keep, repeats, late = self._unwrapper.unwrap(samples["counter"])
+        counter, is_new, repeats, late = self._unwrapper.unwrap(samples["counter"])
         self.counts.duplicate_samples += repeats
         self.counts.disordered_samples += late
-        samples = samples[keep].copy()
-        samples["counter"] = counter[keep]
+        samples = samples[is_new].copy()
+        samples["counter"] = counter[is_new]
         if len(samples) == 0:
             return samples
         before = self._previous or (int(samples["counter"][0]) - 1, float(samples["host_time_s"][0]))
@@ -259,13 +259,13 @@ class Stream:
             return samples
         newest_s = np.maximum.accumulate(np.concatenate(((self._newest_stamp_s,), stamp_s)))
         behind_s = newest_s[:-1] - stamp_s
-        keep = (behind_s < 0) | (behind_s > STAMPS_BACK_S)  # a clock that was set back begins anew
+        in_order = (behind_s < 0) | (behind_s > STAMPS_BACK_S)  # a clock that was set back begins anew
         repeats = int(np.count_nonzero(behind_s == 0))
         self.counts.duplicate_samples += repeats
-        self.counts.disordered_samples += len(samples) - int(np.count_nonzero(keep)) - repeats
-        if keep.any():
-            self._newest_stamp_s = float(stamp_s[keep][-1])
-        return samples[keep]
+        self.counts.disordered_samples += len(samples) - int(np.count_nonzero(in_order)) - repeats
+        if in_order.any():
+            self._newest_stamp_s = float(stamp_s[in_order][-1])
+        return samples[in_order]
 
     def _check_jump(self, samples: NDArray[Any], before: tuple[int, float], missing: int) -> None:
         elapsed_s = float(samples["host_time_s"][-1]) - before[1]
@@ -283,7 +283,7 @@ class Stream:
         if self._closing.is_set() or self._lost.is_set():
             return
         try:
-            self.take(block)
+            self.add(block)
         except Exception as error:  # a bug in a driver or here: report it at once, not after a timeout
             log.exception("the receiver of the %s failed", self._name)
             self._lose(f"{self._name}: internal: {type(error).__name__}: {error}")

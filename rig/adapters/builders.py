@@ -36,13 +36,13 @@ class Previews:
     def __init__(self, table: dict[str, Limit], speed: float) -> None:
         rows = {name: asdict(row) for name, row in table.items()}
         self._first = json.dumps({"table": rows, "speed": speed}).encode() + b"\n"
-        self._one = asyncio.Lock()
+        self._lock = asyncio.Lock()
         self._waiting = 0
         self._process: asyncio.subprocess.Process | None = None
 
     async def warm(self) -> None:
         """Start it, so that the first request does not wait for it: on a busy computer that takes seconds."""
-        async with self._one:
+        async with self._lock:
             try:
                 await self._begin()
             except OSError as error:  # it is started again when it is needed
@@ -96,7 +96,7 @@ class Previews:
         self._waiting += 1
         request = json.dumps(angle_set_at_utc).encode() + b"\n" + line.rstrip(b"\n") + b"\n"
         try:
-            async with self._one:
+            async with self._lock:
                 process = await self._begin()  # its start is not part of the time
                 return await asyncio.wait_for(self._exchange(process, request), MAX_BUILD_S)
         except TimeoutError:

@@ -33,23 +33,23 @@ class ReadAhead:
     def __init__(self, port: Any) -> None:
         self._port = port
         self._bytes = b""
-        self._given = 0
+        self._returned = 0
 
     @property
     def in_waiting(self) -> int:
-        return len(self._bytes) - self._given or self._port.in_waiting
+        return len(self._bytes) - self._returned or self._port.in_waiting
 
     def read(self, size: int = 1) -> bytes:
         """At most `size` bytes; waits for the port's own timeout if none is there."""
-        if self._given == len(self._bytes):
-            self._bytes, self._given = self._port.read(max(1, self._port.in_waiting)), 0
-        part = self._bytes[self._given : self._given + size]
-        self._given += len(part)
+        if self._returned == len(self._bytes):
+            self._bytes, self._returned = self._port.read(max(1, self._port.in_waiting)), 0
+        part = self._bytes[self._returned : self._returned + size]
+        self._returned += len(part)
         return part
 
     def reset_input_buffer(self) -> None:
         """Forget what was not read yet."""
-        self._bytes, self._given = b"", 0
+        self._bytes, self._returned = b"", 0
         self._port.reset_input_buffer()
 
     @property
@@ -106,18 +106,18 @@ class CanBus:
     def find(arguments: dict[str, Any], name: str) -> CanBus | None:
         """An adapter that is open already; None: it is not. Raises DeviceError if it is open with other arguments."""
         with _registering:
-            found = _open.get(_key(arguments))
-        if found is not None and found._arguments != arguments:
+            bus = _open.get(_key(arguments))
+        if bus is not None and bus._arguments != arguments:
             raise DeviceError(
-                f"{_table(name)}.bus: {found.place} is already open with other arguments; give the same as for the "
-                f"{found._name}, or leave it out"
+                f"{_table(name)}.bus: {bus.place} is already open with other arguments; give the same as for the "
+                f"{bus._name}, or leave it out"
             )
-        return found
+        return bus
 
     def listen(self, listener: Listener) -> None:
         self._listening = (*self._listening, _Gathering(listener))
 
-    def leave(self, listener: Listener) -> None:
+    def detach(self, listener: Listener) -> None:
         self._listening = tuple(other for other in self._listening if other.listener is not listener)
 
     def send(self, frames: Sequence[tuple[int, bytes, bool]]) -> None:
@@ -248,7 +248,7 @@ class _Gathering:
             return
         block = self.listener.decode(self._frames, self.damaged, self.errors)
         self._frames, self.damaged, self.errors, self.end_s = [], 0, 0, math.inf
-        post(lambda: self.listener.take(block))
+        post(lambda: self.listener.handle(block))
 
 
 def _size_buffer(bus: can.BusABC) -> None:

@@ -21,9 +21,9 @@ class Files:
         # not a file of its own: whoever removed that would let a second rig in
         journals, holder = folder / "journals", folder / "rig.lock"
         self.make_folder(journals)
-        with contextlib.ExitStack() as held:
+        with contextlib.ExitStack() as stack:
             fd = os.open(journals, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-            held.callback(os.close, fd)
+            stack.callback(os.close, fd)
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError:
@@ -32,7 +32,7 @@ class Files:
                     f"data_dir {folder}: another rig (process {pid}) uses it; stop that rig first"
                 ) from None
             holder.write_text(str(os.getpid()))
-            return held.pop_all()
+            return stack.pop_all()
 
     def create(self, path: Path) -> LogFile:
         return LogFile(path)
@@ -78,8 +78,8 @@ class Files:
         return []
 
     def free_bytes(self, folder: Path) -> int:
-        found = os.statvfs(folder)
-        return found.f_bavail * found.f_frsize
+        status = os.statvfs(folder)
+        return status.f_bavail * status.f_frsize
 
 
 class LogFile:

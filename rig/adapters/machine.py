@@ -35,7 +35,7 @@ LONGEST_WAIT_S = 3600.0
 
 
 class Driver:
-    """Owns the thread. `post` and `ask` may be called from any thread."""
+    """Owns the thread. `post` and `submit` may be called from any thread."""
 
     def __init__(self, clock: Clock) -> None:
         self.tasks = Tasks(clock, self._work)
@@ -51,7 +51,7 @@ class Driver:
         """Have something done in the tasks' thread, before any task goes on."""
         self._inbox.put(action)
 
-    def ask(self, make: Callable[[], Coroutine[Any, Any, T]]) -> Future[T]:
+    def submit(self, make: Callable[[], Coroutine[Any, Any, T]]) -> Future[T]:
         """Start a task; the future has its result."""
         future: Future[T] = Future()
         self.post(lambda: self._follow(self.tasks.begin(make(), "request"), future))

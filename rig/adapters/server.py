@@ -36,7 +36,7 @@ MAX_PENDING = 64
 """Largest number of waiting requests of one connection."""
 MAX_SILENT, MAX_ACTIVE = 64, 128
 
-Ask = Callable[[Callable[[], Coroutine[Any, Any, Any]]], Future[Any]]
+Submit = Callable[[Callable[[], Coroutine[Any, Any, Any]]], Future[Any]]
 
 
 class Server:
@@ -44,7 +44,7 @@ class Server:
 
     def __init__(self) -> None:
         self.rig: Rig
-        self._ask: Ask
+        self._submit: Submit
         self._loop: asyncio.AbstractEventLoop | None = None
         self._subscribers: set[asyncio.StreamWriter] = set()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -58,19 +58,19 @@ class Server:
         if self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(lambda: self._send_all(to_line(event)))
 
-    async def start(self, rig: Rig, ask: Ask, path: Path) -> None:
+    async def start(self, rig: Rig, submit: Submit, path: Path) -> None:
         """Listen on `path` and on the stop socket; only this user and group may connect.
 
-        `ask` starts a task of the rig, from any thread.
+        `submit` starts a task of the rig, from any thread.
         """
         self._loop = asyncio.get_running_loop()
-        self.rig, self._ask = rig, ask
+        self.rig, self._submit = rig, submit
         self._previews = Previews(rig.table, rig.speed)
         if await _is_listening(path):
             raise ConfigError(f"socket: {path}: another rig is listening there; stop it or use another path")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._stop_server = StopServer(lambda reason, by: ask(lambda: rig.stop(reason, by)))
+            self._stop_server = StopServer(lambda reason, by: submit(lambda: rig.stop(reason, by)))
             self._stop_server.open(stop_socket(path))  # first: whoever can send a request can also stop
             path.unlink(missing_ok=True)
             self._server = await asyncio.start_unix_server(self._serve, path, limit=LONGEST_LINE, backlog=512)
@@ -79,7 +79,7 @@ class Server:
             raise ConfigError(
                 f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
             ) from None
-        self._keep(self._loop.create_task(self._live()))
+        self._track(self._loop.create_task(self._live()))
         await self._previews.warm()
 
     async def close(self) -> None:
@@ -93,7 +93,7 @@ class Server:
         if self._previews is not None:
             await self._previews.close()
 
-    def _keep(self, task: asyncio.Task[None]) -> None:
+    def _track(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -130,14 +130,14 @@ class Server:
                     task = asyncio.create_task(self._answer(line, writer, len(pending) >= MAX_PENDING))
                     pending.add(task)
                     task.add_done_callback(pending.discard)
-                    self._keep(task)
+                    self._track(task)
         except ValueError:
             _write(writer, to_line(refusal(0, PlanError(f"request: longer than {LONGEST_LINE // 1000} kB"))))
         except ConnectionError as error:
             log.warning("client disconnected: %s", error)
         finally:
             self._subscribers.discard(writer)
-            self._connections.leave(writer.transport)
+            self._connections.remove(writer.transport)
             await asyncio.gather(*pending, return_exceptions=True)
             writer.close()
             with contextlib.suppress(ConnectionError, OSError):
@@ -184,11 +184,11 @@ class Server:
             await self._answer(to_line(request), writer, crowded=False)
             return
         rig = self.rig
-        reply = await asyncio.wrap_future(self._ask(lambda: obey(rig, request)))
+        reply = await asyncio.wrap_future(self._submit(lambda: obey(rig, request)))
         _write(writer, to_line(reply))
         if request.kind == "subscribe" and reply.ok:
             self._subscribers.add(writer)
-            _write(writer, to_line(StateEvent(status=await asyncio.wrap_future(self._ask(self._status)))))
+            _write(writer, to_line(StateEvent(status=await asyncio.wrap_future(self._submit(self._status)))))
 
     async def _status(self) -> Status:
         return self.rig.status()

@@ -37,29 +37,29 @@ class Connections:
     """
 
     def __init__(self, max_silent: int, max_active: int) -> None:
-        self._most = {False: max_silent, True: max_active}
+        self._max_count = {False: max_silent, True: max_active}
         self._members: dict[bool, dict[asyncio.BaseTransport, float]] = {False: {}, True: {}}
 
     def __len__(self) -> int:
         return sum(len(members) for members in self._members.values())
 
     def enter(self, transport: asyncio.BaseTransport) -> None:
-        self._put(transport, spoken=False)
+        self._add(transport, spoken=False)
 
     def spoke(self, transport: asyncio.BaseTransport) -> None:
-        self.leave(transport)
-        self._put(transport, spoken=True)
+        self.remove(transport)
+        self._add(transport, spoken=True)
 
-    def leave(self, transport: asyncio.BaseTransport) -> None:
+    def remove(self, transport: asyncio.BaseTransport) -> None:
         for members in self._members.values():
             members.pop(transport, None)
 
-    def _put(self, transport: asyncio.BaseTransport, spoken: bool) -> None:
+    def _add(self, transport: asyncio.BaseTransport, spoken: bool) -> None:
         members, now_s = self._members[spoken], time.monotonic()
         members[transport] = now_s  # the newest is last: dictionaries keep their order
         longest, since_s = next(iter(members.items()))
-        many = len(members) > self._most[spoken] and now_s - since_s >= GRACE_S
-        if many or len(members) > MOST_AT_ONCE:
+        too_many = len(members) > self._max_count[spoken] and now_s - since_s >= GRACE_S
+        if too_many or len(members) > MOST_AT_ONCE:
             del members[longest]
             longest.abort() if isinstance(longest, asyncio.WriteTransport) else longest.close()
 
@@ -140,6 +140,6 @@ class StopServer:
             log.warning("client disconnected: %s", error)
         finally:
             self._tasks.discard(task)
-            self._connections.leave(writer.transport)
+            self._connections.remove(writer.transport)
             with contextlib.suppress(OSError):
                 writer.close()

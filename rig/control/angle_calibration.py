@@ -84,8 +84,12 @@ class AngleCalibrating:
     @property
     def scale(self) -> AngleScale | None:
         """By the two poses; None: there is no calibration."""
-        found = self.calibration
-        return None if found is None else AngleScale(found.offset, found.direction, found.radians_per_unit)
+        calibration = self.calibration
+        return (
+            None
+            if calibration is None
+            else AngleScale(calibration.offset, calibration.direction, calibration.radians_per_unit)
+        )
 
     def described(self, rig_file: AngleScale) -> dict[str, Any]:
         """What holds now, for journals and recordings: the calibration, else what the rig file says."""
@@ -105,10 +109,10 @@ class AngleCalibrating:
         if before is None:
             self._first = pose, self._clock.now_s()
             return False
-        found = self._of_two(before, pose, by, receiver.sensor.scale)
-        await self._file.write({"sensor": self._sensor, "calibration": found.model_dump(mode="json")})
-        self._first, self.calibration = None, found
-        log.info("angle sensor calibrated: %s", found.model_dump_json(exclude={"by"}))
+        calibration = self._of_two(before, pose, by, receiver.sensor.scale)
+        await self._file.write({"sensor": self._sensor, "calibration": calibration.model_dump(mode="json")})
+        self._first, self.calibration = None, calibration
+        log.info("angle sensor calibrated: %s", calibration.model_dump_json(exclude={"by"}))
         return True
 
     def _of_two(self, first: AnglePose, second: AnglePose, by: str, rig_file: AngleScale) -> AngleCalibration:
@@ -143,22 +147,24 @@ def _slope(first: AnglePose, second: AnglePose) -> float:
     return (second.angle_rad - first.angle_rad) / apart if apart else float("inf")
 
 
-def _check_poses(kept: AngleCalibration) -> AngleCalibration:
+def _check_poses(calibration: AngleCalibration) -> AngleCalibration:
     """A calibration out of its file, if it is what its two poses make: a digit that changed is noticed, too.
 
     Raises ValueError: it is not.
     """
-    if len(kept.poses) != 2:
-        raise ValueError(f"it has {len(kept.poses)} poses")
-    first, second = kept.poses
+    if len(calibration.poses) != 2:
+        raise ValueError(f"it has {len(calibration.poses)} poses")
+    first, second = calibration.poses
     slope = _slope(first, second)
-    apart_rad, told = abs(second.angle_rad - first.angle_rad), kept.direction * kept.radians_per_unit
-    off_rad = abs(slope * (first.raw - kept.offset) - first.angle_rad)
-    if not (apart_rad >= APART_RAD and kept.radians_per_unit > 0 and abs(told - slope) <= ROUNDED * abs(slope)):
+    apart_rad, scale_rad = abs(second.angle_rad - first.angle_rad), calibration.direction * calibration.radians_per_unit
+    off_rad = abs(slope * (first.raw - calibration.offset) - first.angle_rad)
+    if not (
+        apart_rad >= APART_RAD and calibration.radians_per_unit > 0 and abs(scale_rad - slope) <= ROUNDED * abs(slope)
+    ):
         raise ValueError("direction and radians_per_unit are not those of its poses")
     if not (off_rad <= ROUNDED * max(1.0, abs(slope * first.raw))):
         raise ValueError("its offset is not that of its poses")
-    return kept
+    return calibration
 
 
 def still_raw(receiver: AngleReceiver, speed: float) -> float:
@@ -203,8 +209,8 @@ class Joint:
     @property
     def set_at_utc(self) -> str | None:
         """When the sensor was calibrated; None: it was not. May be called from another thread."""
-        found = self.poses.calibration
-        return None if found is None else found.set_at_utc
+        calibration = self.poses.calibration
+        return None if calibration is None else calibration.set_at_utc
 
     def status(self) -> AngleStatus:
         if not self._present:
@@ -213,8 +219,8 @@ class Joint:
         now: dict[str, Any] = {}
         if angle is not None:
             age_s = angle.age_s(self._tasks.clock.now_s())
-            found = {"angle_rad": angle.angle_rad, "velocity_rad_s": angle.velocity_rad_s, "age_s": age_s}
-            now = {"problem": angle.problem, **{name: finite(value) for name, value in found.items()}}
+            status = {"angle_rad": angle.angle_rad, "velocity_rad_s": angle.velocity_rad_s, "age_s": age_s}
+            now = {"problem": angle.problem, **{name: finite(value) for name, value in status.items()}}
         return AngleStatus(
             present=True,
             calibrated=poses.calibration is not None,

@@ -82,10 +82,10 @@ class Calibrations:
         RigError (the result could not be written: it stays open).
         """
         async with self._state.in_turn():
-            if self._state.calibration is None and (kept := self._result.of(request.calibration_id)) is not None:
-                result = kept.result
+            if self._state.calibration is None and (stored := self._result.of(request.calibration_id)) is not None:
+                result = stored.result
                 if request.discard:
-                    await self._result.let_go(kept.calibration_id)
+                    await self._result.let_go(stored.calibration_id)
                     result = result.model_copy(update={"profile": None})
             else:
                 result = await self._close(self._open(request.calibration_id), request.discard)
@@ -104,8 +104,13 @@ class Calibrations:
         profile = None if discard else calibration.profile(self._tasks.clock.unix_s())
         result = CalibrationResult(profile=profile, recordings=calibration.recordings)
         if not discard:
-            found = {"calibration_id": of.calibration_id, "participant": of.participant, "by": of.by, "result": result}
-            await self._result.keep(Calibrated.model_validate(found))
+            calibrated = {
+                "calibration_id": of.calibration_id,
+                "participant": of.participant,
+                "by": of.by,
+                "result": result,
+            }
+            await self._result.store(Calibrated.model_validate(calibrated))
         if self._state.phase.state == "calibrating":  # a stop may have come meanwhile: it takes no result back
             self._state.change(self._state.phase.calibrated())
         return result

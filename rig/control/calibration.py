@@ -337,8 +337,8 @@ def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: f
         The message says what is wrong with the profile.
     """
     sensory_us, motor_us = profile.sensory_pulse_width_us, profile.motor_pulse_width_us
-    found = (sensory_us, motor_us, profile.set_at_utc, profile.expires_at_utc)
-    if all(value is None for value in found):
+    thresholds = (sensory_us, motor_us, profile.set_at_utc, profile.expires_at_utc)
+    if all(value is None for value in thresholds):
         if required:
             raise RefusedError("participant's profile: not calibrated; a test needs a calibration made on the same day")
         return

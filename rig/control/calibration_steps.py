@@ -96,15 +96,15 @@ def marks_of(last: Profile | None, current_ma: float) -> dict[Threshold, float]:
     """
     if last is None or last.sensory_pulse_width_us is None or last.motor_pulse_width_us is None:
         return {}
-    found: dict[Threshold, float] = {
+    marks: dict[Threshold, float] = {
         "sensory": last.sensory_pulse_width_us,
         "motor": last.motor_pulse_width_us,
         "comfort": last.max_pulse_width_us,
     }
-    in_order = all(low <= high for low, high in itertools.pairwise((*found.values(), float("1e4"))))
-    if not (in_order and found["sensory"] > 0 and last.current_ma > 0):
+    in_order = all(low <= high for low, high in itertools.pairwise((*marks.values(), float("1e4"))))
+    if not (in_order and marks["sensory"] > 0 and last.current_ma > 0):
         raise RefusedError(
             "calibration: the marks of the earlier calibration are not above 0 and in the order sensory, motor, "
             "comfort; calibrate without them"
         )
-    return found if current_ma <= last.current_ma else {}
+    return marks if current_ma <= last.current_ma else {}

@@ -60,7 +60,7 @@ def _of_run(run: TestRun, zero_s: float) -> dict[str, Any]:
     done = run.gate.done[run.told_pulses :]
     run.told_pulses += len(done)
     rate_hz = run.plan.pulse_rate_hz
-    segments = run.score.laid.segments if run.score.adaptive else ()  # they hold every pulse before
+    segments = run.score.queue.segments if run.score.adaptive else ()  # they hold every pulse before
     return {
         "test_id": run.plan.test_id,
         "segment": run.segment(),

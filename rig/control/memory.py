@@ -47,13 +47,13 @@ class SmallFile:
 
     async def write(self, content: dict[str, Any]) -> None:
         """Replace the file, unless it holds that already. Raises RigError."""
-        await self._put(json.dumps(content).encode())
+        await self._write(json.dumps(content).encode())
 
     async def remove(self) -> None:
         """Also where there is none. Raises RigError."""
-        await self._put(None)
+        await self._write(None)
 
-    async def _put(self, data: bytes | None) -> None:
+    async def _write(self, data: bytes | None) -> None:
         async with self._turn:
             if data is not None and data == self._stored:
                 return
@@ -137,7 +137,7 @@ class Rest:
             with contextlib.suppress(RigError):  # the disk is read-only now: the latch file still says that a test ran
                 await self._file.remove()
 
-    def doubt(self) -> str:
+    def uncertainty(self) -> str:
         """A sentence if the line may still hold a pulse that was sent before; empty if not."""
         return "" if self._ended else "a pulse that was sent before may still be felt"
 
@@ -182,15 +182,17 @@ class Result:
 
     def __init__(self, folder: Path, machine: Machine) -> None:
         self._file, self._clock = SmallFile(folder / "calibrated.json", "calibration", machine), machine.tasks.clock
-        self._kept: Calibrated | None = None
+        self._stored: Calibrated | None = None
 
     @property
     def waiting(self) -> Calibrated | None:
         """What nobody has stored yet; None also once its day has ended: then it is no profile any more."""
-        profile = self._kept and self._kept.result.profile
+        profile = self._stored and self._stored.result.profile
         if not profile or not profile.expires_at_utc:
             return None
-        return self._kept if self._clock.unix_s() < datetime.fromisoformat(profile.expires_at_utc).timestamp() else None
+        return (
+            self._stored if self._clock.unix_s() < datetime.fromisoformat(profile.expires_at_utc).timestamp() else None
+        )
 
     def of(self, calibration_id: str) -> Calibrated | None:
         """The result of that calibration, if it waits."""
@@ -198,26 +200,26 @@ class Result:
 
     def refuse_waiting(self) -> None:
         """Raise BusyError if one waits: a new calibration would replace it."""
-        if (kept := self.waiting) is not None:
+        if (waiting := self.waiting) is not None:
             raise BusyError(
-                f"the result of calibration {kept.calibration_id} of participant {kept.participant} waits to be "
+                f"the result of calibration {waiting.calibration_id} of participant {waiting.participant} waits to be "
                 "stored; finish that one again, or discard it"
             )
 
     async def recall(self) -> None:
         try:
             content = await self._file.read()
-            self._kept = None if content is None else Calibrated.model_validate(content)
+            self._stored = None if content is None else Calibrated.model_validate(content)
         except (OSError, ValueError) as error:
             log.error("%s: not readable (%s); calibrate again", self._file.path, " ".join(str(error).split()))
 
-    async def keep(self, found: Calibrated) -> None:
+    async def store(self, result: Calibrated) -> None:
         """Raises RigError: it could not be written, so it must not be told yet."""
-        await self._file.write(found.model_dump(mode="json"))
-        self._kept = found
+        await self._file.write(result.model_dump(mode="json"))
+        self._stored = result
 
     async def let_go(self, calibration_id: str) -> None:
         """It is stored, or discarded; nothing if another one waits. Raises RigError: it waits still."""
         if self.of(calibration_id) is not None:
             await self._file.remove()
-            self._kept = None
+            self._stored = None

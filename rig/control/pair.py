@@ -130,8 +130,8 @@ class Pair:
         asked_s = self._clock.now_s()
         end_s = asked_s + FRESH_S * self._clock.speed
         while receiver.age_s(asked_s) >= 0 or not receiver.settled():
-            came = receiver.age_s(asked_s) < 0
-            if self._clock.now_s() > (end_s + SETTLE_S * self._clock.speed if came else end_s):
+            has_torque = receiver.age_s(asked_s) < 0
+            if self._clock.now_s() > (end_s + SETTLE_S * self._clock.speed if has_torque else end_s):
                 return False
             await self._tasks.sleep(0.005)
         return True

@@ -141,16 +141,16 @@ class Player:
         if not hmac.compare_digest(request.key.encode("utf-8", "replace"), self._key.encode("utf-8", "replace")):
             raise PlanError("extend.key: it is not the key with which this test was started")
         await run.score.extend(request.after, request.segments)
-        laid = len(request.segments), run.score.duration_s
-        log.info("extended by %d segments, %.3f s are laid", *laid, extra={"test_id": request.test_id})
-        return run.score.left(run.torque_time_nms)
+        queued = len(request.segments), run.score.duration_s
+        log.info("extended by %d segments, %.3f s are laid", *queued, extra={"test_id": request.test_id})
+        return run.score.progress(run.torque_time_nms)
 
     async def enough(self, request: EnoughRequest) -> Extended:
         """End the running test with its safe end. Raises TooLateError, PlanError, JournalError."""
         run = self._running(request.test_id)
         run.score.enough(request.by, request.at_once)
         log.info("enough", extra={"test_id": request.test_id})
-        return run.score.left(run.torque_time_nms)
+        return run.score.progress(run.torque_time_nms)
 
     def _running(self, test_id: str) -> TestRun:
         """The adaptive test of that id, if it is the one that plays."""

@@ -22,8 +22,8 @@ _HEAD = re.compile(rb'\s*\{\s*"kind"\s*:\s*"([a-z_-]{1,40})"\s*,\s*"id"\s*:\s*(\
 
 def head_of(line: bytes) -> tuple[str, int] | None:
     """Kind and id of a request that begins with them, as `stimrig.rig.messages` writes it, without parsing the rest."""
-    found = _HEAD.match(line[:200])
-    return (found[1].decode(), int(found[2])) if found else None
+    match = _HEAD.match(line[:200])
+    return (match[1].decode(), int(match[2])) if match else None
 
 
 def id_of(line: bytes) -> int:

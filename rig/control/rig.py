@@ -62,14 +62,16 @@ class Rig:
         self.table = config.limits.table()
         """Hard limits, narrowed by the rig file."""
         self._born_s = self._clock.now_s()
-        self.state = State(LatchFile(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._tell)
+        self.state = State(
+            LatchFile(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._publish_status
+        )
         self.pair = Pair(config, machine, self.fault, self._lost)
         self.joint = Joint(config, machine, self.pair, self.table["angle_rad"])
         self.rest = Rest(config.data_dir, machine)
         self.store = RecordingStore(config, machine)
         self._result = Result(config.data_dir, machine)
         self.player = Player(self.state, self.pair, self.rest, self.store, machine, config.watch, publish)
-        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self._tell)
+        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self._publish_status)
 
     @property
     def latch(self) -> str:
@@ -86,7 +88,7 @@ class Rig:
         cell = dict(self.pair.identity["load_cell"])
         if receiver and (measured_hz := receiver.measured_rate_hz()) is not None:
             cell["measured_rate_hz"] = round(measured_hz, 2)
-        seen = receiver is not None and receiver.last_s is not None
+        has_samples = receiver is not None and receiver.last_s is not None
         stimulator = self.pair.identity["stimulator"]
         return Status(
             state=phase.state,
@@ -99,7 +101,7 @@ class Rig:
             duration_s=run.score.longest_s if run else 0.0,
             stimulator=stimulator and {**stimulator, "shortest_us": self.pair.steps.shortest_us},
             load_cell=cell,
-            torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and seen else None,
+            torque_age_s=receiver.age_s(self._clock.now_s()) if receiver and has_samples else None,
             torque_nm=finite(receiver.last_torque_nm) if receiver else None,
             angle=self.joint.status(),
             calibration=calibration.status() if calibration else None,
@@ -112,8 +114,8 @@ class Rig:
     def trouble(self) -> str | None:
         """Which task or request of this process hangs or has died; None: none. For the process's watchdog."""
         phase, receiver = self.state.phase, self.pair.receiver
-        if (found := self.state.trouble() or self.player.trouble()) is not None:
-            return found
+        if (trouble := self.state.trouble() or self.player.trouble()) is not None:
+            return trouble
         if receiver is not None and not receiver.living and phase.state != "disconnected" and not phase.lost:
             return "the torque receiver has ended"
         return None
@@ -220,7 +222,7 @@ class Rig:
         """A pose of the angle sensor's calibration; raises as `Joint.pose`."""
         async with self.state.in_turn():
             await self.joint.pose(request, self.state.phase)
-            self._tell()
+            self._publish_status()
         return self.status()
 
     async def library(self) -> Sequences:
@@ -258,7 +260,7 @@ class Rig:
 
     def _unconfirmed(self, detail: str) -> StopEvidence:
         """Evidence if the device did not answer: a pulse that was sent before may still be felt."""
-        possible = self.pair.gate.still_possible() if self.pair.gate else self.rest.doubt()
+        possible = self.pair.gate.still_possible() if self.pair.gate else self.rest.uncertainty()
         words = "; ".join(part for part in (detail, possible) if part)
         return StopEvidence(confirmed=False, detail=words, pulse_may_follow=bool(possible))
 
@@ -294,11 +296,11 @@ class Rig:
 
     async def _recover(self, reason: str) -> bool:
         """Seal the journals that were left; whether there were any."""
-        found = await self._tasks.work(self.store.recover, reason)
-        for event in found:
+        recovered = await self._tasks.work(self.store.recover, reason)
+        for event in recovered:
             self.player.finished = event
             self._publish(event)
-        return bool(found)
+        return bool(recovered)
 
     def fault(self, reason: str) -> None:
         log.error("%s", reason)
@@ -309,25 +311,25 @@ class Rig:
         self.player.end("fault", reason, latch_idle=False)
         self.state.change(self.state.phase.disconnected(reason))
 
-    def _tell(self) -> None:
+    def _publish_status(self) -> None:
         self._publish(StateEvent(status=self.status()))
 
 
 _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
 _DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
-    "start": lambda rig, asked: rig.start(asked.plan, asked.key),
-    "stop": lambda rig, asked: rig.stop(asked.reason, asked.by),
-    "withdraw": lambda rig, asked: rig.player.withdraw(asked),
-    "extend": lambda rig, asked: rig.player.extend(asked),
-    "enough": lambda rig, asked: rig.player.enough(asked),
+    "start": lambda rig, request: rig.start(request.plan, request.key),
+    "stop": lambda rig, request: rig.stop(request.reason, request.by),
+    "withdraw": lambda rig, request: rig.player.withdraw(request),
+    "extend": lambda rig, request: rig.player.extend(request),
+    "enough": lambda rig, request: rig.player.enough(request),
     "sequences": lambda rig, _: rig.library(),
-    "rearm": lambda rig, asked: rig.rearm(asked.by, asked.latch),
-    "calibrate-start": lambda rig, asked: rig.calibrations.start(asked),
-    "calibrate-step": lambda rig, asked: rig.calibrations.step(asked),
-    "calibrate-mark": lambda rig, asked: rig.calibrations.mark(asked),
-    "calibrate-finish": lambda rig, asked: rig.calibrations.finish(asked),
-    "calibrate-stored": lambda rig, asked: rig.calibrations.stored(asked.calibration_id),
+    "rearm": lambda rig, request: rig.rearm(request.by, request.latch),
+    "calibrate-start": lambda rig, request: rig.calibrations.start(request),
+    "calibrate-step": lambda rig, request: rig.calibrations.step(request),
+    "calibrate-mark": lambda rig, request: rig.calibrations.mark(request),
+    "calibrate-finish": lambda rig, request: rig.calibrations.finish(request),
+    "calibrate-stored": lambda rig, request: rig.calibrations.stored(request.calibration_id),
     "angle_pose": Rig.angle_pose,
 }
 """What has no answer of its own, and all others, are answered by the status."""

@@ -51,31 +51,36 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
     """
     columns, rate_hz = recording.columns, recording.attributes["pulse_rate_hz"]
     status, n = columns["pulses/status"], len(columns["pulses/status"])
-    felt = np.isin(status, MAY_BE_FELT)
-    widths_us, currents_ma = columns["pulses/sent_pulse_width_us"][felt], columns["pulses/current_ma"][felt]
-    widest_us = _most(columns["pulses/pulse_width_us"], widths_us, HARD_LIMITS["pulse_width_us"].hi)
-    highest_ma = _most(np.array([recording.attributes["current_ma"]]), currents_ma, HARD_LIMITS["current_ma"].hi)
+    may_be_felt = np.isin(status, MAY_BE_FELT)
+    widths_us, currents_ma = (
+        columns["pulses/sent_pulse_width_us"][may_be_felt],
+        columns["pulses/current_ma"][may_be_felt],
+    )
+    widest_us = _largest(columns["pulses/pulse_width_us"], widths_us, HARD_LIMITS["pulse_width_us"].hi)
+    highest_ma = _largest(np.array([recording.attributes["current_ma"]]), currents_ma, HARD_LIMITS["current_ma"].hi)
     widths_us = np.where(widths_us > 0, widths_us, widest_us)  # of a pulse whose width is lost
     currents_ma = np.where(currents_ma > 0, currents_ma, highest_ma)
     header = contents.first_json(Kind.HEADER)  # None: it is lost
     planned_us = np.empty(0) if header is None else assembly.planned_pulses(contents, header, [])[0]
     unseen_us = planned_us[n : n + int(np.ceil(lost_s * rate_hz))]
     doubtful = int(np.sum(status == PulseStatus.UNACKNOWLEDGED)) + int(np.sum(unseen_us > 0))
-    played_s = max([n / rate_hz if felt.any() else 0.0, *columns["segments/end_s"].tolist()])
+    played_s = max([n / rate_hz if may_be_felt.any() else 0.0, *columns["segments/end_s"].tolist()])
     return {
         "duration_s": played_s + len(unseen_us) / rate_hz,
-        "pulses": int(felt.sum()) + int(np.sum(unseen_us > 0)),
+        "pulses": int(may_be_felt.sum()) + int(np.sum(unseen_us > 0)),
         "dropped_pulses": int(np.sum(status == PulseStatus.DROPPED)),
         "charge_uc": float(np.sum(widths_us * currents_ma) + np.sum(unseen_us) * highest_ma) * 1e-3,
-        **_torque_dose(columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][felt]),
+        **_torque_dose(
+            columns["torque/time_s"], columns["torque/torque_nm"], columns["pulses/planned_time_s"][may_be_felt]
+        ),
         "dose_is_bound": doubtful > 0,
         "doubtful_pulses": doubtful,
     }
 
 
-def _most(one: NDArray[Any], other: NDArray[Any], unknown: float) -> float:
+def _largest(first: NDArray[Any], second: NDArray[Any], unknown: float) -> float:
     """The largest number of both; `unknown` where there is none above 0."""
-    return max((float(value) for value in (*one, *other) if value > 0), default=unknown)
+    return max((float(value) for value in (*first, *second) if value > 0), default=unknown)
 
 
 def _torque_dose(time_s: NDArray[Any], torque_nm: NDArray[Any], pulses_s: NDArray[Any]) -> dict[str, float]:
@@ -128,45 +133,45 @@ def _angle_summary(recording: Recording) -> dict[str, Any]:
 def warnings(recording: Recording) -> list[str]:
     """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
     alignment, attributes = recording.alignment, recording.attributes
-    found = [*_disturbed_line(recording), *_sensor_warnings(recording)]
+    texts = [*_disturbed_line(recording), *_sensor_warnings(recording)]
     if attributes["journal_note"]:
-        found.append(f"journal: {attributes['journal_note']}")
+        texts.append(f"journal: {attributes['journal_note']}")
     nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
     if not len(recording.columns["torque/time_s"]):
-        return found
+        return texts
     torque_nm = recording.columns["torque/torque_nm"]
     if np.all(torque_nm == torque_nm[0]):
-        found.append(
+        texts.append(
             f"load cell: its value stayed at exactly {torque_nm[0]:.3f} N·m in the whole test; it may be stuck"
         )
     if not (alignment.error_ms <= DOUBTFUL_ALIGNMENT_MS):
         error = "unknown" if alignment.error_ms != alignment.error_ms else f"{alignment.error_ms:.1f} ms"
-        found.append(
+        texts.append(
             f"torque and pulses: the error of their alignment is {error} (usual: up to {DOUBTFUL_ALIGNMENT_MS:g} ms), "
             "because the computer or the bus was blocked; delays in a model of this recording may be wrong"
         )
     if nominal_hz > 0 and not (abs(measured_hz / nominal_hz - 1) <= DOUBTFUL_RATE):
-        found.append(
+        texts.append(
             f"load cell: {measured_hz:.0f} samples/s arrived, the rig file says {nominal_hz:g}: times in this "
             "recording may be wrong"
         )
-    return found
+    return texts
 
 
 def _sensor_warnings(recording: Recording) -> list[str]:
     """Warnings about an angle sensor that failed in a test that did not need it, or whose times are uncertain."""
-    found = [
+    texts = [
         f"{event['reason']}; the angle in this recording may be wrong or missing"
         for event in recording.events
         if event.get("event") == "angle_trouble"
     ]
     if not recording.angle or not len(recording.columns["angle/time_s"]):
-        return found
+        return texts
     error_ms = recording.angle["error_ms"]
     if not (error_ms <= DOUBTFUL_ALIGNMENT_MS):
         error = "unknown" if error_ms != error_ms else f"{error_ms:.1f} ms"
-        found.append(f"angle and torque: the error of their alignment is {error}; a model of a movement may be wrong")
-    return found
+        texts.append(f"angle and torque: the error of their alignment is {error}; a model of a movement may be wrong")
+    return texts
 
 
 def _pauses(recording: Recording) -> list[dict[str, Any]]:
@@ -179,10 +184,10 @@ def notes(recording: Recording) -> list[str]:
     if not pauses:
         return []
     count, whole_s = len(pauses), sum(pause["for_s"] for pause in pauses)
-    found = f"the computer stopped for {whole_s:.1f} s; no current flowed meanwhile, and the test went on"
+    text = f"the computer stopped for {whole_s:.1f} s; no current flowed meanwhile, and the test went on"
     if count > 1:
-        found = f"the computer stopped {count} times, {whole_s:.1f} s in all; no current flowed, and the test went on"
-    return [found, *sorted({pause["cause"] for pause in pauses} - {""})]
+        text = f"the computer stopped {count} times, {whole_s:.1f} s in all; no current flowed, and the test went on"
+    return [text, *sorted({pause["cause"] for pause in pauses} - {""})]
 
 
 def _disturbed_line(recording: Recording) -> list[str]:
@@ -198,9 +203,9 @@ def _disturbed_line(recording: Recording) -> list[str]:
         for event in recording.events
         if event.get("event") == "late_ack" and not any(lo <= event["time_s"] <= hi for lo, hi in spans_s)
     ]
-    found = []
+    texts = []
     if unasked := named.count("unasked_ack"):
-        found.append(
+        texts.append(
             "stimulator: it acknowledged 1 pulse that was not sent; it may have been felt and is not in this recording"
             if unasked == 1
             else f"stimulator: it acknowledged {unasked} pulses that were not sent; they may have been felt and are "
@@ -211,7 +216,7 @@ def _disturbed_line(recording: Recording) -> list[str]:
         pulses = (
             "1 pulse that came due meanwhile was" if dropped == 1 else f"{dropped} pulses that came due meanwhile were"
         )
-        found.append(
+        texts.append(
             f"stimulator: 1 acknowledgement came late, {most_ms} ms after the pulse was sent; this pulse may have been "
             f"felt that late; {pulses} dropped"
             if len(late_s) == 1
@@ -222,20 +227,20 @@ def _disturbed_line(recording: Recording) -> list[str]:
     narrower = (planned_us - sent_us > ROUNDED_US) & (sent_us > 0)  # one below the shortest pulse is not sent at all
     if weaker := int(np.count_nonzero(narrower & ~_climbing(recording, pauses))):
         pulses = "1 pulse was" if weaker == 1 else f"{weaker} pulses were"
-        found.append(
+        texts.append(
             f"stimulator: {pulses} narrower than planned, since after a pulse that was dropped, or too short to be "
             "sent, the width climbs no faster than its limit"
         )
-    return found
+    return texts
 
 
 def _climbing(recording: Recording, pauses: list[dict[str, Any]]) -> NDArray[np.bool_]:
     """Pulses that come so soon after a pause that it tells why they are narrow."""
     planned_s = recording.columns["pulses/planned_time_s"]
-    found = np.zeros(len(planned_s), bool)
+    climbing = np.zeros(len(planned_s), bool)
     for pause in pauses:
-        found |= (planned_s >= pause["at_s"]) & (planned_s <= pause["at_s"] + pause["for_s"] + CLIMB_S)
-    return found
+        climbing |= (planned_s >= pause["at_s"]) & (planned_s <= pause["at_s"] + pause["for_s"] + CLIMB_S)
+    return climbing
 
 
 log = logging.getLogger("rig.sealing")
@@ -331,8 +336,8 @@ class RecordingStore:
             path = self.journals / name
             log.warning("recovering %s", name)
             events.append(self._seal(path, path.stem, "fault", reason, {"recovered": True}, None))
-            left = name in self._disk.names(self.journals)
-            if left and self._free_bytes() >= MIN_FREE_BYTES:  # else the disk is full: try again later
+            remains = name in self._disk.names(self.journals)
+            if remains and self._free_bytes() >= MIN_FREE_BYTES:  # else the disk is full: try again later
                 with contextlib.suppress(OSError):
                     self._disk.rename(path, path.with_suffix(".unsealed"))
         return events

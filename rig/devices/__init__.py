@@ -30,7 +30,7 @@ class DeviceSettings(BaseModel):
 
     device: str
 
-    def beside(self, _cell: DeviceSettings) -> Self:
+    def with_cell(self, _cell: DeviceSettings) -> Self:
         """These settings, completed by those of the rig's load cell: the two may share an adapter."""
         return self
 

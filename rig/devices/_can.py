@@ -113,15 +113,17 @@ class SampleFrame:
             known = [s.name for m in database.messages for s in m.signals]
             if not having:
                 _choose("signal", signals[0], known, dbc)
-            found = having[0]
+            message_format = having[0]
         else:
-            found = database.get_message_by_name(_choose("message", message, [m.name for m in database.messages], dbc))
-        self.message: Message = found
-        names = [s.name for s in found.signals]
-        place = f"message {found.name} of {dbc}"
+            message_format = database.get_message_by_name(
+                _choose("message", message, [m.name for m in database.messages], dbc)
+            )
+        self.message: Message = message_format
+        names = [s.name for s in message_format.signals]
+        place = f"message {message_format.name} of {dbc}"
         self._signals = tuple(_choose("signal", s, names, place) for s in signals)
         for name in self._signals:
-            signal = found.get_signal_by_name(name)
+            signal = message_format.get_signal_by_name(name)
             if signal.is_float and signal.choices:  # a word is looked up by a whole number: 5.1 would be a 5
                 raise ConfigError(f"signal: {place}, {name}: a floating-point signal has no words; remove its VAL_")
         self._counter = _choose("counter", counter, names, place) if counter else None
@@ -130,7 +132,7 @@ class SampleFrame:
         self._fault = _choose("fault", fault, names, place) if fault and has_fault else None
         self.counter_modulus = 0
         if self._counter:
-            self.counter_modulus = 1 << found.get_signal_by_name(self._counter).length
+            self.counter_modulus = 1 << message_format.get_signal_by_name(self._counter).length
 
     @property
     def samples_per_frame(self) -> int:
@@ -138,13 +140,13 @@ class SampleFrame:
 
     def decode_all(self, frames: Iterable[Frame]) -> tuple[list[tuple[Frame, FrameSamples]], int]:
         """The frames that can be read, each with its values, and how many cannot."""
-        found, damaged = [], 0
+        readings, damaged = [], 0
         for frame in frames:
             try:
-                found.append((frame, self.decode(frame.data)))
+                readings.append((frame, self.decode(frame.data)))
             except WireError:
                 damaged += 1
-        return found, damaged
+        return readings, damaged
 
     def decode(self, data: bytes) -> FrameSamples:
         """Values of one frame; NaN where the description has a word for a value (`VAL_`, as "no reading"), and in a
@@ -193,10 +195,10 @@ class CanSensor:
     def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> Block:
         """The samples of frames, in their order; damaged ones are counted. Pure."""
         readable, unreadable = self._frame.decode_all(frames)
-        rows = [row for frame, found in readable for row in self._rows(frame, found)]
+        rows = [row for frame, samples in readable for row in self._rows(frame, samples)]
         return Block(np.array(rows, dtype=self.dtype), damaged + unreadable, errors)
 
-    def _rows(self, frame: Frame, found: FrameSamples) -> Iterable[tuple[float, ...]]:
+    def _rows(self, frame: Frame, samples: FrameSamples) -> Iterable[tuple[float, ...]]:
         """The samples of a frame."""
         raise NotImplementedError
 

@@ -250,7 +250,7 @@ class PacketLine:
         """
         self._serial.discard()
 
-    def tell(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
+    def send(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
         """Write the frame that `make` returns for the next packet number; returns the number.
 
         Raises LateError: the clock had passed `latest_s` right before the write: nothing was written. DeviceError: the
@@ -264,13 +264,13 @@ class PacketLine:
         self._write(frame, latest_s)
         return self._number
 
-    async def ask(self, make: Callable[[int], bytes], name: str, answer: int, timeout_s: float) -> Packet:
+    async def request(self, make: Callable[[int], bytes], name: str, answer: int, timeout_s: float) -> Packet:
         """Write a command and wait so many real seconds for its ack, which has the command number `answer`.
 
         Raises DeviceError: no ack in time, or an unexpected answer.
         """
         answered, packets = Signal(), list[Packet]()
-        number = self.tell(make)
+        number = self.send(make)
         self._waiting[number] = answered, packets
         await self._tasks.sleep(timeout_s, answered)
         if self._waiting.get(number, (None,))[0] is answered:
@@ -342,7 +342,7 @@ class LineStimulator(Generic[S]):
     def __init__(self, settings: S, machine: Machine) -> None:
         self._settings = settings
         port = machine.port(settings.port, **self.serial)
-        self._line = PacketLine(machine, port, settings.port, self.framing, self._take)
+        self._line = PacketLine(machine, port, settings.port, self.framing, self._handle)
         self.listen = self._line.listen
 
     async def open(self) -> dict[str, Any]:
@@ -372,15 +372,15 @@ class LineStimulator(Generic[S]):
     async def _identity(self) -> tuple[str, str]:
         raise NotImplementedError
 
-    def _take(self, packet: Packet, time_s: float) -> None:
+    def _handle(self, packet: Packet, time_s: float) -> None:
         raise NotImplementedError
 
     def _frame(self, command: IntEnum, data: bytes = b"") -> Callable[[int], bytes]:
         return lambda number: self.framing.encode(Packet(number, command, data))
 
-    async def _ask(self, command: IntEnum, data: bytes = b"") -> Packet:
+    async def _request(self, command: IntEnum, data: bytes = b"") -> Packet:
         frame, timeout_s = self._frame(command, data), self._settings.reply_timeout_s
-        return await self._line.ask(frame, in_words(command), command + 1, timeout_s)
+        return await self._line.request(frame, in_words(command), command + 1, timeout_s)
 
 
 def in_words(command: IntEnum) -> str:

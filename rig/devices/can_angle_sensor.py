@@ -38,16 +38,16 @@ class Settings(DeviceSettings):
     offset: float = Field(0.0, description="signal of a straight arm, in its unit")
     of_the_cell: bool = Field(False, description="the signal stands in the load cell's own frame")
 
-    def beside(self, _cell: DeviceSettings) -> Self:
+    def with_cell(self, _cell: DeviceSettings) -> Self:
         """The cell's bus, and of a signal in its frame the cell's description, unless the rig file gives others."""
-        given, cell = self.model_fields_set, _cell.model_dump()
-        taken = {} if self.bus else {"bus": cell.get("bus", {})}
+        set_fields, cell = self.model_fields_set, _cell.model_dump()
+        shared = {} if self.bus else {"bus": cell.get("bus", {})}
         if self.of_the_cell:
-            taken |= {name: cell[name] for name in OF_THE_CELL if name in cell and name not in given}
+            shared |= {name: cell[name] for name in OF_THE_CELL if name in cell and name not in set_fields}
             several = cell.get("signal")
-            if isinstance(several, list) and "sample_rate_hz" in taken:
-                taken["sample_rate_hz"] /= len(several)
-        return self.model_copy(update=taken)
+            if isinstance(several, list) and "sample_rate_hz" in shared:
+                shared["sample_rate_hz"] /= len(several)
+        return self.model_copy(update=shared)
 
 
 class CanAngleSensor(CanSensor):
@@ -79,13 +79,13 @@ class CanAngleSensor(CanSensor):
         if bus is None:
             return
         if self.on_the_cells_bus and self._listener is not None:
-            bus.leave(self._listener)
+            bus.detach(self._listener)
         else:
             await self._machine.tasks.work(bus.close)
 
-    def _rows(self, frame: Frame, found: FrameSamples) -> Iterator[tuple[float, ...]]:
-        raw = found.values[0]
-        yield frame.host_time_s, frame.stamp_s, raw, self.scale.angle_rad(raw), found.counter, found.flag
+    def _rows(self, frame: Frame, samples: FrameSamples) -> Iterator[tuple[float, ...]]:
+        raw = samples.values[0]
+        yield frame.host_time_s, frame.stamp_s, raw, self.scale.angle_rad(raw), samples.counter, samples.flag
 
 
 create = CanAngleSensor

@@ -84,7 +84,7 @@ class CanLoadCell(CanSensor):
             await work(bus.send, [message_of(frame) for frame in self._settings.start_frames])
         except DeviceError:
             assert self._listener is not None
-            bus.leave(self._listener)  # it is told by what is raised, not by a loss as well
+            bus.detach(self._listener)  # it is told by what is raised, not by a loss as well
             await self.close()
             raise
         return identity
@@ -98,12 +98,12 @@ class CanLoadCell(CanSensor):
             await work(bus.send, [message_of(frame) for frame in self._settings.stop_frames])
         await work(bus.close)
 
-    def _rows(self, frame: Frame, found: FrameSamples) -> Iterator[tuple[float, ...]]:
-        n = len(found.values)
-        for i, value in enumerate(found.values):
-            counter = found.counter * n + i if found.counter >= 0 else -1
+    def _rows(self, frame: Frame, samples: FrameSamples) -> Iterator[tuple[float, ...]]:
+        n = len(samples.values)
+        for i, value in enumerate(samples.values):
+            counter = samples.counter * n + i if samples.counter >= 0 else -1
             stamp_s = frame.stamp_s - (n - 1 - i) / self.sample_rate_hz  # a frame is sent with its last sample
-            yield frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, found.flag
+            yield frame.host_time_s, stamp_s, value * self._settings.scale_nm, counter, samples.flag
 
 
 create = CanLoadCell

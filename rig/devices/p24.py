@@ -122,15 +122,15 @@ class P24(LineStimulator[Settings]):
     serial = {"baudrate": 3_000_000, "stopbits": 2, "rtscts": True}  # noqa: RUF012
 
     async def _identity(self) -> tuple[str, str]:
-        serial_number = parse_device_id((await self._ask(Command.DEVICE_ID)).data)
-        return serial_number, parse_version((await self._ask(Command.EXTENDED_VERSION)).data)
+        serial_number = parse_device_id((await self._request(Command.DEVICE_ID)).data)
+        return serial_number, parse_version((await self._request(Command.EXTENDED_VERSION)).data)
 
     async def arm(self) -> None:
-        await self._ask(Command.LL_INIT, bytes((0,)))
+        await self._request(Command.LL_INIT, bytes((0,)))
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
         channel, connector = self._settings.channel - 1, self._settings.connector - 1
-        return self._line.tell(
+        return self._line.send(
             lambda number: ll_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma, connector), latest_s
         )
 
@@ -140,22 +140,22 @@ class P24(LineStimulator[Settings]):
     async def stop(self) -> None:
         self._line.discard()
         # a device that is not initialised has already stopped
-        await self._ask(Command.LL_STOP, fine=(0, NOT_INITIALISED))
+        await self._request(Command.LL_STOP, fine=(0, NOT_INITIALISED))
 
     async def state(self) -> tuple[bool, str]:
-        result, level, _ = parse_status((await self._ask(Command.STIM_STATUS)).data)
+        result, level, _ = parse_status((await self._request(Command.STIM_STATUS)).data)
         if result != 0:
             raise DeviceError(f"stimulator {self._settings.port} answered its state with {result_text(result)}")
         return level == 0, LEVELS.get(level, f"level {level}")
 
-    async def _ask(self, command: IntEnum, data: bytes = b"", fine: tuple[int, ...] = (0,)) -> Packet:
-        packet = await super()._ask(command, data)
+    async def _request(self, command: IntEnum, data: bytes = b"", fine: tuple[int, ...] = (0,)) -> Packet:
+        packet = await super()._request(command, data)
         result = packet.data[0] if packet.data else 1  # an answer without a result is none
         if result not in fine:
             raise DeviceError(f"stimulator {self._settings.port}: {in_words(command)}: {result_text(result)}")
         return packet
 
-    def _take(self, packet: Packet, time_s: float) -> None:
+    def _handle(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.LL_CHANNEL_CONFIG + 1:
             result = packet.data[0] if packet.data else 1
             words = result_text(result) if result else self._of_another_output(packet.data)

@@ -135,23 +135,23 @@ class RehaStim2(LineStimulator[Settings]):
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
         channel = self._settings.channel - 1
-        return self._line.tell(
+        return self._line.send(
             lambda number: single_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma), latest_s
         )
 
     def feed(self) -> None:
         if self._armed and self._clock.now_s() - self._line.last_written_s >= FEED_S:
-            self._line.tell(self._frame(Command.WATCHDOG))
+            self._line.send(self._frame(Command.WATCHDOG))
 
     async def stop(self) -> None:
         self._armed = False
         self._line.discard()
-        result = result_of((await self._ask(Command.STOP)).data)
+        result = result_of((await self._request(Command.STOP)).data)
         if result != 0:
             raise DeviceError(f"stimulator {self._settings.port}: stop: {result_text(result)}")
 
     async def state(self) -> tuple[bool, str]:
-        data = (await self._ask(Command.GET_MODE)).data
+        data = (await self._request(Command.GET_MODE)).data
         result = result_of(data)
         if result != 0 or len(data) < 2:
             raise DeviceError(f"stimulator {self._settings.port} answered its mode with {result_text(result)}")
@@ -161,14 +161,14 @@ class RehaStim2(LineStimulator[Settings]):
         self._armed = False
         super().close()
 
-    async def _ask(self, command: IntEnum, data: bytes = b"") -> Packet:
+    async def _request(self, command: IntEnum, data: bytes = b"") -> Packet:
         """Ask; if the device has closed the connection, accept its next offer and ask once more."""
         try:
-            return await super()._ask(command, data)
+            return await super()._request(command, data)
         except DeviceError:
             if not await self._take_offer():
                 raise
-        return await super()._ask(command, data)
+        return await super()._request(command, data)
 
     async def _take_offer(self) -> bool:
         """Accept a connection that the device offers; False if it offers none."""
@@ -179,12 +179,12 @@ class RehaStim2(LineStimulator[Settings]):
             return False
         accepted = offer.data[:1] == bytes((VERSION,))
         result = 0 if accepted else -5
-        self._line.tell(lambda _: SCIENCEMODE_2.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
+        self._line.send(lambda _: SCIENCEMODE_2.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
         if not accepted:
             raise DeviceError(f"stimulator {self._settings.port}: it uses protocol {offer.data.hex()}, this driver 1")
         return True
 
-    def _take(self, packet: Packet, time_s: float) -> None:
+    def _handle(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.SINGLE_PULSE + 1:
             result = result_of(packet.data)
             self._line.on_ack(Ack(packet.number, time_s, result_text(result) if result else None))

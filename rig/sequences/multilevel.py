@@ -36,14 +36,14 @@ def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64
     total = pulses_in(settings.duration_s, pulse_rate_hz)
     shortest = max(1, pulses_in(settings.min_hold_s, pulse_rate_hz))
     longest = max(shortest, pulses_in(settings.max_hold_s, pulse_rate_hz))
-    holds: list[int] = []
-    held = 0
-    while held < total:
-        holds.append(int(rng.integers(shortest, longest + 1)))
-        held += holds[-1]
-    n_zero = round(settings.zero_share * len(holds))
-    n_levels = len(holds) - n_zero
+    hold_pulses: list[int] = []
+    total_pulses = 0
+    while total_pulses < total:
+        hold_pulses.append(int(rng.integers(shortest, longest + 1)))
+        total_pulses += hold_pulses[-1]
+    n_zero = round(settings.zero_share * len(hold_pulses))
+    n_levels = len(hold_pulses) - n_zero
     bands = (rng.permutation(n_levels) + rng.random(n_levels)) / max(n_levels, 1)
     span_us = settings.max_pulse_width_us - settings.min_pulse_width_us
     levels_us = rng.permutation(np.concatenate([settings.min_pulse_width_us + bands * span_us, np.zeros(n_zero)]))
-    return np.repeat(levels_us, holds)[:total]
+    return np.repeat(levels_us, hold_pulses)[:total]

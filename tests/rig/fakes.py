@@ -150,7 +150,7 @@ class FakeCell:
         period_s = per_block / RATE_HZ / self.rate
         first_s = self.clock.now_s()
         for i in range(1, math.ceil((until_s - first_s) / period_s)):
-            self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver.take, per_block))
+            self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver.add, per_block))
 
     def _block(self, take: Callable[[Block], None], n: int) -> None:
         self.counter += n + self.skip
@@ -233,7 +233,7 @@ class VirtualRig:
             self.test, self.table, self.journal, self.gate, self.receiver, self.machine, self.halt, watch, self.angle
         )
         self.journal.append_json(Kind.HEADER, header(self.run, self.clock) | ({} if self.angle is None else OF_ANGLE))
-        self.journal.append(Kind.PLAN, self.run.score.laid.pulse_width_us.astype("<f8").tobytes())
+        self.journal.append(Kind.PLAN, self.run.score.queue.pulse_width_us.astype("<f8").tobytes())
 
     def at(self, time_s: float, action: Callable[[], object]) -> None:
         """Do something at a time on the test's clock (its start: torque settled, then the lead)."""
@@ -271,7 +271,7 @@ def header(run: TestRun, clock: VirtualClock) -> dict[str, Any]:
     return {
         "recording_id": "0" * 32,
         "plan": run.plan.model_dump(mode="json"),
-        "segments": [segment._asdict() for segment in run.score.laid.segments],
+        "segments": [segment._asdict() for segment in run.score.queue.segments],
         "current_ma": run.plan.profile.current_ma,
         "sample_rate_hz": RATE_HZ,
         "software": "stimrig test",
@@ -384,11 +384,11 @@ class FakeSensor:
         if self.late_s:
             self.clock.call_at(self.clock.now_s() + self.late_s, lambda: self._arrive(receiver, block))
         else:
-            receiver.take(block)
+            receiver.add(block)
 
     def _arrive(self, receiver: AngleReceiver, block: Block) -> None:
         block.samples["host_time_s"] = self.clock.now_s()
-        receiver.take(block)
+        receiver.add(block)
 
 
 class OpenedSensor(FakeSensor):

@@ -95,7 +95,7 @@ def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
     for at_s, at_once in ((0.7, False), (0.8, False), (1.0, True), (1.1, True), (1.2, False)):
         rig.at(at_s, lambda at_once=at_once: score.enough("me", at_once))
     found: list[RigError] = []
-    rig.at(1.3, lambda: found.extend(refusals(lambda: extend(rig, len(score.laid), [hold()]))))
+    rig.at(1.3, lambda: found.extend(refusals(lambda: extend(rig, len(score.queue), [hold()]))))
     result = rig.execute()
     assert result.summary["duration_s"] == pytest.approx(0.5 + len(rig.stimulator.sent) / PULSES_HZ + 1.0)
     assert 19 <= len(rig.stimulator.sent) <= 21
@@ -131,11 +131,11 @@ def test_a_stop_is_a_stop(tmp_path: Path, cause: Any):
     rig.at(1.0, lambda: rig.halt.set(cause, "that hurts"))
     for at_s in (1.001, 1.01, 1.05):
         rig.at(at_s, lambda: found.extend(refusals(
-            lambda: extend(rig, len(score.laid), [hold()]), lambda: score.enough("me", True)
+            lambda: extend(rig, len(score.queue), [hold()]), lambda: score.enough("me", True)
         )))  # fmt: skip
     result = rig.execute()
     size = rig.path.stat().st_size
-    found += refusals(lambda: extend(rig, len(score.laid), [hold()]), lambda: score.enough("me", False))
+    found += refusals(lambda: extend(rig, len(score.queue), [hold()]), lambda: score.enough("me", False))
     assert (result.outcome, result.summary["ended_by"], len(found)) == (cause, cause, 8)
     assert all(isinstance(error, TooLateError) for error in found)
     assert rig.stimulator.sent[-1][0] <= rig.halt.time_s
@@ -151,7 +151,7 @@ def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
     rig.execute()
     laid_to, seen = 20, []
     for kind, payload in journal.read(rig.path).blocks:
-        if kind == Kind.LAID:
+        if kind == Kind.EXTENSION:
             block = LaidBlock.from_bytes(payload)
             assert len(block.pulse_width_us) == block.segment.end - block.segment.start
             laid_to = block.segment.end
@@ -172,7 +172,7 @@ def test_a_disk_that_takes_no_segment_ends_it_as_a_fault(tmp_path: Path):
     rig.journal._failure = "disk full"
     with pytest.raises(JournalError):
         extend(rig, 20, [hold()])
-    assert len(rig.run.score.laid) == 20
+    assert len(rig.run.score.queue) == 20
 
 
 def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path: Path):
@@ -201,7 +201,7 @@ def test_a_journal_cut_anywhere_or_without_a_laid_block_loses_no_pulse(tmp_path:
         acknowledged.append(told)
         archive.to_bytes(recording)
     assert acknowledged == sorted(acknowledged) and acknowledged[-1] > 50
-    at = blocks_of(whole, Kind.LAID)
+    at = blocks_of(whole, Kind.EXTENSION)
     assert len(at) == 3
     for lost in ([0], [1], [2], [0, 1], [0, 1, 2]):
         spoiled = bytearray(whole)
@@ -241,8 +241,8 @@ def test_a_wrong_extension_is_refused_and_lays_nothing(tmp_path: Path, name: str
     rig = adaptive(tmp_path, 60.0, max_pulse_width_us=280.0)
     with pytest.raises(kind, match=words):
         extend(rig, 20, segments)
-    assert len(rig.run.score.laid) == 20
-    assert Kind.LAID not in {kind for kind, _ in journal.read(rig.path).blocks}
+    assert len(rig.run.score.queue) == 20
+    assert Kind.EXTENSION not in {kind for kind, _ in journal.read(rig.path).blocks}
 
 
 def test_the_dose_is_that_of_the_whole_test(tmp_path: Path):
@@ -291,7 +291,7 @@ def test_the_bound_of_the_whole_test_holds_with_its_safe_end(tmp_path: Path):
     with pytest.raises(RefusedError, match=r"with its safe end: duration_s 10\.1"):
         extend(rig, 20, [hold(on_s=8.6)])
     extend(rig, 20, [hold(on_s=8.5)])
-    assert rig.run.score.left(0.0).duration_left_s == pytest.approx(1.0)
+    assert rig.run.score.progress(0.0).duration_left_s == pytest.approx(1.0)
 
 
 def test_a_fixed_plan_that_does_not_fit_its_own_bound_is_refused_before_the_first_pulse(tmp_path: Path):
@@ -370,21 +370,21 @@ def test_whatever_strangers_send_the_whole_test_stays_within_its_limits(tmp_path
     base = limits.tightened(base, "charge_per_second_uc", 180.0, "rig file")
     pause = [rest(0.3), hold("a", 0.5, max_pulse_width_us=200.0), rest(0.5), hold("b", 0.5, max_pulse_width_us=150.0)]
     rig = adaptive(tmp_path, 12.0, 60.0, pause, base=base, max_pulse_width_us=280.0)
-    score, counts, shown = rig.run.score, {"laid": 0, "refused": 0}, [rig.run.score.laid]
+    score, counts, shown = rig.run.score, {"laid": 0, "refused": 0}, [rig.run.score.queue]
 
     def ask() -> None:
-        before = score.laid
+        before = score.queue
         after = len(before) + int(rng.choice([0, 0, 0, 0, 1, -1, 40]))
         try:
             extend(rig, after, [mad_segment(rng) for _ in range(rng.integers(0, 4))])
         except RigError:
             counts["refused"] += 1
-            assert score.laid is before
+            assert score.queue is before
         else:
             counts["laid"] += 1
-            assert np.array_equal(score.laid.pulse_width_us[: len(before)], before.pulse_width_us)
-            assert score.laid.segments[: len(before.segments)] == before.segments
-        shown.append(score.laid)
+            assert np.array_equal(score.queue.pulse_width_us[: len(before)], before.pulse_width_us)
+            assert score.queue.segments[: len(before.segments)] == before.segments
+        shown.append(score.queue)
 
     for at_s in np.sort(rng.uniform(-0.1, 12.0, 250)):
         rig.at(float(at_s), ask)

@@ -62,7 +62,7 @@ def on_one_bus(
 def test_angles_on_the_cells_bus_are_aligned_with_the_torque(stamps: str, method: str, within_ms: float):
     for seed in range(3):
         angle, torque, taken_s = on_one_bus(20.0, np.random.default_rng(seed), stamps)
-        time_s, told = align_angle.beside(angle, SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
+        time_s, told = align_angle.align_angle(angle, SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
         assert told.method == method
         assert np.max(np.abs(time_s - taken_s)) * 1e3 < within_ms
         assert told.rate_ppm == pytest.approx(-PPM, abs=10.0)
@@ -74,7 +74,7 @@ def test_a_standstill_of_the_host_shifts_no_angle():
     for samples in (angle, torque.samples):
         late = (samples["host_time_s"] > 508.0) & (samples["host_time_s"] < 508.4)
         samples["host_time_s"][late] = 508.4 + 1e-3 * (samples["host_time_s"][late] - 508.0)
-    time_s, told = align_angle.beside(angle, SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
+    time_s, told = align_angle.align_angle(angle, SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
     assert told.method == "order"
     assert np.max(np.abs(time_s - taken_s)) < 2e-4
 
@@ -84,7 +84,7 @@ def test_a_sensor_in_step_with_the_cell_is_off_by_less_than_half_a_sample():
     taken_s = 10 / CELL_HZ + np.arange(len(angle)) / SENSOR_HZ  # every eighth torque, to the microsecond
     at = np.searchsorted(torque.time_s, taken_s - 1e-9)
     angle["host_time_s"] = torque.samples["host_time_s"][np.minimum(at, len(torque.samples) - 1)] + 1e-7
-    time_s, told = align_angle.beside(angle[:3900], SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
+    time_s, told = align_angle.align_angle(angle[:3900], SENSOR_HZ, torque, of_the_cell=False, one_bus=True)
     error_ms = np.abs(time_s - taken_s[:3900]) * 1e3
     assert np.max(error_ms) <= 0.5e3 / CELL_HZ + 0.01 and told.error_ms >= 1e3 / CELL_HZ / math.sqrt(12)
 
@@ -101,7 +101,7 @@ def test_an_angle_in_the_cells_frame_has_exactly_its_time(per_frame: int):
     angle["counter"] = 70 + np.arange(frames)
     lost = Reference(np.delete(torque.samples, np.s_[600:660]), np.delete(torque.time_s, np.s_[600:660]), 500.0, 0.2)
     for reference in (torque, lost):
-        time_s, told = align_angle.beside(angle, CELL_HZ / per_frame, reference, of_the_cell=True, one_bus=True)
+        time_s, told = align_angle.align_angle(angle, CELL_HZ / per_frame, reference, of_the_cell=True, one_bus=True)
         assert told.method == "cell"
         assert np.allclose(time_s, torque.time_s[per_frame - 1 :: per_frame][:frames], atol=1e-9)
 

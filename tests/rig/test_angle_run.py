@@ -173,7 +173,7 @@ def test_enough_ends_a_passive_test_well_and_no_pulse_can_be_added(tmp_path: Pat
 
     def add() -> None:
         refused.extend(
-            map(str, refusals(lambda: extend(rig, len(rig.run.score.laid), [hold(max_pulse_width_us=50.0)])))
+            map(str, refusals(lambda: extend(rig, len(rig.run.score.queue), [hold(max_pulse_width_us=50.0)])))
         )
 
     rig.at(1.31, add)
@@ -220,7 +220,7 @@ def test_a_start_away_from_the_target_is_refused(tmp_path: Path):
         rig.angle._recent.clear()  # pyright: ignore
         if degrees is not None:
             rig.sensor.angle_rad = lambda _: math.radians(degrees)
-            rig.angle.take(rig.sensor.block(10))  # pyright: ignore
+            rig.angle.add(rig.sensor.block(10))  # pyright: ignore
         check_start(rig.angle, plan, limits.for_plan(limits.HARD_LIMITS, plan), rig.clock)
 
     starts(64.0)

@@ -119,7 +119,7 @@ MACHINE = VirtualMachine()
 
 def sensor_of(bus: dict[str, Any], cell: can_load_cell.Settings | None = None, **more: Any) -> CanAngleSensor:
     settings = can_angle_sensor.Settings(device="can_angle_sensor", bus=bus, **more)
-    return CanAngleSensor(settings if cell is None else settings.beside(cell), MACHINE)
+    return CanAngleSensor(settings if cell is None else settings.with_cell(cell), MACHINE)
 
 
 def frame(data: bytes, host_time_s: float = 1000.0) -> Frame:

@@ -225,7 +225,7 @@ def test_a_sender_that_lost_the_processor_wrote_before_the_ack() -> None:
         if acked_s is not None:
             blocks.append((Kind.ACKED, journal.ACKED.pack(index, acked_s)))
     pulses = _Pulses(np.full(3, 120.0), 20.0, 10.0)
-    pulses.take(JournalContents(Path("j"), blocks, 0, 0))
+    pulses.add(JournalContents(Path("j"), blocks, 0, 0))
     columns = pulses.columns(40.0, 0.075, blocks_missing=False, notes=[])
     expected_s = [0.0013, 0.0251, 0.0503]
     np.testing.assert_allclose(columns["pulses/written_time_s"], expected_s, atol=1e-9)

@@ -26,7 +26,7 @@ def errors_for(rig: VirtualRig, for_s: float) -> None:
     """Error frames, one each 10 ms; nothing is lost."""
     for number in range(int(for_s / 0.01)):
         at_s = rig.clock.now_s() + 0.01 * number
-        rig.clock.call_at(at_s, lambda: rig.receiver.take(Block(np.empty(0, SAMPLE), error_frames=1)))
+        rig.clock.call_at(at_s, lambda: rig.receiver.add(Block(np.empty(0, SAMPLE), error_frames=1)))
 
 
 def repeat_frames(rig: VirtualRig) -> None:

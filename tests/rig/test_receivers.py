@@ -58,9 +58,9 @@ class Heard(Receiver):
 
 def test_counts(tmp_path: Path):
     receiver = Heard()
-    receiver.take(block([1, 2, 5]))
+    receiver.add(block([1, 2, 5]))
     receiver.begin(tmp_path / "j")
-    receiver.take(block([6, 9, 9, 8, 10]))
+    receiver.add(block([6, 9, 9, 8, 10]))
     counts = receiver.release()
     assert counts.samples == 3  # 6, 9, 10
     assert counts.lost_samples == 2  # 7 and 8: the 8 that came late has no place any more
@@ -78,7 +78,7 @@ def test_the_range_does_not_depend_on_how_the_bus_cut_the_samples(tmp_path: Path
             part = block(list(range(at, min(at + per_block, 999))))
             part.samples["counter"] += 0 if name == "first" else 2000
             part.samples["torque_nm"] = torque_nm[at : at + per_block]
-            receiver.take(part)
+            receiver.add(part)
         means_nm = torque_nm[:992].reshape(-1, 16).mean(axis=1)  # 10 ms at 1600 samples/s
         assert receiver.range_nm == pytest.approx((means_nm.min(), means_nm.max()))
 
@@ -86,8 +86,8 @@ def test_the_range_does_not_depend_on_how_the_bus_cut_the_samples(tmp_path: Path
 def test_every_sample_of_a_slow_cell_counts_for_the_range(tmp_path: Path):
     receiver = Heard(rate_hz=10.0)
     receiver.begin(tmp_path / "j")
-    receiver.take(block([1], torque_nm=1.0))
-    receiver.take(block([2], torque_nm=3.0))
+    receiver.add(block([1], torque_nm=1.0))
+    receiver.add(block([2], torque_nm=3.0))
     assert receiver.range_nm == (1.0, 3.0)
 
 
@@ -184,7 +184,7 @@ def test_a_sensor_that_was_without_power_for_a_moment_counts_on_soon(heard: Hear
 def test_one_sample_that_is_no_number_leaves_no_angle(heard: HeardAngle):
     receiver = heard.feed(0.5)
     heard.sensor.nan = True
-    receiver.take(heard.sensor.block(1))
+    receiver.add(heard.sensor.block(1))
     assert receiver.angle_around(0.1) is None
 
 

@@ -41,7 +41,7 @@ def test_who_left_before_the_answer_is_told_nothing_more(tmp_path: Path, leaves:
             asked.append(Future())
             return asked[-1]
 
-        server._ask = ask
+        server._submit = ask
         async with await asyncio.start_unix_server(server._serve, tmp_path / "s"), asyncio.timeout(10.0):
             _, writer = await asyncio.open_unix_connection(tmp_path / "s")
             writer.write(json.dumps({"kind": "subscribe", "id": 1}).encode() + b"\n")
@@ -115,7 +115,7 @@ def test_a_long_plan_is_parsed_beside_no_test_only(
 
     async def asked() -> dict[str, Any]:
         server = Server()
-        server.rig, server._ask = rig, ask
+        server.rig, server._submit = rig, ask
         async with await asyncio.start_unix_server(server._serve, tmp_path / "t", limit=LONGEST_LINE):
             reader, writer = await asyncio.open_unix_connection(tmp_path / "t", limit=LONGEST_LINE)
             writer.write(line)

@@ -18,7 +18,7 @@ from stimrig.rig.devices._line import SCIENCEMODE_2, SCIENCEMODE_4, FrameReader,
 from stimrig.rig.devices._line import Packet as RigsPacket
 from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted
-from stimrig.rig.machine import Told
+from stimrig.rig.machine import OnMessage
 from stimrig.rig.signals import Ack
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
@@ -105,7 +105,7 @@ class Other(VirtualMachine):
         self.asked = path, arguments
         return self
 
-    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: Told) -> None:
+    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: OnMessage) -> None:
         self._on_bytes, self._on_lost = on_bytes, on_lost
         self._say(self._greeting)
 
@@ -340,7 +340,7 @@ class Line:
     def __init__(self) -> None:
         self.written: list[bytes] = []
 
-    def open(self, on_bytes: Callable[[bytes, float], None], _on_lost: Told) -> None:
+    def open(self, on_bytes: Callable[[bytes, float], None], _on_lost: OnMessage) -> None:
         self.take = on_bytes
 
     def write(self, data: bytes) -> int:

@@ -17,7 +17,7 @@ from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 PATIENCE_S = 30.0
 
 
-class Told(list[tuple[str, float]]):
+class OnMessage(list[tuple[str, float]]):
     def __init__(self, machine: VirtualMachine) -> None:
         self.clock = machine.clock
 
@@ -31,11 +31,11 @@ def machine() -> VirtualMachine:
 
 
 @pytest.fixture
-def told(machine: VirtualMachine) -> Told:
-    return Told(machine)
+def told(machine: VirtualMachine) -> OnMessage:
+    return OnMessage(machine)
 
 
-def test_who_is_due_first_goes_on_first_and_of_those_who_asked_first(machine: VirtualMachine, told: Told):
+def test_who_is_due_first_goes_on_first_and_of_those_who_asked_first(machine: VirtualMachine, told: OnMessage):
     async def waits(name: str, until_s: float) -> None:
         assert not await machine.tasks.wait(until_s)
         told(name)
@@ -55,7 +55,7 @@ def test_a_sleep_lasts_so_many_real_seconds(machine: VirtualMachine):
     assert machine.clock.now_s() == 8.0
 
 
-def test_a_signal_wakes_all_who_wait_and_their_times_wake_them_no_more(machine: VirtualMachine, told: Told):
+def test_a_signal_wakes_all_who_wait_and_their_times_wake_them_no_more(machine: VirtualMachine, told: OnMessage):
     signal, never = Signal(), Signal()
 
     async def waits(name: str) -> None:
@@ -79,7 +79,7 @@ def test_what_is_set_already_is_not_waited_for_until_it_is_cleared(machine: Virt
     assert machine.clock.now_s() == 5.0
 
 
-def test_one_at_a_time_in_the_order_of_asking_also_after_an_error(machine: VirtualMachine, told: Told):
+def test_one_at_a_time_in_the_order_of_asking_also_after_an_error(machine: VirtualMachine, told: OnMessage):
     turn = Turn(machine.tasks)
 
     async def takes(name: str) -> None:
@@ -97,7 +97,7 @@ def test_one_at_a_time_in_the_order_of_asking_also_after_an_error(machine: Virtu
     assert [type(task.error) for task in asked.values()] == [type(None), ZeroDivisionError, type(None)]
 
 
-def test_what_takes_long_gives_its_result_or_its_error_and_holds_up_nobody(machine: VirtualMachine, told: Told):
+def test_what_takes_long_gives_its_result_or_its_error_and_holds_up_nobody(machine: VirtualMachine, told: OnMessage):
     slow_work(machine, 1.0)
     tasks = machine.tasks
 
@@ -114,7 +114,7 @@ def test_what_takes_long_gives_its_result_or_its_error_and_holds_up_nobody(machi
 
 
 def test_what_begins_when_the_computer_stood_still_counts_before_what_is_due_by_then(
-    machine: VirtualMachine, told: Told
+    machine: VirtualMachine, told: OnMessage
 ):
     halt = Signal()
 
@@ -144,7 +144,7 @@ def test_tasks_share_one_thread_and_what_takes_long_has_another(driver: Driver):
     async def where() -> set[str]:
         return {threading.current_thread().name, await driver.tasks.work(lambda: threading.current_thread().name)}
 
-    asked = [driver.ask(where) for _ in range(10)]
+    asked = [driver.submit(where) for _ in range(10)]
     found = set.union(*(one.result(PATIENCE_S) for one in asked))
     assert "rig" in found
     assert all(name.startswith("work") for name in found - {"rig"})
@@ -156,19 +156,19 @@ def test_the_driver_waits_for_times_and_passes_on_errors(driver: Driver):
         await driver.tasks.sleep(0.05)
         return driver.tasks.clock.now_s() - asked_s
 
-    assert driver.ask(waits).result(PATIENCE_S) >= 5.0
+    assert driver.submit(waits).result(PATIENCE_S) >= 5.0
 
     async def fails() -> None:
         await driver.tasks.work(divmod, 1, 0)
 
     with pytest.raises(ZeroDivisionError):
-        driver.ask(fails).result(PATIENCE_S)
+        driver.submit(fails).result(PATIENCE_S)
 
 
 def test_a_mistake_in_what_comes_ends_no_driver(driver: Driver, caplog: pytest.LogCaptureFixture):
     driver.post(lambda: 1 // 0)  # pyright: ignore[reportArgumentType]
     signal = Signal()
-    waiting = driver.ask(lambda: driver.tasks.wait(math.inf, signal))
+    waiting = driver.submit(lambda: driver.tasks.wait(math.inf, signal))
     driver.post(signal.set)
     assert waiting.result(PATIENCE_S)
     assert "could not be taken" in caplog.text

@@ -43,7 +43,7 @@ class Asked:
     """Called when the reply has come."""
 
 
-class Told(NamedTuple):
+class OnMessage(NamedTuple):
     """A state that a rig's process told, and when."""
 
     time_s: float
@@ -63,7 +63,7 @@ class Clinic:
     device: Callable[[], dict[str, Any]]
     """What the devices are in."""
     asked: list[Asked] = field(default_factory=list)
-    states: list[Told] = field(default_factory=list)
+    states: list[OnMessage] = field(default_factory=list)
     shown: dict[str, float] = field(default_factory=dict)
     """Each latch that was told, and when first."""
     finished: list[FinishedEvent] = field(default_factory=list)
@@ -93,7 +93,7 @@ class Clinic:
             state = event.status.state
             waits = event.status.calibrated
             calibrated = "" if waits is None else waits.calibration_id
-            self.states.append(Told(time_s, process, state, event.status.latch, calibrated, event.status.reason))
+            self.states.append(OnMessage(time_s, process, state, event.status.latch, calibrated, event.status.reason))
             self.shown.setdefault(event.status.latch, time_s)
             self.world.tell("rig", f"{state} {event.status.reason}".rstrip(), time_s)
             if process is self.process:

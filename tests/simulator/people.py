@@ -175,7 +175,7 @@ class People:
         run = None if rig is None else rig.player.run
         if run is None:
             return
-        test_id, after = run.plan.test_id, len(run.score.laid)
+        test_id, after = run.plan.test_id, len(run.score.queue)
         if self.chance.random() < 0.3:
             self.clinic.ask(EnoughRequest(id=1, test_id=test_id, by="clinician"), test_id)
         else:

@@ -9,7 +9,7 @@ from typing import Any
 
 from stimrig.hardware_sim.devices import Devices
 from stimrig.rig.errors import DeviceError
-from stimrig.rig.machine import Bus, Frame, Listener, Port, Told
+from stimrig.rig.machine import Bus, Frame, Listener, OnMessage, Port
 from tests.simulator.host import Process
 from tests.simulator.world import World
 
@@ -202,9 +202,9 @@ class SimulatedPort:
     def __init__(self, wires: Wires, process: Process, path: str) -> None:
         self.process, self.path, self._wires = process, path, wires
         self.on_bytes: Callable[[bytes, float], None] | None = None
-        self._on_lost: Told = lambda _: None
+        self._on_lost: OnMessage = lambda _: None
 
-    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: Told) -> None:
+    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: OnMessage) -> None:
         self._wires.open_port(self)
         self.on_bytes, self._on_lost = on_bytes, on_lost
 
@@ -254,7 +254,7 @@ class _SimulatedBus:
     def listen(self, listener: Listener) -> None:
         self._listening.append(listener)
 
-    def leave(self, listener: Listener) -> None:
+    def detach(self, listener: Listener) -> None:
         self._listening = [other for other in self._listening if other is not listener]
 
     def send(self, frames: Sequence[tuple[int, bytes, bool]]) -> None:
@@ -289,4 +289,4 @@ class _SimulatedBus:
             if mine:
                 self._wires.read_s.setdefault(listener.frame_id, []).append(self.process.computer.true_s)
             if mine or errors:
-                listener.take(listener.decode(mine, 0, errors))
+                listener.handle(listener.decode(mine, 0, errors))

@@ -77,8 +77,8 @@ def _de_groote(x, p, s, c):
 @draws("dynamics", 2.5, "log_ratio", _base=second_order, slower=SLOWER, smoothing=(0.02, 0.15))
 def _cross_bridges(x, p, s, c):
     """p: log ratio, 1/Tω, ζ, smoothing. Second order; the rate depends on whether force is being made or lost."""
-    made = math.tanh((x - s[0]) / (p[3] * c[LARGEST_NM]))
-    rate = p[1] * math.exp(0.25 * p[0] * made)
+    attached = math.tanh((x - s[0]) / (p[3] * c[LARGEST_NM]))
+    rate = p[1] * math.exp(0.25 * p[0] * attached)
     y = second_order_step(x, rate, p[2], s, 0, c[STEP_S])
     c[FORCE] = y / c[LARGEST_NM]
     return y

@@ -28,9 +28,9 @@ def _lags(x, p, s, c):
     if p[0] <= 0.0:
         return x
     n = int(p[1])
-    keep = np.exp(-c[STEP_S] * n / p[0])
+    decay = np.exp(-c[STEP_S] * n / p[0])
     for i in range(n):
-        s[i] = x + (s[i] - x) * keep
+        s[i] = x + (s[i] - x) * decay
         x = s[i]
     return x
 

@@ -89,10 +89,10 @@ def _slow_tail(x, p, s, c):
 def _third_order(x, p, s, c):
     """p: slow share, 1/Tω, ζ, time constant of each of three lags s."""
     fast = second_order_step(x, p[1], p[2], s, 0, c[STEP_S])
-    keep = math.exp(-c[STEP_S] / p[3])
+    decay = math.exp(-c[STEP_S] / p[3])
     signal = x
     for i in range(3):
-        s[2 + i] = signal + (s[2 + i] - signal) * keep
+        s[2 + i] = signal + (s[2 + i] - signal) * decay
         signal = s[2 + i]
     y = (1.0 - p[0]) * fast + p[0] * signal
     c[FORCE] = y / c[LARGEST_NM]

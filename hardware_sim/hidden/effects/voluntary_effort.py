@@ -69,10 +69,10 @@ def _ramps(x, p, s, c):
         if c[TIME_S] < start:
             break
         length = p[2 + 4 * i]
-        left, right = c[TIME_S] - start, start + length - c[TIME_S]
-        if right > 0.0:
+        since_start, until_end = c[TIME_S] - start, start + length - c[TIME_S]
+        if until_end > 0.0:
             edge = p[4 + 4 * i] * length
-            q = min(left, right, edge) / edge
+            q = min(since_start, until_end, edge) / edge
             x += p[0] * p[3 + 4 * i] * q * q * (3.0 - 2.0 * q)
     return x
 
