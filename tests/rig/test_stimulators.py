@@ -65,7 +65,7 @@ def test_every_answer_but_the_good_one_is_an_error(data: bytes, monkeypatch: pyt
     async def ask(*_: object) -> RigsPacket:
         return RigsPacket(0, 1, data)
 
-    monkeypatch.setattr(device._line, "ask", ask)
+    monkeypatch.setattr(device._line, "request", ask)
     monkeypatch.setattr(device._line, "discard", lambda: None)
     for asked in (device.arm, device.stop):
         with pytest.raises(DeviceError, match="error"):
