@@ -1,7 +1,7 @@
-"""Results on disk: parts beside the output while the run goes on, joined into one file in the end.
+"""Results on disk: a line for each row beside the output while the run goes on, one Parquet file in the end.
 
-`RESULTS.parquet.parts/` holds a lock and parts, each written whole or not at all, with the options of the run. The next
-run with the same options skips the records that have a row, in the output or in a part.
+`RESULTS.parquet.rows` holds the options of the run and then its rows, as JSON. The next run with the same options skips
+the records that have a row, there or in the output.
 """
 
 from __future__ import annotations
@@ -9,14 +9,15 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
-import shutil
+import os
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
+from datetime import date, datetime
+from itertools import islice
 from pathlib import Path
-from typing import IO, Self
+from typing import IO, Any, Self
 
-import pyarrow as pa
 import pyarrow.parquet as pq
 
 from stimrig.api.cohort import table
@@ -26,14 +27,15 @@ from stimrig.api.cohort.sources import Entry
 from stimrig.api.cohort.task import Task
 from stimrig.api.whole_file import whole_path
 
-PART_ROWS = 500
-PART_S = 10.0
-"""What a run that is killed loses at most."""
+TO_DISK_S = 10.0
+"""What a run loses at most where the machine goes down."""
 GROUP_ROWS = 5000
 COPY = "copy"
 """Status of a row whose content has a newer row: of another address."""
 TRANSIENT = ("timeout", "killed", "out of memory", "unreadable", "unexpected")
 """Errors that another try may not meet (`--again`)."""
+TIMES = {"day": date, "begun_utc": datetime, "computed_utc": datetime}
+"""Columns that are texts in JSON."""
 
 
 class Results:
@@ -56,141 +58,137 @@ class Results:
 
     def __init__(self, output: Path, task: Task, again: bool = False) -> None:
         self.output, self.task, self.again = output, task, again
-        self.folder = output.with_name(output.name + ".parts")
+        self.journal = output.with_name(output.name + ".rows")
         self._done: set[bytes] = set()  # files in the state in which they were done
-        self._waiting: list[Row] = []
-        self._written_s = time.monotonic()
-        self._lock: IO[bytes] | None = None
+        self._file: IO[bytes]
+        self._synced_s = time.monotonic()
 
     def __enter__(self) -> Self:
         if self.output.is_dir():
             raise CohortError(f"{self.output}: a folder. Give a file.")
         try:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            self._lock = (self.folder / "lock").open("ab")
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._unlock()
-            raise CohortError(f"{self.output}: another run writes it now. Wait for it, or give another -o.") from None
+            self.journal.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self.journal.open("a+b")
         except OSError as error:
-            self._unlock()
-            remedy = "Give a file in a folder that can be written."
-            raise CohortError(f"{self.folder}: {error.strerror}. {remedy}") from None
+            raise CohortError(
+                f"{self.journal}: {error.strerror}. Give a file in a folder that can be written."
+            ) from None
         try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not self.journal.exists() or self.journal.stat().st_ino != os.fstat(self._file.fileno()).st_ino:
+                raise BlockingIOError  # the run that had the lock has removed the file
             self._read()
-        except BaseException:
-            self._close()
+        except BaseException as error:
+            self._file.close()
+            if isinstance(error, BlockingIOError):
+                words = "another run writes it now. Wait for it, or give another -o."
+                raise CohortError(f"{self.output}: {words}") from None
             raise
         return self
 
     def __exit__(self, *_: object) -> None:
-        try:
-            self.flush()
-        finally:
-            self._close()
+        if self.journal.stat().st_size <= len(self._header()):  # nothing to resume from
+            self.journal.unlink()
+        self._file.close()
 
-    def _close(self) -> None:
-        if not self._parts():  # nothing to resume from
-            shutil.rmtree(self.folder, ignore_errors=True)
-        self._unlock()
-
-    def _unlock(self) -> None:
-        if self._lock is not None:
-            self._lock.close()
-            self._lock = None
-
-    def _parts(self) -> list[Path]:
-        return sorted(self.folder.glob("[0-9]*.parquet"))
-
-    def _files(self) -> list[Path]:
-        """List the files with rows, the oldest first."""
-        return [*([self.output] if self.output.exists() else []), *self._parts()]
+    def _header(self) -> bytes:
+        return json.dumps(self.task.options()).encode() + b"\n"
 
     def _read(self) -> None:
-        """Compare the options, and read which records are done."""
+        """Compare the options, and read which records are done; remove a line that was cut off."""
+        if self.output.exists():
+            self._compare(table.read_options(self.output), self.output)
+        self._file.seek(0)
+        if not (header := self._file.readline()):
+            self._write(self._header())
+        else:
+            self._compare(_parse(header, self.journal), self.journal)
+            self._file.truncate(len(header) + sum(len(line) for line in self._file if line.endswith(b"\n")))
+        for row in self._rows(("address", "stamp", "error_kind")):
+            if row["stamp"] and not (self.again and row.get("error_kind") in TRANSIENT):
+                self._done.add(_digest(row["address"], row["stamp"]))
+
+    def _compare(self, before: Mapping[str, Any], file: Path) -> None:
         now = self.task.options()
-        for file in self._files():
-            before = table.read_options(file)
-            if other := [name for name in now if before.get(name) != now[name]]:
-                words = ", ".join(f"{name} {before.get(name, 'none')}, now {now[name]}" for name in other)
-                raise CohortError(f"{file}: made with other options ({words}). Give another -o, or remove it.")
-            for row in table.read_rows(file, ("address", "stamp", "error_kind")):
-                if row["stamp"] and not (self.again and row["error_kind"] in TRANSIENT):
-                    self._done.add(_digest(row["address"], row["stamp"]))
+        if other := [name for name in now if before.get(name) != now[name]]:
+            words = ", ".join(f"{name} {before.get(name, 'none')}, now {now[name]}" for name in other)
+            raise CohortError(f"{file}: made with other options ({words}). Give another -o, or remove it.")
+
+    def _rows(self, columns: tuple[str, ...] = ()) -> Iterator[Row]:
+        """Yield all rows, the oldest first; of those in the output these columns, or all."""
+        if self.output.exists():
+            yield from table.read_rows(self.output, columns)
+        with self.journal.open("rb") as file:
+            for line in islice(file, 1, None):
+                row = _parse(line, self.journal)
+                yield row | {name: kind.fromisoformat(row[name]) for name, kind in TIMES.items() if row.get(name)}
 
     def has(self, entry: Entry) -> bool:
         """Return whether this file, in its state of now, has a row."""
         return bool(entry.stamp) and _digest(entry.address, entry.stamp) in self._done
 
     def add(self, row: Row) -> str:
-        """Add a record's row, unless it was not selected; return its status."""
+        """Write a record's row, unless it was not selected; return its status. Raises InterruptedRunError."""
         if row["status"] != LEFT_OUT:
-            self._waiting.append(row)
-            if len(self._waiting) >= PART_ROWS or time.monotonic() - self._written_s > PART_S:
-                self.flush()
+            self._write(json.dumps(row, default=str).encode() + b"\n")
         return row["status"]
 
-    def flush(self) -> None:
-        """Write the rows that wait as a part. Raises InterruptedRunError: the disk refuses."""
-        self._written_s = time.monotonic()
-        if self._waiting:
-            number = 1 + int(([Path("0"), *self._parts()])[-1].stem)
-            self._write(self.folder / f"{number:08d}.parquet", [table.rows_to_table(self._waiting)])
-            self._waiting = []
+    def _write(self, line: bytes) -> None:
+        try:
+            self._file.write(line)
+            self._file.flush()
+            if time.monotonic() - self._synced_s > TO_DISK_S:
+                self._synced_s = time.monotonic()
+                os.fsync(self._file.fileno())
+        except OSError as error:
+            raise _no_room(self.journal, error) from None
 
     def join(self) -> Counter[str]:
-        """Write the output, remove the parts, and count the rows by status.
+        """Write the output, empty what stands beside it, and count the rows by status.
 
-        Raises InterruptedRunError: the disk refuses; the parts stay.
+        Raises InterruptedRunError: the disk refuses; the lines stay.
         """
-        self.flush()
         statuses = self._statuses()
-        self._write(self.output, self._current(iter(statuses)))
-        shutil.rmtree(self.folder, ignore_errors=True)
+        rows = ({**row, "status": status} for row, status in zip(self._rows(), statuses, strict=True) if status)
+        schema = table.SCHEMA.with_metadata({"format": table.FORMAT, "options": json.dumps(self.task.options())})
+        try:
+            with whole_path(self.output) as place, pq.ParquetWriter(place, schema, compression="zstd") as writer:
+                while some := list(islice(rows, GROUP_ROWS)):
+                    writer.write_table(table.rows_to_table(some))
+        except OSError as error:
+            raise _no_room(self.output, error) from None
+        self._file.truncate(0)
         return Counter(status for status in statuses if status)
 
     def _statuses(self) -> list[str | None]:
         """Return the status of each row, the oldest first; None: its file has a newer row."""
         statuses: list[str | None] = []
-        places, contents = set[bytes](), set[str]()
-        for file in reversed(self._files()):
-            for row in reversed(list(table.read_rows(file, ("address", "sha256", "status")))):
-                place, status = _digest(row["address"]), row["status"]
-                if place in places:
-                    status = None
-                elif status != "error":
-                    status = COPY if row["sha256"] in contents else "ok"
-                    contents.add(row["sha256"])
-                places.add(place)
+        places, contents = set[bytes](), set[Any]()
+        columns = ("address", "sha256", "status")
+        keys = [(_digest(row["address"]), row.get("sha256"), row["status"]) for row in self._rows(columns)]
+        for place, sha256, status in reversed(keys):
+            if place in places:
+                statuses.append(None)
+            elif status == "error":
                 statuses.append(status)
+            else:
+                statuses.append(COPY if sha256 in contents else "ok")
+                contents.add(sha256)
+            places.add(place)
         return statuses[::-1]
-
-    def _current(self, statuses: Iterator[str | None]) -> Iterator[pa.Table]:
-        """Yield the rows that have a status, many at a time."""
-        column, waiting = table.SCHEMA.get_field_index("status"), [table.SCHEMA.empty_table()]
-        for file in self._files():
-            with pq.ParquetFile(file) as rows:
-                for batch in rows.iter_batches(table.BATCH_ROWS):
-                    new = pa.array([next(statuses) for _ in range(len(batch))], pa.string())
-                    marked = pa.Table.from_batches([batch]).set_column(column, "status", new)
-                    waiting.append(marked.filter(new.is_valid()).cast(table.SCHEMA))
-                    if sum(map(len, waiting)) >= GROUP_ROWS:
-                        yield pa.concat_tables(waiting)
-                        waiting = []
-        if waiting:
-            yield pa.concat_tables(waiting)
-
-    def _write(self, file: Path, tables: Iterable[pa.Table]) -> None:
-        about = {"format": table.FORMAT, "options": json.dumps(self.task.options())}
-        schema = table.SCHEMA.with_metadata(about)
-        try:
-            with whole_path(file) as place, pq.ParquetWriter(place, schema, compression="zstd") as writer:
-                for rows in tables:
-                    writer.write_table(rows)
-        except OSError as error:
-            raise InterruptedRunError(f"{file}: {error.strerror}. Make room; the same command goes on.") from None
 
 
 def _digest(*texts: str) -> bytes:
     """Return sixteen bytes that stand for texts: a run remembers every record."""
     return hashlib.blake2b("\0".join(texts).encode(), digest_size=16).digest()
+
+
+def _parse(line: bytes, file: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(line))
+    except (ValueError, TypeError):
+        raise CohortError(f"{file}: a line of it is damaged. Remove it, or give another -o.") from None
+
+
+def _no_room(file: Path, error: OSError) -> InterruptedRunError:
+    return InterruptedRunError(f"{file}: {error.strerror}. Make room; the same command goes on.")

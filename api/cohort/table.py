@@ -101,11 +101,11 @@ def rows_to_table(rows: Sequence[Row]) -> pa.Table:
         return pa.Table.from_pylist([keys | failed("unexpected", f"its row cannot be stored ({error})")], SCHEMA)
 
 
-def read_rows(file: Path, columns: Sequence[str]) -> Iterator[Row]:
-    """Read rows of a table, some at a time. Raises CohortError: it is damaged, or no such table."""
+def read_rows(file: Path, columns: Sequence[str] = ()) -> Iterator[Row]:
+    """Read these or all columns of a table, some rows at a time. Raises CohortError: it is damaged."""
     try:
         with pq.ParquetFile(file) as table:
-            for batch in table.iter_batches(BATCH_ROWS, columns=list(columns)):
+            for batch in table.iter_batches(BATCH_ROWS, columns=list(columns) or None):
                 yield from batch.to_pylist()
     except (pa.ArrowException, OSError) as error:
         raise CohortError(f"{file}: cannot be read ({' '.join(str(error).split())[:200]}).") from None

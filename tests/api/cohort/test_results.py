@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Any
@@ -65,33 +64,34 @@ def refuse(output: Path, match: str, task: Task = TASK) -> None:
 def test_interrupted_run_resumes(output: Path) -> None:
     run(output, row("a"), failure("b", "bad record"), row("c", status=LEFT_OUT), join=False)
     assert not output.exists()
-    Path(f"{output}.parts/.00000001.parquet.new").write_bytes(b"PAR1half")  # the process was killed as it wrote
+    with Path(f"{output}.rows").open("ab") as file:
+        file.write(b'{"address": "/d/d", "sta')  # the process was killed as it wrote
     with Results(output, TASK) as results:
         assert [results.has(entry(name)) for name in "abcd"] == [True, True, False, False]
         assert not results.has(entry("a", "changed"))
         results.add(row("d"))
         assert results.join() == {"ok": 2, "error": 1}
-    assert not results.folder.exists()
+    assert not results.journal.exists()
     run(output, row("e"))
     assert written(output) == ["a ok", "b error", "d ok", "e ok"], "what is new is added to finished results"
 
 
 def test_run_that_did_nothing_leaves_nothing(output: Path) -> None:
     with Results(output, TASK) as results:
-        assert results.folder.exists()
+        assert results.journal.exists()
     assert list(output.parent.iterdir()) == []
 
 
-def test_killed_between_joining_and_removing_the_parts(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch:
-        patch.setattr(shutil, "rmtree", lambda *_, **__: None)
-        run(output, row("a"), failure("b", "timeout"))
-    assert Path(f"{output}.parts").exists()
+def test_killed_between_joining_and_removing_the_lines(output: Path) -> None:
+    run(output, row("a"), failure("b", "timeout"), join=False)
+    lines = Path(f"{output}.rows").read_bytes()
+    run(output)
+    Path(f"{output}.rows").write_bytes(lines)
     run(output)
     assert written(output) == ["a ok", "b error"]
 
 
-def test_full_disk_keeps_the_parts(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk_keeps_the_lines(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run(output, row("a"), join=False)
     with Results(output, TASK) as results, monkeypatch.context() as patch:
         patch.setattr(pq.ParquetWriter, "write_table", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
@@ -141,6 +141,12 @@ def test_two_runs_never_write_one_output(output: Path) -> None:
         refuse(output, "another run")
 
 
+def test_a_damaged_line_is_refused(output: Path) -> None:
+    run(output, row("a"), join=False)
+    Path(f"{output}.rows").write_bytes(b"letter\n")
+    refuse(output, "damaged")
+
+
 EMPTY = table.SCHEMA.empty_table()
 
 
@@ -173,7 +179,6 @@ def test_place_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 def test_many_rows_are_written_in_groups(output: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(results, "PART_ROWS", 7)
     monkeypatch.setattr(results, "GROUP_ROWS", 10)
     monkeypatch.setattr(table, "BATCH_ROWS", 4)
     run(output, *(row(str(number % 50), status="ok" if number % 3 else LEFT_OUT) for number in range(60)))
