@@ -12,7 +12,7 @@ log = logging.getLogger("stimrig")
 current_test: ContextVar[str | None] = ContextVar("test_id", default=None)
 """Id of the current test, added to every log line written on its behalf."""
 current_request: ContextVar[str | None] = ContextVar("request_id", default=None)
-"""The HTTP request that is being answered, and what it started in the background; `RequestId` draws the id."""
+"""The HTTP request that is being answered, and what it started in the background; the middleware draws the id."""
 
 
 class JsonLines(logging.Formatter):
