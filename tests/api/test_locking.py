@@ -319,13 +319,18 @@ class Tomorrow(Clock):
         return self.now.unix_s() + 86_400.0
 
 
-def test_a_key_that_ends_between_its_intent_and_its_command_plays_nothing(
-    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("when", ["its intent", "its command"])
+def test_a_key_that_ends_before(
+    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch, when: str
 ) -> None:
-    """It is told to the rig at once; and the start that follows is refused here, whatever the rig remembers."""
-    _key, controller = key_of(service, client, participant)
-    runner = service.context.runner
-    write = runner._write_intent
+    """It was good when it was asked. The start that follows is refused here, whatever the rig remembers."""
+    key, controller = key_of(service, client, participant)
+    context, runner = service.context, service.context.runner
+    look, write = runner._previewed, runner._write_intent
+
+    async def revoked(plan: Any) -> Any:
+        await asyncio.to_thread(context.auth.revoke, key, "somebody elsewhere")
+        return await look(plan)
 
     def then_it_is_tomorrow(*given: Any) -> Any:
         row = write(*given)
@@ -333,30 +338,16 @@ def test_a_key_that_ends_between_its_intent_and_its_command_plays_nothing(
         service.run(runner.look_again())
         return row
 
-    monkeypatch.setattr(runner, "_write_intent", then_it_is_tomorrow)
+    if when == "its intent":
+        monkeypatch.setattr(runner, "_previewed", revoked)
+    else:
+        monkeypatch.setattr(runner, "_write_intent", then_it_is_tomorrow)
     starts = service.rig.starts
     refused = controller.post("/v1/tests", json={"participant": participant, **TRIAL})
     assert refused.status_code == 409 and refused.json()["title"] == "The right to this test has ended"
-    assert service.rig.starts == starts and len(service.rig.withdrawn) == 1 and approved
-
-
-def test_a_key_that_is_revoked_before_its_intent_plays_nothing(
-    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It was good when it was asked; it is revoked while the plan is looked at."""
-    key, controller = key_of(service, client, participant)
-    context, starts = service.context, service.rig.starts
-    look = context.runner._previewed
-
-    async def meanwhile(plan: Any) -> Any:
-        await asyncio.to_thread(context.auth.revoke, key, "somebody elsewhere")
-        return await look(plan)
-
-    monkeypatch.setattr(context.runner, "_previewed", meanwhile)
-    refused = controller.post("/v1/tests", json={"participant": participant, **TRIAL})
-    assert refused.status_code == 409 and refused.json()["title"] == "The right to this test has ended"
-    assert service.rig.starts == starts and approved
-    assert client.get("/v1/tests").json()[0]["kind"] != "sequence", "no intent was written"
+    written = client.get("/v1/tests").json()[0]["kind"] == "sequence"
+    assert service.rig.starts == starts and approved and written == (when == "its command")
+    assert len(service.rig.withdrawn) == written, "the rig is told at once"
 
 
 @pytest.mark.parametrize("by_key", [True, False])
