@@ -90,8 +90,13 @@ def test_pages_of_jobs_lead_to_the_result_or_say_why_there_is_none(
         return job, pages.get(url.removeprefix("/v1"))
 
     job, page = ended("improve", {})
-    assert client.get(job["result_url"]).json()["effects"] == ["fatigue"]
     assert page.status_code == 303 and page.headers["location"] == job["result_url"].removeprefix("/v1")
+    better = client.get(job["result_url"]).json()
+    assert (better["effects"], better["parent_id"], better["added_effect"]) == (["fatigue"], model, "fatigue")
+    assert better["model"]["extra"]["parent"] == model
+    again = client.post(f"/v1/models/{model}/improve")
+    assert again.status_code == 201 and again.headers["location"] == f"/v1/models/{better['id']}"
+    assert [version["id"] for version in again.json()["versions"]] == [model, better["id"]], "a version a step"
     _, page = ended("effects", {"effects": ["tremor"]})
     assert page.status_code == 409
     assert "gives no evidence for this effect" in page.text and "Back to the model" in page.text
@@ -141,16 +146,6 @@ def test_an_effect_added_before_anybody_had_looked_is_not_marked_for_good(
     asked = client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
     assert asked["id"] != hasty["id"] and asked["without_evidence"] == []
     assert client.post(f"/v1/models/{model}/improve").json()["versions"][-1]["id"] == asked["id"]
-
-
-def test_improve_makes_a_version_a_step(client: httpx.Client, model: str) -> None:
-    done = client.post(f"/v1/models/{model}/improve")
-    assert done.status_code == 201, done.text
-    versions = done.json()["versions"]
-    assert [version["added_effect"] for version in versions] == [None, "fatigue"]
-    better = versions[-1]["id"]
-    assert versions[-1]["parent_id"] == model and done.headers["location"] == f"/v1/models/{better}"
-    assert client.get(f"/v1/models/{better}").json()["model"]["extra"]["parent"] == model
 
 
 def test_version_with_effects_is_criticised_with_them(client: httpx.Client, pages: httpx.Client, model: str) -> None:
@@ -277,15 +272,12 @@ def test_a_conclusion_advises_what_the_diagnosis_asks_for(
     assert title in said.title and said.advice == advice and why_ended(diagnosis).startswith(ended)
 
 
-def test_effects_are_shown_in_the_order_in_which_improve_adds_them() -> None:
+def test_effects_are_shown_in_the_order_of_improve_and_only_the_likely_are_advised() -> None:
     rows = [{**FATIGUE, "effect": name, "name": name.title()} for name in ("tremor", "fatigue", "potentiation")]
     view = explanation.view(MISSING | {"missing": rows, "add": ["fatigue", "tremor"]}, None)
     assert [entry["id"] for entry in view["missing"]] == ["fatigue", "tremor", "potentiation"]
     assert view["advice"] == "Add “Fatigue”, then “Tremor” to the model."
-
-
-def test_only_what_is_likely_missing_is_advised() -> None:
-    perhaps = {**FATIGUE, "effect": "tremor", "name": "Tremor", "probability": 0.45}
+    perhaps = {**rows[0], "probability": 0.45}
     both, alone = (explanation.view(MISSING | {"missing": rows}, None) for rows in ([FATIGUE, perhaps], [perhaps]))
     assert both["likely"] == ["Fatigue"] and both["title"] == "An effect is missing in this model"
     assert alone["likely"] == [] and "possibly missing" in alone["title"] and len(alone["missing"]) == 1

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, JsonValue
 
 from stimrig.api.models.tracking import Limits
 from stimrig.api.web.responses.base import Document, Problem, SegmentOut
@@ -18,18 +18,6 @@ class ParameterOut(Document):
     unit: str = ""
 
 
-class CarriedEffect(Document):
-    """What a new recording says of an effect of the last approved model."""
-
-    effect: str
-    name: str
-    needed: bool | None = Field(description="null: undecided, since something else is missing")
-    log_evidence_gain: float | None = Field(description="with it less without it; null: not compared")
-    required: float = Field(description="log evidence that it must gain")
-    why: str = Field(description="the reason as one word")
-    reason: str
-
-
 class CarriedOut(Document):
     """The structure of the last approved model on a new recording, beside the plain structure."""
 
@@ -40,7 +28,10 @@ class CarriedOut(Document):
     still_needed: list[str]
     no_longer_needed: list[str]
     undecided: list[str] = Field(description="left out; something else is missing that may hide them")
-    effects: list[CarriedEffect]
+    effects: list[dict[str, JsonValue]] = Field(
+        description="of each: id, `name`, whether it is `needed` (null: undecided, since something else is missing), "
+        "`log_evidence_gain` (with it less without it; null: not compared), what was `required`, `why` and `reason`"
+    )
 
 
 class VersionOut(Document):
@@ -235,17 +226,12 @@ class TrendOut(Document):
     )
 
 
-class LevelOut(Document):
-    """A quantity with its 95 % band."""
-
-    value: float
-    low: float
-    high: float
-
-
 Levels = Annotated[
-    dict[Literal["gain", "threshold_shift_us", "time_scale"], LevelOut],
-    Field(description="factors on the approved curve and time constant; shift of the curve to wider pulses, µs"),
+    dict[Literal["gain", "threshold_shift_us", "time_scale"], dict[Literal["value", "low", "high"], float]],
+    Field(
+        description="with 95 % bands: factors on the approved curve and time constant; shift of the curve to wider "
+        "pulses, µs"
+    ),
 ]
 
 
