@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tests.api.conftest import TOKEN, Service
+from tests.api.conftest import TOKEN, Service, soon
 
 PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser")
 """The first without windows of its own: with the others each tab costs three times the processor."""
@@ -18,8 +18,7 @@ ARGUMENTS = [
     "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
     "--disable-component-update", "--disable-sync",
 ]  # fmt: skip
-WIDE, NARROW, PHONE = (1280, 860), (1024, 768), (390, 844)
-TABLET, ZOOMED = (820, 1180), (640, 430)
+WIDE, TABLET, PHONE, ZOOMED = (1280, 860), (820, 1180), (390, 844), (640, 430)
 """ZOOMED: what a window of WIDE shows at 200 %."""
 UNCOVERED = """() => { const b = document.getElementById('stop').getBoundingClientRect();
   const at = (x, y) => document.elementFromPoint(b.left + b.width * x, b.top + b.height * y);
@@ -54,26 +53,27 @@ def open_tab(browser: Any, service: Service, signed_in: bool = True, **options: 
 
 def close(context: Any) -> None:
     """Each page brought to rest first: chromium never closes a context one of whose pages is loading the next one."""
+    for page in context.pages:
+        try_until(lambda page=page: page.goto("about:blank"), lambda page=page: page.url == "about:blank")
+    context.close()
+
+
+def try_until(do: Callable[[], Any], done: Callable[[], bool]) -> None:
+    """Do it until it is done; a page may go elsewhere meanwhile by itself."""
     from playwright.sync_api import Error
 
-    for page in context.pages:
-        end = time.monotonic() + 60
-        while page.url != "about:blank":
-            try:
-                page.goto("about:blank")
-            except Error:  # the page itself went elsewhere meanwhile
-                assert time.monotonic() < end
-    context.close()
+    end = time.monotonic() + 90
+    while not done():
+        assert time.monotonic() < end
+        with suppress(Error):
+            do()
 
 
 def bring_to_rest(service: Service) -> None:
     """Whatever it does, stopped; then re-armed."""
     with service.client() as http:
-        end = time.monotonic() + 60
-        stopped = http.post("/v1/stop")
-        while (rig := http.get("/v1/rig").json())["holder"] or service.rig.state == "running":
-            assert time.monotonic() < end, (stopped.text, rig, http.get("/v1/tests").json()[:2], service.rig.status())
-            time.sleep(0.05)
+        http.post("/v1/stop")
+        soon(lambda: not http.get("/v1/rig").json()["holder"] and service.rig.state != "running", 60)
         rearmed = http.post("/v1/rearm")
         assert rearmed.status_code == 200, rearmed.text
 
@@ -131,11 +131,6 @@ def participant(page: Any, service: Service, code: str) -> None:
 def start(page: Any) -> None:
     """As a clinician does: press *Start*, read what is about to happen, say yes."""
     page.get_by_role("button", name="Start the pre-session test").click()
-    say_yes(page)
-
-
-def say_yes(page: Any) -> None:
-    """The question before current flows."""
     page.get_by_role("button", name="Start now").click()
     page.wait_for_url("**/tests/T*")
 
@@ -166,30 +161,22 @@ def expected(locator: Any) -> Any:
 
 def after_the_end(page: Any, where: str, link: str) -> None:
     """From a test that ends to what comes of it: its page leads there, or offers a link where it was loaded late."""
-    from playwright.sync_api import Error
 
-    end = time.monotonic() + 90
-    while where not in page.url:
-        assert time.monotonic() < end, page.url
+    def go_on() -> None:
         late = page.get_by_role("link", name=link, exact=True)
-        with suppress(Error):  # the page itself went on meanwhile
-            if late.count():
-                late.click(timeout=2000)
+        if late.count():
+            late.click(timeout=2000)
         page.wait_for_timeout(100)
+
+    try_until(go_on, lambda: where in page.url)
     page.wait_for_load_state()
 
 
-def painted(page: Any, canvas: str) -> int:
-    """How many pixels of a canvas are not empty."""
-    script = """(id) => { const c = document.getElementById(id);
-      const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
-      let n = 0; for (let i = 3; i < d.length; i += 4) if (d[i]) n++; return n; }"""
-    return page.evaluate(script, canvas)
+PAINTED = """(id) => { const c = document.getElementById(id);
+  const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
+  let n = 0; for (let i = 3; i < d.length; i += 4) if (d[i]) n++; return n; }"""
 
 
 def painted_soon(page: Any, canvas: str) -> int:
-    """The same once the first frames have been drawn."""
-    end = time.monotonic() + 15
-    while (count := painted(page, canvas)) < 3001 and time.monotonic() < end:
-        time.sleep(0.05)
-    return count
+    """Return how many pixels of a canvas are not empty, once the first frames have been drawn."""
+    return soon(lambda: (count := page.evaluate(PAINTED, canvas)) > 3000 and count, 15)

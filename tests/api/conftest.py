@@ -31,7 +31,7 @@ from stimrig.api.web.app import create_app
 from stimrig.api.web.server import configuration
 from tests.api import thread_worker
 from tests.api.fake_rig import FakeRig, RigThread
-from tests.api.forms import read
+from tests.api.forms import Page
 from tests.harness.looks_first import LooksFirst
 
 TOKEN = "administrator-token-of-the-tests"
@@ -394,7 +394,7 @@ def signed_in(service: Service, token: str = TOKEN) -> Iterator[httpx.Client]:
 
 
 def csrf(browser: httpx.Client) -> str:
-    return read(browser.get("/").text).meta
+    return Page(browser.get("/").text).meta
 
 
 @pytest.fixture

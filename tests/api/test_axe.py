@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-import time
 import zlib
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -27,15 +25,10 @@ from tests.api.browser import (
     sign_in_with_token,
     start,
 )
-from tests.api.conftest import Service, play_test, shared_service
+from tests.api.conftest import Service, play_test, shared_service, soon
 
 axe_path = pytest.importorskip("axe_playwright_python.base").AXE_FILE_PATH
 pytestmark = pytest.mark.browser
-
-STICKING_OUT = """() => [...document.querySelectorAll('body *')].filter((e) => !e.closest('.scroll, .sr') &&
-  e.getBoundingClientRect().right > innerWidth + 1).slice(0, 5).map((e) => e.outerHTML.slice(0, 120))"""
-
-
 service = shared_service(speed=8.0)
 
 
@@ -51,49 +44,44 @@ def violations(page: Any) -> list[str]:
     ]
 
 
-def fits(page: Any, what: str) -> None:
-    """Nothing sticks out to the right, once the page is whole and the figures have taken the new width."""
+def examine(page: Any, what: str, stop: bool = True) -> None:
+    """Look at all sizes; axe takes one of two, chosen by the state's name: to run it is dear."""
+    look = (WIDE, PHONE)[zlib.crc32(re.sub(r"[0-9a-f-]{8,}|T[0-9-]+\w*", "", what).encode()) % 2]
     page.wait_for_load_state()
-    end = time.monotonic() + 8
-    while not page.evaluate("document.documentElement.scrollWidth <= innerWidth"):
-        assert time.monotonic() < end, (what, page.evaluate(STICKING_OUT))
-        page.wait_for_timeout(100)
+    for size in (WIDE, TABLET, ZOOMED, PHONE):
+        page.set_viewport_size({"width": size[0], "height": size[1]})
+        assert soon(lambda: page.evaluate("document.documentElement.scrollWidth <= innerWidth"), 8), (what, size)
+        assert size != look or violations(page) == [], (what, size)
+        for scroll in ("0", "document.body.scrollHeight") if stop else ():
+            page.evaluate(f"window.scrollTo(0, {scroll})")
+            assert page.evaluate(UNCOVERED) and page.locator("#stop").bounding_box()["height"] >= 44, (what, size)
 
 
-def examined(page: Any, what: str, stop: bool = True) -> None:
-    """All sizes are looked at; axe takes one of two, chosen by the state's name: to run it is dear."""
-    look = (WIDE, PHONE)[zlib.crc32(re.sub(r"[0-9a-f-]{8,}|T[0-9-]+\w*", "", what).encode()) % 2][0]
-    for width, height in (WIDE, TABLET, ZOOMED, PHONE):
-        page.set_viewport_size({"width": width, "height": height})
-        fits(page, f"{what} at {width}")
-        assert width != look or violations(page) == [], (what, width)
-        assert not stop or page.evaluate(UNCOVERED), (what, width)
-
-
-def visit(page: Any, service: Service, path: str, ready: Callable[[], Any] | None = None, stop: bool = True) -> None:
+def visit(page: Any, service: Service, path: str, *figures: str, stop: bool = True) -> None:
     page.set_viewport_size({"width": WIDE[0], "height": WIDE[1]})
     page.goto(service.url + path)
     settled(page)
-    if ready:
-        ready()
-    examined(page, path, stop)
+    for name in figures:
+        chart(page, name)
+    examine(page, path, stop)
 
 
 def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
-    visit(tab, service, "/")
+    for path in ("/", "/models/none"):
+        visit(tab, service, path)
     participant(tab, service, "X1")
     tab.get_by_label("Current of every pulse").fill("1.234,5")
     tab.get_by_role("button", name="Start the pre-session test").click()
     tab.get_by_text("is not a plain number").wait_for()
-    examined(tab, "limits refused")
+    examine(tab, "limits refused")
     tab.get_by_label("Current of every pulse").fill("20")
     tab.get_by_role("button", name="Start the pre-session test").click()
     tab.get_by_role("button", name="Start now").wait_for()
-    examined(tab, "before current flows")
+    examine(tab, "before current flows")
     tab.goto(service.url + "/participants/X1/calibration")
     tab.get_by_role("button", name="Begin the calibration").click()
     tab.locator("#step-up").wait_for()
-    examined(tab, "calibration")
+    examine(tab, "calibration")
     tab.get_by_role("button", name="Discard").click()
     for stranger in open_tab(browser, service, signed_in=False):
         visit(stranger, service, "/sign-in", stop=False)
@@ -102,7 +90,7 @@ def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
         stranger.get_by_label("Name of the controller").fill("ilc")
         stranger.get_by_role("button", name="Make the key").click()
         stranger.get_by_text("shown this once").wait_for()
-        examined(stranger, "a new key")
+        examine(stranger, "a new key")
 
 
 @pytest.mark.parametrize("scheme", ["light", pytest.param("dark", marks=pytest.mark.campaign)])
@@ -112,11 +100,11 @@ def test_a_test_and_its_ends(browser: Any, service: Service, scheme: str) -> Non
         participant(page, service, f"X2-{scheme}")
         start(page)
         page.locator("#age", has_text="ms").wait_for()
-        examined(page, "live")
+        examine(page, "live")
         service.rig.confirms_stop = False
         page.get_by_role("button", name="Stop stimulation").click()
         page.get_by_role("heading", name="The stop is not confirmed").wait_for()
-        examined(page, "not confirmed")
+        examine(page, "not confirmed")
     service.rig.speed = 8.0
 
 
@@ -129,7 +117,7 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: http
     for figure in ("comparison", "recruitment", "residual", "falling"):
         chart(tab, figure)
     look_closer(tab, "step")
-    examined(tab, "model, all open")
+    examine(tab, "model, all open")
     visit(tab, service, f"/models/{first}/report", stop=False)
     for path in (f"/compare?model={first}&model={added}", "/participants/X3/trend", f"/models/{first}/widths"):
         visit(tab, service, path)

@@ -11,7 +11,7 @@ import httpx
 import pytest
 
 from tests.api.conftest import Service, soon, wait_done
-from tests.api.forms import forms, press
+from tests.api.forms import Page, press
 from tests.api.test_problems import problem
 from tests.api.test_profiles import calibrate, mark_all
 
@@ -182,7 +182,9 @@ def test_the_page_says_that_it_goes_no_further(client: httpx.Client, pages: http
     assert client.put(PROFILE, json=LOWER).status_code == 200
     shown = pages.get(PAGE).text
     assert "P017 now has other limits (5 mA, 60 µs, 5 N·m)" in shown
-    calls = [(call, button) for form in forms(shown) for call, _, button in form.calls() if "/calibration/" in call]
+    calls = [
+        (call, button) for form in Page(shown).forms for call, _, button in form.calls() if "/calibration/" in call
+    ]
     assert len(calls) == 9
     assert [call for call, button in calls if button and not button.disabled] == [f"POST {WHERE}/discard"]
     for call, answer in (("/step", 409), ("/finish", 409), ("/discard", 200)):

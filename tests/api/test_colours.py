@@ -45,13 +45,13 @@ SURFACES = ("card", "paper", "soft", "chart")
 TEXT = [
     *((ink, surface) for surface in SURFACES for ink in ("ink", "dim", "accent")),
     *((ink, kind + "-bg") for kind in ("good", "warn", "bad") for ink in (kind, "ink", "dim")),
-    *((f"on-{name}", name) for name in ("unknown", "emulated")), ("on-strong", "stimulate"), ("on-strong", "stop"),
+    ("on-strong", "stimulate"), ("on-strong", "stop"),
     ("on-primary", "accent"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"), ("card", "good"),
 ]  # fmt: skip
 """Ink and what it stands on."""
 SEEN = [
-    *((part, surface) for part in ("edge", "focus", "stop", "stimulate", "accent") for surface in ("card", "paper")),
-    *((part, "card") for part in ("good", "warn", "cursor", "unknown")),
+    *((part, surface) for part in ("edge", "stop", "stimulate", "accent") for surface in ("card", "paper")),
+    *((part, "card") for part in ("good", "warn", "cursor")),
     *((f"series-{k}", "chart") for k in range(1, 7)),
     *((role, "chart") for role in ("measured", "model", "residual", "width", "rising", "falling", "limit", "worst")),
 ]  # fmt: skip

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import pytest
 
-from tests.api.browser import NAME, PASSWORD, expected, open_tab, settled
+from tests.api.browser import NAME, PASSWORD, expected, open_tab, settled, there
 from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 service = shared_service(speed=4.0)
-SEEN = """() => { const e = document.activeElement, s = getComputedStyle(e), b = e.getBoundingClientRect();
+FOCUSED = """() => { const e = document.activeElement, s = getComputedStyle(e), b = e.getBoundingClientRect();
   const label = e.labels && e.labels.length ? e.labels[0].textContent : e.getAttribute('aria-label') || e.textContent;
   return {names: [e.id, label.trim()], ring: s.outlineStyle !== 'none' && parseFloat(s.outlineWidth) >= 1,
           there: b.bottom > 0 && b.top < innerHeight, top: e === document.body}; }"""
@@ -30,7 +29,7 @@ class Hand:
         stops = self.page.locator("a, button, input, select, textarea, summary, [tabindex]").count() + 2
         for _ in range(stops):
             self.page.keyboard.press("Tab")
-            at = self.page.evaluate(SEEN)
+            at = self.page.evaluate(FOCUSED)
             assert at["top"] or (at["ring"] and at["there"]), at
             if any(text == name or text.startswith(f"{name}:") for text in at["names"]):
                 return
@@ -38,8 +37,7 @@ class Hand:
 
     def press(self, name: str) -> None:
         self.to(name)
-        self.page.keyboard.press("Enter")
-        self.count += 1
+        self.enter()
 
     def type(self, name: str, text: str) -> None:
         self.to(name)
@@ -51,22 +49,14 @@ class Hand:
         self.count += 1
 
 
-@pytest.fixture
-def hand(browser: Any, service: Service) -> Iterator[Hand]:
-    with service.client() as http:
-        http.post("/v1/users", json={"name": NAME, "password": PASSWORD})
-    for tab in open_tab(browser, service, signed_in=False):
-        yield Hand(tab)
-
-
 def sign_in(hand: Hand, service: Service) -> None:
     hand.page.goto(service.url)
     hand.page.locator("#name:focus").wait_for()  # it has the focus by itself
     hand.page.keyboard.type(NAME)
-    hand.count += 1
+    hand.count = 1
     hand.type("password", PASSWORD)
     hand.enter()
-    hand.page.get_by_role("heading", name="Participants").wait_for()
+    there(hand.page, "Participants")
 
 
 def calibrate(hand: Hand) -> None:
@@ -86,44 +76,42 @@ def calibrate(hand: Hand) -> None:
     page.get_by_text("Start the pre-session test").first.wait_for()
 
 
-def test_and_approve(hand: Hand) -> str:
+def play_and_approve(hand: Hand) -> None:
     """From the participant's page to an approved model; the model's page comes by itself."""
-    page = hand.page
     hand.press("Start the pre-session test")
-    page.get_by_role("heading", name="Start the pre-session test of").wait_for()
+    hand.page.get_by_role("heading", name="Start the pre-session test of").wait_for()
     hand.press("Start now")
-    page.wait_for_url("**/models/*")
+    hand.page.wait_for_url("**/models/*")
     hand.type("approve-password", PASSWORD)
     hand.enter()
-    page.get_by_text(f"Approved by {NAME}").first.wait_for()
-    return page.url.rpartition("/")[2].partition("#")[0]
+    hand.page.get_by_text(f"Approved by {NAME}").first.wait_for()
 
 
-test_and_approve.__test__ = False  # type: ignore[attr-defined]
-
-
-def test_from_signing_in_to_an_approved_model(hand: Hand, service: Service) -> None:
+def test_from_signing_in_to_an_approved_model(browser: Any, service: Service) -> None:
     """At most 12 presses with a new participant, 9 with a known one; the trains and answers of a calibration apart."""
+    with service.client() as http:
+        http.post("/v1/users", json={"name": NAME, "password": PASSWORD})
     (service.data / "recordings" / "nothing-missing").touch()
-    sign_in(hand, service)
-    hand.type("code", "D1")
-    hand.enter()
-    hand.page.get_by_role("heading", name="D1").wait_for()
-    settled(hand.page)
-    for name in ("Skip to content", "Stop stimulation"):
-        hand.page.keyboard.press("Tab")
-        assert hand.page.evaluate("document.activeElement.textContent.trim()") == name
-    calibrate(hand)
-    test_and_approve(hand)
-    assert hand.count == 10, "name, password, in; code, create; begin; start, now; password, approve"
-    hand.press("Sign out")
-    hand.page.get_by_role("heading", name="Sign in").wait_for()
-    hand.count = 0
-    sign_in(hand, service)
-    hand.press("D1")
-    hand.page.get_by_role("heading", name="D1").wait_for()
-    hand.press("Calibrate")  # it holds for today; the next day the line begins it, as above
-    hand.page.get_by_role("heading", name="Begin").wait_for()
-    hand.page.go_back()
-    test_and_approve(hand)
-    assert hand.count <= 9, "the one that looks at the calibration stands for the one that begins it"
+    for page in open_tab(browser, service, signed_in=False):
+        hand = Hand(page)
+        sign_in(hand, service)
+        hand.type("code", "D1")
+        hand.enter()
+        there(page, "D1")
+        settled(page)
+        for name in ("Skip to content", "Stop stimulation"):
+            page.keyboard.press("Tab")
+            assert page.evaluate("document.activeElement.textContent.trim()") == name
+        calibrate(hand)
+        play_and_approve(hand)
+        assert hand.count == 10, "name, password, in; code, create; begin; start, now; password, approve"
+        hand.press("Sign out")
+        page.get_by_role("heading", name="Sign in").wait_for()
+        sign_in(hand, service)
+        hand.press("D1")
+        there(page, "D1")
+        hand.press("Calibrate")  # it holds for today; the next day the line begins it, as above
+        page.get_by_role("heading", name="Begin").wait_for()
+        page.go_back()
+        play_and_approve(hand)
+        assert hand.count <= 9, "the one that looks at the calibration stands for the one that begins it"

@@ -8,12 +8,13 @@ from typing import Any
 
 import pytest
 
-from tests.api.browser import PASSWORD, expected, open_tab, participant, start
+from tests.api.browser import expected, open_tab, participant, start
 from tests.api.conftest import Service, play_test, shared_service, soon
 
 pytestmark = pytest.mark.browser
 service = shared_service()
-PAGES = ("/participants/{code}/calibration", "/models/{model}", "/tests/{test}", "/models/none")
+CONFIRMED = "The rig confirms that stimulation is off."
+NOT_STOPPED = "No answer to stop came. Use the emergency switch on the stimulator. Then press stop again."
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +26,7 @@ def ids(service: Service) -> dict[str, str]:
 
 
 @pytest.fixture
-def paced(browser: Any, service: Service) -> Iterator[Any]:
+def paced(browser: Any, service: Service, ids: dict[str, str]) -> Iterator[Any]:
     """A tab whose clock can be put forward: timers fire as after a machine has slept."""
     for tab in open_tab(browser, service):
         tab.clock.install()
@@ -34,46 +35,49 @@ def paced(browser: Any, service: Service) -> Iterator[Any]:
 
 
 def doubt(tab: Any) -> Any:
-    return tab.locator("#page-old")
+    return expected(tab.locator("#page-old"))
 
 
-def heard_of(tab: Any) -> None:
-    """The service has been asked, and has answered."""
+def go(tab: Any, address: str) -> None:
+    """Open a page, and wait until it has asked the service and heard an answer."""
+    tab.goto(address)
     expected(tab.locator("#rig-state [data-now=at]")).to_be_empty()
 
 
+def press_stop(tab: Any) -> None:
+    tab.get_by_role("button", name="Stop stimulation").click()
+
+
+@pytest.mark.parametrize("path", ["/participants/{code}/calibration", "/models/{model}", "/models/none"])
 def test_every_page_says_that_the_service_is_silent_and_that_it_is_back(
-    paced: Any, service: Service, ids: dict[str, str]
+    paced: Any, service: Service, ids: dict[str, str], path: str
 ) -> None:
-    for path in PAGES:
-        paced.goto(service.url + path.format(**ids))
-        heard_of(paced)
-        expected(doubt(paced)).to_be_hidden()
-        paced.context.set_offline(True)
-        paced.clock.fast_forward(3_000)
-        expected(doubt(paced)).to_contain_text(re.compile(r"has not answered since \S*\d\d:\d\d"))
-        expected(paced.locator("#rig-state")).to_contain_text("Unknown")
-        assert doubt(paced).bounding_box()["y"] < 400, "it is seen without scrolling"
-        paced.context.set_offline(False)
-        paced.clock.fast_forward(1_000)
-        expected(doubt(paced)).to_be_hidden()
+    go(paced, service.url + path.format(**ids))
+    doubt(paced).to_be_hidden()
+    paced.context.set_offline(True)
+    paced.clock.fast_forward(3_000)
+    doubt(paced).to_contain_text(re.compile(r"has not answered since \S*\d\d:\d\d"))
+    expected(paced.locator("#rig-state")).to_contain_text("Unknown")
+    assert paced.locator("#page-old").bounding_box()["y"] < 400, "it is seen without scrolling"
+    paced.context.set_offline(False)
+    paced.clock.fast_forward(1_000)
+    doubt(paced).to_be_hidden()
 
 
 def test_the_stop_button_stays_and_says_that_it_did_not_get_through(paced: Any, service: Service) -> None:
-    paced.goto(service.url + "/participants/O2")
-    heard_of(paced)
+    go(paced, service.url + "/participants/O2")
     paced.context.set_offline(True)
     paced.clock.fast_forward(3_000)
-    expected(doubt(paced)).to_contain_text("has not answered")
-    paced.get_by_role("button", name="Stop stimulation").click()
-    expected(doubt(paced)).to_contain_text("No answer to stop came. Use the emergency switch")
+    doubt(paced).to_contain_text("has not answered")
+    press_stop(paced)
+    doubt(paced).to_contain_text(NOT_STOPPED)
     assert service.rig.state == "ready"
     paced.context.set_offline(False)
     paced.clock.fast_forward(1_000)
     expected(paced.locator("#rig-state")).to_contain_text("No stimulation")
-    expected(doubt(paced)).to_contain_text("press stop again")
-    paced.get_by_role("button", name="Stop stimulation").click()
-    paced.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    doubt(paced).to_contain_text("press stop again")
+    press_stop(paced)
+    paced.get_by_text(CONFIRMED).wait_for()
 
 
 def test_a_stop_gets_through_where_only_the_state_is_not_heard_of(tab: Any, service: Service) -> None:
@@ -83,48 +87,42 @@ def test_a_stop_gets_through_where_only_the_state_is_not_heard_of(tab: Any, serv
     tab.route("**/rig/now", lambda route: route.abort())
     with service.client() as http:
         http.post("/v1/tests", json={"participant": "O2"})
-    expected(doubt(tab)).to_contain_text("has not answered")
-    tab.get_by_role("button", name="Stop stimulation").click()
-    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    doubt(tab).to_contain_text("has not answered")
+    press_stop(tab)
+    tab.get_by_text(CONFIRMED).wait_for()
     soon(lambda: service.rig.state == "latched")
     service.rig.speed = 30.0
 
 
 def test_a_stop_without_an_answer_says_so_in_time_and_can_be_pressed_again(paced: Any, service: Service) -> None:
-    paced.goto(service.url + "/participants/O2")
-    heard_of(paced)
+    go(paced, service.url + "/participants/O2")
     held: list[Any] = []
     paced.route("**/v1/stop", lambda route: held.append(route))  # and no answer ever
     paced.route("**/rig/now", lambda route: route.abort())
     paced.clock.fast_forward(3_000)
-    expected(doubt(paced)).to_contain_text("has not answered")
-    stop = paced.get_by_role("button", name="Stop stimulation")
-    for press in (1, 2):
-        stop.click()
-        expected(doubt(paced)).to_contain_text("Stop is being sent")
-        while len(held) < press:
+    doubt(paced).to_contain_text("has not answered")
+    for presses in (1, 2):
+        press_stop(paced)
+        doubt(paced).to_contain_text("Stop is being sent")
+        while len(held) < presses:
             paced.wait_for_timeout(20)
-        if press == 2:  # who presses on does not wait longer
-            paced.clock.fast_forward(4_000)
-            stop.click()
-            paced.clock.fast_forward(2_000)
-            assert "No answer to stop came" in doubt(paced).inner_text()  # now: the page's clock goes on by itself
-        else:
-            paced.clock.fast_forward(6_000)
-        expected(doubt(paced)).to_contain_text("No answer to stop came. Use the emergency switch on the stimulator.")
+        paced.clock.fast_forward(4_000)
+        if presses == 2:  # who presses on does not wait longer
+            press_stop(paced)
+        paced.clock.fast_forward(2_000)
+        doubt(paced).to_contain_text(NOT_STOPPED)
     paced.unroute("**/v1/stop")
-    stop.click()
-    paced.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    press_stop(paced)
+    paced.get_by_text(CONFIRMED).wait_for()
 
 
 def test_after_an_hour_of_sleep_the_page_says_how_old_it_is(paced: Any, service: Service, ids: dict[str, str]) -> None:
-    paced.goto(f"{service.url}/models/{ids['model']}")
-    heard_of(paced)
+    go(paced, f"{service.url}/models/{ids['model']}")
     paced.clock.fast_forward("01:00:00")
-    expected(doubt(paced)).to_contain_text("heard nothing from")
+    doubt(paced).to_contain_text("heard nothing from")
     paced.evaluate("window.same = true")
-    doubt(paced).get_by_role("button", name="Show it anew").click()
-    expected(doubt(paced)).to_be_hidden()
+    paced.get_by_role("button", name="Show it anew").click()
+    doubt(paced).to_be_hidden()
     assert paced.evaluate("window.same === undefined")
 
 
@@ -146,16 +144,12 @@ def test_a_test_that_went_on_or_ended_while_the_laptop_slept(paced: Any, service
 
 
 def test_a_session_that_ended_is_told_with_the_way_back(tab: Any, service: Service) -> None:
-    tab.goto(service.url + "/participants/O2?x=1")
-    heard_of(tab)
+    go(tab, service.url + "/participants/O2?x=1")
     other = tab.context.new_page()
     other.goto(service.url + "/")
     other.get_by_role("button", name="Sign out").click()
     other.get_by_role("heading", name="Sign in").wait_for()
-    expected(doubt(tab)).to_contain_text("You have been signed out.")
-    doubt(tab).get_by_role("link", name="Sign in").click()
-    tab.get_by_label("Name", exact=True).fill("Ada")
-    tab.get_by_label("Password").fill(PASSWORD)
-    tab.get_by_role("button", name="Sign in", exact=True).click()
-    tab.wait_for_url("**/participants/O2?x=1")
+    doubt(tab).to_contain_text("You have been signed out.")
+    way = tab.locator("#page-old").get_by_role("link", name="Sign in").get_attribute("href")
+    assert way == "/sign-in?next=/participants/O2%3Fx%3D1"
     other.close()

@@ -10,7 +10,7 @@ import pytest
 from stimrig.api.client.decisions import document_of
 from tests.api.conftest import HTML, Service, play_test, shared_service
 from tests.api.fake_arm import still
-from tests.api.forms import Control, Form, forms
+from tests.api.forms import Control, Form, Page
 from tests.api.test_profiles import calibrate
 from tests.api.test_verdict import make_poor
 
@@ -90,7 +90,7 @@ def test_every_button_calls_a_route_with_its_fields_and_on_a_version(service: Se
         for address in addresses:
             answer = client.get(address)
             assert answer.status_code == 200, (address, answer.status_code)
-            for form in forms(answer.text):
+            for form in Page(answer.text).forms:
                 for call, given, button in form.calls():
                     method, _, path = call.partition(" ")
                     calls.add(f"{method} {re.sub(r'[?].*', '', path)}")
