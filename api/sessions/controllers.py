@@ -12,7 +12,7 @@ from pydantic import Field, FiniteFloat, StringConstraints
 from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Auth, Principal, Scope, outside
-from stimrig.api.sessions.playing import Requester
+from stimrig.api.sessions.playing import Requester, refuse_archived
 from stimrig.api.sessions.profiles import LIMITS
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
@@ -50,17 +50,6 @@ class KeyFor(PlanIn):
     """A key's name and plan."""
 
     name: Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_. -]{1,60}$")]
-
-
-def plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
-    """Return the plan to store with the key. Raises ApiError: 422 wider than the participant's limits."""
-    for name in LIMITED:
-        value, limit = getattr(plan, name), participant.profile.get(name)
-        if limit is None or not value <= limit:
-            unit = LIMITS[name].unit
-            detail = f"{LIMITS[name].words}: {value:g} {unit} is above the limit of today, {limit or 0:g} {unit}."
-            raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
-    return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
 
 
 async def start(runner: Runner, principal: Principal, body: TestIn, tags: Tags | None) -> Test:
@@ -168,37 +157,44 @@ KEY_SCOPES = [Scope.READ_MODEL, Scope.READ_LIVE, Scope.RUN_TEST]
 """The scopes of a key; `stimrig.api.web.guards` restricts which calls they open."""
 
 
-def refuse_maker_without(maker: Principal) -> None:
-    """Raise 403 where the maker lacks a scope of the key: a key never has more rights than its maker."""
-    lacking = [str(scope) for scope in KEY_SCOPES if not maker.may(scope)]
-    if lacking:
+def make_key(auth: Auth, maker: Principal, participant: str, body: KeyFor, tags: Tags | None) -> tuple[str, Token, int]:
+    """Make a key that ends with its day: its text, shown this once, its row, and the participant's new version.
+
+    Once the token of who makes it is revoked or has expired, the key opens nothing.
+
+    Raises ApiError: 403 who makes it lacks a scope of the key; 404 no such participant; 409 archived; 412 changed since
+    it was seen; 422 the plan is wider than the participant's limits.
+    """
+    if lacking := [str(scope) for scope in KEY_SCOPES if not maker.may(scope)]:
         held_by_key = ", ".join(KEY_SCOPES)
         detail = f"A key holds {held_by_key}. Who makes one holds them all; {maker.name} lacks {', '.join(lacking)}."
         raise forbidden(detail)
-
-
-def make_key(
-    auth: Auth, name: str, participant: str, plan: dict[str, Any], by: str, made_by: str | None = None,
-    tags: Tags | None = None,
-) -> tuple[str, Token, int]:  # fmt: skip
-    """Make a key that ends with its day: its text, shown this once, its row, and the participant's new version.
-
-    `name`: of the controller; the row's is made unique, since tests are counted by it. `made_by`: hash of the token of
-    who makes it: once that is revoked or has expired, the key opens nothing. `tags`: versions of the participant.
-    """
     text, now = f"stimrig_{secrets.token_urlsafe(32)}", auth.clock.utc()
-    row = Token(
-        hash=digest(text), prefix=text[:12], name=f"{name} ({digest(text)[:6]})", created_utc=now,
-        participant=participant, plan=plan, scopes=[str(scope) for scope in KEY_SCOPES], made_by=made_by,
-        expires_utc=auth.clock.end_of_day_utc(),
-    )  # fmt: skip
     with auth.store.write() as session:
         person = require_found(session.get(Participant, participant), "participant", participant)
+        refuse_archived(person)
         locking.check(session, person, tags)
+        row = Token(
+            hash=digest(text), prefix=text[:12], created_utc=now, expires_utc=auth.clock.end_of_day_utc(),
+            name=f"{body.name} ({digest(text)[:6]})",  # unique, since tests are counted by it
+            participant=participant, plan=_plan_within(body, person), scopes=[str(scope) for scope in KEY_SCOPES],
+            made_by=maker.token_hash,
+        )  # fmt: skip
         session.add(row)
-        bound = {"participant": participant, "plan": plan, "until": row.expires_utc}
-        locking.write(session, person, now, by, "issue token", row.name, scopes=row.scopes, **bound)
+        bound = {"participant": participant, "plan": row.plan, "until": row.expires_utc}
+        locking.write(session, person, now, maker.name, "issue token", row.name, scopes=row.scopes, **bound)
     return text, row, person.version
+
+
+def _plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
+    """Return the plan to store with the key; refuse one that is wider than the participant's limits."""
+    for name in LIMITED:
+        value, limit = getattr(plan, name), participant.profile.get(name)
+        if limit is None or not value <= limit:
+            unit = LIMITS[name].unit
+            detail = f"{LIMITS[name].words}: {value:g} {unit} is above the limit of today, {limit or 0:g} {unit}."
+            raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
+    return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
 
 
 def keys_of(auth: Auth, participant: str) -> list[dict[str, Any]]:

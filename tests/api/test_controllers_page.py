@@ -16,7 +16,6 @@ from pathlib import Path
 import httpx
 import pytest
 
-from stimrig.api.sessions import controllers
 from tests.api.browser import bring_to_rest
 from tests.api.conftest import REAL, Service, run_service, soon
 from tests.api.test_jobs import made_up_csv
@@ -24,8 +23,7 @@ from tests.harness.c_program import compiled
 
 ROOT = Path(__file__).parents[2]
 TEXT = (ROOT / "docs" / "controllers.md").read_text("utf-8")
-PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 30.0, "trials": 9,
-        "site": [None, None, None]}  # fmt: skip
+PLAN = {"current_ma": 20.0, "max_pulse_width_us": 300.0, "max_duration_s": 30.0, "trials": 9}
 
 
 def blocks(language: str, text: str = TEXT) -> list[str]:
@@ -47,8 +45,12 @@ def served(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterato
         with service.client(timeout=120) as admin:
             admin.post("/v1/participants", json={"code": "P017"})
             approve(admin, weaker(made_up_csv(folder / "record.csv"), 0.87))
-        text, *_ = controllers.make_key(service.context.auth, "page", "P017", PLAN, "test")
-        yield service, text
+        yield service, key_of(service, "page")
+
+
+def key_of(service: Service, name: str) -> str:
+    with service.client() as admin:
+        return admin.post("/v1/participants/P017/keys", json={"name": name, **PLAN}).json()["key"]
 
 
 def approve(admin: httpx.Client, recording: bytes) -> None:
@@ -122,8 +124,7 @@ def learner(served: tuple[Service, str], program: str) -> tuple[tuple[Service, s
     """A key of its own, and the page's lines for a program."""
     skip_without(program)
     (lines,) = [block for block in blocks("bash") if f"ten_minutes/{program}" in block]
-    text, *_ = controllers.make_key(served[0].context.auth, program, "P017", PLAN, "test")
-    return (served[0], text), ["export URL KEY", lines]
+    return (served[0], key_of(served[0], program)), ["export URL KEY", lines]
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ import pytest
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import Scope
-from stimrig.api.sessions import controllers
 from stimrig.api.sessions import playing as playing_module
 from stimrig.api.store import Store, locking
 from stimrig.api.store.tables import Participant, Token
@@ -150,21 +149,6 @@ def test_why_a_model_was_decided_on_is_told_to_nobody_who_only_tests(
     assert (change["who"], change["subject"], change["old"], change["new"]) == (
         "administrator", approved, "approve", "reject"
     )  # fmt: skip
-
-
-def test_a_key_is_refused_also_where_the_change_comes_behind_the_first_check(
-    service: Service, client: httpx.Client, participant: str, approved: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    make_key = controllers.make_key
-
-    def overtaken(*given: Any) -> Any:
-        assert client.put(f"{HOME}/profile", json={"max_torque_nm": 12}).is_success
-        return make_key(*given)
-
-    monkeypatch.setattr(controllers, "make_key", overtaken)
-    tag = client.get(HOME).headers["etag"]
-    assert client.post(f"{HOME}/keys", json=KEY, headers={"If-Match": tag}).status_code == 412
-    assert not [token for token in client.get("/v1/tokens").json() if token["name"].startswith("ilc")] and approved
 
 
 # ---- the angle sensor and the calibration -------------------------------------------------------------------------

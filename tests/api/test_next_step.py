@@ -9,7 +9,6 @@ from typing import Any
 import httpx
 import pytest
 
-from stimrig.api.sessions import controllers
 from stimrig.api.store.tables import Model, Test
 from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.next_view import Situation, next_step
@@ -149,7 +148,7 @@ def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service,
     second = run_test(client, participant)["model_id"]
     client.post(f"/v1/models/{second}/approve")
     assert shown(service) == shown(service, f"/models/{second}") == KEYLESS_NOW
-    controllers.make_key(service.context.auth, "arm", participant, PLAN, "test")
+    assert client.post(f"/v1/participants/{participant}/keys", json={"name": "arm", **PLAN}).status_code == 201
     assert shown(service) == shown(service, f"/models/{second}") == DONE_NOW
     better = client.post(f"/v1/models/{second}/effects", json={"effects": ["fatigue"]}).json()["id"]
     assert shown(service)[0] == f"look {better}"

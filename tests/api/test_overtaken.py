@@ -76,9 +76,11 @@ TRIAL = {"kind": "sequence", "segments": [
     {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [0, 100, 150] * 20}}]}  # fmt: skip
 
 
-def key_of(service: Service, client: httpx.Client, participant: str) -> tuple[str, httpx.Client]:
+def key_of(
+    service: Service, client: httpx.Client, participant: str, maker: httpx.Client | None = None
+) -> tuple[str, httpx.Client]:
     """A controller's key of the participant: its public id, and a client with it."""
-    made = client.post(f"/v1/participants/{participant}/keys", json=PLAN)
+    made = (maker or client).post(f"/v1/participants/{participant}/keys", json=PLAN)
     assert made.status_code == 201, made.text
     return made.json()["id"], service.client(made.json()["key"])
 

@@ -172,7 +172,7 @@ def participant_key(
     Who makes it holds `run-test`, `read-live` and `read-model`, too, and answers for what it plays. Its text is shown
     this once. `DELETE /v1/participants/{code}/keys/{id}` revokes it.
     """
-    text, row, version = keys.make(context, principal, code, body, tags)
+    text, row, version = controllers.make_key(context.auth, principal, code, body, tags)
     response.headers["ETag"] = f'"{version}"'
     fields = ("name", "prefix", "scopes", "expires_utc", "participant", "plan")
     return {"key": text, "id": row.hash[:16], **{name: getattr(row, name) for name in fields}}
