@@ -71,20 +71,10 @@ def svg(
     figure: Figure, width: float = 720.0, height: float | None = None, label: str = "", light: bool = False,
     right: float = 0.0,
 ) -> Markup:  # fmt: skip
-    """Draw a figure as an SVG element.
+    """Draw a figure as an SVG element of some `width` and `height`, with room on the `right` (px).
 
-    Parameters
-    ----------
-    figure : Figure
-        What is drawn.
-    width, height : float
-        px; default height: the figure's.
-    label : str
-        Text alternative; without one the element is hidden from screen readers, and what stands around it says it.
-    light : bool
-        In light colours on their ground, for paper and files; else the page's style sheet gives the colours.
-    right : float
-        px; room on the right.
+    Its colours are those of the page's style sheet, or `light` ones on their ground, for paper and files. `label`: text
+    alternative; without one the element is hidden from screen readers, and what stands around it says it.
     """
     height = height or figure["layout"]["height"]
     body = _draw("light" if light else "page", json.dumps(figure), width, height, right).decode()
@@ -170,7 +160,8 @@ def _lay_out(figure: Figure, width: float, height: float, right: float, colours:
     for shape in layout["shapes"]:
         _draw_shape(shape, panels, colours)
     for note in layout["annotations"]:
-        _draw_note(note, panels[0], colours, width)
+        if "bgcolor" in note or width >= NARROW:
+            _draw_note(note, panels[0], colours)
     for setting, axes in zip(settings, panels, strict=True):
         last, label = axes is panels[-1], setting["title"]["text"]
         axes.patch.set_visible(False)
@@ -235,14 +226,11 @@ def _draw_shape(shape: dict[str, Any], panels: Sequence[Any], colours: Mapping[s
                        ha="right" if right else "left")  # fmt: skip
 
 
-def _draw_note(note: dict[str, Any], axes: Any, colours: Mapping[str, Any], width: float) -> None:
-    is_badge = "bgcolor" in note
-    if width < NARROW and not is_badge:
-        return
-    style: dict[str, Any] = {"color": colours[note["font"]["color"]], "va": "top" if is_badge else "bottom"}
-    if is_badge:
-        style["bbox"] = {"facecolor": colours[note["bgcolor"]], "edgecolor": "none", "pad": 3}
-    axes.annotate(note["text"], (note["x"], 1), (0, -6 if is_badge else 3), ("data", "axes fraction"), "offset points",
+def _draw_note(note: dict[str, Any], axes: Any, colours: Mapping[str, Any]) -> None:
+    style: dict[str, Any] = {"color": colours[note["font"]["color"]], "va": "bottom"}
+    if ground := note.get("bgcolor"):
+        style |= {"va": "top", "bbox": {"facecolor": colours[ground], "edgecolor": "none", "pad": 3}}
+    axes.annotate(note["text"], (note["x"], 1), (0, -6 if ground else 3), ("data", "axes fraction"), "offset points",
                   ha="center", annotation_clip=False, **style)  # fmt: skip
 
 

@@ -64,20 +64,9 @@ def figure(
     shapes: Sequence[dict[str, Any]] = (), names: Sequence[dict[str, Any]] = (), height: float = 340.0,
     shares: Sequence[float] = (1.0,),
 ) -> Figure:  # fmt: skip
-    """Put a figure together: panels one above another over one x axis.
+    """Put a figure of some `height` (px) together: panels one above another, with `shares` of it, over one x axis.
 
-    Parameters
-    ----------
-    x, panels : dict
-        Axes, of `axis`.
-    traces : sequence of dict
-        Of `curve` and `band`.
-    shapes, names : sequence of dict
-        Of `shade`, `level` and `rule`; of `name` and `badge`.
-    height : float
-        px.
-    shares : sequence of float
-        Heights of the panels relative to one another.
+    `traces`: of `curve` and `band`; `shapes`: of `shade`, `level` and `rule`; `names`: of `name` and `badge`.
     """
     legend, above = sum(trace["showlegend"] for trace in traces) > 1, 18 if names else 0
     top = (30 if legend else 10) + above
@@ -180,37 +169,37 @@ def band(
     return [edge, {**edge, "y": list(lower), **fill}]
 
 
+def _over_all_panels(start: float, end: float) -> dict[str, Any]:
+    return {"xref": "x", "yref": "paper", "x0": start, "x1": end, "y0": 0, "y1": 1}
+
+
+def _over_all_x(low: float, high: float, panel: int) -> dict[str, Any]:
+    return {"xref": "paper", "yref": _axis_id("y", panel), "x0": 0, "x1": 1, "y0": low, "y1": high}
+
+
 def shade(colour: str, start: float, end: float) -> dict[str, Any]:
     """Return a stretch of x over all panels."""
-    return _rectangle(colour, {"xref": "x", "yref": "paper", "x0": start, "x1": end, "y0": 0, "y1": 1})
+    style = {"fillcolor": variable(colour), "line": {"width": 0}, "layer": "below"}
+    return {"type": "rect", **_over_all_panels(start, end), **style}
 
 
 def level(colour: str, low: float, high: float, panel: int = 0) -> dict[str, Any]:
     """Return a range of one panel's values over all x."""
-    place = {"xref": "paper", "yref": _axis_id("y", panel), "x0": 0, "x1": 1, "y0": low, "y1": high}
-    return _rectangle(colour, place)
-
-
-def _rectangle(colour: str, place: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "rect", **place, "fillcolor": variable(colour), "line": {"width": 0}, "layer": "below"}
+    return {**shade(colour, 0, 1), **_over_all_x(low, high, panel)}
 
 
 def rule(at: float, words: str = "", colour: str = "limit", *, upright: bool = False, right: bool = False) -> Figure:
     """Return a dashed line at a value of the first panel, or upright at a place on the x axis, with its words."""
-    place = {"xref": "paper", "yref": "y", "x0": 0, "x1": 1, "y0": at, "y1": at}
-    if upright:
-        place = {"xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1}
-    where = {"textposition": "end" if right else "start", "yanchor": "bottom", "textangle": 0}
-    label = {"text": text(words), "font": {"color": variable(colour)}, **where}
-    line = {"color": variable(colour), "width": 1.6, "dash": "dash"}
-    return {"type": "line", **place, "line": line, "label": label}
+    place, position = _over_all_panels(at, at) if upright else _over_all_x(at, at, 0), "end" if right else "start"
+    label = {"text": text(words), "font": {"color": variable(colour)}, "textposition": position, "yanchor": "bottom",
+             "textangle": 0}  # fmt: skip
+    return {"type": "line", **place, "line": {"color": variable(colour), "width": 1.6, "dash": "dash"}, "label": label}
 
 
 def name(x: float, words: str) -> dict[str, Any]:
     """Return a name above the panels."""
-    font = {"size": 12, "color": variable("mark")}
     return {"xref": "x", "yref": "paper", "x": x, "y": 1.0, "yanchor": "bottom", "showarrow": False,
-            "text": text(words), "font": font}  # fmt: skip
+            "text": text(words), "font": {"size": 12, "color": variable("mark")}}  # fmt: skip
 
 
 def badge(x: float, words: str, colour: str) -> dict[str, Any]:

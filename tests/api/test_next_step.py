@@ -31,10 +31,8 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({**RUNS, **READY}, "running", "The test is running", "/tests/T1"),
     ({**RUNS, "rig": "stopping"}, "running", "is being stopped", "/tests/T1"),
     ({**RUNS, "rig": "unreachable"}, "running", "last heard of", "/tests/T1"),
-    ({**RUNS, "rig": "silent"}, "running", "last heard of", "/tests/T1"),
     ({**RUNS, "state": "sealing"}, "identifying", "is being saved", "/tests/T1"),
     ({**TRIAL, **RUNS}, "running", "The controller plays a trial.", "/tests/T1"),
-    ({**TRIAL, **RUNS, "state": "sealing"}, "identifying", "is being saved", "/tests/T1"),
     ({"state": "identifying", "test": "T1"}, "identifying", "is being made", "/tests/T1"),
     ({"state": "identifying", "test": "T1", "rig": "silent"}, "identifying", "is being made", "/tests/T1"),
     ({"rig": "running", "holder": "P2"}, "wait", "in use for P2", ""),
@@ -54,19 +52,14 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({**SERVED, "holder": "P2", "rig": "running"}, "done", "until 23:59", "/"),
     ({**SERVED, "rig": "latched"}, "rearm", "until 23:59. The rig has stopped and needs a re-arm", ""),
     ({**SERVED, "rig": "silent"}, "wait", "until 23:59. The rig does not answer", ""),
-    ({**SERVED, "rig": "disconnected"}, "wait", "until 23:59. A device is not connected", ""),
     ({**SERVED, **POOR}, "done", "until 23:59", "/"),
     ({**SERVED, "state": "stopped"}, "done", "The last test was stopped. The controller has", "/"),
     ({**TRIAL, "state": "completed"}, "done", "Done. The controller has", "/"),
     ({**TRIAL, "state": "stopped"}, "done", "The last trial was stopped. The controller has", "/"),
-    ({**TRIAL, "state": "fault"}, "done", "The last trial ended by a fault.", "/"),
-    ({**TRIAL, "state": "refused"}, "done", "The last trial was not started.", "/"),
     ({**TRIAL, "state": "failed"}, "done", "The last trial was not finished.", "/"),
     ({**SERVED, "needs_test": True}, "asked", "new test is needed", "/participants/P1#trials"),
-    ({**SERVED, "needs_test": True, "rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({**SERVED, "of": "joint", "state": "completed"}, "joint", "Go on with", "/participants/P1/joint"),
     # nothing to serve
-    ({"needs_test": True}, "test", "Start the pre-session test", "form"),
     ({"of": "trial", "state": "stopped"}, "test", "trial was stopped. Calibrated. Start", "form"),
     ({"of": "joint", "state": "completed"}, "joint", "Go on with the tests of the joint", "/participants/P1/joint"),
     ({"of": "joint", "state": "stopped"}, "joint", "was stopped. Go on with", "/participants/P1/joint"),
@@ -75,7 +68,6 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({**POOR, "calibration": "expired"}, "calibrate", "not usable. The last", "form"),
     (REJECTED, "again", "was rejected. Test again", "form"),
     ({"state": "stopped"}, "again", "was stopped. Test again", "form"),
-    ({"state": "stopped", "rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({"state": "fault"}, "again", "ended by a fault", "form"),
     ({"state": "refused"}, "again", "was not started", "form"),
     ({"state": "failed"}, "again", "gave no model", "form"),
@@ -83,11 +75,9 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     ({"rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({"rig": "uncertain"}, "rearm", "needs a re-arm", ""),
     ({"archived_since": "today"}, "archived", "In the archive since today", "form"),
-    ({"archived_since": "today", "rig": "latched"}, "archived", "no test starts", "form"),
     ({"archived_since": "today", **READY}, "archived", "no test starts", "form"),
     ({"archived_since": "today", **RUNS}, "running", "is running", "/tests/T1"),
     ({"rig": "disconnected"}, "wait", "not connected", ""),
-    ({"rig": "unreachable"}, "wait", "does not answer", ""),
     ({"rig": "silent"}, "wait", "does not answer", ""),
 ]  # fmt: skip
 
@@ -112,7 +102,7 @@ def test_keys_change_with_what_is_shown_and_with_nothing_else() -> None:
     """A page that shows one line and hears of another key is out of date."""
     steps = [next_step(Situation("P1", **so)) for so, *_ in TABLE]
     shown = {(step.kind, step.words, step.button, step.href): step.key for step in steps}
-    assert len(set(shown.values())) == len(shown) > 40
+    assert len(set(shown.values())) == len(shown) > 35
     assert all(step.key == shown[step.kind, step.words, step.button, step.href] for step in steps)
 
 
@@ -154,13 +144,12 @@ def test_the_line_goes_from_test_to_done(client: httpx.Client, service: Service,
     assert shown(service)[0] == f"look {better}"
     client.post(f"/v1/models/{better}/reject")
     assert shown(service) == DONE_NOW
-
-
-def test_a_model_of_another_day_is_not_todays(client: httpx.Client, service: Service, participant: str) -> None:
-    document = run_test(client, participant)
-    service.change(Model, document["model_id"], created_utc="2026-01-02T10:00:00.000Z")
-    service.change(Test, document["id"], requested_utc="2026-01-02T09:00:00.000Z")
-    assert shown(service)[0] == "calibrate"
+    for document in service.context.store.all(Test):
+        service.change(Test, document.id, requested_utc="2026-01-02T09:00:00.000Z")
+    for version in service.context.store.all(Model):
+        service.change(Model, version.id, created_utc="2026-01-02T10:00:00.000Z")
+    client.post(f"/v1/models/{second}/reject")
+    assert shown(service)[1].startswith("Calibrate for today"), "models of another day are not today's"
 
 
 def test_of_two_versions_of_a_test_the_offered_one_is_next(client: httpx.Client, service: Service, participant: str):
