@@ -34,6 +34,7 @@ def test_every_figure_stands_in_the_docs_and_tells_nothing_of_anybody(
     assert [labels["state"] for labels, value in there["stimrig_rig_state"] if value] == ["latched"]
     assert {labels["quantile"] for labels, _ in there["stimrig_pulse_lateness_seconds"]} == {"0.5", "0.99", "1"}
     assert participant not in text and "typed by" not in text
+    assert participant not in client.get("/health", headers={"Authorization": ""}).text
     labels = {key for samples in there.values() for one, _ in samples for key in one}
     assert labels == {"state", "outcome", "quantile", "version", "le"}
     page = (Path(__file__).parents[2] / "docs" / "operation.md").read_text("utf-8")

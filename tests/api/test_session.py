@@ -164,14 +164,6 @@ def test_database_is_durable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     store.close()
 
 
-@pytest.mark.parametrize("path", ["/health", "/metrics"])
-def test_operation_needs_no_token_and_names_nobody(service: Service, participant: str, path: str) -> None:
-    with service.client(token=None) as stranger:
-        answer = stranger.get(path)
-    assert answer.status_code == 200
-    assert participant not in answer.text
-
-
 def test_version_with_other_contents_is_refused_and_the_old_one_stays(tmp_path: Path) -> None:
     clinic = Clinic(tmp_path)
     row = clinic.model()
