@@ -77,14 +77,9 @@ def copied_before(database: str | None, current: str | None) -> Iterator[None]:
 
 
 def refuse_incomplete(connection: Connection) -> None:
-    """Raise SchemaError if a table or a column of `stimrig.api.store.tables` is missing in the database."""
+    """Raise SchemaError if a column of `stimrig.api.store.tables` is missing in the database."""
     inspected = inspect(connection).get_multi_columns()
-    existing = {table: {column["name"] for column in columns} for (_, table), columns in inspected.items()}
-    for table in Table.metadata.sorted_tables:
-        if table.name not in existing:
-            problem = f"there is no table {table.name}"
-        elif missing := [column.name for column in table.columns if column.name not in existing[table.name]]:
-            problem = f"table {table.name} lacks {missing[0]}"
-        else:
-            continue
-        raise SchemaError(f"{problem}; restore the database from a backup")
+    existing = {f"{table}.{column['name']}" for (_, table), columns in inspected.items() for column in columns}
+    expected = [str(column) for table in Table.metadata.sorted_tables for column in table.columns]
+    if missing := [column for column in expected if column not in existing]:
+        raise SchemaError(f"there is no column {missing[0]}; restore the database from a backup")

@@ -28,35 +28,22 @@ def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
     return body
 
 
-@pytest.mark.parametrize(
-    ("body", "field"),
-    [
-        ({"code": "Anna Schmidt"}, "code"),
-        ({"code": "x" * 33}, "code"),
-        ({"code": ""}, "code"),
-        ({"code": "P1\n"}, "code"),
-        ({}, "code"),
-        ({"code": "P1", "name": "Anna"}, "name"),
-        ({"code": "P1", "profile": {"current_ma": -1}}, "profile.current_ma"),
-        ({"code": "P1", "profile": {"max_pulse_width_us": "wide"}}, "profile.max_pulse_width_us"),
-    ],
-)
+@pytest.mark.parametrize(("body", "field"), [
+    ({"code": "Anna Schmidt"}, "code"), ({"code": "x" * 33}, "code"), ({"code": ""}, "code"), ({"code": "P1\n"}, "code"),
+    ({}, "code"), ({"code": "P1", "name": "Anna"}, "name"),
+    ({"code": "P1", "profile": {"current_ma": -1}}, "profile.current_ma"),
+    ({"code": "P1", "profile": {"max_pulse_width_us": "wide"}}, "profile.max_pulse_width_us"),
+])  # fmt: skip
 def test_participant_that_does_not_hold(shared_client: httpx.Client, body: dict[str, Any], field: str) -> None:
     found = problem(shared_client.post("/v1/participants", json=body), 422)
     assert field in [error["field"] for error in found["errors"]]
     assert shared_client.get("/v1/participants").json() == []
 
 
-@pytest.mark.parametrize(
-    ("method", "path", "status"),
-    [
-        ("GET", "/nowhere", 404),
-        ("DELETE", "/v1/participants", 405),
-        ("GET", "/v1/tests/T1", 404),
-        ("GET", "/static/../app.py", 404),
-        ("GET", "/static/app.py", 404),
-    ],
-)
+@pytest.mark.parametrize(("method", "path", "status"), [
+    ("GET", "/nowhere", 404), ("DELETE", "/v1/participants", 405), ("GET", "/v1/tests/T1", 404),
+    ("GET", "/static/../app.py", 404), ("GET", "/static/app.py", 404),
+])  # fmt: skip
 def test_what_is_not_there(shared_client: httpx.Client, method: str, path: str, status: int) -> None:
     problem(shared_client.request(method, path), status)
 
