@@ -29,8 +29,8 @@ def problem(answer: httpx.Response, status: int) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("body", "field"), [
-    ({"code": "Anna Schmidt"}, "code"), ({"code": "x" * 33}, "code"), ({"code": ""}, "code"), ({"code": "P1\n"}, "code"),
-    ({}, "code"), ({"code": "P1", "name": "Anna"}, "name"),
+    ({"code": "Anna Schmidt"}, "code"), ({"code": "x" * 33}, "code"), ({"code": ""}, "code"), ({}, "code"),
+    ({"code": "P1\n"}, "code"), ({"code": "P1", "name": "Anna"}, "name"),
     ({"code": "P1", "profile": {"current_ma": -1}}, "profile.current_ma"),
     ({"code": "P1", "profile": {"max_pulse_width_us": "wide"}}, "profile.max_pulse_width_us"),
 ])  # fmt: skip
