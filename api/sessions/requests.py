@@ -82,23 +82,12 @@ class Body(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-class FirstProfileIn(Body):
-    """A participant's first limits; the rig's hard limits hold besides. All of them, or none: no part is made up."""
-
-    current_ma: CurrentMa
-    max_pulse_width_us: WidthUs
-    max_torque_nm: TorqueNm
-    angle_range_rad: RangeRad | None = None
-
-
-FIRST_PROFILE = FirstProfileIn(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0)
-"""Limits of a new participant until a person sets them or calibrates."""
 KEPT: Any = None
 """Default of a limit that keeps its value where it is left out; null is refused as no number."""
 
 
 class ProfileIn(Body):
-    """Some of a participant's limits; one that is left out keeps its value."""
+    """Some of a participant's limits; one that is left out keeps its value. First ones are all set, or none."""
 
     current_ma: CurrentMa = KEPT
     max_pulse_width_us: WidthUs = KEPT
@@ -108,6 +97,10 @@ class ProfileIn(Body):
     def sent(self) -> dict[str, Any]:
         """Return the sent limits in the form of a profile."""
         return self.model_dump(mode="json", exclude_unset=True)
+
+
+FIRST_PROFILE = ProfileIn(current_ma=20.0, max_pulse_width_us=300.0, max_torque_nm=30.0)
+"""Limits of a new participant until a person sets them or calibrates."""
 
 
 class SegmentIn(Body):
@@ -314,7 +307,7 @@ class ParticipantIn(MuscleIn):
     """A new participant, and its site."""
 
     code: Code
-    profile: FirstProfileIn = Field(default=FIRST_PROFILE)
+    profile: ProfileIn = FIRST_PROFILE
 
 
 class RanByIn(Body):
