@@ -8,7 +8,7 @@ from typing import Annotated, Any
 from pydantic import Field, FiniteFloat, StrictBool, model_validator
 
 from stimrig.api.services.context import Context
-from stimrig.api.sessions.requests import Body, tighter
+from stimrig.api.sessions.requests import Body
 from stimrig.api.store.tables import Participant
 
 RISE = "width_rise_us"
@@ -92,3 +92,8 @@ async def invert(context: Context, model_id: str, body: ReferenceIn) -> dict[str
     trial = {"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": inverted["pulse_width_us"]}}
     limits = {"max_pulse_width_us": largest_us, "max_rise_us": rise_us, "shortest_pulse_us": shortest_us}
     return {"model_id": model_id, **inverted, **limits, "segments": [rest, trial, rest]}
+
+
+def tighter(first: float | None, second: float | None) -> float | None:
+    """Return the smaller of the two limits; None where neither is set."""
+    return min((value for value in (first, second) if value is not None), default=None)

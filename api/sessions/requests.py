@@ -171,12 +171,6 @@ class TestIn(Labels, Body):
         description="a whole test by its id in `GET /v1/sequences`; None: the default. Not together with segments",
     )
     pulse_rate_hz: RateHz = 40.0
-    max_pulse_width_us: FiniteFloat | None = Field(
-        default=None, ge=LIMITS["max_pulse_width_us"].lowest, description="for this test alone, if tighter, µs"
-    )
-    max_torque_nm: FiniteFloat | None = Field(
-        default=None, ge=LIMITS["max_torque_nm"].lowest, description="for this test alone, if tighter, N·m"
-    )
     ran_by: PersonName | None = Field(
         default=None, description="who runs it at the rig, if that is not who asks for it"
     )
@@ -377,14 +371,6 @@ def limits_of(body: TestIn, participant_profile: Mapping[str, Any] | None) -> di
         narrow = "A test may narrow them; to widen them, calibrate anew or set the participant's."
         detail = f"{'; '.join(error['detail'] for error in errors)}. {narrow}"
         raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail, errors=errors)
-    profile = {**own, **{name: asked[name] for name in ("current_ma", RANGE) if asked.get(name) is not None}}
-    return {
-        "profile": Profile(**profile),
-        "max_pulse_width_us": tighter(body.max_pulse_width_us, asked.get("max_pulse_width_us")),
-        "max_torque_nm": tighter(body.max_torque_nm, asked.get("max_torque_nm")),
-    }
-
-
-def tighter(first: float | None, second: float | None) -> float | None:
-    """Return the smaller of the two limits; None where neither is set."""
-    return min((value for value in (first, second) if value is not None), default=None)
+    kept = {name: asked[name] for name in ("current_ma", RANGE) if asked.get(name) is not None}
+    narrowed = {name: asked.get(name) for name in ("max_pulse_width_us", "max_torque_nm")}
+    return {"profile": Profile(**{**own, **kept}), **narrowed}

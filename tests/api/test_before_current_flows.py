@@ -83,7 +83,7 @@ def test_a_plan_is_of_one_participant_and_complete(tab: httpx.Client, client: ht
     asked = {"participant": "P017", "plan_hash": plan_hash}
     assert client.post("/v1/tests", json={**asked, "participant": "P018"}).status_code == 410
     assert client.post("/v1/tests", json={**asked, "plan_hash": "0" * 64}).status_code == 410
-    refused = problem(client.post("/v1/tests", json={**asked, "max_torque_nm": 5.0}), 422)
+    refused = problem(client.post("/v1/tests", json={**asked, "pulse_rate_hz": 20.0}), 422)
     assert "all else is as it was previewed" in refused["detail"]
     assert tab.post("/v1/tests", json=asked).status_code == 403, "a start carries the session's CSRF token"
     assert service.rig.starts == 0

@@ -59,7 +59,7 @@ def test_no_calibration_during_a_test(client: httpx.Client, service: Service, pa
 
 def test_sequence_is_played_and_nothing_is_identified(client: httpx.Client, service: Service, participant: str) -> None:
     segments = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [0, 100, 0]}}]
-    body = {"participant": participant, "kind": "sequence", "segments": segments, "max_torque_nm": 5}
+    body = {"participant": participant, "kind": "sequence", "segments": segments, "profile": {"max_torque_nm": 5}}
     started = client.post("/v1/tests", json=body)
     assert started.status_code == 202 and service.rig.last_plan is not None and service.rig.last_plan.max_torque_nm == 5
     document = wait_done(client, started.json()["id"])

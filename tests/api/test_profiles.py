@@ -79,9 +79,7 @@ def test_what_is_no_number_is_refused_everywhere(text: str) -> None:
         refused(ProfileIn, **{name: value})
         refused(ParticipantIn, code="P019", profile={**TIGHT, name: value})
         refused(TestIn, participant="P017", profile={name: value})
-    for name in ("pulse_rate_hz", "max_pulse_width_us", "max_torque_nm"):
-        if value is not None or name == "pulse_rate_hz":  # null is what "no tighter limit" is called there
-            refused(TestIn, participant="P017", **{name: value})
+    refused(TestIn, participant="P017", pulse_rate_hz=value)
     for name in ("step_us", "train_s", "current_ma", "max_torque_nm"):
         if value is not None or name not in TIGHT:
             refused(CalibrationIn, **{name: value})
@@ -151,29 +149,22 @@ def test_a_tighter_limit_keeps_the_calibration(asked: dict[str, float], words: s
     assert profile == {**CALIBRATED, **asked, **(dict.fromkeys(profiles.CALIBRATION_FIELDS) if words else {})}
 
 
-def test_a_calibration_is_lost_knowingly_alone(client: httpx.Client, tight: dict[str, float]) -> None:
-    found, asked = calibrate(client), {"current_ma": 12.5}
-    refused = problem(client.put(f"{P}/profile", json=asked), 409)
+def test_a_calibration_is_lost_knowingly_alone(client: httpx.Client, service: Service, tight: dict[str, float]) -> None:
+    """A confirmation is one person's, of one change and one version."""
+
+    def put(token: str, current_ma: float = 12.5, by: httpx.Client = client) -> httpx.Response:
+        return by.put(f"{P}/profile", params={"confirm": token}, json={"current_ma": current_ma})
+
+    found, refused = calibrate(client), problem(put(""), 409)
     assert "above the 12 mA" in refused["detail"] and client.get(P).json()["profile"] == found
-    token = {"confirm": refused["confirm"]["token"]}
-    assert client.put(f"{P}/profile", params=token, json={"current_ma": 13.0}).status_code == 409, "just that change"
-    assert client.put(f"{P}/profile", params=token, json=asked).status_code == 200
-    profile = client.get(P).json()["profile"]
-    assert [profile[name] for name in profiles.CALIBRATION_FIELDS] == [None] * 4 and profile | asked == profile
-
-
-def test_a_confirmation_is_one_persons_and_of_one_version(
-    service: Service, client: httpx.Client, tight: dict[str, float]
-) -> None:
-    def asked(by: httpx.Client, token: str) -> httpx.Response:
-        return by.put(f"{P}/profile", params={"confirm": token}, json={"current_ma": 12.5})
-
-    calibrate(client)
-    token = problem(asked(client, ""), 409)["confirm"]["token"]
-    assert asked(service.client(service.token("lab", "run-test")), token).status_code == 409
+    token = refused["confirm"]["token"]
+    lab = service.client(service.token("lab", "run-test"))
+    assert put(token, 13.0).status_code == 409 == put(token, by=lab).status_code
     assert client.put(f"{P}/muscle", json={"side": "left"}).status_code == 200
-    token = problem(asked(client, token), 409)["confirm"]["token"]
-    assert asked(client, token).status_code == 200
+    token = problem(put(token), 409)["confirm"]["token"]
+    assert put(token).status_code == 200
+    profile = client.get(P).json()["profile"]
+    assert [profile[name] for name in profiles.CALIBRATION_FIELDS] == [None] * 4 and profile["current_ma"] == 12.5
 
 
 def test_a_calibration_takes_the_participants_own_limits(
@@ -245,8 +236,8 @@ def test_a_wider_limit_is_refused_and_nothing_starts(client: httpx.Client, servi
 
 def test_a_narrower_limit_reaches_the_rig(client: httpx.Client, service: Service, limited: str) -> None:
     service.rig.speed = 0.5
-    body = {"participant": limited, "profile": {"current_ma": 10}, "max_pulse_width_us": 200, "max_torque_nm": 11}
-    test_id = client.post("/v1/tests", json=body).json()["id"]
+    profile = {"current_ma": 10, "max_pulse_width_us": 200, "max_torque_nm": 11}
+    test_id = client.post("/v1/tests", json={"participant": limited, "profile": profile}).json()["id"]
     plan = service.rig.last_plan
     assert plan is not None
     assert (plan.profile.current_ma, plan.profile.max_pulse_width_us, plan.profile.max_torque_nm) == (10, 220, 12)
@@ -258,8 +249,7 @@ def test_a_narrower_limit_reaches_the_rig(client: httpx.Client, service: Service
 
 def test_a_narrower_limit_leaves_the_calibration_whole() -> None:
     """Narrower than the motor threshold even: the calibration stays what a person found, and its day stays its day."""
-    asked = ProfileIn(current_ma=10, max_pulse_width_us=100)
-    found = limits_of(a_test(profile=asked, max_pulse_width_us=150, max_torque_nm=5), CALIBRATED)
+    found = limits_of(a_test(profile=ProfileIn(current_ma=10, max_pulse_width_us=100, max_torque_nm=5)), CALIBRATED)
     assert found["profile"].model_dump() == {**CALIBRATED, "current_ma": 10}
     assert (found["max_pulse_width_us"], found["max_torque_nm"]) == (100, 5)
     unasked = limits_of(a_test(), CALIBRATED)
@@ -276,6 +266,5 @@ def test_what_neither_says_is_not_made_up(own: dict[str, Any] | None) -> None:
 
 def test_what_is_no_number_is_wider() -> None:
     asked = ProfileIn.model_construct(_fields_set={"current_ma"}, current_ma=math.nan)
-    body = TestIn.model_construct(profile=asked, max_pulse_width_us=None, max_torque_nm=None)
     with pytest.raises(Exception, match="Wider than"):
-        limits_of(body, CALIBRATED)
+        limits_of(TestIn.model_construct(profile=asked), CALIBRATED)
