@@ -62,12 +62,10 @@ def fit(select: str = "") -> Task:
     return Task("fit", select, software=software_version())
 
 
-def go(
-    client: Client, data: str | Path | Callable[[], Iterator[Entry]], output: Path, select: str = ""
-) -> Counter[str]:
-    entries = data if callable(data) else lambda: list_records([str(data)])
+def go(client: Client, data: Path | Iterator[Entry], output: Path, select: str = "") -> Counter[str]:
+    entries = list_records([str(data)]) if isinstance(data, Path) else data
     with Results(output, fit(select)) as results:
-        counts = run_records(client, entries(), fit(select), PATIENT, results)
+        counts = run_records(client, entries, fit(select), PATIENT, results)
         results.join()
     return counts
 
@@ -97,6 +95,7 @@ def test_mixed_folder_gives_a_row_for_each_file(client: Client, folder: Path, tm
     assert parameters["threshold_us"]["unit"] == "µs" and parameters["threshold_us"]["sd"] > 0
     left = client.run(lambda dask_worker: [str(path) for path in Path(dask_worker.local_directory).rglob("*.h5")])
     assert list(left.values()) == [[], []], "no recording stays in a worker's folder"  # pyright: ignore
+    assert go(client, folder, tmp_path / "r.parquet") == {DONE_BEFORE: 16} and len(read(tmp_path / "r.parquet")) == 16
 
 
 def test_diagnosis_and_improvement_name_what_is_missing(tmp_path: Path) -> None:
@@ -121,33 +120,22 @@ def test_selection(client: Client, folder: Path, tmp_path: Path) -> None:
     assert compute_row(folder / "half.h5", "half.h5", {}, fit('participant == "P002"'))["status"] == "error"
 
 
-def test_bucket_is_computed_as_a_folder_is(client: Client, folder: Path, tmp_path: Path, s3: Any) -> None:
-    s3.mkdir("cohort")
-    for name in ("P001/session-00000.h5", "half.h5"):
-        s3.pipe(f"cohort/{name}", (folder / name).read_bytes())
-    for expected in ({"ok": 1, "error": 1}, {DONE_BEFORE: 2}):
-        assert go(client, "s3://cohort", tmp_path / "r.parquet") == expected
-    rows = {row["address"]: row["status"] for row in read(tmp_path / "r.parquet")}
-    assert rows == {"s3://cohort/P001/session-00000.h5": "ok", "s3://cohort/half.h5": "error"}
-
-
 def unreadable(count: int) -> Iterator[Entry]:
     for number in range(count):
         yield Entry(f"/nowhere/{number}.csv", f"/nowhere/{number}.csv", stamp="1", known={"name": str(number)})
 
 
 def test_list_is_never_held_whole(client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    send, most = client.map, 0
+    send, sizes = client.map, list[int]()
 
-    def counted(function: Any, batch: list[Entry], *more: Any, **options: Any) -> Any:
-        nonlocal most
-        most = max(most, len(batch))
-        return send(function, batch, *more, **options)
+    def counted(function: Any, batch: list[Entry], **options: Any) -> Any:
+        sizes.append(len(batch))
+        return send(function, batch, **options)
 
     monkeypatch.setattr(client, "map", counted)
-    assert go(client, lambda: unreadable(300), tmp_path / "r.parquet") == {"error": 300}
+    assert go(client, unreadable(300), tmp_path / "r.parquet") == {"error": 300}
     assert {row["error_kind"] for row in read(tmp_path / "r.parquet")} == {"unreadable"}
-    assert most == IN_FLIGHT * THREADS
+    assert max(sizes) == IN_FLIGHT * THREADS
 
 
 # ---- what a record can do to the process that computes it
@@ -224,28 +212,29 @@ def test_process_is_replaced_after_some_records(
 def test_record_with_which_workers_are_lost_is_a_row(
     client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def deadly(entry: Entry, *more: Any, **options: Any) -> Any:
+    def deadly(entry: Entry, **more: Any) -> Any:
         if entry.name == "17":
             raise KilledWorker("it", SimpleNamespace(address="tcp://gone"), 0)  # pyright: ignore[reportArgumentType]
-        return record_row(entry, *more, **options)
+        return record_row(entry, **more)
 
     monkeypatch.setattr(run, "record_row", deadly)
-    go(client, lambda: unreadable(40), tmp_path / "r.parquet")
+    go(client, unreadable(40), tmp_path / "r.parquet")
     kinds = {row["name"]: row["error_kind"] for row in read(tmp_path / "r.parquet")}
     assert len(kinds) == 40 and [name for name, kind in kinds.items() if kind == "killed"] == ["17"]
 
 
-def test_worker_of_another_version_ends_the_run(
-    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(worker, "software_version", lambda: "9.9")
-    with pytest.raises(CohortError, match=r"a worker has stimrig 9\.9"):
-        go(client, lambda: unreadable(1), tmp_path / "r.parquet")
-
-
+@pytest.mark.parametrize(
+    ("module", "name", "value", "error", "says"),
+    [
+        (worker, "software_version", lambda: "9.9", CohortError, r"a worker has stimrig 9\.9"),
+        (run, "record_row", Mock(side_effect=OSError(28, "No space left")), InterruptedRunError, "No space left"),
+    ],
+    ids=["another version", "cannot compute"],
+)
 def test_worker_that_cannot_compute_ends_the_run(
-    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(run, "record_row", Mock(side_effect=OSError(28, "No space left on device")))
-    with pytest.raises(InterruptedRunError, match="No space left"):
-        go(client, lambda: unreadable(1), tmp_path / "r.parquet")
+    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: Any, name: str, value: Any, error: Any,
+    says: str,
+) -> None:  # fmt: skip
+    monkeypatch.setattr(module, name, value)
+    with pytest.raises(error, match=says):
+        go(client, unreadable(1), tmp_path / "r.parquet")
