@@ -99,9 +99,9 @@ async def _read_samples(context: Context) -> None:
     rows = await asyncio.to_thread(context.store.all, Recording, Recording.samples_sha256.is_(None))
     for first in range(0, len(rows), AT_ONCE):
         some = rows[first : first + AT_ONCE]
-        found = await context.pool.submit("samples", paths=[row.path for row in some]).result
+        answer = await context.pool.submit("samples", paths=[row.path for row in some]).result
 
-        def store(some: Sequence[Recording] = some, digests: Sequence[str] = found["digests"]) -> None:
+        def store(some: Sequence[Recording] = some, digests: Sequence[str] = answer["digests"]) -> None:
             with context.store.write() as session:
                 for row, digest in zip(some, digests, strict=True):
                     session.execute(update(Recording).where(Recording.id == row.id).values(samples_sha256=digest))

@@ -7,7 +7,7 @@ from contextlib import closing
 from pathlib import Path
 
 from stimrig.api import owner_only
-from stimrig.api.whole_file import sha256_of, to_disk
+from stimrig.api.whole_file import sha256_of, whole_path
 
 
 class CopyError(OSError):
@@ -19,30 +19,25 @@ def copy_database(source: Path, to: Path) -> str:
 
     Raises CopyError: there is no room, or what was copied is damaged. Nothing is left then.
     """
-    part = to.with_name(f".{to.name}.new")
     try:
         owner_only.folder(to.parent)
-        part.unlink(missing_ok=True)
-        owner_only.file(part)
-        with (
-            closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True, timeout=10)) as old,
-            closing(sqlite3.connect(part)) as new,
-        ):
-            old.backup(new)
-            new.execute("PRAGMA journal_mode=DELETE")
-            answer = new.execute("PRAGMA quick_check").fetchone()[0]
-        if answer != "ok":
-            raise CopyError(f"{source}: damaged ({answer}); restore it from a backup")
-        to_disk(part)
-        part.replace(to)
-        to_disk(to.parent)
+        with whole_path(to) as part:
+            part.unlink(missing_ok=True)
+            owner_only.file(part)
+            with (
+                closing(sqlite3.connect(f"{source.absolute().as_uri()}?mode=ro", uri=True, timeout=10)) as old,
+                closing(sqlite3.connect(part)) as new,
+            ):
+                old.backup(new)
+                new.execute("PRAGMA journal_mode=DELETE")
+                answer = new.execute("PRAGMA quick_check").fetchone()[0]
+            if answer != "ok":
+                raise CopyError(f"{source}: damaged ({answer}); restore it from a backup")
+    except CopyError:
+        raise
     except (OSError, sqlite3.Error) as error:
-        if isinstance(error, CopyError):
-            raise
         why = error.strerror if isinstance(error, OSError) else error
         raise CopyError(f"{to}: no copy of the database could be made ({why}); free some disk space") from error
-    finally:
-        part.unlink(missing_ok=True)
     return sha256_of(to)
 
 
