@@ -128,11 +128,15 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
 def html_report(what: Any, record: identify.Record | None, name: str) -> str:
     """Write a model or an explanation beside its record as one HTML file that works offline."""
     from stimrig.api.jobs.curves import curves, rounded
-    from stimrig.api.web.pages.report_file import comparison_html
+    from stimrig.api.web.pages.report_file import comparison_html, story_html
     from stimrig.identify.json_text import json_value
 
     if record is not None and isinstance(what, identify.Explanation):
-        return story_page(story_of(record, what, held_by(what.improvement.models[0], record)), name)
+        narrative = story_of(record, what)
+        structure = in_words(held_by(what.improvement.models[0], record))
+        return story_html(
+            narrative["story"], narrative["before"], narrative["after"], name, narrative["refused"], structure
+        )
     if record is not None and isinstance(what, identify.Model):
         comparison = rounded(identify.compare(what, record).to_dict())
         return comparison_html(what.to_dict(), json_value(curves(what, record)), name, comparison=comparison)
@@ -140,8 +144,8 @@ def html_report(what: Any, record: identify.Record | None, name: str) -> str:
     raise identify.BadRequest("a report is of a model or an explanation, beside its record", place=name, fix=fix)
 
 
-def story_of(record: Any, explained: Any, structure: Sequence[str]) -> dict[str, Any]:
-    """Return the story of a record, and what its figures are drawn from."""
+def story_of(record: Any, explained: Any) -> dict[str, Any]:
+    """Return the `story` of a record, what its figures show (`before`, `after`), and the `refused` effects."""
     from stimrig.api.jobs.curves import curves, rounded
     from stimrig.api.jobs.verbs import with_experiment
     from stimrig.api.models.explanation import step_versions
@@ -155,20 +159,11 @@ def story_of(record: Any, explained: Any, structure: Sequence[str]) -> dict[str,
     )
     after = after if len(models) > 1 else before
     diagnoses = (
-        with_experiment(record, explained.diagnosis, structure),
-        with_experiment(record, explained.left, held_by(models[-1], record)),
+        with_experiment(record, diagnosis, held_by(model, record))
+        for model, diagnosis in ((models[0], explained.diagnosis), (models[-1], explained.left))
     )
     improvement, left_open = explained.improvement.to_dict(), only_open(vars(explained.left)) or {}
     # the last diagnosis describes what is left open
-    improvement["refused"] = [row for row in improvement["refused"] if row["effect"] != left_open.get("effect")]
-    narrative = story(step_versions(improvement), before["comparison"], after["comparison"], *diagnoses)
-    words = in_words(structure)
-    return {"story": narrative, "before": before, "after": after, "improvement": improvement, "structure": words}
-
-
-def story_page(story: dict[str, Any], name: str) -> str:
-    """Write the story as a file."""
-    from stimrig.api.web.pages.report_file import story_html
-
-    refused = story["improvement"]["refused"]
-    return story_html(story["story"], story["before"], story["after"], name, refused, story["structure"])
+    refused = [row for row in improvement["refused"] if row["effect"] != left_open.get("effect")]
+    text = story(step_versions(improvement), before["comparison"], after["comparison"], *diagnoses)
+    return {"story": text, "before": before, "after": after, "refused": refused}

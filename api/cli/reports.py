@@ -45,8 +45,6 @@ def _adaptive_rows(adaptive: Mapping[str, Any] | None) -> list[tuple[str, str]]:
         f"{title} within {quantity(known.get(name), '%')} (asked: {quantity(target.get(name), '%')})"
         for name, title in (("curve_percent", "curve"), ("step_percent", "step response"))
     )
-    most = (
-        f"{quantity(adaptive['torque_time_nm_s'], '')} of at most {quantity(adaptive['max_torque_time_nm_s'], 'N·m·s')}"
-    )
-    rows = [("ended", f"{words(adaptive['ended'], 'end')}; {most}"), ("known", reached)]
+    used, bound = (quantity(adaptive[name], "N·m·s") for name in ("torque_time_nm_s", "max_torque_time_nm_s"))
+    rows = [("ended", f"{words(adaptive['ended'], 'end')}; {used} of at most {bound}"), ("known", reached)]
     return [*rows, *([("in doubt", adaptive["problem"])] if adaptive["problem"] else [])]

@@ -8,7 +8,6 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import httpx
 
@@ -87,8 +86,10 @@ def at_service(url: str, token: str, stray: Callable[[], bool] = lambda: True) -
 
     def stop() -> str:
         with httpx.Client(base_url=url, headers={"Authorization": f"Bearer {token}"}) as client:
-            with contextlib.suppress(Exception):  # an error of this query must not prevent a stop
-                if stray() and _rests(client.get("/v1/rig", timeout=STATUS_S).raise_for_status().json()):
+            # An error of this query must not prevent a stop, nor a state that the service has not heard of lately.
+            with contextlib.suppress(Exception):
+                rig = client.get("/v1/rig", timeout=STATUS_S).raise_for_status().json() if stray() else {}
+                if rig["state"] in IDLE and rig["connected"] and rig["age_s"] < HEARD_S and rig["holder"] is None:
                     return NOTHING
             try:
                 answer = client.post("/v1/stop", json={"reason": REASON}, timeout=STOP_S + 1.0)
@@ -97,8 +98,3 @@ def at_service(url: str, token: str, stray: Callable[[], bool] = lambda: True) -
         return CONFIRMED if answer.is_success else f"{NOT_CONFIRMED} {url}: {answer.text[:300]}"
 
     return stop
-
-
-def _rests(rig: dict[str, Any]) -> bool:
-    """Return whether a service knows that its rig plays nothing; the rig's own state may arrive late or never."""
-    return rig["state"] in IDLE and rig["connected"] and rig["age_s"] < HEARD_S and rig["holder"] is None

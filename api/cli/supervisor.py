@@ -190,6 +190,9 @@ class Services:
         if settings.rig_file is None and not self.attached:
             self.emulator = self._child("emulator", "stimrig.hardware_sim", "--die-with-parent", *emulate)
         self.rig, self.api = self._child("rig", "stimrig.rig"), self._child("api", "stimrig.api.web")
+        self.emulated = self.emulator is not None or (self.attached and settings.emulated)
+        """No person is connected: the emulator is started here, or runs behind the attached rig."""
+        self.url = ""
 
     def _child(self, name: str, *module: str) -> Child:
         return Child(name, [sys.executable, "-m", *module], self.settings.logs_dir / f"{name}.log")
@@ -215,16 +218,6 @@ class Services:
         shutil.rmtree(self.runtime, ignore_errors=True)
         for number, handler in self._handlers.items():
             signal.signal(number, handler)
-
-    @property
-    def emulated(self) -> bool:
-        """Return whether no person is connected: the emulator was started here, or runs behind the attached rig."""
-        return self.emulator is not None or (self.attached and self.settings.emulated)
-
-    @property
-    def url(self) -> str:
-        """The address of the service."""
-        return str(self.api.ready["url"])
 
     def _start(self) -> None:
         """Start everything, the devices first, once the data folder is locked.
@@ -258,7 +251,7 @@ class Services:
             "STIMRIG_EMULATED": str(self.emulated).lower(),
             **({} if self.admin_token is None else {"STIMRIG_ADMIN_TOKEN": self.admin_token}),
         }
-        self.api.start()
+        self.url = str(self.api.start()["url"])
         self.api.environment["STIMRIG_PORT"] = str(self.api.ready["port"])  # the same one after a restart
 
     def watch(self) -> list[str]:

@@ -84,17 +84,6 @@ def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path)
         assert client.post("/v1/rearm")["state"] == "ready"
 
 
-@pytest.mark.campaign
-@pytest.mark.timeout(900)  # an identification gives way to every other process: beside them it takes minutes
-def test_killed_service_comes_back_at_the_same_place_with_everything(tmp_path: Path) -> None:
-    with running(tmp_path) as (services, client):
-        test_id = begin(client)
-        services.api.process.kill()  # pyright: ignore[reportOptionalMemberAccess]
-        services.api.process.wait()  # pyright: ignore[reportOptionalMemberAccess]
-        assert any("api had ended" in event for event in services.watch())
-        assert ended(client, test_id).model_id
-
-
 def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Path) -> None:
     with running(tmp_path) as (_, client):
         test_id = begin(client)

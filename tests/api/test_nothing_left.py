@@ -5,6 +5,7 @@ They are found by a marker in their environment: `PATH`, which is passed on to w
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -48,47 +49,39 @@ time.sleep(3600)
 """A child that is held between fork and exec, before or after the launcher has readied it."""
 
 
-TERM, KILL = signal.SIGTERM, signal.SIGKILL
+KILL = signal.SIGKILL
 
 
 class Started:
     """A program of its own."""
 
-    def __init__(self, folder: Path, name: str, *program: str) -> None:
-        self.folder, self.marker = folder / name, f"/marker-{os.getpid()}-{name}-{time.monotonic_ns()}"
+    def __init__(self, name: str, *program: str) -> None:
+        self.marker = f"/marker-{os.getpid()}-{name}-{time.monotonic_ns()}"
         environment = {**os.environ, "PATH": f"{os.environ['PATH']}:{self.marker}", "STIMRIG_ADMIN_TOKEN": TOKEN}
         self.process = subprocess.Popen(
             [sys.executable, *program], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             start_new_session=True,
         )  # fmt: skip
 
-    def url(self) -> str:
-        """Its address, once all has started."""
+    def line(self) -> str:
+        """The next line of its standard output."""
         assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        assert line.startswith("stimrig serves"), (line, self.process.communicate())
-        return line.split()[2]
+        return self.process.stdout.readline().strip()
 
-    def tell(self, number: signal.Signals) -> None:
-        """To its whole process group; it may have ended by itself."""
-        if self.process.poll() is None:
-            os.killpg(self.process.pid, number)
-
-    def left(self) -> dict[int, str]:
-        """Its processes that live, with their commands."""
-        found = {}
+    def left(self) -> list[int]:
+        """Its processes that live."""
+        found = []
         for place in Path("/proc").glob("[0-9]*"):
-            try:
+            with contextlib.suppress(OSError):  # another user's, or gone
                 if self.marker.encode() in (place / "environ").read_bytes():
-                    found[int(place.name)] = (place / "cmdline").read_text().replace("\0", " ")
-            except OSError:  # another user's, or gone
-                continue
+                    found.append(int(place.name))
         return found
 
-    def ended(self) -> dict[int, str]:
-        """What is left of it when it has ended and the others have had their time."""
-        left: dict[int, str] = {}
+    def killed(self) -> list[int]:
+        """What is left of it when its group is killed and the others have had their time."""
+        os.killpg(self.process.pid, KILL)
         self.process.communicate(timeout=LIMIT_S)
+        left: list[int] = []
         end_s, looks = time.monotonic() + LIMIT_S, 0
         while looks < 3 and time.monotonic() < end_s:  # one that becomes another program has no environment just then
             left = self.left()
@@ -101,35 +94,31 @@ class Started:
 
 def test_a_running_test_is_sealed_although_the_launcher_is_killed(tmp_path: Path) -> None:
     """It says nothing to the rig any more: the kernel does."""
-    served = Started(tmp_path, "served", "-m", "stimrig", "serve", "--port", "0", "--data", str(tmp_path / "served"))
-    url, said = served.url(), served.process.stdout
-    assert said is not None and said.readline()
-    control = said.readline().partition("the emulator's control line: ")[2].strip()
-    assert Path(control).is_socket()
+    served = Started("served", "-m", "stimrig", "serve", "--port", "0", "--data", str(tmp_path))
+    url, _, control = served.line().split()[2], served.line(), served.line()
+    assert Path(control.partition("the emulator's control line: ")[2]).is_socket()
     with httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=LIMIT_S) as http:
         http.post("/v1/participants", json={"code": "P1"})
         http.post("/v1/tests", json={"participant": "P1"})
-        while not (found := list(served.folder.glob("journals/*"))):
+        while not list(tmp_path.glob("journals/*")):
             time.sleep(0.05)
-    served.tell(KILL)
-    assert served.ended() == {}
-    assert found and len(list(served.folder.glob("recordings/*.h5"))) == 1
+    assert served.killed() == []
+    assert len(list(tmp_path.glob("recordings/*.h5"))) == 1
 
 
 @pytest.mark.parametrize(("when", "killed"), [("before", "parent"), ("after", "parent"), ("before", "child")])
 def test_no_end_is_lost_between_fork_and_exec(tmp_path: Path, when: str, killed: str) -> None:
     """There a child has the launcher's handlers still: what they hear, the program that it becomes never does."""
-    parent = Started(tmp_path, "parent", "-c", BIRTH, str(tmp_path), when)
+    parent = Started("parent", "-c", BIRTH, str(tmp_path), when)
     place, end_s = tmp_path / "child", time.monotonic() + LIMIT_S
     while not (place.exists() and place.read_text()):
         assert time.monotonic() < end_s and parent.process.poll() is None
         time.sleep(0.01)
     child = int(place.read_text())
     if killed == "child":
-        os.kill(child, TERM)
+        os.kill(child, signal.SIGTERM)
         (tmp_path / "go").touch()
         while alive(child):
             assert time.monotonic() < end_s, "it became a program that nobody told"
             time.sleep(0.01)
-    parent.tell(KILL)
-    assert parent.ended() == {}
+    assert parent.killed() == []

@@ -152,7 +152,7 @@ def test_each_process_of_serve_is_started_under_the_lock_and_the_service_takes_i
 
     monkeypatch.setattr(Child, "start", start)
     services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
-    services.api.ready = {"port": 1}
+    services.api.ready = {"port": 1, "url": ""}
     with services:
         assert begun == ["emulator", "rig", "api"]
         with pytest.raises(HeldError):

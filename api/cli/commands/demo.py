@@ -50,8 +50,8 @@ def demo(
     seconds = round(time.monotonic() - began, 1)
     document = {"test": test, "model": model, "files": files, "seconds": seconds}
     listed = [f"{name:10} {path}" for name, path in files.items()]
-    shown = identify.Model.from_dict(model)
-    report(document, as_json, report_test(test), "", shown, "", *listed, f"done in {seconds} s")
+    printed = identify.Model.from_dict(model)
+    report(document, as_json, report_test(test), "", printed, "", *listed, f"done in {seconds} s")
 
 
 def approve_and_fetch(client: Client, model_id: str) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import shutil
-import socket as sockets
 import stat
 import subprocess
 import sys
@@ -202,12 +201,8 @@ def check_door(settings: Settings) -> Iterator[Finding]:
         refuse_open_door(settings)
     except OSError as error:
         yield Finding("address", "fails", str(error))
-        return
-    with sockets.socket(sockets.AF_INET6 if ":" in settings.host else sockets.AF_INET) as line:
-        line.settimeout(1)
-        in_use = line.connect_ex((settings.host, settings.port)) == 0
-    text = f"{settings.host}:{settings.port} {'is in use, by the service or another program' if in_use else 'is free'}"
-    yield Finding("address", "ok", text)
+    else:
+        yield Finding("address", "ok", f"the service listens at {settings.host}:{settings.port}")
 
 
 def doctor(

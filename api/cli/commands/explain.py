@@ -9,7 +9,7 @@ import typer
 
 from stimrig import identify
 from stimrig.api.cli.commands.diagnose import next_commands
-from stimrig.api.cli.files import load_structure, short, story_of, story_page, write
+from stimrig.api.cli.files import html_report, load_structure, short, story_of, write
 from stimrig.api.cli.options import ColumnMap, HeldModel, Json, LastModel, SeveralData
 from stimrig.api.cli.terminal import report
 from stimrig.api.progress_bar import progress_bar
@@ -32,17 +32,16 @@ def explain(
     with progress_bar() as progress:
         explained = identify.explain(record, progress, model)
     write(output, explained.improvement.models[-1])
-    if html is not None or figures is not None:
-        document = story_of(record, explained, structure)
-        write(html, story_page(document, short(data)))
-        if figures is not None:
-            from stimrig.api.charts.diagnosis_charts import story_figures
-            from stimrig.api.charts.drawing import file
+    if html is not None:
+        write(html, html_report(explained, record, short(data)))
+    if figures is not None:
+        from stimrig.api.charts.diagnosis_charts import story_figures
+        from stimrig.api.charts.drawing import file
 
-            figures.mkdir(parents=True, exist_ok=True)
-            drawn = story_figures(document["story"], document["before"], document["after"])
-            for name, figure in drawn.items():
-                for kind in ("svg", "pdf", "png"):
-                    write(figures / f"{name}.{kind}", file(figure, kind))
+        figures.mkdir(parents=True, exist_ok=True)
+        narrative = story_of(record, explained)
+        for name, figure in story_figures(narrative["story"], narrative["before"], narrative["after"]).items():
+            for kind in ("svg", "pdf", "png"):
+                write(figures / f"{name}.{kind}", file(figure, kind))
     document = {"structure": structure, **explained.to_dict()}
     report(document, as_json, explained, *next_commands(explained.left), files=[output, html, figures])

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stimrig import identify
-from stimrig.api.cli.files import load_structure, short, story_of, story_page, write
+from stimrig.api.cli.files import html_report, load_structure, short, write
 from stimrig.api.cli.options import ColumnMap, HeldModel, Html, Json, LastModel, SeveralData
 from stimrig.api.cli.terminal import report
 from stimrig.api.progress_bar import progress_bar
@@ -28,7 +28,7 @@ def improve(
         else:
             explained = identify.explain(record, progress, model)
             improved = explained.improvement
-            write(html, story_page(story_of(record, explained, structure), short(data)))
+            write(html, html_report(explained, record, short(data)))
     write(output, improved.models[-1])
     document = {"structure": structure, **improved.to_dict()}
     del document["models"]

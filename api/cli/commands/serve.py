@@ -36,11 +36,11 @@ def serve(
     settings = Settings(**set_options(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
     attached = settings.rig_socket
     if attached is not None:
-        rig_status(attached)
         if settings.rig_file is not None or emulate.strip():
             other = "--emulate" if settings.rig_file is None else f"--rig {settings.rig_file}"
             fix = "give one of them (STIMRIG_RIG_SOCKET and STIMRIG_RIG_FILE count, too)."
             raise InputError(f"--rig-socket {attached} attaches to a rig that runs, {other} starts one: {fix}")
+        rig_status(attached)
     services = Services(settings, emulate.split(), attach=attached)
     with contextlib.suppress(KeyboardInterrupt), services:
         say(*welcome(services, rig_status(services.socket)))
