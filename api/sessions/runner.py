@@ -217,7 +217,7 @@ class Runner(Playing):
             entry |= {"model": requester.model} if requester.model else {}
             locking.write(session, row, now, by, "start test", plan.test_id, **entry)
             session.add(row)
-        current.version = version
+            current.version = version
         log.info("test requested, kind %s", plan.kind, extra={"test_id": plan.test_id})
 
     async def _command(self, planned: Planned, current: Current) -> None:

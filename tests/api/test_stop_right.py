@@ -6,7 +6,7 @@ import asyncio
 import re
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 from unittest.mock import Mock
 from urllib.parse import urlsplit
@@ -154,8 +154,9 @@ def test_a_stop_waits_for_no_database(service: Service, participant: str, monkey
     running(service, participant)
     store = service.context.store
     with store.write():  # another writer does not let go
-        monkeypatch.setattr(store, "get", Mock(side_effect=OperationalError("SELECT", {}, Exception("disk I/O error"))))
-        monkeypatch.setattr(store, "all", Mock(side_effect=OperationalError("SELECT", {}, Exception("disk I/O error"))))
+        for read in ("get", "all"):
+            broken = Mock(side_effect=OperationalError("SELECT", {}, Exception("disk I/O error")))
+            monkeypatch.setattr(store, read, broken)
         answer = press(service, right, cookies={cookie_name(service): "old"})
         assert answer.status_code == 200 and CONFIRMED in answer.text
     monkeypatch.undo()
@@ -172,9 +173,9 @@ def test_the_answer_to_a_stop_that_is_not_confirmed_has_the_button_still(service
     assert press(service, right_on(answer.text)).status_code == 200
 
 
-def test_nobody_makes_a_right(service: Service) -> None:
-    rights: StopRights = service.context.stop_rights
-    real = rights.give("Ada", None)
+def test_nobody_makes_a_right_and_a_restart_keeps_them(service: Service) -> None:
+    real = service.context.stop_rights.give("Ada", None)
+    assert StopRights(service.context.store.secret("stop-right"), Clock()).holder(real) == "Ada"
     words, _, mark = real.partition(".")
     other = StopRights(b"k" * 32, Clock()).give("Eve", None)
     for wrong in ("", "x", ".", "a.b", words, f"{words}.", f".{mark}", f"x{real}", f"{words}.{mark[:-4]}", other,
@@ -184,8 +185,8 @@ def test_nobody_makes_a_right(service: Service) -> None:
         assert "Nothing was stopped" in answer.text and "emergency switch" in answer.text
     assert service.rig.stopped_by is None
     with service.client(token=None) as http:
-        assert http.post("/v1/stop", headers={"X-Stop-Right": real}).json()["stopped"]
         assert http.post("/v1/stop", headers={"X-Stop-Right": other}).status_code == 401
+        assert http.post("/v1/stop", headers={"X-Stop-Right": real}).json()["stopped"]
 
 
 OPEN = ("/v1/stop", "/v1/sessions")
@@ -215,12 +216,6 @@ def test_a_right_lasts_a_day_or_as_long_as_its_test() -> None:
     assert rights.holder(of_home) == "Ada", "a clock that is set back takes the right from nobody"
 
 
-def test_a_restart_of_the_service_keeps_the_rights_of_open_pages(service: Service) -> None:
-    context = service.context
-    right = context.stop_rights.give("Ada", None)
-    assert StopRights(context.store.secret("stop-right"), Clock()).holder(right) == "Ada"
-
-
 def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Service, client: httpx.Client) -> None:
     """The configured token, after a restart, while a client with an old token tries on at the same address."""
     for _ in range(20):
@@ -231,31 +226,35 @@ def test_a_right_token_stops_whatever_was_guessed_at_its_address(service: Servic
     assert service.client("guess").post("/v1/stop").status_code == 429
 
 
-def test_a_right_in_a_form_that_comes_slowly_is_waited_for(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stimrig.api.web.guards.PATIENCE_S", 0.01)
-    monkeypatch.setattr("stimrig.api.web.guards.LONGEST_PATIENCE_S", 60.0, raising=False)
-    right = service.context.stop_rights.give("Ada", None)
-    with slow_form(service, f"right={right}", f"Cookie: {cookie_name(service)}=ended\r\n") as connection:
-        connection.sendall(right[-1:].encode())
-        assert connection.recv(12) == b"HTTP/1.1 200"
-    assert service.rig.stopped_by == "Ada"
-
-
-def test_a_stop_that_is_allowed_anyway_waits_for_no_form(service: Service, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("stimrig.api.web.guards.LONGEST_PATIENCE_S", 60.0)
-    with slow_form(service, "reason=x", f"Authorization: Bearer {TOKEN}\r\n") as connection:
-        assert connection.recv(12) == b"HTTP/1.1 200"
-
-
-def slow_form(service: Service, form: str, header: str) -> socket.socket:
-    """A stop of which all has come but the last letter of its form: the caller sends it."""
+@pytest.fixture
+def slow_form(service: Service) -> Iterator[Callable[[str, str], socket.socket]]:
+    """Sends a stop of which all has come but the last letter of its form: the caller sends it."""
     place = urlsplit(service.url)
-    connection = socket.create_connection((place.hostname, place.port), timeout=20)
-    kind = "Content-Type: application/x-www-form-urlencoded"
-    head = f"POST /v1/stop HTTP/1.1\r\nHost: x\r\n{header}{kind}\r\nContent-Length: {len(form)}\r\n\r\n"
-    connection.sendall((head + form[:-1]).encode())
+    with socket.create_connection((place.hostname, place.port), timeout=20) as connection:
+
+        def send(form: str, header: str) -> socket.socket:
+            kind = f"Content-Type: application/x-www-form-urlencoded\r\nContent-Length: {len(form)}"
+            connection.sendall(f"POST /v1/stop HTTP/1.1\r\nHost: x\r\n{header}\r\n{kind}\r\n\r\n{form[:-1]}".encode())
+            return connection
+
+        yield send
+
+
+def test_a_right_in_a_form_that_comes_slowly_is_waited_for(
+    service: Service, slow_form: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("stimrig.api.web.guards.PATIENCE_S", 0.01)
+    monkeypatch.setattr("stimrig.api.web.guards.LONGEST_PATIENCE_S", 60.0)
+    right = service.context.stop_rights.give("Ada", None)
+    connection = slow_form(f"right={right}", f"Cookie: {cookie_name(service)}=ended")
     time.sleep(0.2)
-    return connection
+    connection.sendall(right[-1:].encode())
+    assert connection.recv(12) == b"HTTP/1.1 200" and service.rig.stopped_by == "Ada"
+
+
+def test_a_stop_that_is_allowed_anyway_waits_for_no_form(slow_form: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("stimrig.api.web.guards.LONGEST_PATIENCE_S", 60.0)
+    assert slow_form("reason=x", f"Authorization: Bearer {TOKEN}").recv(12) == b"HTTP/1.1 200"
 
 
 # ---- re-arming ----------------------------------------------------------------------------------------------
