@@ -129,12 +129,12 @@ def side_by_side(before: dict[str, Any], after: dict[str, Any], places: Places, 
         hover = fig.RESIDUAL if key == "residual_nm" else fig.TORQUE
         return curve([row[0] for row in rows], [row[1] for row in rows], label, colour, width, hover=hover, **more)
 
-    predicted, left = "predicted_torque_nm", {"panel": 1, "listed": False}
+    predicted, below = "predicted_torque_nm", {"panel": 1, "listed": False}
     lines = [line(curves, "torque_nm", "measured", "measured", 3.2)]
     if changed:
         lines.append(line(curves, predicted, "model at first", "series-2", 1.6, dash="dot"))
-        lines.append(line(before["comparison"]["series"], "residual_nm", "left at first", "series-2", 0.9, **left))
+        lines.append(line(before["comparison"]["series"], "residual_nm", "left at first", "series-2", 0.9, **below))
     lines.append(line(after["curves"], predicted, "model at last" if changed else "model", "model", 1.8))
-    lines.append(line(after["comparison"]["series"], "residual_nm", "left", "residual", 1.0, **left))
+    lines.append(line(after["comparison"]["series"], "residual_nm", "left", "residual", 1.0, **below))
     panels = [axis("Torque (N·m)"), axis("Residual (N·m)")]
     return figure(time_axis(start_s, end_s), panels, lines, shapes, [*names, *badges], 420, (0.6, 0.35))

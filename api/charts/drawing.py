@@ -180,8 +180,8 @@ def _lay_out(figure: Figure, width: float, height: float, right: float, colours:
         axes.set_xticks(setting["tickvals"], ticks if fits else [words.split()[0] for words in ticks])
     if listed:
         anchor = (LEFT_PX / width if width >= NARROW else 0.01, 1)
-        shown = [(handle, trace["name"].lstrip("_")) for handle, trace in handles if trace["showlegend"]]
-        paper.legend(*zip(*shown, strict=True), loc="upper left", bbox_to_anchor=anchor, ncols=columns)
+        entries = [(handle, trace["name"].lstrip("_")) for handle, trace in handles if trace["showlegend"]]
+        paper.legend(*zip(*entries, strict=True), loc="upper left", bbox_to_anchor=anchor, ncols=columns)
     return paper
 
 

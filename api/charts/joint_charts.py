@@ -49,12 +49,12 @@ def _figure(joint: dict[str, Any], name: str, unit: str, hover: str, title: str)
     for way, low, high, colour, width, marker in WAYS:
         inside = [k for k, value in enumerate(velocity) if low <= value < high]
         rows = zip(angle_rad, joint[f"seen_{name}"], strict=True)
-        seen = [angle for angle, row in rows if any(row[k] for k in inside)]
-        if not seen:
+        covered_rad = [angle for angle, row in rows if any(row[k] for k in inside)]
+        if not covered_rad:
             continue
         still = way == "not moving"
         column = min(inside, key=lambda k: abs(velocity[k])) if still else max(inside, key=counts.__getitem__)
-        near = [any(abs(angle - other) <= NEAR_RAD for other in seen) for angle in angle_rad]
+        near = [any(abs(angle - other) <= NEAR_RAD for other in covered_rad) for angle in angle_rad]
         y, notes = [row[column] for row in joint[name + unit]], []
         if f"{name}_lower{unit}" in joint:
             lower, upper = ([row[column] for row in joint[f"{name}_{edge}{unit}"]] for edge in ("lower", "upper"))

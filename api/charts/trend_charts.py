@@ -42,7 +42,7 @@ def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         return []
     times_s = [unix_of(session["at_utc"]) for session in sessions]
     days = [(time_s - times_s[0]) / DAY_S for time_s in times_s]
-    x, drawn = _dates(times_s[0], days[-1]), []
+    x, pictures = _dates(times_s[0], days[-1]), []
     for key in changes.in_order(name for session in sessions for name in session["figures"]):
         figures = [session["figures"].get(key) for session in sessions]
         name = changes.name_of(key, next((each["unit"] for each in figures if each), ""))
@@ -56,8 +56,8 @@ def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
                 None if spread is None else BEYOND * spread * name.factor, session["approved"], bool(session["notes"]),
                 session["figures"]["current_ma"]["value"] if key in OF_THE_CURVE else None,
             ))  # fmt: skip
-        drawn.append(_panel(points, name.words, name.unit, words, x))
-    return drawn
+        pictures.append(_panel(points, name.words, name.unit, words, x))
+    return pictures
 
 
 def _dates(start_s: float, days: float) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def history(points: Sequence[Point], unit: str, x: dict[str, Any], levels: Seque
             line.append((point.x, None))
         line.append((point.x, point.value))
     bars = [(point.x, end) for point, value, half in known if half for end in (value - half, value + half, None)]
-    shown: Any = (
+    parts: Any = (
         (line, "model", {"width": 1.6}),
         (bars, "model-band", {"width": 7.0}),
         ([(point.x, value) for point, value, _half in known], "model", {"width": 0, "marker": "circle", "size": 7}),
@@ -99,7 +99,7 @@ def history(points: Sequence[Point], unit: str, x: dict[str, Any], levels: Seque
          {"width": 0, "marker": "diamond", "size": 6}),
     )  # fmt: skip
     traces = [
-        curve([x for x, _ in rows], [y for _, y in rows], "", colour, **style) for rows, colour, style in shown if rows
+        curve([x for x, _ in rows], [y for _, y in rows], "", colour, **style) for rows, colour, style in parts if rows
     ]
     rules = [fig.rule(at, colour="width") for at in levels if low <= at <= high]
     return figure(x, [axis(unit, limits=(low, high))], traces, rules, height=TALL_PX)
@@ -137,7 +137,7 @@ def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[di
     numbers = [trial["number"] for trial in trials]
     ticks = [(number, str(number)) for number in numbers[:: -(-len(numbers) // MOST_NUMBERS)]]
     x = axis("Number of the trial", limits=(numbers[0] - 0.5, numbers[-1] + 0.5), ticks=ticks)
-    drawn = []
+    pictures = []
     for name, (title, unit, factor) in TRIAL_FIGURES.items():
         points = [
             Point(trial["number"], *_value(trial, name), trial["outcome"] in ("followed", "little"), bool(trial["ask"]))
@@ -146,8 +146,8 @@ def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[di
         known = [trial for trial, point in zip(trials, points, strict=True) if point.value is not None]
         if known or name != "error_percent":
             latest, levels = trial_words(known[-1], name) if known else "–", bounds.get(name, ())
-            drawn.append(_panel(points, title, unit, latest, x, [factor * end for end in levels]))
-    return drawn
+            pictures.append(_panel(points, title, unit, latest, x, [factor * end for end in levels]))
+    return pictures
 
 
 def _value(trial: Mapping[str, Any], name: str) -> tuple[float | None, float | None]:

@@ -25,18 +25,8 @@ def comparison_html(
 ) -> str:
     """Write measurement against model: where it fails, and by how much.
 
-    Parameters
-    ----------
-    document : dict
-        A MODEL.json.
-    curves : dict
-        As `stimrig.api.jobs.curves.curves` gives them.
-    name : str
-        Name of the file or the test.
-    test : dict, optional
-        The test as the service shows it.
-    comparison : dict, optional
-        As `identify.compare` gives it, cleaned and thinned.
+    `document`: a MODEL.json; `curves`: as `stimrig.api.jobs.curves.curves` gives them; `name`: of the file or the test;
+    `test`: as the service shows it; `comparison`: as `identify.compare` gives it, cleaned and thinned.
     """
     effects, compared = [effect["id"] for effect in document.get("effects") or []], comparison or {}
     model = {**stored_model.figures(document), **stored_model.quality(document)}
@@ -76,18 +66,9 @@ def story_html(
 ) -> str:  # fmt: skip
     """Write the story of a model.
 
-    Parameters
-    ----------
-    story : dict
-        As `stimrig.api.models.story.story` gives it.
-    before, after : dict
-        Curves and comparison of the first model and of the last one.
-    name : str
-        Name of the record.
-    refused : sequence of dict
-        Effects that were tried and not added.
-    structure : str
-        The structure that the first model had.
+    `story`: as `stimrig.api.models.story.story` gives it; `before`, `after`: curves and comparison of the first model
+    and of the last one; `name`: of the record; `refused`: effects that were tried and not added; `structure`: of the
+    first model.
     """
     begun = f" · begun with {structure}" if structure else ""
     lead = f"{name} · noise {story['noise_sd_nm'] or 0.0:.4f} N·m{begun}"

@@ -36,13 +36,13 @@ MOST_NOTES = 12
 @router.get("/report")
 async def report(request: Request, context: Ctx, _principal: ModelReader, row: Version) -> Response:
     """Show one sheet on a model."""
-    shown = await parts(context, row)
+    content = await parts(context, row)
 
     def write() -> Response:
-        figures, recording = shown["figures"], context.store.get(Recording, row.recording_id)
-        drawn = {name: svg(figures[name], *place, light=True) for name, place in CHARTS.items() if name in figures}
+        figures, recording = content["figures"], context.store.get(Recording, row.recording_id)
+        pictures = {name: svg(figures[name], *place, light=True) for name, place in CHARTS.items() if name in figures}
         session = session_of(context, recording)
-        return page(request, "report_sheet.html", **shown, drawn=drawn, recording=recording, session=session)
+        return page(request, "report_sheet.html", **content, drawn=pictures, recording=recording, session=session)
 
     return await asyncio.to_thread(write)
 
