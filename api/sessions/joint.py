@@ -123,9 +123,6 @@ class JointTests(Watched):
     def document(self, row: Test) -> dict[str, Any]:
         return {**super().document(row), **row.plan["joint"]}
 
-    def needs_watching(self, row: Test) -> bool:
-        return row.kind != HELD
-
     # ---- today's ---------------------------------------------------------------------------------------------
 
     def _targets(self, rows: list[Test], shared: Layout) -> list[dict[str, Any]]:

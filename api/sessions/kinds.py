@@ -193,17 +193,13 @@ class Watched(Kind):
         return self.watcher if self.watcher is not None and self.watcher.plan.test_id == test_id else None
 
     def _status(self, row: Test) -> dict[str, Any]:
-        """A test that is not watched never began, needs no watching, or the service was restarted."""
+        """A test that is not watched never began, has a fixed plan, or the service was restarted."""
         if (watcher := self._watcher_of(row.id)) is not None:
             return watcher.document()
         status = self.status_type(self.watching)
-        if self.needs_watching(row) and row.state not in ("requested", "refused"):
+        if row.plan["adaptive"] is not None and row.state not in ("requested", "refused"):
             status.state, status.problem = self.alone, f"{self.left_alone}: the service was restarted during the test."
         return asdict(status)
-
-    def needs_watching(self, row: Test) -> bool:  # noqa: ARG002
-        """Return whether a test of this kind is watched at all."""
-        return True
 
 
 class Watcher:

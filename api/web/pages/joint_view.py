@@ -12,7 +12,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.services import joint, participants
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.joint import target_of
-from stimrig.api.sessions.joint_plan import HELD, MOVING, PASSIVE
+from stimrig.api.sessions.joint_plan import KINDS
 from stimrig.api.sessions.trials import SEQUENCE
 from stimrig.api.store.tables import Participant, Test
 from stimrig.api.web.dependencies import Context, Ctx, Tester
@@ -20,8 +20,6 @@ from stimrig.api.web.pages import starting
 from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
-ISOMETRIC = ("pre-session", "adaptive", "next-experiment")
-"""Kinds of tests in which the joint stands still at the angle of the fixture."""
 
 
 @router.get("/participants/{code}/joint")
@@ -44,25 +42,18 @@ def _gather(context: Context, row: Participant, overview: dict[str, Any]) -> dic
         Test.requested_utc >= context.clock.start_of_day_utc(),
     )  # fmt: skip
     rows = context.store.all(Test, *conditions, order=Test.requested_utc)
-    picked, next_rad = _newest_of_each(rows), overview["next_rad"]
+    kinds = [test.kind if test.kind in KINDS else "isometric" for test in rows]
+    newest = {(kind, f"{target_of(test):.1f}"): test.id for kind, test in zip(kinds, rows, strict=True)}
+    picked = set(newest.values())
     return {
         "range_rad": profiles.range_of(row.profile),
         "may_start": starting.calibrated(context, row).may_start,
         "archived": row.archived_utc is not None,
         "held": [{**each, "deg": starting.allowed_deg(each["angle_rad"])} for each in overview["targets"]],
-        "allowed": starting.allowed_deg(next_rad),
+        "allowed": starting.allowed_deg(overview["next_rad"]),
         "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],
-        "kinds_lacking": [kind for kind in (PASSIVE, HELD, MOVING) if not any(test.kind == kind for test in rows)],
+        "kinds_lacking": [kind for kind in KINDS if kind not in kinds],
     }
-
-
-def _newest_of_each(rows: list[Test]) -> set[str]:
-    """Return the newest isometric, passive and moving test, and the newest at each angle that was held."""
-    newest: dict[str, str] = {}
-    for test in rows:
-        angle = f"{target_of(test):.1f}" if test.kind == HELD else ""
-        newest[("isometric" if test.kind in ISOMETRIC else test.kind) + angle] = test.id
-    return set(newest.values())
 
 
 @router.get("/rig/angle")
