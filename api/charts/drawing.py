@@ -20,7 +20,8 @@ from markupsafe import Markup, escape
 
 from stimrig.api.charts.figure import GAP_PX, LIGHT, TOOLBAR_PX, Figure, variable
 
-MOST_POINTS, MOST_BAND = 2000, 250
+MOST_BAND = 250
+"""Points of a band: unlike those of a line matplotlib keeps them all."""
 WIDE = ("comparison", "residual", "falling", "story-torque", "story-place")
 """Charts that a report gives its whole width."""
 NARROW = 560.0
@@ -29,7 +30,7 @@ FONT_PX, LETTER_PX, LINE_PX, LEFT_PX = 11.5, 6.6, 17.0, 72.0
 SETTINGS = {
     "svg.fonttype": "none", "pdf.fonttype": 42, "font.family": "DejaVu Sans", "font.size": FONT_PX,
     "axes.labelsize": FONT_PX, "xtick.labelsize": FONT_PX, "ytick.labelsize": FONT_PX, "legend.fontsize": FONT_PX,
-    "text.parse_math": False, "path.simplify_threshold": 0.3, "lines.scale_dashes": False, "axes.xmargin": 0.0,
+    "text.parse_math": False, "path.simplify_threshold": 0.8, "lines.scale_dashes": False, "axes.xmargin": 0.0,
     "lines.solid_capstyle": "butt",
     "axes.formatter.useoffset": False, "axes.grid": True, "axes.grid.axis": "y", "axes.spines.left": False,
     "axes.spines.right": False, "axes.spines.top": False, "xtick.major.size": 0, "ytick.major.size": 0,
@@ -123,20 +124,6 @@ def _colour(value: str) -> Any:
     return red / 255, green / 255, blue / 255, opacity
 
 
-def decimate(x: Sequence[float], y: Sequence[float | None], limit: int = MOST_POINTS) -> tuple[Any, Any]:
-    """Keep the lowest and the highest of each few neighbours, and the gaps: about `limit` points, and no peak lost."""
-    at, value = np.asarray(x, dtype=float), np.asarray(y, dtype=float)
-    if at.size <= limit:
-        return at, value
-    gaps = np.isnan(value)
-    low, high = np.where(gaps, np.inf, value), np.where(gaps, -np.inf, value)
-    chosen = set(np.flatnonzero(gaps))
-    for part in np.array_split(np.arange(at.size), limit // 2):
-        chosen |= {part[np.argmin(low[part])], part[np.argmax(high[part])]}
-    rows = sorted(chosen)
-    return at[rows], value[rows]
-
-
 def _lay_out(figure: Figure, width: float, height: float, right: float, colours: Mapping[str, Any]) -> Any:
     """Return matplotlib's figure, in which a point is a px. Its margins follow from the legend and the labels."""
     from matplotlib.figure import Figure as Paper
@@ -156,7 +143,7 @@ def _lay_out(figure: Figure, width: float, height: float, right: float, colours:
     panels = list(
         paper.subplots(len(settings), 1, sharex=True, squeeze=False, height_ratios=shares, gridspec_kw=place)[:, 0]
     )
-    handles = _draw_traces(figure["data"], panels, colours, width)
+    handles = _draw_traces(figure["data"], panels, colours)
     for shape in layout["shapes"]:
         _draw_shape(shape, panels, colours)
     for note in layout["annotations"]:
@@ -186,10 +173,10 @@ def _lay_out(figure: Figure, width: float, height: float, right: float, colours:
 
 
 def _draw_traces(
-    traces: Sequence[dict[str, Any]], panels: Sequence[Any], colours: Mapping[str, Any], width: float
+    traces: Sequence[dict[str, Any]], panels: Sequence[Any], colours: Mapping[str, Any]
 ) -> list[tuple[Any, dict[str, Any]]]:
     """Draw curves and bands; return of each its handle for the legend."""
-    handles, limit = [], min(MOST_POINTS, int(1.5 * width))
+    handles = []
     for number, trace in enumerate(traces):
         axes, line = panels[int(trace["yaxis"][1:] or 1) - 1], trace["line"]
         if "fill" in trace:
@@ -204,7 +191,7 @@ def _draw_traces(
                 style |= {"marker": MARKERS[marker["symbol"]], "markersize": marker["size"],
                           "markerfacecolor": colours[marker["color"]], "markeredgewidth": marker["line"]["width"],
                           "markevery": -(-len(trace["x"]) // (marker["maxdisplayed"] or len(trace["x"])))}  # fmt: skip
-            handles += [(handle, trace) for handle in axes.plot(*decimate(trace["x"], trace["y"], limit), **style)]
+            handles += [(handle, trace) for handle in axes.plot(trace["x"], np.array(trace["y"], dtype=float), **style)]
     return handles
 
 
