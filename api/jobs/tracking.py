@@ -98,8 +98,8 @@ def error_percent(record: Any, reference_torque_nm: Sequence[float] | None) -> f
         return None
     pulses = np.flatnonzero(record.pulse_width_us > 0.0)
     rest = slice(0, pulses[0] if pulses.size else time_s.size)
-    known = time_s[rest].size > 1 and time_s[rest][-1] - time_s[rest][0] >= SETTLED_S
-    offset_nm = float(np.mean(torque_nm[rest])) if known else 0.0
+    settled = time_s[rest].size > 1 and time_s[rest][-1] - time_s[rest][0] >= SETTLED_S
+    offset_nm = float(np.mean(torque_nm[rest])) if settled else 0.0
     measured = count > 0
     mean_nm = np.bincount(period[inside], torque_nm[inside], reference.size)[measured] / count[measured]
     return float(100.0 * np.sqrt(np.mean((reference[measured] - (mean_nm - offset_nm)) ** 2)) / size_nm)

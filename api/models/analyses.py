@@ -73,9 +73,9 @@ class Analyses:
         self, model: Model, on_call: OnCall | None, *, background: bool = False
     ) -> tuple[Model, str, dict[str, Any]]:
         place, kind = await asyncio.to_thread(self._criticised, model)
-        own = {"model_json": stored_model.text(place)} if kind == OWN_DIAGNOSIS else {}
-        found = await self._find(place, kind, "diagnosis", on_call=on_call, background=background, **own)
-        return place, kind, found
+        structure = {"model_json": stored_model.text(place)} if kind == OWN_DIAGNOSIS else {}
+        diagnosis = await self._find(place, kind, "diagnosis", on_call=on_call, background=background, **structure)
+        return place, kind, diagnosis
 
     def _criticised(self, model: Model) -> tuple[Model, str]:
         """Return the version and the name that a diagnosis is stored under.
@@ -193,9 +193,9 @@ class Analyses:
             raise ApiError(409, "effect-not-there", title, detail, reasons=against)
         free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in (diagnosis or {}).get("free") or []}
         forms = free | stored_model.structure(stored_model.read(model))
+        with_forms = [forms.get(effect, effect) for effect in effects]
         path = await asyncio.to_thread(self.path, model.recording_id)
-        wanted = [forms.get(effect, effect) for effect in effects]
-        fitted = await self.run("fit", on_call, data=path, method=model.method, effects=wanted)
+        fitted = await self.run("fit", on_call, data=path, method=model.method, effects=with_forms)
 
         def store() -> Model:
             row = self._child(model, added, json.loads(fitted["json"]), by, list(against))

@@ -163,9 +163,9 @@ def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
     cards = []
     for effect in document.get("effects") or []:
         if shape := effect.get("shape"):
-            own = {"effect": effect["id"], "name": effect_words(effect["id"]), "axis": shape["effect"]}
-            entry = {**shape, **own, **{key: effect[key] for key in ("equation", "parameters") if key in effect}}
-            cards.append(free_card(entry, {}, f"In this model: {own['name']}"))
+            naming = {"effect": effect["id"], "name": effect_words(effect["id"]), "axis": shape["effect"]}
+            entry = {**shape, **naming, **{key: effect[key] for key in ("equation", "parameters") if key in effect}}
+            cards.append(free_card(entry, {}, f"In this model: {naming['name']}"))
     return cards
 
 

@@ -92,9 +92,9 @@ class Versions:
 
         Three queries, and no model is read whole.
         """
-        wanted = (Model.participant == participant, Model.created_utc >= since_utc)
-        query = select(Model).options(defer(Model.document)).where(*wanted)
-        of_these = Approval.model_id.in_(select(Model.id).where(*wanted))
+        conditions = (Model.participant == participant, Model.created_utc >= since_utc)
+        query = select(Model).options(defer(Model.document)).where(*conditions)
+        of_these = Approval.model_id.in_(select(Model.id).where(*conditions))
         decided = select(Approval).where(of_these).order_by(Approval.id)
         with self.store.read() as session:
             rows = list(session.scalars(query.order_by(Model.created_utc.desc())))

@@ -127,10 +127,10 @@ def sentences(trials: Sequence[Mapping[str, Any]], since_utc: str) -> list[str]:
     `trials`: as `stimrig.api.models.tracked.trial_document` gives them, the oldest first; `since_utc`: when the
     recording of the approved model was made.
     """
-    known = [trial for trial in trials if trial["now"] and trial["distance"] is not None]
-    if not known:
+    followed = [trial for trial in trials if trial["now"] and trial["distance"] is not None]
+    if not followed:
         return []
-    number, now, since = known[-1]["number"], known[-1]["now"], when(since_utc)
+    number, now, since = followed[-1]["number"], followed[-1]["now"], when(since_utc)
     changes = []
     for name, (what, less, more) in CHANGES.items():
         level, middle = now[name], MIDDLES[name]
