@@ -29,7 +29,7 @@ lint: setup-test ## style and layers
 	@$(BIN)/lint-imports --no-cache
 
 types: setup-test ## types
-	@$(BIN)/basedpyright --level error
+	@$(BIN)/pyrefly check --min-severity error
 
 bench: $(VENV)-bench/.bench ## the figures in docs/, measured on this machine
 	@$(VENV)-bench/bin/python -m bench
