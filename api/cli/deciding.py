@@ -87,5 +87,5 @@ def diagnose_together(data: Sequence[Path], recording: bytes) -> tuple[identify.
         new.write_bytes(recording)
         record = load_record([*data, new])
         explained = identify.explain(record, progress)
-    left = {"structure": held_by(explained.improvement.models[-1], record), **explained.left.to_dict()}
-    return explained, {"structure": [], **explained.diagnosis.to_dict(), "left": left}
+    remaining = {"structure": held_by(explained.improvement.models[-1], record), **explained.left.to_dict()}
+    return explained, {"structure": [], **explained.diagnosis.to_dict(), "left": remaining}

@@ -88,8 +88,8 @@ def read_content(entry: Entry) -> bytes:
 def _records_of(names: Iterable[str]) -> list[str]:
     """Return the names of a folder's files that may be records."""
     tables = set(EXPORT_TABLES) if set(EXPORT_TABLES) <= set(names) else set()
-    shown = (name for name in names if name not in tables and not name.startswith((".", "_")))
-    return sorted(name for name in shown if name.lower().endswith(SUFFIXES))
+    visible = (name for name in names if name not in tables and not name.startswith((".", "_")))
+    return sorted(name for name in visible if name.lower().endswith(SUFFIXES))
 
 
 def _list_folder(place: Path) -> Iterator[Entry]:

@@ -124,7 +124,9 @@ def _write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]
 
 def _code(row: dict[str, Any]) -> str:
     """Return the participant's code as a part of a file's name."""
-    return "".join(one for one in row.get("participant") or "" if one.isascii() and one.isalnum()) or "unknown"
+    return (
+        "".join(letter for letter in row.get("participant") or "" if letter.isascii() and letter.isalnum()) or "unknown"
+    )
 
 
 def _undated(record: Record) -> Record:

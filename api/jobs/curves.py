@@ -102,19 +102,19 @@ def recorded(data: str, progress: Progress) -> dict[str, Any]:
         tables: Any = {name: {key: table[()] for key, table in group.items()} for name, group in file.items()}
         names: Any = file["segments/name"]
         labels, rate_hz = names.asstr()[:], float(np.asarray(file.attrs["pulse_rate_hz"]))
-    pulses, spans, drawn = tables["pulses"], tables["segments"], {}
+    pulses, spans, curves = tables["pulses"], tables["segments"], {}
     for table, source, name, factor in (
         ("torque", "torque_nm", "torque_nm", 1.0), ("angle", "angle_rad", "angle_deg", 180 / math.pi),
     ):  # fmt: skip
         if tables.get(table):
-            drawn[name] = _envelope(tables[table]["time_s"], factor * tables[table][source])
+            curves[name] = _envelope(tables[table]["time_s"], factor * tables[table][source])
     due_s, widths_us = pulses["planned_time_s"].tolist(), pulses["sent_pulse_width_us"].tolist()
     end_s = due_s[-1] + 1.0 / rate_hz if due_s else 0.0
     widths_us = [width_us if math.isfinite(width_us) else None for width_us in [*widths_us, *widths_us[-1:]]]
-    angle = drawn.get("angle_deg")
+    angle = curves.get("angle_deg")
     return {
-        "time_s": drawn["torque_nm"][0],
-        "torque_nm": drawn["torque_nm"][1],
+        "time_s": curves["torque_nm"][0],
+        "torque_nm": curves["torque_nm"][1],
         "pulse_time_s": [*due_s, end_s] if due_s else [],
         "sent_pulse_width_us": widths_us,
         "pulses_end_s": end_s,

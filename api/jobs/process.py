@@ -28,7 +28,7 @@ class _Context(ForkServerContext):
 
     process: ForkServerProcess
 
-    def Process(self, *arguments: Any, **more: Any) -> ForkServerProcess:  # noqa: N802  # pyright: ignore
+    def Process(self, *arguments: Any, **more: Any) -> ForkServerProcess:  # noqa: N802  # type: ignore
         self.process = ForkServerProcess(*arguments, **more)
         return self.process
 
@@ -116,7 +116,7 @@ def _begin(progress: Connection, modules: list[str], memory_bytes: int, nice: in
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends this process
     # It ends with the fork server, and that one with its parent: once nobody but the parent holds this pipe.
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
-    os.close(forkserver._forkserver._forkserver_alive_fd)  # pyright: ignore[reportAttributeAccessIssue]
+    os.close(forkserver._forkserver._forkserver_alive_fd)  # type: ignore
     os.nice(nice)
     _Child.progress = progress
     for name in modules:

@@ -90,14 +90,14 @@ def with_experiment(record: Any, diagnosis: Any, structure: Sequence[str]) -> di
     """Return a diagnosis with the library's entries of the effects that it names, and the next experiment."""
     from stimrig.identify.effects import library
 
-    document = {**diagnosis.to_dict(), "structure": list(structure)}
+    document: dict[str, Any] = {**diagnosis.to_dict(), "structure": list(structure)}
     named = {row["effect"] for rows in (document.get("candidates") or []) for row in rows}
     for entry in [*document["missing"], *document["free"]]:
         named |= {entry["effect"], *(entry.get("confused_with") or [])}
     document["library"] = {entry["id"]: entry for entry in library() if entry["id"] in named}
     plan = experiment(document["missing"], document["deciding_experiment"])
     # A list of widths is one of pulses: at another rate it would be another test, and could not be joined.
-    document["experiment"] = plan and {**plan, "pulse_rate_hz": record.pulse_rate_hz}
+    document["experiment"] = None if plan is None else {**plan, "pulse_rate_hz": record.pulse_rate_hz}
     return document
 
 
@@ -106,7 +106,7 @@ def experiment(missing: Sequence[dict[str, Any]], further: dict[str, Any] | None
     from stimrig.identify.diagnosis import planned
 
     plan = planned(missing, further)
-    return plan and {**plan.to_dict(), "effect": next(iter(plan.rivals), "")}
+    return None if plan is None else {**plan.to_dict(), "effect": next(iter(plan.rivals), "")}
 
 
 def signatures(record: Any, improvement: Any) -> dict[str, Any]:

@@ -173,8 +173,8 @@ class People:
             row = known_user(session, name)
             locking.check(session, row, tags)
             row.password_hash, row.places = hashed, []
-            own = principal.page_session.hash if principal.page_session else None
-            cookie = self.auth.end_sessions(session, row.token_hash, but=own)
+            session_hash = principal.page_session.hash if principal.page_session else None
+            cookie = self.auth.end_sessions(session, row.token_hash, but=session_hash)
             locking.write(session, row, self.clock.utc(), principal.name, "change password", row.name)
         return cookie
 
@@ -266,8 +266,8 @@ def written_name(text: str) -> str:
         raise ValueError(f"a name has 1 to {LONGEST} characters, this one {len(name)}")
     for sign in name:
         kind, called = unicodedata.category(sign), unicodedata.name(sign, "without a name")
-        seen = sign not in UNSEEN and "VARIATION SELECTOR" not in called
-        if not (seen and (kind[0] == "L" or kind in ("Mn", "Mc", "Nd"))) and sign not in NAME_MARKS:
+        is_visible = sign not in UNSEEN and "VARIATION SELECTOR" not in called
+        if not (is_visible and (kind[0] == "L" or kind in ("Mn", "Mc", "Nd"))) and sign not in NAME_MARKS:
             raise ValueError(f"the character U+{ord(sign):04X} ({called.lower()}) cannot stand in a name")
     if not any(unicodedata.category(sign)[0] in "LN" for sign in name):
         raise ValueError("a name has at least one letter or digit")

@@ -52,7 +52,7 @@ class Principal:
     @property
     def csrf(self) -> str | None:
         """The session's CSRF token; None for a bearer token."""
-        return self.page_session and self.page_session.csrf
+        return None if self.page_session is None else self.page_session.csrf
 
     def may(self, scope: Scope) -> bool:
         """Return whether the scope is held."""

@@ -83,8 +83,8 @@ async def step(context: Context, code: str, body: StepIn, tags: Tags) -> dict[st
 
 async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags) -> dict[str, Any]:
     """Mark the last train's width as a threshold and return the calibration's state."""
-    shown = await _act(context, code, tags, requests.CalibrateMarkRequest(**body.model_dump()))
-    width = {"pulse_width_us": shown["pulse_width_us"]}
+    status = await _act(context, code, tags, requests.CalibrateMarkRequest(**body.model_dump()))
+    width = {"pulse_width_us": status["pulse_width_us"]}
     await asyncio.to_thread(context.store.note, context.clock, by, f"mark {body.threshold}", code, **width)
     return await standing(context, code)
 

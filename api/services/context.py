@@ -46,8 +46,8 @@ class Context:
         store = self.store = Store(settings.database)
         guesses = self.guesses = Guesses(clock)
         self.auth = Auth(store, clock, guesses, IdleLock(store, clock, settings.idle_lock_min), settings.session_hours)
-        given = settings.admin_token.get_secret_value() if settings.admin_token else None
-        self.drawn_token = self.auth.first_administrator(given)
+        admin_token = settings.admin_token.get_secret_value() if settings.admin_token else None
+        self.drawn_token = self.auth.first_administrator(admin_token)
         self.people = People(store, clock, self.auth, guesses)
         self.versions = Versions(store, clock)
         self.rig = RigClient(settings.rig_socket, clock)

@@ -83,7 +83,7 @@ async def take_in(
         new = Recording(id=whole.stem, participant=code, test_id=None, path=str(whole), origin="upload")
         new.file_sha256 = await asyncio.to_thread(sha256_of, part)
         new.samples_sha256 = fitted.get("samples_sha256") or ""
-        new.warnings = [note for note in (*assumed, *fitted["notes"]) if note]
+        warnings = new.warnings = [note for note in (*assumed, *fitted["notes"]) if note]
         await _read_samples(context)
         of = await asyncio.to_thread(_other_owner, context, new, principal, fitted.get("of") or "", of)
     except BaseException:  # refused, or nobody waits for it any more
@@ -91,7 +91,7 @@ async def take_in(
         raise
     row = await asyncio.shield(asyncio.to_thread(_store, context, new, principal.name, of, tags))
     plain = await asyncio.to_thread(context.versions.add, fitted["json"], code, row.id, principal.name)
-    return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), new.warnings
+    return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), warnings
 
 
 async def _read_samples(context: Context) -> None:

@@ -23,7 +23,7 @@ def find(context: Context, test_id: str) -> Test:
 def change_ran_by(context: Context, test_id: str, name: str | None, by: str, tags: Tags) -> Test:
     """Note who ran a test at the rig. Raises ApiError: 404 no such test; 412 it was changed since."""
     with context.store.write() as session:
-        row = require_found(session.get(Test, test_id), "test", test_id, LISTED)
+        row: Test = require_found(session.get(Test, test_id), "test", test_id, LISTED)
         locking.check(session, row, tags)
         row.ran_by = other_than(row.requested_by, name)
         ran_by = row.ran_by or row.requested_by

@@ -171,7 +171,7 @@ def make_key(auth: Auth, maker: Principal, participant: str, body: KeyFor, tags:
         raise forbidden(detail)
     text, now = f"stimrig_{secrets.token_urlsafe(32)}", auth.clock.utc()
     with auth.store.write() as session:
-        person = require_found(session.get(Participant, participant), "participant", participant)
+        person: Participant = require_found(session.get(Participant, participant), "participant", participant)
         refuse_archived(person)
         locking.check(session, person, tags)
         row = Token(

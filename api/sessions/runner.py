@@ -88,11 +88,12 @@ class Runner(Playing):
 
     def _plan(self, body: TestIn, participant: Participant) -> messages.TestPlan:
         segments = [messages.SegmentPlan(**segment.model_dump()) for segment in body.segments or ()] or None
+        protocol: dict[str, Any] = {} if body.protocol is None else {"protocol": body.protocol}
         return messages.TestPlan(
             test_id=self._new_id(),
             **{name: getattr(body, name) for name in messages.LABELS},
             segments=segments,
-            **({} if body.protocol is None else {"protocol": body.protocol}),
+            **protocol,
             pulse_rate_hz=body.pulse_rate_hz,
             **limits_of(body, participant.profile),
         )
@@ -116,7 +117,7 @@ class Runner(Playing):
         there, before_ma = self.versions.measured_at(model)
         here, now_ma = site_of(participant), plan.profile.current_ma
         title = "The recordings could not be joined"
-        if there not in (None, here):
+        if there is not None and there != here:
             detail = f"The model was measured at {in_words(there)}, this test is at {in_words(here)}."
             raise ApiError(409, "other-site", title, detail)
         if before_ma not in (None, now_ma):

@@ -95,9 +95,9 @@ def blanked(entries: list[AuditEntry]) -> set[int]:
     numbers: set[int] = set()
     for entry in entries:
         if entry.action == ERASE and entry.hash == entry_hash(entry):
-            blank = [one for one in by_eraser.get(entry.seq, []) if one.seq < entry.seq]
+            blank = [earlier for earlier in by_eraser.get(entry.seq, []) if earlier.seq < entry.seq]
             if (len(blank), left_of(blank)) == (entry.detail.get("entries"), entry.detail.get("kept")):
-                numbers |= {one.seq for one in blank}
+                numbers |= {earlier.seq for earlier in blank}
     return numbers
 
 

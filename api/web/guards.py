@@ -59,8 +59,8 @@ def require(scope: Scope | None = None, *, even_locked: bool = False) -> Callabl
         else:
             principal = await identified(request)
         if scope is not None and not principal.may(scope):
-            holds = ", ".join(sorted(principal.scopes))
-            raise forbidden(f"This needs the scope {scope}; {principal.name} holds {holds}.")
+            scopes = ", ".join(sorted(principal.scopes))
+            raise forbidden(f"This needs the scope {scope}; {principal.name} holds {scopes}.")
         if request.method in SAFE_METHODS:
             return principal
         sent = request.headers.get("x-csrf-token", "").encode()
@@ -201,8 +201,8 @@ def if_match(document: str, needed: bool = True) -> Any:
         if not sent:
             participant = request.state.principal.participant  # a controller's key reads no participant
             names = {"code": "{code}", **request.path_params}
-            shown = f"/v1/participants/{participant}/model" if participant else document.format(**names)
-            detail = f"Send the ETag of GET {shown} as If-Match, as you last saw it. Nothing was done."
+            address = f"/v1/participants/{participant}/model" if participant else document.format(**names)
+            detail = f"Send the ETag of GET {address} as If-Match, as you last saw it. Nothing was done."
             raise ApiError(428, "version-missing", "Say what this was decided on", detail)
         return sent
 

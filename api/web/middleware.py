@@ -99,9 +99,9 @@ class Boundary:
 
         path = scope["path"].rstrip("/")
         what = "previews" if path == PREVIEW else "uploads" if path.endswith(UPLOAD) else ""
-        most = {"previews": MOST_PREVIEWS, "uploads": MOST_UPLOADS}.get(what)
-        if most is not None and self._in_work[what] >= most:
-            await crowded(what, most, path)(scope, receive, send_more)
+        max_waiting = {"previews": MOST_PREVIEWS, "uploads": MOST_UPLOADS}.get(what)
+        if max_waiting is not None and self._in_work[what] >= max_waiting:
+            await crowded(what, max_waiting, path)(scope, receive, send_more)
             return
         self._in_work[what] += 1
         try:
@@ -161,10 +161,10 @@ def add_headers(headers: MutableHeaders) -> None:
         headers.add_vary_header("Cookie")
 
 
-def crowded(what: str, most: int, path: str) -> JSONResponse:
+def crowded(what: str, max_waiting: int, path: str) -> JSONResponse:
     """503: others' previews or uploads are in work."""
     wait_s = "1" if what == "previews" else "30"
-    detail = f"{most} {what} are in work already. Try again in {wait_s} s."
+    detail = f"{max_waiting} {what} are in work already. Try again in {wait_s} s."
     body = ApiError(503, "crowded", f"Too many {what} at once", detail).body(path)
     return JSONResponse(body, 503, media_type="application/problem+json", headers={"Retry-After": wait_s})
 

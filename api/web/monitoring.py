@@ -60,7 +60,11 @@ class Figures:
         for name, words, value in (
             ("rig_connected", "1 where the rig's socket is open", float(rig.connected)),
             ("rig_age_seconds", "Time since the rig spoke; -1: never", known(rig.age_s)),
-            ("rig_torque_age_seconds", "Age of the newest torque; -1: none", known(status and status.torque_age_s)),
+            (
+                "rig_torque_age_seconds",
+                "Age of the newest torque; -1: none",
+                known(None if status is None else status.torque_age_s),
+            ),
             ("live_listeners", "Open live channels", hub.listeners),
             ("lost_samples", "Lost in the newest test", newest.lost_samples if newest else 0),
             ("dropped_pulses", "Dropped in it", newest.dropped_pulses if newest else 0),

@@ -221,7 +221,7 @@ def run_test(
 def _progress(test: TestOut) -> tuple[str, str]:
     """Return the part of the test that goes on, and a line of how far it is."""
     if test.state == "identifying":
-        segment = (test.identification or {}).get("text") or "identifying"
+        segment = str((test.identification or {}).get("text") or "identifying")
         return segment, f"identification: {segment}"
     if test.adaptive and test.state == "running":
         segment = test.adaptive["problem"] or test.adaptive["words"] or "a first look at the muscle"

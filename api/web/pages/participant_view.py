@@ -22,8 +22,8 @@ from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.render import page
 
 router = APIRouter(include_in_schema=False)
-environment.globals["note_kinds"] = {kind: kind.capitalize() for kind in get_args(NoteKind)}
-environment.globals["muscles"] = ("biceps brachii", "triceps brachii")
+environment.globals["note_kinds"] = {kind: kind.capitalize() for kind in get_args(NoteKind)}  # type: ignore
+environment.globals["muscles"] = ("biceps brachii", "triceps brachii")  # type: ignore
 """Offered where a muscle is typed; any other may be."""
 
 
