@@ -26,14 +26,16 @@ async def carry(analyses: Analyses, plain: Model, path: str, on_call: OnCall | N
     if earlier is None or earlier.recording_id == plain.recording_id or plain.effects:
         return plain
     try:
-        carried = await analyses.run("carry", on_call, data=path, model_json=stored_model.text(earlier), **how)
+        carried: dict[str, Any] = await analyses.run(
+            "carry", on_call, data=path, model_json=stored_model.text(earlier), **how
+        )
     except (ApiError, OSError, ValueError) as error:  # every error of a worker's call
         why, words = (
             (error.code, f"{error.title}. {error.detail}") if isinstance(error, ApiError) else ("failed", error)
         )
-        found: dict[str, Any] = {key: [] for key in ("still_needed", "no_longer_needed", "undecided", "effects")}
+        nothing: dict[str, Any] = {key: [] for key in ("still_needed", "no_longer_needed", "undecided", "effects")}
         reason = f"The structure of the last session was not fitted. {words}".strip()
-        carried = {"json": None, "found": {**found, "offered": "plain", "why": why, "reason": reason}}
+        carried = {"json": None, "found": {**nothing, "offered": "plain", "why": why, "reason": reason}}
     finding = {key: value for key, value in carried["found"].items() if key != "carried_from"}
     finding["from_model_id"] = earlier.id
 

@@ -154,8 +154,8 @@ def free_card(entry: Mapping[str, Any], library: Mapping[str, Any], heading: str
     """Describe a free effect, of a diagnosis or of a model."""
     about = "A free effect: it describes what no effect of the library explains, and names no cause."
     parameters, plain = _labelled(entry, library), f"{entry['words']} {entry.get('left_out') or ''}".strip()
-    shown = {"heading": heading, "plain": plain, "notes": [about], "source": None, "parameters": parameters}
-    return {"equation": "", **entry, **shown, "id": entry["effect"]}
+    card = {"heading": heading, "plain": plain, "notes": [about], "source": None, "parameters": parameters}
+    return {"equation": "", **entry, **card, "id": entry["effect"]}
 
 
 def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -215,8 +215,8 @@ def tidy_experiment(experiment: Mapping[str, Any]) -> dict[str, Any]:
     """Describe the next experiment for people."""
     rate_hz = experiment.get("pulse_rate_hz")
     played = [(segment_words(row["sequence"]), _seconds(row["settings"], rate_hz)) for row in experiment["segments"]]
-    shown = [f"{name} {seconds}".strip() for name, seconds in played]
-    return {**experiment, "text": worded(experiment["text"]), "shown": shown}
+    segments = [f"{name} {seconds}".strip() for name, seconds in played]
+    return {**experiment, "text": worded(experiment["text"]), "shown": segments}
 
 
 def _seconds(settings: Mapping[str, Any], pulse_rate_hz: float | None) -> str:

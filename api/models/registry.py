@@ -156,7 +156,7 @@ class Versions:
             person = session.get_one(Participant, row.participant)
             locking.check(session, person, tags)
             now, here, (there, _current) = self.clock.utc(), site_of(person), self.measured_at(row)
-            if approved and there not in (None, here):
+            if approved and there is not None and there != here:
                 words = (
                     f"{row.id} was measured at {in_words(there)}. {person.code} is now stimulated at {in_words(here)}. "
                     "Test anew there, or set the site back on the participant's page. Nothing was decided."
@@ -170,9 +170,9 @@ class Versions:
                 site=list(here),
             )  # fmt: skip
             session.add(decision)
-            shown = {name: value for name, value in row.fit.items() if name != "figures"}
+            fit = {name: value for name, value in row.fit.items() if name != "figures"}
             action = "approve" if approved else "reject"
-            locking.write(session, person, now, by, action, row.id, **entry, shown=shown, **limits)
+            locking.write(session, person, now, by, action, row.id, **entry, shown=fit, **limits)
             return person.version
 
     def measured_at(self, row: Model) -> tuple[Site | None, float | None]:

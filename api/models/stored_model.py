@@ -150,7 +150,7 @@ def validity(document: Mapping[str, Any]) -> str | None:
     if known.get("pulse_width_us"):
         named.append("pulse widths of {:.0f}–{:.0f} µs".format(*known["pulse_width_us"]))
     if known.get("torque_nm"):
-        largest = max(known["torque_nm"], key=abs)
+        largest = max(map(float, known["torque_nm"]), key=abs)
         named.append(f"torques up to {largest:.1f} N·m" if largest >= 0 else f"torques down to {largest:.1f} N·m")
     if known.get("pulse_rate_hz"):
         named.append("{:.0f}–{:.0f} pulses/s".format(*known["pulse_rate_hz"]))

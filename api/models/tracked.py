@@ -162,14 +162,14 @@ class TrackedVersions:
             return None
         moved = (Tracked.approval_id == approved.approval_id, Tracked.document.is_not(None))
         row: Tracked | None = self.store.first(Tracked, *moved, order=Tracked.number.desc())
-        ask, body = self.new_test_reason(approved.approval_id), row.document if row else None
-        if body is None and ask is None:
+        reason, body = self.new_test_reason(approved.approval_id), row.document if row else None
+        if body is None and reason is None:
             return approved
         if body is None:
             approval: Approval = self.store.get(Approval, approved.approval_id)
             body = _body(json.loads(approved.body), approval, 0, None, approved.at_utc, {})
         document = json.loads(body)
-        document["tracking"]["ask"] = ask
+        document["tracking"]["ask"] = reason
         body = _dumped(document)
         etag = f'"{hashlib.sha256(body).hexdigest()}"'
         return Served(body, etag, approved.approval_id, document["tracking"]["at_utc"])

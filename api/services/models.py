@@ -82,7 +82,7 @@ async def invert(context: Context, model_id: str, body: ReferenceIn) -> dict[str
     rig = context.rig.status
     rise, shortest_us = (rig.limits.get(RISE), rig.stimulator.get("shortest_us")) if rig else (None, None)
     largest_us = tighter(body.max_pulse_width_us, participant.profile.get("max_pulse_width_us"))
-    rise_us = tighter(body.max_rise_us, rise and rise.hi)
+    rise_us = tighter(body.max_rise_us, None if rise is None else rise.hi)
     reference = body.model_dump(include={"reference_torque_nm", "time_s", "angle_rad", "pulse_rate_hz", "table"})
     inverted = await context.pool.submit(
         "invert", urgent=True, model_json=text, largest_us=largest_us, rise_us=rise_us, whole=body.whole_us,

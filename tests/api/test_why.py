@@ -156,6 +156,8 @@ def test_version_with_effects_is_criticised_with_them(client: httpx.Client, page
     page = pages.get(f"/models/{better}").text
     assert "Structure of the model: fatigue" in page and 'id="effect-threshold_drift"' in page
     assert 'id="effect-fatigue"' not in page
+    assert f'data-next="/models/{model}#versions"' in page and "Undo: back to the previous version" in page
+    assert "Undo" not in pages.get(f"/models/{model}").text
     rows = client.post(f"/v1/models/{better}/improve").json()["versions"]
     assert rows[0]["id"] == better and rows[-1]["parent_id"] == better
     assert rows[-1]["effects"] == ["fatigue", "threshold_drift"]

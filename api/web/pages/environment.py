@@ -53,7 +53,7 @@ environment.filters.update({
     "label_rows": clinical_words.label_rows, "dose": dose_words,
 })  # fmt: skip
 environment.policies["json.dumps_kwargs"] = {"sort_keys": True}
-environment.globals |= {
+environment.globals |= {  # type: ignore
     "site_words": site_words,
     "site_of": site_of,
     "label_titles": LABEL_TITLES,

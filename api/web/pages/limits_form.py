@@ -37,7 +37,7 @@ def fields(profile: Mapping[str, Any], status: Status | None) -> list[dict[str, 
     if status is None or not status.angle.present:
         return entries
     range_rad, calibration = profiles.range_of(profile), status.angle.calibration
-    outdated = profiles.range_outdated(profile, calibration and calibration.set_at_utc)
+    outdated = profiles.range_outdated(profile, None if calibration is None else calibration.set_at_utc)
     shown_rad = (None, None) if range_rad is None or outdated else range_rad
     texts = ["" if rad is None else number_text(round(math.degrees(rad), 2) + 0.0) for rad in shown_rad]
     within = "" if status.angle.range_rad is None else f"within {profiles.range_words(status.angle.range_rad)} (rig)"

@@ -26,7 +26,7 @@ from stimrig.api.web.pages.render import page
 from stimrig.api.web.pages.report_file import missing_parts
 
 router = APIRouter(include_in_schema=False)
-environment.globals |= {"tracking_words": limits_words, "usual_tracking": Limits().model_dump()}
+environment.globals |= {"tracking_words": limits_words, "usual_tracking": Limits().model_dump()}  # type: ignore
 MOST_FINDINGS = 2
 """Failed checks in the first screen; the others stand with the parameters."""
 TITLES = {"diagnosis": "Diagnosing", "add-effects": "Adding the effect", "improve": "Improving the model",

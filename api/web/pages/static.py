@@ -54,7 +54,7 @@ def url(name: str) -> str:
     return f"/static/{name}?v={contents(path, path.stat().st_mtime)[2]}"
 
 
-environment.globals["static"] = url
+environment.globals["static"] = url  # type: ignore
 
 
 @router.get("/static/{name}")
