@@ -30,13 +30,13 @@ class Task:
         from stimrig.identify.effects import find_effect
         from stimrig.identify.errors import IdentifyError
         from stimrig.identify.methods import method_of
-        from stimrig.identify.records.columns import parsed
+        from stimrig.identify.records.columns import parse_column_map
 
         try:
             method_of(self.method)
             for name in self.effects:
                 if name != "auto":
                     find_effect(name.partition(":")[0])
-            parsed(list(self.columns) or None)
+            parse_column_map(list(self.columns) or None)
         except IdentifyError as error:
             raise CohortError(str(error)) from error

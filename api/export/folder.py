@@ -22,7 +22,7 @@ from stimrig.api.export.record_file import check_format, write_record
 from stimrig.api.whole_file import whole_path
 from stimrig.identify.errors import IdentifyError
 from stimrig.identify.records.cells import lines
-from stimrig.identify.records.columns import parsed
+from stimrig.identify.records.columns import parse_column_map
 from stimrig.identify.records.record import Record, Source
 
 RECORDS, ERRORS = EXPORT_TABLES
@@ -65,7 +65,7 @@ def export_records(
         An address is missing, or the folder is not empty or cannot be written.
     """
     check_format(format)
-    parsed(columns)
+    parse_column_map(columns)
     selection, total = Selection(select), count_records(data)
     rows: dict[str, dict[str, Any]] = {}  # by the SHA-256 of the record's file
     errors: list[tuple[str, str]] = []

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from stimrig.identify.errors import BadRequest
-from stimrig.identify.records.columns import SHOWN
+from stimrig.identify.records.columns import COMMON_UNITS
 from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.record import Record
 
@@ -36,7 +36,7 @@ def write_parquet(record: Record, path: Path) -> None:
     import pyarrow.parquet as pq
 
     samples = record.samples()
-    fields = [pa.field(name, pa.float64(), metadata={"unit": SHOWN.get(name, ("1",))[0]}) for name in samples]
+    fields = [pa.field(name, pa.float64(), metadata={"unit": COMMON_UNITS.get(name, ("1",))[0]}) for name in samples]
     arrays = [pa.array(np.asarray(column, float)) for column in samples.values()]
     segments = pa.DictionaryArray.from_arrays(pa.array(record.segment, pa.int32()), list(record.segment_names))
     schema = pa.schema(

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from stimrig.identify.records.record import Record
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-"""How a sealed recording begins; the service asks, too, and loads no reader for it."""
+"""First bytes of a sealed recording; the service checks them without loading a reader."""
 PARQUET_MAGIC = b"PAR1"
 
 
 def read(
     path: str | Path, pulse_rate_hz: float | None = None, map: Mapping[str, str] | Iterable[str] | None = None
 ) -> Record:
-    """Read a record; its `notes` say what was assumed.
+    """Read a record; its `notes` list the assumptions made.
 
     Parameters
     ----------
@@ -44,20 +44,20 @@ def read(
     path = Path(path)
     if pulse_rate_hz is not None:
         bounds.check_rate(pulse_rate_hz, "pulse rate")
-    given = columns.parsed(map)
+    column_map = columns.parse_column_map(map)
     content = bounds.content_of(path)
     if content.startswith(HDF5_MAGIC):
         from stimrig.identify.records.recording import read_recording
 
-        if given:
+        if column_map:
             raise BadRecord("a sealed recording has its own columns", place=str(path), fix="Leave --map out.")
         return read_recording(content, path, pulse_rate_hz)
     if is_mat(content) or path.suffix.lower() == ".mat":
-        return read_mat(content, path, pulse_rate_hz, given)
+        return read_mat(content, path, pulse_rate_hz, column_map)
     if content.startswith(PARQUET_MAGIC) or path.suffix.lower() == ".parquet":
         from stimrig.identify.records.parquet import read_parquet
 
-        return read_parquet(content, path, pulse_rate_hz, given)
+        return read_parquet(content, path, pulse_rate_hz, column_map)
     from stimrig.identify.records.csv import read_csv
 
-    return read_csv(content, path, pulse_rate_hz, given)
+    return read_csv(content, path, pulse_rate_hz, column_map)

@@ -20,7 +20,7 @@ LEAST_CHANGES = 8
 LONGEST_HOLD_S = 0.3
 """A ramp holds a width no longer; else it is a staircase."""
 LEAST_PRBS = 4
-MOST_TOLD = 8
+MAX_LISTED = 8
 
 
 def find_segments(time_s: np.ndarray, width_us: np.ndarray) -> tuple[np.ndarray, list[str], str]:
@@ -70,20 +70,20 @@ def _switching(level: np.ndarray) -> str:
 
 def _note(names: list[str], starts_s: np.ndarray, end_s: float) -> str:
     ends_s = np.append(starts_s[1:], end_s)
-    told = [f"{name} {a:.4g} to {b:.4g} s" for name, a, b in zip(names, starts_s, ends_s, strict=True)]
-    more = f" and {len(told) - MOST_TOLD} more" if len(told) > MOST_TOLD else ""
-    return f"no segment column: found from the pulse widths: {', '.join(told[:MOST_TOLD])}{more}; none is held out"
+    spans = [f"{name} {a:.4g} to {b:.4g} s" for name, a, b in zip(names, starts_s, ends_s, strict=True)]
+    more = f" and {len(spans) - MAX_LISTED} more" if len(spans) > MAX_LISTED else ""
+    return f"no segment column: found from the pulse widths: {', '.join(spans[:MAX_LISTED])}{more}; none is held out"
 
 
-def record_of(found: FileContent) -> Record:
-    """The record, with notes on all that was assumed. Raises BadRecord: with the place and what to do."""
-    check_numbers(found)
-    found = from_zero(without_holes(found))
-    check_widths(found)
-    time_s = found.columns["time_s"]
-    bounds.check_span(time_s, found.at(time_s.size - 1))
-    found = clock.regular(found)
-    if "segment" not in found.columns:
-        code, names, note = find_segments(found.columns["time_s"], found.columns["pulse_width_us"])
-        found = found.noting(note, names=names, columns=found.columns | {"segment": code})
-    return found.record()
+def record_of(file: FileContent) -> Record:
+    """Make the record of a file, with notes on all assumptions. Raises BadRecord: with the place and the fix."""
+    check_numbers(file)
+    file = from_zero(without_holes(file))
+    check_widths(file)
+    time_s = file.columns["time_s"]
+    bounds.check_span(time_s, file.at(time_s.size - 1))
+    file = clock.regular(file)
+    if "segment" not in file.columns:
+        code, names, note = find_segments(file.columns["time_s"], file.columns["pulse_width_us"])
+        file = file.noting(note, names=names, columns=file.columns | {"segment": code})
+    return file.record()

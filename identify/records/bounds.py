@@ -1,4 +1,4 @@
-"""What a record of a muscle can hold: every reader refuses what lies outside, before it takes the memory for it."""
+"""Bounds of a record: every reader refuses what lies outside before it allocates memory."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ UNITS = {
     "angle_rad": "No joint turns so far. If these are degrees, say so: --map angle_rad=angle_rad:deg, and the same "
     "for a velocity."
 }
-"""What is likely wrong where all numbers of a column are finite, and one is too large."""
+"""Likely cause where all numbers of a column are finite, and one is too large."""
 LARGEST_CALENDAR_S = 1e11
 """Times as they are read may be counted from 1970, or from 1904."""
 LONGEST_NAME = 100
 LONGEST_TEXT = 10_000
 LONGEST_PLAN = 8 * 2**20
-"""What the rig writes of a test as one text (configuration, events): a plan lists each pulse of its trains."""
+"""Longest text that the rig writes of a test (configuration, events): a plan lists each pulse of its trains."""
 MOST_SEGMENTS = 1000
 MOST_PARTS = 1000
 PULSE_RATES_HZ = (1.0, 200.0)
@@ -77,7 +77,7 @@ def wrong_rows(column: str, values: np.ndarray) -> np.ndarray:
 
 
 def fix_of(column: str, wrong: np.ndarray, otherwise: str) -> str:
-    """What to do about numbers of a column that are too large, or none."""
+    """Advice on numbers of a column that are too large, or missing."""
     return UNITS.get(column, otherwise) if np.isfinite(wrong).all() else otherwise
 
 

@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator
 SIGNS = r"=+\-@\t\r\n\uff1d\uff0b\uff0d\uff20"
 """With what a formula begins; the last four are the wide ones of Asian keyboards."""
 FORMULA = re.compile(rf"(^ *|[;,] *)('*[{SIGNS}])")
-TOLD = re.compile(rf"(^ *|[;,] *)'('*[{SIGNS}])")
+QUOTED_SIGN = re.compile(rf"(^ *|[;,] *)'('*[{SIGNS}])")
 
 
 def cell_text(text: str) -> str:
@@ -24,7 +24,7 @@ def cell_text(text: str) -> str:
 
 def as_written(cell: str) -> str:
     """The text that `cell_text` made this cell of."""
-    return TOLD.sub(r"\1\2", cell) if "'" in cell else cell
+    return QUOTED_SIGN.sub(r"\1\2", cell) if "'" in cell else cell
 
 
 def cell(value: str | float | None) -> str:
@@ -37,7 +37,7 @@ def cell(value: str | float | None) -> str:
 
 
 def is_number(cell: str) -> bool:
-    """Whether a cell is a number as a measuring tool writes it: no digits of other scripts, no underscores."""
+    """Return true for a number as a measuring tool writes it: no digits of other scripts, no underscores."""
     try:
         float(cell)
     except ValueError:

@@ -32,21 +32,21 @@ def pulse_phase_s(record: Record) -> float:
     latest = np.mod(record.time_s[changes] - record.time_s[0], step_s)
     latest, often = np.unique(np.round(latest, 9), return_counts=True)
     if sample_s > NEARLY * step_s:
-        # Any phase but a sliver is explained by all changes: the sliver tells. It is the widest without a change.
+        # All changes explain any phase but a sliver, the widest span without a change: it gives the phase.
         gaps = np.diff(np.r_[latest, latest[0] + step_s])
         widest = int(np.argmax(gaps))
         first = float(latest[(widest + 1) % latest.size])
         near = min(first, step_s - first) < 1e-3 * step_s
         return 0.0 if near or gaps[widest] < 0.5 * (step_s - sample_s) else first
     trial = np.linspace(0.0, step_s, 401)[:-1]
-    # How many changes each trial phase explains, with a tolerance of a hair for rounding.
+    # Count the changes that each trial phase explains, with a tolerance of a hair for rounding.
     lag = np.mod(latest[:, None] - trial[None, :] + 1e-3 * sample_s, step_s)
     explained = often @ (lag < sample_s * 1.002)
     best = np.flatnonzero(explained == explained.max())
     anchor = trial[best[best.size // 2]]
     # From the anchor the earliest 'latest' time is the bound; take it exactly, free of the trial's spacing.
-    ahead = np.mod(latest - anchor + 1e-3 * sample_s, step_s)
-    inside = ahead[ahead < sample_s * 1.002]
+    offset_s = np.mod(latest - anchor + 1e-3 * sample_s, step_s)
+    inside = offset_s[offset_s < sample_s * 1.002]
     phase = float(np.mod(anchor + np.min(inside) - 1e-3 * sample_s, step_s))
     return 0.0 if step_s - phase < 1e-9 else phase
 
@@ -57,14 +57,14 @@ EXPLAINED = 0.9
 """Share of the changes of width that one phase of the pulses must explain, or the pulses do not keep to the rate."""
 
 
-def _width_in_slots(found: FileContent, at_s: np.ndarray, before: np.ndarray) -> np.ndarray:
+def _width_in_slots(file: FileContent, at_s: np.ndarray, before: np.ndarray) -> np.ndarray:
     """Pulse widths at the rising times `at_s`, shape (M,); `before` is the last sample at or before each.
 
     A change of width that a sample shows came with a pulse between it and the sample before. Pulses keep to their rate:
-    all changes together tell when they come, far more closely than one. Where they do not, the last sample's width
-    stands.
+    all changes together give their phase far more closely than one. Where they do not, the last sample's width
+    is used.
     """
-    time_s, width_us, pulse_rate_hz = found.columns["time_s"], found.columns["pulse_width_us"], found.pulse_rate_hz
+    time_s, width_us, pulse_rate_hz = file.columns["time_s"], file.columns["pulse_width_us"], file.pulse_rate_hz
     phase_s = _phase_s(time_s, width_us, pulse_rate_hz)
     if phase_s is None:
         return width_us[before]
@@ -79,20 +79,20 @@ def _width_in_slots(found: FileContent, at_s: np.ndarray, before: np.ndarray) ->
 
 
 def _phase_s(time_s: np.ndarray, width_us: np.ndarray, pulse_rate_hz: float) -> float | None:
-    """When pulses come, modulo their interval, s: the latest phase that explains the most changes; None for none."""
+    """Phase of the pulses in their interval, s: the latest one that explains the most changes; None for none."""
     changes = np.flatnonzero(np.diff(width_us)) + 1
     if not changes.size:
         return None
     changes = changes[:: -(-changes.size // MOST_CHANGES)]
     step_s = 1.0 / pulse_rate_hz
-    shown, unseen = np.mod(time_s[changes], step_s), time_s[changes] - time_s[changes - 1]
+    change_phase_s, before_s = np.mod(time_s[changes], step_s), time_s[changes] - time_s[changes - 1]
     trial = np.arange(TRIALS) * step_s / TRIALS
-    explained = np.sum(np.mod(shown[:, None] - trial + 1e-9, step_s) < unseen[:, None], axis=0)
+    explained = np.sum(np.mod(change_phase_s[:, None] - trial + 1e-9, step_s) < before_s[:, None], axis=0)
     if explained.max() < EXPLAINED * changes.size:
         return None
     best = float(trial[np.argmax(explained)])
-    ahead = np.mod(shown - best + 1e-9, step_s)
-    return best + float(np.min(ahead[ahead < unseen])) - 1e-9
+    offset_s = np.mod(change_phase_s - best + 1e-9, step_s)
+    return best + float(np.min(offset_s[offset_s < before_s])) - 1e-9
 
 
 PAUSE_S = 1.0
@@ -123,39 +123,39 @@ class _Part:
     jitter_s: float = 0.0
 
 
-def regular(found: FileContent) -> FileContent:
+def regular(file: FileContent) -> FileContent:
     """The same with uniform times, and with notes on what of it was assumed; where it is resampled, pulses stay.
 
     Raises BadRecord: time does not rise, too few samples, or a rate that can't be used.
     """
-    time_s, note = _finer(found.columns["time_s"])
-    found = found.noting(note, columns=found.columns | {"time_s": time_s})
-    _check_rising(found)
-    edges = _pauses(found)
-    parts = [_part(found, a, b) for a, b in pairwise(edges)]
+    time_s, note = _finer(file.columns["time_s"])
+    file = file.noting(note, columns=file.columns | {"time_s": time_s})
+    _check_rising(file)
+    edges = _pauses(file)
+    parts = [_part(file, a, b) for a, b in pairwise(edges)]
     step_s = parts[0].step_s
     for part, edge in zip(parts, edges, strict=False):
-        bounds.check_sampling(1 / part.step_s, found.at(edge))
+        bounds.check_sampling(1 / part.step_s, file.at(edge))
         if abs(part.step_s - step_s) > SAME_RATE * step_s:
             message = f"sampled at {1 / part.step_s:.4g} Hz after a pause, {1 / step_s:.4g} Hz before it"
-            raise BadRecord(message, place=found.at(edge), fix="Resample to one rate.")
+            raise BadRecord(message, place=file.at(edge), fix="Resample to one rate.")
     even = [part.even_s for part in parts if part.even_s is not None]
     if len(even) < len(parts):
-        return _resampled(found, step_s)
-    lost = _lost_note(found, np.concatenate([part.lost for part in parts]))
-    return found.noting(_jitter_note(parts), lost, columns=found.columns | {"time_s": np.concatenate(even)})
+        return _resampled(file, step_s)
+    lost = _lost_note(file, np.concatenate([part.lost for part in parts]))
+    return file.noting(_jitter_note(parts), lost, columns=file.columns | {"time_s": np.concatenate(even)})
 
 
-def _check_rising(found: FileContent) -> None:
-    time_s = found.columns["time_s"]
-    bounds.check_size(time_s.size, found.at(0))
+def _check_rising(file: FileContent) -> None:
+    time_s = file.columns["time_s"]
+    bounds.check_size(time_s.size, file.at(0))
     gaps = np.diff(time_s)
     backwards = np.flatnonzero(~(gaps > 0))
     if backwards.size:
         index = int(backwards[0]) + 1
         verb = "stands still" if gaps[index - 1] == 0 else "runs backwards"
         fix = "Sort the rows by time, once each."
-        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=found.at(index), fix=fix)
+        raise BadRecord(f"time {verb} at {time_s[index]:g} s", place=file.at(index), fix=fix)
 
 
 def _finer(time_s: np.ndarray) -> tuple[np.ndarray, str]:
@@ -171,21 +171,21 @@ def _finer(time_s: np.ndarray) -> tuple[np.ndarray, str]:
     return line_s, f"times are written to {1e3 * coarse_s:g} ms only: samples are taken as even, at {rate_hz:.5g} Hz"
 
 
-def _pauses(found: FileContent) -> list[int]:
+def _pauses(file: FileContent) -> list[int]:
     """Rows at which a part begins, and the number of rows: tests of one session may follow after a pause at rest."""
-    time_s, width_us = found.columns["time_s"], found.columns["pulse_width_us"]
+    time_s, width_us = file.columns["time_s"], file.columns["pulse_width_us"]
     steps = np.diff(time_s)
     least_s = max(PAUSE_S, 20 * float(np.median(steps)))
     jumps = np.flatnonzero((steps >= least_s) & (width_us[:-1] == 0) & (width_us[1:] == 0)) + 1
     if jumps.size > MOST_PAUSES:
         fix = "Give a record without holes."
-        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=found.at(int(jumps[MOST_PAUSES])), fix=fix)
+        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=file.at(int(jumps[MOST_PAUSES])), fix=fix)
     return [0, *jumps.tolist(), time_s.size]
 
 
-def _part(found: FileContent, first: int, end: int) -> _Part:
-    time_s, torque_nm = found.columns["time_s"][first:end], found.columns["torque_nm"][first:end]
-    bounds.check_size(time_s.size, found.at(first))
+def _part(file: FileContent, first: int, end: int) -> _Part:
+    time_s, torque_nm = file.columns["time_s"][first:end], file.columns["torque_nm"][first:end]
+    bounds.check_size(time_s.size, file.at(first))
     gaps = np.diff(time_s)
     typical_s = float(np.median(gaps))
     near = np.abs(gaps - typical_s) <= NEAR * typical_s
@@ -209,7 +209,7 @@ def _part(found: FileContent, first: int, end: int) -> _Part:
 
 
 def _resolution_s(time_s: np.ndarray) -> float:
-    """What the last decimal place of the written times is worth, s."""
+    """Value of the last decimal place of the written times, s."""
     some = time_s[:: max(time_s.size // 1000, 1)]
     for places in range(7):
         if np.all(np.abs(some * 10**places - np.rint(some * 10**places)) < 1e-4):
@@ -219,9 +219,9 @@ def _resolution_s(time_s: np.ndarray) -> float:
 
 def _roughness(time_s: np.ndarray, torque_nm: np.ndarray) -> float:
     """Mean square by which a sample's torque is off the line between its neighbours, as a share of the noise in it."""
-    ahead = (time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2])
-    error = torque_nm[1:-1] - (1.0 - ahead) * torque_nm[:-2] - ahead * torque_nm[2:]
-    return float(np.mean(error**2 / (1.0 + ahead**2 + (1.0 - ahead) ** 2)))
+    share = (time_s[1:-1] - time_s[:-2]) / (time_s[2:] - time_s[:-2])
+    error = torque_nm[1:-1] - (1.0 - share) * torque_nm[:-2] - share * torque_nm[2:]
+    return float(np.mean(error**2 / (1.0 + share**2 + (1.0 - share) ** 2)))
 
 
 def _jitter_note(parts: list[_Part]) -> str:
@@ -234,25 +234,25 @@ def _jitter_note(parts: list[_Part]) -> str:
     )
 
 
-def _lost_note(found: FileContent, rows: np.ndarray) -> str:
-    time_s = found.columns["time_s"]
+def _lost_note(file: FileContent, rows: np.ndarray) -> str:
+    time_s = file.columns["time_s"]
     if not rows.size:
         return ""
     if rows.size > max(MOST_PAUSES, MOST_GAPS * time_s.size):
-        place = found.at(int(rows[MOST_PAUSES]))
+        place = file.at(int(rows[MOST_PAUSES]))
         raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, fix="Give a record without holes.")
     longest_s = float(np.max(time_s[rows] - time_s[rows - 1]))
     places = "1 place" if rows.size == 1 else f"{rows.size} places"
     first = int(rows[0])
     return (
-        f"samples are missing at {places} (first at {found.cell(first, 'time_s')}; longest {longest_s:.3g} s): "
+        f"samples are missing at {places} (first at {file.cell(first, 'time_s')}; longest {longest_s:.3g} s): "
         "left as gaps"
     )
 
 
-def _resampled(found: FileContent, step_s: float) -> FileContent:
+def _resampled(file: FileContent, step_s: float) -> FileContent:
     """The same at a uniform rate: torque and movement on straight lines between samples, gaps left open."""
-    time_s = found.columns["time_s"]
+    time_s = file.columns["time_s"]
     steps = np.diff(time_s)
     gap = steps > GAP_STEPS * np.median(steps)
     gaps, usual = np.flatnonzero(gap) + 1, steps[~gap]
@@ -265,13 +265,13 @@ def _resampled(found: FileContent, step_s: float) -> FileContent:
     share = np.clip((even_s - time_s[before]) / steps[before], 0.0, 1.0)
     columns = {
         name: (1.0 - share) * column[before] + share * column[before + 1] if name in INTERPOLATED else column[before]
-        for name, column in found.columns.items()
+        for name, column in file.columns.items()
     }
     columns["time_s"] = even_s
-    columns["pulse_width_us"] = _width_in_slots(found, even_s, before)
+    columns["pulse_width_us"] = _width_in_slots(file, even_s, before)
     note = (
         f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms): resampled to "
         f"{1 / step_s:.5g} Hz, torque on straight lines between samples: "
         "noise and error figures come out too small"
     )
-    return found.noting(note, _lost_note(found, gaps), columns=columns)
+    return file.noting(note, _lost_note(file, gaps), columns=columns)

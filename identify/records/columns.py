@@ -1,4 +1,4 @@
-"""Which column of another tool's file is which: as `--map` says, else by its name and the unit that stands there.
+"""Columns of another tool's file: chosen by `--map`, else recognised by name and unit.
 
 A unit is never guessed: a column whose name is known and whose unit is not is refused with the `--map` that would do.
 """
@@ -31,7 +31,7 @@ UNITS: dict[str, dict[str, float]] = {
     "segment": {},
 }
 """For each column the units that are known, as `plain_unit` writes them, with the factor to the column's own unit."""
-SHOWN = {
+COMMON_UNITS = {
     "time_s": ("s", "ms", "µs"),
     "pulse_width_us": ("µs", "ms", "s"),
     "torque_nm": ("Nm", "mNm", "Ncm"),
@@ -39,7 +39,7 @@ SHOWN = {
     "velocity_rad_s": ("rad/s", "deg/s", "rpm"),
     "late_s": ("s", "ms", "µs"),
 }
-"""The usual ones, the column's own first: what messages offer."""
+"""Units that messages offer, the column's own first."""
 _NO_SIGNS = str.maketrans({"μ": "µ", **dict.fromkeys("·⋅∙*. []()", None)})
 
 
@@ -49,7 +49,7 @@ def plain_unit(unit: str) -> str:
 
 
 def unit_factor(target: str, unit: str) -> float | None:
-    """By what a column's numbers are multiplied to come in its own unit; None where the unit is not known."""
+    """Factor from a unit to the column's own unit; None where the unit is not known."""
     return UNITS[target].get(plain_unit(unit))
 
 
@@ -72,8 +72,8 @@ LONGEST_NAME = 100
 
 
 @dataclass(frozen=True)
-class Asked:
-    """One `--map`: the column that is meant, and its unit where one was given after the last colon."""
+class ColumnChoice:
+    """One `--map` entry: the column's name, and its unit after the last colon, if given."""
 
     target: str
     text: str
@@ -85,42 +85,42 @@ class Asked:
 
     @property
     def unit(self) -> str:
-        """What stands after the last colon; empty without one."""
+        """The text after the last colon; empty without one."""
         return self.text.rpartition(":")[2].strip() if ":" in self.text else ""
 
 
 @dataclass(frozen=True)
 class Column:
-    """A column that was found: where it stands, by what its numbers are multiplied, and what of it was assumed."""
+    """A column of a file: its index, the factor to our unit, and a note on what was assumed."""
 
     index: int
     factor: float = 1.0
     note: str = ""
 
 
-Given = Mapping[str, Asked]
+ColumnMap = Mapping[str, ColumnChoice]
 
 
-def parsed(given: Mapping[str, str] | Iterable[str] | None) -> Given:
-    """What `--map` says, by target: a mapping, or texts `target=name` or `target=name:unit`.
+def parse_column_map(entries: Mapping[str, str] | Iterable[str] | None) -> ColumnMap:
+    """Parse `--map` into choices by target: a mapping, or texts `target=name` or `target=name:unit`.
 
     Raises BadRecord: no such target, no name, or one target twice.
     """
-    if given is None:
+    if entries is None:
         return {}
-    given = [given] if isinstance(given, str) else given
-    pairs = list(given.items()) if isinstance(given, Mapping) else [_pair(text) for text in given]
-    found: dict[str, Asked] = {}
+    entries = [entries] if isinstance(entries, str) else entries
+    pairs = list(entries.items()) if isinstance(entries, Mapping) else [_pair(text) for text in entries]
+    choices: dict[str, ColumnChoice] = {}
     for target, text in pairs:
         if target not in TARGETS:
             fix = f"Give one of {', '.join(TARGETS)}, for instance --map torque_nm=Moment:Nm."
             raise BadRecord(f"no column is called {short(target)!r}", place="--map", fix=fix)
-        if target in found:
+        if target in choices:
             raise BadRecord(f"{target} is given twice", place="--map", fix="Give each column once.")
         if not str(text).strip():
             raise BadRecord(f"no name for {target}", place="--map", fix=f"Give --map {target}=NAME:UNIT.")
-        found[target] = Asked(target, str(text).strip())
-    return found
+        choices[target] = ColumnChoice(target, str(text).strip())
+    return choices
 
 
 def _pair(text: str) -> tuple[str, str]:
@@ -131,46 +131,46 @@ def _pair(text: str) -> tuple[str, str]:
     return target.strip(), name
 
 
-def places(header: Sequence[str], given: Given) -> dict[str, list[int]]:
-    """For each column the cells of a header that may be it: as asked, else of its own name, else of a known name."""
+def places(header: Sequence[str], column_map: ColumnMap) -> dict[str, list[int]]:
+    """Find the cells of a header that may be each column: by `--map`, else by our name, else by a known name."""
     plain = [cell.strip() for cell in header]
     known = [_known_as(cell) for cell in plain]
-    found: dict[str, list[int]] = {}
+    indices_of: dict[str, list[int]] = {}
     for target in TARGETS:
-        if target in given:
-            found[target] = _asked_for(plain, given[target])
+        if target in column_map:
+            indices_of[target] = _chosen_cells(plain, column_map[target])
         elif not (exact := [index for index, cell in enumerate(plain) if cell == target]):
             named = [index for index, name in enumerate(known) if name == target]
             with_unit = [index for index in named if _split(plain[index], target)[1]]
-            found[target] = with_unit if len(with_unit) == 1 else named
+            indices_of[target] = with_unit if len(with_unit) == 1 else named
         else:
-            found[target] = exact
-    return {target: indices for target, indices in found.items() if indices}
+            indices_of[target] = exact
+    return {target: indices for target, indices in indices_of.items() if indices}
 
 
-def complete(found: Mapping[str, list[int]]) -> bool:
-    """Whether a header has all that a record needs."""
-    return all(target in found for target in NEEDED)
+def complete(indices_of: Mapping[str, list[int]]) -> bool:
+    """Return true if a header has all columns that a record needs."""
+    return all(target in indices_of for target in NEEDED)
 
 
-def columns(header: Sequence[str], given: Given, units_row: Sequence[str], place: str) -> dict[str, Column]:
+def columns(header: Sequence[str], column_map: ColumnMap, units_row: Sequence[str], place: str) -> dict[str, Column]:
     """The columns of a header with their units; `units_row` is a row of units below it, empty without one.
 
     Raises BadRecord: a column is missing, there twice, or of a unit that is unknown; with the `--map` that would
     do.
     """
     plain = [cell.strip() for cell in header]
-    found = places(plain, given)
-    missing = [target for target in (*NEEDED, *given) if target not in found]
+    indices_of = places(plain, column_map)
+    missing = [target for target in (*NEEDED, *column_map) if target not in indices_of]
     if missing:
-        raise _missing(plain, missing, given, place)
+        raise _missing(plain, missing, column_map, place)
     columns: dict[str, Column] = {}
-    for target, indices in found.items():
+    for target, indices in indices_of.items():
         if len(indices) > 1:
             raise _twice(plain, target, indices, place)
         index = indices[0]
         below = units_row[index].strip() if index < len(units_row) else ""
-        if (column := _convert_column(plain[index], target, index, below, given.get(target), place)) is not None:
+        if (column := _convert_column(plain[index], target, index, below, column_map.get(target), place)) is not None:
             columns[target] = column
     _refuse_shared(plain, columns, place)
     return columns
@@ -186,19 +186,21 @@ def _refuse_shared(cells: Sequence[str], columns: Mapping[str, Column], place: s
         owner[column.index] = target
 
 
-def _convert_column(name: str, target: str, index: int, below: str, asked: Asked | None, place: str) -> Column | None:
-    """A column in its unit; None where nobody asked for it and its unit is not said."""
+def _convert_column(
+    name: str, target: str, index: int, below: str, choice: ColumnChoice | None, place: str
+) -> Column | None:
+    """Make a column in its unit; None for an optional column without a unit."""
     if target == "segment":
-        note = "" if asked or (name == target and not below) else f"segment is column {short(name)!r}"
+        note = "" if choice or (name == target and not below) else f"segment is column {short(name)!r}"
         return Column(index, note=note)
-    wanted = asked.unit if asked is not None and not _is(name, asked.text) else ""
+    wanted = choice.unit if choice is not None and not _is(name, choice.text) else ""
     written = below or _split(name, target)[1]
     unit = wanted or written
     if not unit and name == target:
         return Column(index)
-    if not unit and asked is not None:
-        own = SHOWN.get(target, ("1",))[0]
-        return Column(index, note=f"{target} is {short(name)!r}, taken in {own} as no unit is given")
+    if not unit and choice is not None:
+        default_unit = COMMON_UNITS.get(target, ("1",))[0]
+        return Column(index, note=f"{target} is {short(name)!r}, taken in {default_unit} as no unit is given")
     if not unit and target not in NEEDED:
         return None
     factor = unit_factor(target, unit) if unit else None
@@ -238,25 +240,25 @@ def _is(cell: str, name: str) -> bool:
     return cell == name.strip() or _name(cell) == _name(name)
 
 
-def _asked_for(cells: Sequence[str], asked: Asked) -> list[int]:
-    """The cells that `--map` means: by number (#3), by the whole name, else by the name without its unit."""
-    for name in dict.fromkeys((asked.text, asked.name)):
+def _chosen_cells(cells: Sequence[str], choice: ColumnChoice) -> list[int]:
+    """Find the cells of a `--map` entry: by number (#3), by the whole name, else by the name without its unit."""
+    for name in dict.fromkeys((choice.text, choice.name)):
         if re.fullmatch(r"#\d{1,4}", name) and 0 < int(name[1:]) <= len(cells):
             return [int(name[1:]) - 1]
-        for same in (cells, [_split(cell, asked.target)[0] for cell in cells]):
-            if found := [index for index, cell in enumerate(same) if cell == name]:
-                return found
-            if found := [index for index, cell in enumerate(same) if _is(cell, name)]:
-                return found
+        for same in (cells, [_split(cell, choice.target)[0] for cell in cells]):
+            if matches := [index for index, cell in enumerate(same) if cell == name]:
+                return matches
+            if matches := [index for index, cell in enumerate(same) if _is(cell, name)]:
+                return matches
     return []
 
 
-def _missing(cells: Sequence[str], missing: Sequence[str], given: Given, place: str) -> BadRecord:
+def _missing(cells: Sequence[str], missing: Sequence[str], column_map: ColumnMap, place: str) -> BadRecord:
     here = ", ".join(short(cell) for cell in cells[:MOST_SHOWN] if cell) + (", …" if len(cells) > MOST_SHOWN else "")
-    if asked := next((given[target] for target in missing if target in given), None):
-        return BadRecord(f"no column {short(asked.text)!r} for {asked.target}", place=place, fix=f"It has: {here}.")
+    if choice := next((column_map[target] for target in missing if target in column_map), None):
+        return BadRecord(f"no column {short(choice.text)!r} for {choice.target}", place=place, fix=f"It has: {here}.")
     target = missing[0]
-    unit = SHOWN[target][0]
+    unit = COMMON_UNITS[target][0]
     fix = f"Say which it is, for instance --map {target}=NAME:{unit}; it has: {here}."
     return BadRecord(f"no column {', '.join(missing)}", place=place, fix=fix)
 
@@ -270,15 +272,15 @@ def _twice(cells: Sequence[str], target: str, indices: Sequence[int], place: str
 
 
 def _unit(name: str, target: str, unit: str, place: str) -> BadRecord:
-    known = SHOWN.get(target, ("1",))
-    shown = short(_split(name, target)[0] or name)
-    fix = f"Give --map {target}={shown}:{known[0]}" + (f" (or {', '.join(known[1:])})." if known[1:] else ".")
+    known = COMMON_UNITS.get(target, ("1",))
+    column_name = short(_split(name, target)[0] or name)
+    fix = f"Give --map {target}={column_name}:{known[0]}" + (f" (or {', '.join(known[1:])})." if known[1:] else ".")
     if target == "torque_nm" and plain_unit(unit) in ("n", "kg", "kn", "v", "mv"):
         fix = "Torque is asked for: multiply by the lever arm or the sensor's scale first."
-    said = f"its unit {short(unit)!r} is not known" if unit else "its unit is not said"
+    reason = f"its unit {short(unit)!r} is not known" if unit else "its unit is not said"
     if unit and unit_factor(target, unit) is not None:
-        said = f"below it stands {short(unit)!r}"
-    return BadRecord(f"column {short(name)!r} is taken for {target}, but {said}", place=place, fix=fix)
+        reason = f"below it stands {short(unit)!r}"
+    return BadRecord(f"column {short(name)!r} is taken for {target}, but {reason}", place=place, fix=fix)
 
 
 def short(text: str) -> str:

@@ -20,7 +20,7 @@ from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns, join
 from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.cells import as_written, is_number
-from stimrig.identify.records.columns import Column, Given
+from stimrig.identify.records.columns import Column, ColumnMap
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
 from stimrig.identify.records.record import Record
 
@@ -36,7 +36,7 @@ PACKED = {
     b"PK\x03\x04": ("an Excel workbook or a ZIP archive", "Save the sheet as CSV text, or unpack the archive."),
     b"\xd0\xcf\x11\xe0": ("an old Excel workbook", "Save the sheet as CSV text."),
 }
-"""How files begin that hold a table and are no text, what they are, and the mend."""
+"""First bytes of tables that are not text, with the kind of file and the fix."""
 Row = tuple[int, list[str]]
 
 
@@ -94,7 +94,7 @@ def text_lines(content: bytes, encoding: str, name: str) -> Iterator[str]:
 
 @dataclass
 class Layout:
-    """How a table is laid out, and its rows from the first one with numbers on."""
+    """Separator and header of a table, and its rows from the first one with numbers."""
 
     separator: str
     header: list[str]
@@ -103,7 +103,7 @@ class Layout:
     units: list[str] = field(default_factory=list)
 
 
-def find_layout(content: bytes, encoding: str, given: Given, name: str) -> Layout:
+def find_layout(content: bytes, encoding: str, column_map: ColumnMap, name: str) -> Layout:
     """Find header and separator among the first lines.
 
     Raises BadRecord: no line names the columns that a record needs, or the rows do not stand under it.
@@ -115,22 +115,22 @@ def find_layout(content: bytes, encoding: str, given: Given, name: str) -> Layou
         before.append(line)
         for separator in SEPARATORS:
             cells = _cells(line, separator)
-            found = columns.places(cells, given)
-            if number <= MOST_BEFORE and len(cells) >= len(columns.NEEDED) and columns.complete(found):
-                if not _numbered(given):
+            indices_of = columns.places(cells, column_map)
+            if number <= MOST_BEFORE and len(cells) >= len(columns.NEEDED) and columns.complete(indices_of):
+                if not _numbered(column_map):
                     rows = _rows(source, separator, number + 1, name)
                     return _below(Layout(separator, cells, number, rows), content, name)
-                if all(is_number(cells[found[target][0]].replace(",", ".")) for target in columns.NEEDED):
+                if all(is_number(cells[indices_of[target][0]].replace(",", ".")) for target in columns.NEEDED):
                     return Layout(separator, cells, 0, _rows(chain([line], source), separator, number, name))
-            score = len(found) + (0.5 if sum(map(_is_word, cells)) >= 3 else 0)
+            score = len(indices_of) + (0.5 if sum(map(_is_word, cells)) >= 3 else 0)
             if score > closest[0]:
                 closest = (score, number, cells)
-    raise _no_header(before, closest[1], closest[2], given, name)
+    raise _no_header(before, closest[1], closest[2], column_map, name)
 
 
-def _numbered(given: Given) -> bool:
-    """Whether columns are asked for by number, so that a header need not be."""
-    return all(target in given and given[target].name.startswith("#") for target in columns.NEEDED)
+def _numbered(column_map: ColumnMap) -> bool:
+    """Return true if all needed columns are chosen by number, so that no header is needed."""
+    return all(target in column_map and column_map[target].name.startswith("#") for target in columns.NEEDED)
 
 
 def _cells(line: str, separator: str) -> list[str]:
@@ -161,56 +161,56 @@ def _rows(source: Iterable[str], separator: str, first_line: int, name: str) -> 
         raise BadRecord(f"not CSV ({error})", place=place, fix="Save the file as comma-separated text.") from error
 
 
-def _below(found: Layout, content: bytes, name: str) -> Layout:
+def _below(layout: Layout, content: bytes, name: str) -> Layout:
     """With the row of units below the header, if there is one, taken off the rows, and comments left out."""
-    double = 2 * found.separator
+    double = 2 * layout.separator
     if any(f"\n{sign}".encode() in content for sign in (*COMMENTS, double)) or b"\0" in content:
-        found.rows = ((line, row) for line, row in found.rows if not _is_aside(row))
-    found.rows = _no_wider(found, found.rows, name)
-    first = next(found.rows, None)
+        layout.rows = ((line, row) for line, row in layout.rows if not _is_aside(row))
+    layout.rows = _no_wider(layout, layout.rows, name)
+    first = next(layout.rows, None)
     if first is None:
-        return found
+        return layout
     line, row = first
     filled = [cell.strip() for cell in row if cell.strip()]
     known = {unit for target in columns.UNITS for unit in columns.UNITS[target]}
     if any(columns.plain_unit(cell) in known for cell in filled) and not any(is_number(cell) for cell in filled):
-        found.units = row
-        return found
-    _check_width(found, line, row, name)
-    found.rows = chain([first], found.rows)
-    return found
+        layout.units = row
+        return layout
+    _check_width(layout, line, row, name)
+    layout.rows = chain([first], layout.rows)
+    return layout
 
 
 def _is_aside(row: list[str]) -> bool:
-    """Whether a row is a comment, or holds nothing."""
+    """Return true for a comment or an empty row."""
     return row[0].lstrip().startswith(COMMENTS) or not any(cell.strip() for cell in row)
 
 
-def _no_wider(found: Layout, rows: Iterator[Row], name: str) -> Iterator[Row]:
+def _no_wider(layout: Layout, rows: Iterator[Row], name: str) -> Iterator[Row]:
     """The rows; one further down with more cells than the header is refused as the first one is."""
-    width = len(found.header)
+    width = len(layout.header)
     for line, row in rows:
         if len(row) > width and any(cell.strip() for cell in row[width:]):
-            _check_width(found, line, row, name)
+            _check_width(layout, line, row, name)
         yield line, row
 
 
-def _check_width(found: Layout, line: int, row: list[str], name: str) -> None:
+def _check_width(layout: Layout, line: int, row: list[str], name: str) -> None:
     """Refuse rows that have more cells than the header has names: it is not known which cell is which."""
     used = max((index for index, cell in enumerate(row, start=1) if cell.strip()), default=0)
-    if used == len(found.header) or (used < len(found.header) and used > 1 and found.separator != BLANKS):
+    if used == len(layout.header) or (used < len(layout.header) and used > 1 and layout.separator != BLANKS):
         return
     fix = "Name every column."
-    if used < len(found.header):
-        fix = f"The header is separated by {SEPARATORS[found.separator]}: separate the rows alike."
-    elif found.separator == ",":
+    if used < len(layout.header):
+        fix = f"The header is separated by {SEPARATORS[layout.separator]}: separate the rows alike."
+    elif layout.separator == ",":
         fix = "Name every column; with decimal commas, separate the cells with semicolons."
-    message = f"{used} {'cell' if used == 1 else 'cells'} under a header of {len(found.header)}"
+    message = f"{used} {'cell' if used == 1 else 'cells'} under a header of {len(layout.header)}"
     raise BadRecord(message, place=f"{name}, line {line}", fix=fix)
 
 
-def _no_header(before: list[str], number: int, cells: list[str], given: Given, name: str) -> BadRecord:
-    """What is missing in the cells of the line that comes closest to a header."""
+def _no_header(before: list[str], number: int, cells: list[str], column_map: ColumnMap, name: str) -> BadRecord:
+    """Describe what the line that is most like a header lacks."""
     fix = "The first line must be time_s,pulse_width_us,torque_nm,segment, or name your columns with --map."
     if not cells:
         filled = any(line.strip("\ufeff \t\r\n") for line in before)
@@ -218,7 +218,7 @@ def _no_header(before: list[str], number: int, cells: list[str], given: Given, n
             fix = "Say which column is which: --map time_s=#1:s --map pulse_width_us=#2:µs --map torque_nm=#3:Nm."
         return BadRecord("no header" if filled else "empty", place=f"{name}, line 1", fix=fix)
     try:
-        columns.columns(cells, given, [], f"{name}, line {number}")
+        columns.columns(cells, column_map, [], f"{name}, line {number}")
     except BadRecord as error:
         return error
     fix = "Put one line with the columns' names before the numbers, or name each column with --map."
@@ -232,11 +232,11 @@ def _is_word(cell: str) -> bool:
 BLOCK = 4096
 CUT = "Every row needs every column; was the file cut off?"
 MISSING = {"", "nan", "na", "n/a", "n.a.", "#n/a", "#nv", "null", "none", "-", "--"}
-"""What tools write where they have no number."""
+"""Texts that tools write where they have no number."""
 
 
 class Table:
-    """What the rows hold: numbers by column, segments by name, and the line each row stands in.
+    """Contents of the rows: numbers by column, segments by name, and each row's line.
 
     `name`: how messages call the file. `columns`: where each column stands, and its factor; a `segment` may be missing.
     `cells`: where the cells stand that describe a part; empty where the file has none. `commas`: whether numbers may
@@ -291,11 +291,11 @@ class Table:
 
     def _column(self, rows: list[Row], column: str) -> np.ndarray:
         """The numbers of a column in its own unit; NaN where the file has none."""
-        found = self.columns[column]
+        source = self.columns[column]
         try:
-            cells = [row[found.index] for _, row in rows]
+            cells = [row[source.index] for _, row in rows]
         except IndexError:
-            line, row = next((line, row) for line, row in rows if len(row) <= found.index)
+            line, row = next((line, row) for line, row in rows if len(row) <= source.index)
             raise self._short(row, line, column) from None
         text = "".join(cells)
         lines = [line for line, _ in rows]
@@ -310,13 +310,13 @@ class Table:
         if not text.isascii() or "_" in text:
             for cell, line in zip(cells, lines, strict=True):
                 self._number(cell, column, line)
-        if found.factor != 1.0:
-            values *= found.factor
+        if source.factor != 1.0:
+            values *= source.factor
         if (bad := bounds.wrong_rows(column, values)).size:
-            shown = columns.short(cells[bad[0]].strip())
+            cell_text = columns.short(cells[bad[0]].strip())
             fix = "Remove the row's cause, or cut the record before it; values must be finite."
             fix = bounds.fix_of(column, values[bad], fix)
-            message = f"{shown} is no measurement" if shown else "empty"
+            message = f"{cell_text} is no measurement" if cell_text else "empty"
             raise BadRecord(message, place=self.at(lines[bad[0]], column), fix=fix)
         return values
 
@@ -354,20 +354,20 @@ class Table:
         return BadRecord(f"only {len(row)} cells", place=self.at(line, column), fix=CUT)
 
     def at(self, line: int, column: str) -> str:
-        """How messages call a cell."""
+        """Name a cell in messages."""
         return f"{self.name}, line {line}, column {column}"
 
 
-def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None, given: Given) -> Record:
-    """A record of a table from its bytes; `path` is how it is called, `given` what `--map` says.
+def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None, column_map: ColumnMap) -> Record:
+    """Read a record from the bytes of a table; `path` names it in messages, `column_map` is the parsed `--map`.
 
-    Pulses come at 40 Hz, unless it or the caller says else. Raises BadRecord: with file, line and column, and what
-    to do.
+    The pulse rate is 40 Hz unless the file or the caller gives another. Raises BadRecord: with file, line, column
+    and fix.
     """
     name = str(path)
     encoding, encoded = encoding_of(content, name)
-    layout = find_layout(content, encoding, given, name)
-    known = columns.columns(layout.header, given, layout.units, f"{name}, line {layout.line}")
+    layout = find_layout(content, encoding, column_map, name)
+    known = columns.columns(layout.header, column_map, layout.units, f"{name}, line {layout.line}")
     cells = _cells_of_parts(layout.header, known, f"{name}, line {layout.line}")
     table = Table(name, known, cells, commas=layout.separator != ",")
     table.fill(layout.rows)
@@ -377,7 +377,7 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None, given: Giv
     numbers = {column: np.array(values) for column, values in table.numbers.items()}
     if "segment" in known:
         numbers["segment"] = np.array(table.segment)
-    found = FileContent(
+    file = FileContent(
         columns=numbers,
         names=list(table.names),
         name=name,
@@ -385,11 +385,11 @@ def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None, given: Giv
         source=file_source(content, path, known, encoded, _written(layout, table)),
         pulse_rate_hz=pulse_rate_hz or PULSE_RATE_HZ,
     )
-    return join.read_joined(found, table.parts, pulse_rate_hz) if cells else record_of(found)
+    return join.read_joined(file, table.parts, pulse_rate_hz) if cells else record_of(file)
 
 
 def _written(layout: Layout, table: Table) -> str:
-    """What was assumed of how the table is written."""
+    """Describe the assumptions on how the table is written."""
     written = []
     if layout.separator != ",":
         written.append(f"{SEPARATORS[layout.separator]} between cells")

@@ -1,4 +1,4 @@
-"""What a file of another tool holds, and what of it no measurement gives."""
+"""Contents of another tool's file, and checks that a measurement can have given them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ PULSE_RATE_HZ = 40.0
 
 @dataclass(frozen=True)
 class FileContent:
-    """What a file of another tool holds."""
+    """Columns of a file of another tool, before checks."""
 
     columns: dict[str, np.ndarray]
     """In our units, by our names, each of shape (N,); NaN where the file has no number. A `segment`, where it has one,
@@ -35,7 +35,7 @@ class FileContent:
     pulse_rate_hz: float = PULSE_RATE_HZ  # pulses a second
 
     def at(self, row: int, column: str = "time_s") -> str:
-        """How errors call a cell: with the file."""
+        """Name a cell, with the file, in messages."""
         return f"{self.name}, {self.cell(row, column)}"
 
     def noting(self, *notes: str, **changes: object) -> FileContent:
@@ -58,68 +58,68 @@ def file_source(content: bytes, path: Path, known: Mapping[str, Column], *writte
     return Source(path.name, sha256=hashlib.sha256(content).hexdigest(), notes=notes)
 
 
-def check_numbers(found: FileContent) -> None:
+def check_numbers(file: FileContent) -> None:
     """Refuse numbers that no measurement gives. Raises BadRecord: infinite, or beyond what is measured."""
-    for name, column in found.columns.items():
+    for name, column in file.columns.items():
         if name != "segment" and (bad := bounds.wrong_rows(name, column)).size:
             fix = bounds.fix_of(name, column[bad], "Cut the record before it; values must be finite.")
-            raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=found.at(int(bad[0]), name), fix=fix)
+            raise BadRecord(f"{column[bad[0]]:g} is no measurement", place=file.at(int(bad[0]), name), fix=fix)
 
 
-def without_holes(found: FileContent) -> FileContent:
+def without_holes(file: FileContent) -> FileContent:
     """Without the rows in which a number is missing: they are gaps like any other.
 
     Raises BadRecord: too many of them.
     """
-    holes = {name: np.isnan(column) for name, column in found.columns.items()}
+    holes = {name: np.isnan(column) for name, column in file.columns.items()}
     rows = np.logical_or.reduce(list(holes.values()))
     count = int(np.count_nonzero(rows))
     if not count:
-        return found
+        return file
     first = int(np.argmax(rows))
     column = next(name for name, hole in holes.items() if hole[first])
     if count > MOST_HOLES * rows.size:
         message = f"no number here, nor in {count - 1} of {rows.size} rows" if count > 1 else "no number"
         fix = f"At most {100 * MOST_HOLES:.0f} % of the rows may lack one."
-        raise BadRecord(message, place=found.at(first, column), fix=fix)
-    kept = np.flatnonzero(~rows)
+        raise BadRecord(message, place=file.at(first, column), fix=fix)
+    complete_rows = np.flatnonzero(~rows)
     times = "1 row is" if count == 1 else f"{count} rows are"
-    return found.noting(
-        f"{times} left out for want of a number (first at {found.cell(first, column)})",
-        columns={name: column[kept] for name, column in found.columns.items()},
-        cell=lambda row, column: found.cell(int(kept[row]), column),
+    return file.noting(
+        f"{times} left out for want of a number (first at {file.cell(first, column)})",
+        columns={name: column[complete_rows] for name, column in file.columns.items()},
+        cell=lambda row, column: file.cell(int(complete_rows[row]), column),
     )
 
 
-def from_zero(found: FileContent) -> FileContent:
+def from_zero(file: FileContent) -> FileContent:
     """With times counted from the first sample where they are those of a calendar."""
-    time_s = found.columns["time_s"]
+    time_s = file.columns["time_s"]
     if not np.max(np.abs(time_s), initial=0.0) > bounds.LARGEST["time_s"]:
-        return found
+        return file
     note = f"time is counted from the first sample, at {time_s[0]:.3f} s"
-    return found.noting(note, columns=found.columns | {"time_s": time_s - time_s[0]})
+    return file.noting(note, columns=file.columns | {"time_s": time_s - time_s[0]})
 
 
-def check_widths(found: FileContent) -> None:
+def check_widths(file: FileContent) -> None:
     """Refuse widths and flags that no measurement gives.
 
     Raises BadRecord: negative widths, widths in another unit, flags that are neither 0 nor 1.
     """
-    width_us = found.columns["pulse_width_us"]
+    width_us = file.columns["pulse_width_us"]
     if (negative := np.flatnonzero(width_us < 0)).size:
         fix = "A pulse width is 0 (no pulse) or positive."
-        place = found.at(int(negative[0]), "pulse_width_us")
+        place = file.at(int(negative[0]), "pulse_width_us")
         raise BadRecord(f"{width_us[negative[0]]:g} µs is negative", place=place, fix=fix)
     largest_us = float(np.max(width_us, initial=0.0))
     if 0.0 < largest_us < LEAST_LARGEST_US:
         raise BadRecord(
             f"the largest is {largest_us:g} µs, and no stimulator gives so little",
-            place=found.at(int(width_us.argmax()), "pulse_width_us"),
+            place=file.at(int(width_us.argmax()), "pulse_width_us"),
             fix="Give µs: multiply seconds by 1000000, milliseconds by 1000; or say the unit, "
             "for instance --map pulse_width_us=pulse_width_us:s.",
         )
-    doubted = found.columns.get("doubted", np.zeros(0))
+    doubted = file.columns.get("doubted", np.zeros(0))
     if (bad := np.flatnonzero((doubted != 0) & (doubted != 1))).size:
         fix = "1 is a row in which it is not known what was felt, 0 any other."
-        place = found.at(int(bad[0]), "doubted")
+        place = file.at(int(bad[0]), "doubted")
         raise BadRecord(f"{doubted[bad[0]]:g} is neither 0 nor 1", place=place, fix=fix)

@@ -21,7 +21,7 @@ LARGEST_CHUNK_BYTES = 2**20
 """Packed it may be a thousandth of it, and libhdf5 unpacks it whole, whatever it was declared to be."""
 MOST_CHUNKS = 100_000
 OVERHEAD_BYTES = 4096
-"""What a filter may add to what cannot be packed."""
+"""Bytes that a filter may add to data that it cannot compress."""
 FIX = "Give a sealed recording, as written by the rig at the end of a test."
 
 
@@ -49,7 +49,7 @@ class StrictFile:
         return float(value) if isinstance(value, int | float | np.number) else float("nan")
 
     def has(self, path: str) -> bool:
-        """Whether something is called so; what it is, `numbers` says."""
+        """Return true if the path exists; its kind is not checked."""
         with self._asking(path):
             return path in self._file
 
@@ -66,10 +66,10 @@ class StrictFile:
 
     def columns(self, group: str, names: Sequence[str], unequal: str) -> list[np.ndarray]:
         """The datasets of a group, equally long, as float64. Raises BadRecord: as for `numbers`, or `unequal`."""
-        found = [self.numbers(f"{group}/{name}") for name in names]
-        if len({column.size for column in found}) > 1:
+        arrays = [self.numbers(f"{group}/{name}") for name in names]
+        if len({column.size for column in arrays}) > 1:
             raise self.bad(unequal, group)
-        return found
+        return arrays
 
     def names(self, path: str) -> list[str]:
         """A dataset of one dimension of texts. Raises BadRecord: as for `numbers`."""
@@ -80,13 +80,13 @@ class StrictFile:
                 raise self.bad("no texts", path)
             if (kind.length or 0) > LONGEST_TEXT:
                 raise self.bad("texts without an end", path)
-            found = []
+            texts = []
             for index in range(len(dataset)):  # many may point to one long text, which is then read once and refused
                 text = dataset[index]
                 if len(text) > LONGEST_TEXT:
                     raise self.bad("a text without an end", path)
-                found.append(_sound(text))
-            return found
+                texts.append(_sound(text))
+            return texts
 
     def _attribute(self, name: str, default: Any) -> Any:
         with self._asking(f"attribute {name}"):
@@ -101,7 +101,7 @@ class StrictFile:
                 raise self.bad("no single number or text", f"attribute {name}")
             return attributes[name]
 
-    def _dataset(self, path: str, most: int) -> h5py.Dataset:
+    def _dataset(self, path: str, max_length: int) -> h5py.Dataset:
         """The dataset of a path, all of its values written, and in this file."""
         here: Any = self._file
         with self._asking(path):
@@ -118,8 +118,8 @@ class StrictFile:
                 raise self.bad("data that are not plainly in this file (virtual or external)", path)
             if here.shape is None or len(here.shape) != 1:
                 raise self.bad("not of one dimension", path)
-            if len(here) > most:
-                raise self.bad(f"{len(here)} values are declared, at most {most} are read", path)
+            if len(here) > max_length:
+                raise self.bad(f"{len(here)} values are declared, at most {max_length} are read", path)
             self._check_written(here, path)
         return here
 

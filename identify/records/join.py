@@ -69,47 +69,47 @@ def _cell(text: str) -> str:
     return quoted("".join(sign for sign in text if sign.isprintable())[:LONGEST_TEXT])
 
 
-def read_joined(found: FileContent, cells: Mapping[int, Mapping[str, str]], pulse_rate_hz: float | None) -> Record:
+def read_joined(file: FileContent, cells: Mapping[int, Mapping[str, str]], pulse_rate_hz: float | None) -> Record:
     """The record of a file with the column `part` and the `cells` of each part's first row, by row.
 
     Times are taken as they are written. Raises BadRecord: parts are not numbered 0, 1, 2…, time does not rise, or a
     cell is not what it must be.
     """
-    for column, values in found.columns.items():
+    for column, values in file.columns.items():
         if column != "segment" and (bad := np.flatnonzero(~(np.abs(values) <= bounds.LARGEST[column]))).size:
-            place = found.at(int(bad[0]), column)
+            place = file.at(int(bad[0]), column)
             raise BadRecord(f"{values[bad[0]]:g} is no measurement", place=place, fix=FIX)
-    check_widths(found)
-    _check_time(found, list(cells))
-    described = (_part(found, number, *cell) for number, cell in enumerate(cells.items()))
+    check_widths(file)
+    _check_time(file, list(cells))
+    described = (_part(file, number, *cell) for number, cell in enumerate(cells.items()))
     parts, sources, rates = zip(*described, strict=True)
     if len(set(rates)) > 1:
-        raise BadRecord("parts of different pulse rates", place=f"{found.name}, column pulse_rate_hz", fix=FIX)
-    time_s = found.columns["time_s"]
-    bounds.check_span(time_s, found.at(time_s.size - 1))
-    source = joined_source(sources, found.source.name, found.source.sha256)
+        raise BadRecord("parts of different pulse rates", place=f"{file.name}, column pulse_rate_hz", fix=FIX)
+    time_s = file.columns["time_s"]
+    bounds.check_span(time_s, file.at(time_s.size - 1))
+    source = joined_source(sources, file.source.name, file.source.sha256)
     return replace(
-        found,
-        columns={name: column for name, column in found.columns.items() if name != "part"},
-        source=replace(source, notes=found.source.notes),
+        file,
+        columns={name: column for name, column in file.columns.items() if name != "part"},
+        source=replace(source, notes=file.source.notes),
         pulse_rate_hz=pulse_rate_hz or rates[0] or PULSE_RATE_HZ,
     ).record(parts=parts)
 
 
-def _check_time(found: FileContent, firsts: Sequence[int]) -> None:
+def _check_time(file: FileContent, firsts: Sequence[int]) -> None:
     """Times must rise, and at a rate that can be used."""
-    time_s = found.columns["time_s"]
+    time_s = file.columns["time_s"]
     backwards = np.flatnonzero(~(np.diff(time_s) > 0))
     if backwards.size:
         row = int(backwards[0]) + 1
-        raise BadRecord(f"time does not rise at {time_s[row]:g} s", place=found.at(row), fix=FIX)
+        raise BadRecord(f"time does not rise at {time_s[row]:g} s", place=file.at(row), fix=FIX)
     for row, end in zip(firsts, [*firsts[1:], time_s.size], strict=True):
         if end - row < 2:
-            raise BadRecord("a part of one sample", place=found.at(row), fix=FIX)
-        bounds.check_sampling(1 / float(np.median(np.diff(time_s[row:end]))), found.at(row))
+            raise BadRecord("a part of one sample", place=file.at(row), fix=FIX)
+        bounds.check_sampling(1 / float(np.median(np.diff(time_s[row:end]))), file.at(row))
 
 
-def _part(found: FileContent, number: int, row: int, texts: Mapping[str, str]) -> tuple[Part, Source, float | None]:
+def _part(file: FileContent, number: int, row: int, texts: Mapping[str, str]) -> tuple[Part, Source, float | None]:
     """A part, its source and its pulse rate from the cells of its first row."""
 
     def figure(column: str, lowest: float, highest: float) -> float | None:
@@ -119,22 +119,22 @@ def _part(found: FileContent, number: int, row: int, texts: Mapping[str, str]) -
         value = float(text) if is_number(text) else np.nan
         if not lowest <= value <= highest:
             message = f"{text[:40]!r} is not {lowest:g} to {highest:g}"
-            raise BadRecord(message, place=found.at(row, column), fix=FIX)
+            raise BadRecord(message, place=file.at(row, column), fix=FIX)
         return value
 
     def text(column: str) -> str:
         cell = texts.get(column, "")
         if len(cell) > LONGEST_TEXT or not cell.isprintable():
-            raise BadRecord("a name that cannot be", place=found.at(row, column), fix=FIX)
+            raise BadRecord("a name that cannot be", place=file.at(row, column), fix=FIX)
         return cell
 
-    time_s, part = found.columns["time_s"], found.columns["part"]
+    time_s, part = file.columns["time_s"], file.columns["part"]
     if part[row] != number:
-        raise BadRecord(f"{part[row]:g} where part {number} begins", place=found.at(row, "part"), fix=FIX)
+        raise BadRecord(f"{part[row]:g} where part {number} begins", place=file.at(row, "part"), fix=FIX)
     pause_s = figure("pause_s", 0.0, bounds.LONGEST_S)
     if pause_s is None:
         fix = "Give the pause before each part, 0 if it isn't known."
-        raise BadRecord("empty", place=found.at(row, "pause_s"), fix=fix)
+        raise BadRecord("empty", place=file.at(row, "pause_s"), fix=fix)
     folded_s, latest_s = figure("folded_s", 0.0, pause_s), bounds.LARGEST["time_s"]
     folded_s = pause_s if folded_s is None else folded_s
     own_s = figure("own_s", -latest_s, latest_s)
@@ -143,18 +143,18 @@ def _part(found: FileContent, number: int, row: int, texts: Mapping[str, str]) -
     begun_s = figure("begun_s", 0.0, bounds.LARGEST_CALENDAR_S)
     source = Source(text("name"), text("recording_id"), text("sha256"))
     if folded_s > (time_s[row] - time_s[row - 1] if number else 0.0) + 1e-6:
-        raise BadRecord("longer than the jump of the time", place=found.at(row, "folded_s"), fix=FIX)
+        raise BadRecord("longer than the jump of the time", place=file.at(row, "folded_s"), fix=FIX)
     return Part(row, own_s, begun_s, pause_s, folded_s), source, rate_hz
 
 
 PAUSE_S = 30.0
-"""What of a pause is kept in the time at most: every pulse interval of it is a row of the grid."""
+"""Longest pause kept in the time: every pulse interval of it is a row of the grid."""
 LEAST_SAMPLES = 2
 """Samples between two pulses from which recordings of different rates are joined."""
 SAME_RATE = 0.01
 """Sampling rates that differ by less, as a share, are one nominal rate and two clocks."""
-TOLD_WHERE_SO = ("late_s", "doubted")
-"""Columns that a record lacks where there is nothing to tell."""
+ONLY_IF_SET = ("late_s", "doubted")
+"""Columns that a record lacks where all their values are 0."""
 RESAMPLED = ("time_s", "torque_nm", "angle_rad", "velocity_rad_s")
 """Columns of which a sample at a lower rate is a mean; a flag is set if one was, and else a value is taken that was."""
 
@@ -193,7 +193,7 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
     that differ by less than 1 % stay as they are. The slots of the pulses fall on one grid. A pause is kept in whole
     pulse intervals, up to 30 s of it in `time_s`; it is 0 where a begin is not known, or where by their clocks two
     parts overlap. An angle or velocity is dropped unless all parts have it; so are the pulses in the gaps, which are
-    doubted then. A part that has no lateness or doubt has none to tell.
+    doubted then. In a part without `late_s` or `doubted` they are 0.
 
     Parameters
     ----------
@@ -219,9 +219,9 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
             message = f"{record.pulse_rate_hz:g} pulses/s, the first has {rate_hz:g}"
             raise BadRecord(message, place=f"recording {number}", fix="Join recordings of one pulse rate.")
         bounds.check_size(record.time_s.size, f"recording {number}")
-        own = _pieces(record, begun)
-        _refuse_twice(own, known, f"recording {number}")
-        pieces += own
+        record_pieces = _pieces(record, begun)
+        _refuse_twice(record_pieces, known, f"recording {number}")
+        pieces += record_pieces
     if len(pieces) > bounds.MOST_PARTS:
         raise BadRecord(f"{len(pieces)} parts", fix=f"Join at most {bounds.MOST_PARTS}.")
     if all(piece.begun_s is not None for piece in pieces):
@@ -249,13 +249,13 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
     slot_s = float(record.time_s[0]) + pulse_phase_s(record)
     alone = len(record.parts) == 1
     edges = [*(part.first for part in record.parts), record.time_s.size]
-    found = []
+    pieces = []
     for index, (part, source) in enumerate(zip(record.parts, record.sources, strict=True)):
         # A plain record's clock is its own.
         shift_s = 0.0 if alone and part.begun_s is None else part.own_s - float(record.time_s[part.first])
         pulses = None if record.pulses is None else _pulses(record.pulses, shift_s, -np.inf, np.inf)
         cut = record.take(np.arange(part.first, edges[index + 1]))
-        found.append(
+        pieces.append(
             _Piece(
                 record=replace(cut, time_s=cut.time_s + shift_s, pulses=pulses, parts=(Part(),)),
                 begun_s=begun_s if alone and part.begun_s is None else part.begun_s,
@@ -264,7 +264,7 @@ def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
                 known_pause_s=part.pause_s if index else 0.0,
             )
         )
-    return found
+    return pieces
 
 
 def samples_between(sample_rate_hz: float, pulse_rate_hz: float) -> int:
@@ -274,17 +274,17 @@ def samples_between(sample_rate_hz: float, pulse_rate_hz: float) -> int:
 
 def _at_one_rate(pieces: list[_Piece], rate_hz: float) -> list[_Piece]:
     """All pieces at the lowest of their rates, or just below it, where a whole number of samples is to make a pulse."""
-    own = [piece.record.sample_rate_hz for piece in pieces]
-    lowest = min(own)
-    if max(own) <= (1 + SAME_RATE) * lowest:
+    rates_hz = [piece.record.sample_rate_hz for piece in pieces]
+    lowest = min(rates_hz)
+    if max(rates_hz) <= (1 + SAME_RATE) * lowest:
         return pieces
     each = samples_between(lowest, rate_hz)
     if each < LEAST_SAMPLES:
         fix = f"Recordings of different rates are joined from {LEAST_SAMPLES * rate_hz:g} Hz on."
-        raise BadRecord(f"sampled at {lowest:.4g} and {max(own):.4g} Hz", fix=fix)
+        raise BadRecord(f"sampled at {lowest:.4g} and {max(rates_hz):.4g} Hz", fix=fix)
     return [
         replace(piece, record=_block_means(piece, each, rate_hz)) if own_hz > (1 + SAME_RATE) * lowest else piece
-        for piece, own_hz in zip(pieces, own, strict=True)
+        for piece, own_hz in zip(pieces, rates_hz, strict=True)
     ]
 
 
@@ -301,8 +301,8 @@ def _block_means(piece: _Piece, each: int, rate_hz: float) -> Record:
     count = np.diff(np.r_[starts, block.size])
     whole = 2 * count >= np.median(count)
     pick = starts + count // 2
-    held = np.add.reduceat(record.held_out.astype(np.int64), starts) > 0
-    for index in np.flatnonzero(held & ~record.held_out[pick]):
+    any_held_out = np.add.reduceat(record.held_out.astype(np.int64), starts) > 0
+    for index in np.flatnonzero(any_held_out & ~record.held_out[pick]):
         pick[index] = starts[index] + int(np.argmax(record.held_out[starts[index] : starts[index] + count[index]]))
     pick = pick[whole]
     changes: dict[str, object] = {}
@@ -313,8 +313,8 @@ def _block_means(piece: _Piece, each: int, rate_hz: float) -> Record:
             changes[name] = np.logical_or.reduceat(column, starts)[whole]
         else:
             changes[name] = column[pick]
-    kept = record.segment[pick]
-    used, segment = np.unique(kept, return_inverse=True)
+    picked_segment = record.segment[pick]
+    used, segment = np.unique(picked_segment, return_inverse=True)
     names = tuple(record.segment_names[index] for index in used)
     return replace(record, segment=segment, segment_names=names, **changes)  # type: ignore
 
@@ -329,12 +329,12 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     first, ended, slot_s = 0, 0, pieces[0].slot_s
     for index, piece in enumerate(pieces):
         time_s = piece.record.time_s
-        own = piece.interval(0, rate_hz)
+        first_interval = piece.interval(0, rate_hz)
         pause = _pause(pieces[index - 1], piece, rate_hz) if index else 0
         folded = min(pause, round(PAUSE_S * rate_hz))
-        start = ended + 1 + folded if index else own
-        shift_s = slot_s + (start - own) / rate_hz - piece.slot_s
-        ended = start + piece.interval(-1, rate_hz) - own
+        start = ended + 1 + folded if index else first_interval
+        shift_s = slot_s + (start - first_interval) / rate_hz - piece.slot_s
+        ended = start + piece.interval(-1, rate_hz) - first_interval
         moved.append(replace(piece.record, time_s=time_s + shift_s))
         if piece.record.pulses is not None:
             pulses.append(_pulses(piece.record.pulses, shift_s, float(time_s[0]), float(time_s[-1])))
@@ -346,7 +346,7 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     columns: dict[str, np.ndarray] = {}
     for name in (*NEEDED, *OPTIONAL):
         each = [column for record in moved if (column := _column(record, name)) is not None]
-        if len(each) == len(pieces) and (name not in TOLD_WHERE_SO or any(column.any() for column in each)):
+        if len(each) == len(pieces) and (name not in ONLY_IF_SET or any(column.any() for column in each)):
             columns[name] = np.concatenate(each)
     bounds.check_span(columns["time_s"], "the joined record")
     return Record(
@@ -362,7 +362,7 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
 
 def _column(record: Record, name: str) -> np.ndarray | None:
     column = getattr(record, name)
-    if column is None and name in TOLD_WHERE_SO:
+    if column is None and name in ONLY_IF_SET:
         return np.zeros(record.time_s.size, bool if name == "doubted" else float)
     return column
 

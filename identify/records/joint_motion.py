@@ -1,4 +1,4 @@
-"""How the joint moved: angle, velocity and acceleration out of an angle with noise, by a filter whose jerk is white.
+"""Motion of the joint: angle, velocity and acceleration from a noisy angle, by a Kalman filter with white jerk.
 
 A velocity that is recorded beside an angle is a slope of the same noisy readings: the angle alone decides. Each part of
 a record has its own intensity of the jerk, and its own noise, by maximum likelihood.
@@ -16,11 +16,11 @@ from scipy.optimize import minimize
 
 MOTION = ("angle_rad", "velocity_rad_s", "acceleration_rad_s2")
 BLOCK_S = 0.01
-"""Readings so close together are averaged where noise is asked for: a column that was interpolated between them says
-little of noise from row to row."""
+"""Readings so close together are averaged where noise is estimated: a column that was interpolated between them shows
+little of the noise from row to row."""
 UNKNOWN, AT_REST = 1e14, 1e3
 """Variance of a state before anything is measured, over that of the noise: it may be whatever it is; or, where there
-is nothing later to tell, the joint begins about at rest."""
+are no later readings, the joint begins about at rest."""
 LEAST_BLOCKS = 8
 LEAST_NOISE_RAD = 2e-6
 """Even an angle without noise is written with so many digits."""
@@ -37,11 +37,11 @@ FEW_STEPS, RESTS = 6.5, 0.8
 """A joint that moves over no more steps, and whose angle is the one before in such a share of readings, is held:
 when it went from one step to the next says nothing of its velocity."""
 STEADY = (0.0, 0.0)
-"""Of a movement of which nothing but its jerk is known."""
+"""Pace of a movement with nothing but white jerk."""
 PACES = ((0.3, 3.0, 30.0), (0.3,))
-"""Starts of the pace, 1/s² and 1/s: what a movement that comes and goes tells of its next moments."""
+"""Starting values of the search for the pace, 1/s² and 1/s."""
 PIECE, LONG_GAP_S = 0.2, 1.0
-"""The series of a step is taken in pieces of so little of a pace; over a longer gap nothing is foretold."""
+"""The series of a step is taken in pieces of so little of a pace; over a longer gap nothing is predicted."""
 LOGS = (-9.0, -9.0, -9.0), (12.0, 9.0, 6.0)
 """Logarithms of the jerk's intensity, rad²/s⁵, and of the pace: no joint swings at over 14 Hz."""
 SETTLED = {"maxiter": 120, "xatol": 0.03, "fatol": 0.3}
@@ -51,14 +51,14 @@ LARGEST_STEP_RAD = 0.035
 
 
 @njit(cache=True, nogil=True)
-def _forward(time_s, angle_rad, noise, jerk, pace, unknown, states, spreads, told):  # pragma: no cover
+def _forward(time_s, angle_rad, noise, jerk, pace, unknown, states, spreads, innovations):  # pragma: no cover
     """Kalman filter of (angle, velocity, acceleration); a reading that is NaN is left out.
 
     The jerk is white, less `pace[0]` times the velocity and `pace[1]` times the acceleration. Writes the filtered
-    `states` (N, 3), `spreads` (N, 6): their covariance; `told` (N, 5): innovation, its variance, gains. Returns the
-    sum of log variances and of squared innovations over their variance, and the count.
+    `states` (N, 3), `spreads` (N, 6): their covariance; `innovations` (N, 5): innovation, its variance, gains. Returns
+    the sum of log variances and of squared innovations over their variance, and the count.
     """
-    keep = states.shape[0] > 0
+    store_states = states.shape[0] > 0
     x, v, a = 0.0, 0.0, 0.0
     for k in range(time_s.size):
         if angle_rad[k] == angle_rad[k]:
@@ -92,7 +92,7 @@ def _forward(time_s, angle_rad, noise, jerk, pace, unknown, states, spreads, tol
         if angle_rad[k] == angle_rad[k]:
             e, s = angle_rad[k] - x, pxx + noise[k]
             gx, gv, ga = pxx / s, pxv / s, pxa / s
-            if count > 3:  # what comes before tells of the start alone
+            if count > 3:  # earlier innovations depend on the start alone
                 logs += np.log(s)
                 squares += e * e / s
             count += 1
@@ -101,24 +101,25 @@ def _forward(time_s, angle_rad, noise, jerk, pace, unknown, states, spreads, tol
             pva -= gv * pxa
             pvv -= gv * pxv
             pxx, pxv, pxa = pxx * (1.0 - gx), pxv * (1.0 - gx), pxa * (1.0 - gx)
-        if keep:
+        if store_states:
             states[k, 0], states[k, 1], states[k, 2] = x, v, a
             spreads[k, 0], spreads[k, 1], spreads[k, 2] = pxx, pxv, pxa
             spreads[k, 3], spreads[k, 4], spreads[k, 5] = pvv, pva, paa
-            told[k, 0], told[k, 1], told[k, 2], told[k, 3], told[k, 4] = e, s, gx, gv, ga
+            innovations[k, 0], innovations[k, 1] = e, s
+            innovations[k, 2], innovations[k, 3], innovations[k, 4] = gx, gv, ga
     return logs, squares, max(count - 4, 0)
 
 
 @njit(cache=True, nogil=True)
-def _backward(time_s, states, spreads, told):  # pragma: no cover
-    """What the later readings say of each state (Bryson and Frazier's smoother), in place of the filtered ones."""
+def _backward(time_s, states, spreads, innovations):  # pragma: no cover
+    """Smooth the filtered states in place by the later readings (Bryson and Frazier's smoother)."""
     lx, lv, la = 0.0, 0.0, 0.0
     for k in range(time_s.size - 1, -1, -1):
         xx, xv, xa, vv, va, aa = spreads[k]
         states[k, 0] -= xx * lx + xv * lv + xa * la
         states[k, 1] -= xv * lx + vv * lv + va * la
         states[k, 2] -= xa * lx + va * lv + aa * la
-        e, s, gx, gv, ga = told[k]
+        e, s, gx, gv, ga = innovations[k]
         if s > 0.0:
             lx -= gx * lx + gv * lv + ga * la + e / s
         if k:
@@ -127,27 +128,27 @@ def _backward(time_s, states, spreads, told):  # pragma: no cover
 
 
 Pace = tuple[float, float]
-"""How the jerk follows velocity and acceleration, 1/s² and 1/s."""
+"""Feedback of velocity and acceleration on the jerk, 1/s² and 1/s."""
 
 
 @dataclass(frozen=True)
 class JointMotion:
-    """How the joint moved, and what its sensor is like."""
+    """Motion of the joint, with the noise and the step of its sensor."""
 
     angle_rad: np.ndarray  # shape (N,), as the next two; at the record's samples
     velocity_rad_s: np.ndarray
     acceleration_rad_s2: np.ndarray
     noise_rad: np.ndarray  # shape (P,); white noise of a sample's angle in each part, rad
     jerk: np.ndarray  # shape (P,); intensity of the white jerk in each part, rad²/s⁵
-    step_rad: float = 0.0  # steps in which the sensor tells the angle, rad; 0 where none are seen
+    step_rad: float = 0.0  # resolution of the angle sensor, rad; 0 where none is visible
 
     @classmethod
     def of(cls, time_s: np.ndarray, angle_rad: np.ndarray, first: Sequence[int] = (0,)) -> JointMotion:
         """From angles, of which any may be NaN; each part, from its `first` reading on, by itself."""
         parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
-        step_rad = step_of([angle_rad[own] for own in parts])
-        read_rad = np.concatenate([_without_held(time_s[own], angle_rad[own]) for own in parts])
-        noise_rad, jerk = np.array([sensor_of(time_s[own], read_rad[own], step_rad) for own in parts]).T
+        step_rad = step_of([angle_rad[part] for part in parts])
+        read_rad = np.concatenate([_without_held(time_s[part], angle_rad[part]) for part in parts])
+        noise_rad, jerk = np.array([sensor_of(time_s[part], read_rad[part], step_rad) for part in parts]).T
         return cls(read_rad, read_rad, read_rad, noise_rad, jerk, step_rad)._smoothed(time_s, read_rad, first)
 
     @classmethod
@@ -156,7 +157,7 @@ class JointMotion:
     ) -> JointMotion:
         """At each reading from those until then alone, as a controller has them.
 
-        How noisy the sensor is, and how the joint moves in general, is told by times and angles of an `earlier` trial.
+        Sensor noise and the pace of the movement are estimated from times and angles of an `earlier` trial.
         """
         at_s, read_rad = earlier[0], _without_held(*earlier)
         step_rad = step_of([read_rad])
@@ -167,14 +168,14 @@ class JointMotion:
         return begun._smoothed(time_s, angle_rad, first, pace)
 
     def read_again(self, time_s: np.ndarray, first: Sequence[int]) -> JointMotion:
-        """The same movement as the same sensor would tell it another time: what its error does to a model."""
+        """The same movement with a new draw of the sensor's noise, to see the effect of its error on a model."""
         read_rad = self.angle_rad + np.random.default_rng(0).normal(size=time_s.size) * np.repeat(
             self.noise_rad, np.diff([*first, time_s.size])
         )
         return self._smoothed(time_s, read_rad, first)
 
-    def ahead(self, late_s: float) -> JointMotion:
-        """Where the joint is by now, where what is told of it is late."""
+    def extrapolated(self, late_s: float) -> JointMotion:
+        """The motion `late_s` later, by velocity and acceleration: corrects for a sensor that reports late."""
         angle, velocity, acceleration = (getattr(self, name) for name in MOTION)
         on = angle + late_s * velocity + 0.5 * late_s**2 * acceleration
         return replace(self, angle_rad=on, velocity_rad_s=velocity + late_s * acceleration)
@@ -184,8 +185,8 @@ class JointMotion:
     ) -> JointMotion:
         parts = [slice(a, b) for a, b in pairwise([*first, time_s.size])]
         sensors = zip(parts, self.noise_rad, self.jerk, strict=True)
-        found = [smooth(time_s[own], read_rad[own], noise, jerk, pace) for own, noise, jerk in sensors]
-        angle, velocity, acceleration = np.concatenate(found).T.copy()
+        states = [smooth(time_s[part], read_rad[part], noise, jerk, pace) for part, noise, jerk in sensors]
+        angle, velocity, acceleration = np.concatenate(states).T.copy()
         return replace(self, angle_rad=angle, velocity_rad_s=velocity, acceleration_rad_s2=acceleration)
 
 
@@ -195,11 +196,11 @@ def smooth(
     """Angle, velocity and acceleration at each reading, shape (N, 3): from all readings; with a pace from those until
     then."""
     size = time_s.size
-    states, spreads, told = np.empty((size, 3)), np.empty((size, 6)), np.empty((size, 5))
+    states, spreads, innovations = np.empty((size, 3)), np.empty((size, 6)), np.empty((size, 5))
     noise, unknown = np.full(size, noise_rad**2), UNKNOWN if pace is None else AT_REST
-    _forward(time_s, angle_rad, noise, jerk, pace or STEADY, unknown, states, spreads, told)
+    _forward(time_s, angle_rad, noise, jerk, pace or STEADY, unknown, states, spreads, innovations)
     if pace is None:
-        _backward(time_s, states, spreads, told)
+        _backward(time_s, states, spreads, innovations)
     return states
 
 
@@ -211,22 +212,22 @@ def pace_of(time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: f
     at_s, read_rad = at_s[::every], read_rad[::every]
     noise = np.full(at_s.size, noise_rad**2)
 
-    def unlikely(logs: np.ndarray) -> float:
-        own, spring, drag = np.exp(np.clip(logs, *LOGS))
-        spread, squares, _ = _forward(at_s, read_rad, noise, own, (spring, drag), UNKNOWN, *nothing)
+    def deviance(logs: np.ndarray) -> float:
+        intensity, spring, drag = np.exp(np.clip(logs, *LOGS))
+        spread, squares, _ = _forward(at_s, read_rad, noise, intensity, (spring, drag), UNKNOWN, *nothing)
         return spread + squares
 
     if not jerk > 0.0 or at_s.size <= LEAST_BLOCKS:
         return jerk, STEADY
     begins = [np.log([jerk, spring, drag]) for spring in PACES[0] for drag in PACES[1]]
-    found = min(
-        (minimize(unlikely, begin, method="Nelder-Mead", options=SETTLED) for begin in begins), key=lambda one: one.fun
+    best_fit = min(
+        (minimize(deviance, begin, method="Nelder-Mead", options=SETTLED) for begin in begins), key=lambda fit: fit.fun
     )
     steady = _forward(at_s, read_rad, noise, jerk, STEADY, UNKNOWN, *nothing)
-    if not found.fun < steady[0] + steady[1]:
+    if not best_fit.fun < steady[0] + steady[1]:
         return jerk, STEADY
-    own, spring, drag = np.exp(np.clip(found.x, *LOGS)).tolist()
-    return own, (spring, drag)
+    intensity, spring, drag = np.exp(np.clip(best_fit.x, *LOGS)).tolist()
+    return intensity, (spring, drag)
 
 
 def sensor_of(time_s: np.ndarray, angle_rad: np.ndarray, step_rad: float = 0.0) -> tuple[float, float]:
@@ -239,28 +240,29 @@ def sensor_of(time_s: np.ndarray, angle_rad: np.ndarray, step_rad: float = 0.0) 
     block = np.floor((at_s - at_s[:1]) / BLOCK_S + 1e-3)  # no rounding of times decides
     first = np.flatnonzero(np.diff(block, prepend=-1.0) > 0)
     count = np.diff(np.r_[first, at_s.size])
-    least = max(LEAST_NOISE_RAD, UNIFORM * step_rad) ** 2
+    least_variance = max(LEAST_NOISE_RAD, UNIFORM * step_rad) ** 2
     if first.size <= LEAST_BLOCKS or _rests(read_rad, step_rad):
-        return float(np.sqrt(least)), 0.0
+        return float(np.sqrt(least_variance)), 0.0
     at_s, mean_rad = np.add.reduceat(at_s, first) / count, np.add.reduceat(read_rad, first) / count
     nothing = np.empty((0, 3)), np.empty((0, 6)), np.empty((0, 5))
 
-    def unlikely(log_ratio: float) -> tuple[float, float, float]:
-        logs, squares, told = _forward(at_s, mean_rad, 1.0 / count, float(np.exp(log_ratio)), STEADY, UNKNOWN, *nothing)
-        variance = max(squares / told, least)
-        return logs + told * np.log(variance) + squares / variance, log_ratio, variance
+    def profile_deviance(log_ratio: float) -> tuple[float, float, float]:
+        ratio = float(np.exp(log_ratio))
+        logs, squares, readings = _forward(at_s, mean_rad, 1.0 / count, ratio, STEADY, UNKNOWN, *nothing)
+        variance = max(squares / readings, least_variance)
+        return logs + readings * np.log(variance) + squares / variance, log_ratio, variance
 
-    at = int(np.argmin([unlikely(ratio)[0] for ratio in RATIOS]))
+    at = int(np.argmin([profile_deviance(ratio)[0] for ratio in RATIOS]))
     low, high = RATIOS[max(at - 1, 0)], RATIOS[min(at + 1, len(RATIOS) - 1)]
     for _ in range(SEARCHES):
         sooner, later = low + GOLDEN * (high - low), high - GOLDEN * (high - low)
-        low, high = (low, later) if unlikely(sooner) < unlikely(later) else (sooner, high)
-    _, log_ratio, variance = unlikely(0.5 * (low + high))
+        low, high = (low, later) if profile_deviance(sooner) < profile_deviance(later) else (sooner, high)
+    _, log_ratio, variance = profile_deviance(0.5 * (low + high))
     return float(np.sqrt(variance)), float(np.exp(log_ratio) * variance)
 
 
 def step_of(parts_rad: Sequence[np.ndarray]) -> float:
-    """Steps in which angles are told, rad, by the plateaus on which they rest; 0 where none are seen."""
+    """Estimate the resolution of the angles, rad, from their plateaus; 0 where none is visible."""
     levels = []
     for angle_rad in parts_rad:
         ends = np.flatnonzero(np.diff(angle_rad, append=np.nan) != 0)
@@ -276,19 +278,19 @@ def step_of(parts_rad: Sequence[np.ndarray]) -> float:
 
 
 def _rests(angle_rad: np.ndarray, step_rad: float) -> bool:
-    """Whether a part shows no more than on which of a few steps the joint was held."""
+    """Return true if the joint was held: the angle rests and moves over a few steps of the sensor only."""
     few = np.ptp(angle_rad) <= FEW_STEPS * step_rad
     return bool(few and np.mean(np.diff(angle_rad) == 0) > RESTS)
 
 
 def _without_held(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
     """The angles, NaN where a part's first or last reading was only repeated for a while where there was none."""
-    found, moved = angle_rad, np.flatnonzero(angle_rad[1:] != angle_rad[:-1])
+    without_held, moved = angle_rad, np.flatnonzero(angle_rad[1:] != angle_rad[:-1])
     if moved.size:
         first, last = moved[0], moved[-1] + 1
-        found = angle_rad.copy()
+        without_held = angle_rad.copy()
         if time_s[first] - time_s[0] < HELD_S:
-            found[:first] = np.nan
+            without_held[:first] = np.nan
         if time_s[-1] - time_s[last] < HELD_S:
-            found[last + 1 :] = np.nan
-    return found
+            without_held[last + 1 :] = np.nan
+    return without_held

@@ -20,7 +20,7 @@ from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns
 from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS, LONGEST_TEXT
-from stimrig.identify.records.columns import Given
+from stimrig.identify.records.columns import ColumnMap
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
 from stimrig.identify.records.record import Record
 
@@ -43,21 +43,21 @@ class BadPiece(Exception):
     """A piece of a file that is not what it is declared to be."""
 
 
-def inflated(data: memoryview, most: int, whole: bool = True) -> bytes:
-    """What zlib packed, at most so many bytes. Raises BadPiece: no zlib, or with `whole` not all of it."""
+def inflated(data: memoryview, max_bytes: int, whole: bool = True) -> bytes:
+    """Unpack zlib data of at most `max_bytes`. Raises BadPiece: no zlib, or with `whole` data left over."""
     packer = zlib.decompressobj()
     try:
-        found = packer.decompress(data, most)
+        unpacked = packer.decompress(data, max_bytes)
     except zlib.error as error:
         raise BadPiece("packed data that do not unpack") from error
     if whole and not packer.eof:
         raise BadPiece("packed data that are damaged, or longer than any record")
-    return found
+    return unpacked
 
 
 @dataclass(frozen=True)
 class Variable:
-    """A variable that was not looked at closely yet."""
+    """A variable by its head; its data are not read yet."""
 
     kind: int  # MATLAB's class
     shape: tuple[int, ...]  # its dimensions, as declared
@@ -110,12 +110,12 @@ class Variable:
         here = self._opened()
         if here.kind == CHAR:
             return _rows_of(here)
-        found = []
+        texts = []
         for cell in _matrices(here, here.size):
             if cell.kind != CHAR:
                 raise BadPiece(f"a cell array with {KINDS.get(cell.kind, 'something')} in it. Give texts only.")
-            found.append("".join(_rows_of(cell)[:1]))
-        return found
+            texts.append("".join(_rows_of(cell)[:1]))
+        return texts
 
     def fields(self) -> dict[str, Variable]:
         """The fields of a struct of one element; nothing for anything else. Raises BadPiece: damaged."""
@@ -142,24 +142,24 @@ def variables(content: bytes, name: str) -> dict[str, Variable]:
         what = "a MAT file of version 7.3" if content.startswith(b"MATLAB 7.3") else "no MAT file of version 5 to 7"
         raise BadRecord(what, place=name, fix=FIX)
     view, place = memoryview(content), HEADER_BYTES
-    found: dict[str, Variable] = {}
+    by_name: dict[str, Variable] = {}
     elements = 0
     try:
         while place + 8 <= len(view):
             tag, body, place = _element(view, place, order)
             title, variable = _listed(tag, body, order)
             if title:
-                found[title] = variable
+                by_name[title] = variable
             elements += 1  # those without a name, or with one that was there before, count too
             if elements > MOST_VARIABLES:
                 raise BadPiece(f"more than {MOST_VARIABLES} variables")
     except BadPiece as error:
         raise BadRecord(f"a damaged MAT file ({error})", place=name, fix=FIX) from error
-    return found
+    return by_name
 
 
 def is_mat(content: bytes) -> bool:
-    """Whether a file is a MAT file, of version 5 to 7.3, by its first bytes."""
+    """Return true for a MAT file of version 5 to 7.3, by its first bytes."""
     return content.startswith(b"MATLAB") and content[126:HEADER_BYTES] in (b"IM", b"MI")
 
 
@@ -239,44 +239,47 @@ RATE = "pulse_rate_hz"
 """A variable of one number that says the pulse rate."""
 
 
-def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None, given: Given) -> Record:
-    """A record of a MAT file from its bytes; `path` is how it is called, `given` what `--map` says.
+def read_mat(content: bytes, path: Path, pulse_rate_hz: float | None, column_map: ColumnMap) -> Record:
+    """Read a record from the bytes of a MAT file; `path` names it in messages, `column_map` is the parsed `--map`.
 
     Raises BadRecord: with the file and the variable, and what to do.
     """
     name = str(path)
-    scope, known, given = _scope(variables(content, name), given, name)
+    scope, known, column_map = _scope(variables(content, name), column_map, name)
     header = list(known)
-    found = columns.columns(header, given, [], f"{name}, {scope}" if scope else name)
+    mapped = columns.columns(header, column_map, [], f"{name}, {scope}" if scope else name)
     before = f"{scope}." if scope else ""
-    of = {target: before + header[column.index] for target, column in found.items()}
+    of = {target: before + header[column.index] for target, column in mapped.items()}
     numbers: dict[str, np.ndarray] = {}
-    for target, column in found.items():
-        with _told(f"{name}, {of[target]}"):
+    for target, column in mapped.items():
+        with _naming_place(f"{name}, {of[target]}"):
             if target != "segment":
                 numbers[target] = known[header[column.index]].numbers() * column.factor
     _check_lengths(numbers, of, name)
     names: list[str] = []
-    if "segment" in found:
-        variable = known[header[found["segment"].index]]
+    if "segment" in mapped:
+        variable = known[header[mapped["segment"].index]]
         numbers["segment"], names = _segments(variable, numbers["time_s"].size, f"{name}, {of['segment']}")
     if pulse_rate_hz is None and RATE in known:
-        with _told(f"{name}, {RATE}"):
+        with _naming_place(f"{name}, {RATE}"):
             pulse_rate_hz = float(known[RATE].numbers()[:1].sum())
         bounds.check_rate(pulse_rate_hz, f"{name}, {RATE}")
-    source, rate_hz = file_source(content, path, found), pulse_rate_hz or PULSE_RATE_HZ
+    source, rate_hz = file_source(content, path, mapped), pulse_rate_hz or PULSE_RATE_HZ
     return record_of(FileContent(numbers, names, name, lambda row, column: f"{of[column]}({row + 1})", source, rate_hz))
 
 
-def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, Mapping[str, Variable], Given]:
-    """Where the columns are: in one struct, else among the variables themselves (""); and `--map` as it reads there."""
-    if columns.complete(columns.places(list(top), given)):
-        return "", top, given
+def _scope(
+    top: Mapping[str, Variable], column_map: ColumnMap, name: str
+) -> tuple[str, Mapping[str, Variable], ColumnMap]:
+    """Find the struct with the columns ("": the variables themselves); with its fields, and `--map` relative to it."""
+    if columns.complete(columns.places(list(top), column_map)):
+        return "", top, column_map
     scopes = []
     for title, variable in top.items():
-        with _told(f"{name}, {title}", FIX):
+        with _naming_place(f"{name}, {title}", FIX):
             fields = variable.fields()
-        inside = {target: replace(asked, text=asked.text.removeprefix(f"{title}.")) for target, asked in given.items()}
+        prefix = f"{title}."
+        inside = {key: replace(choice, text=choice.text.removeprefix(prefix)) for key, choice in column_map.items()}
         if fields and columns.complete(columns.places(list(fields), inside)):
             scopes.append((title, fields, inside))
         if len(scopes) > 1:  # at once: each struct that is opened holds its unpacked bytes
@@ -284,11 +287,12 @@ def _scope(top: Mapping[str, Variable], given: Given, name: str) -> tuple[str, M
             raise BadRecord(f"records in {both}", place=name, fix="Save each in a file of its own.")
     if not top:
         raise BadRecord("no variable", place=name, fix=FIX)
-    return scopes[0] if scopes else ("", top, given)
+    return scopes[0] if scopes else ("", top, column_map)
 
 
 @contextmanager
-def _told(place: str, fix: str = "") -> Iterator[None]:
+def _naming_place(place: str, fix: str = "") -> Iterator[None]:
+    """Raise a BadPiece of the block as a BadRecord with the place."""
     try:
         yield
     except BadPiece as error:
@@ -307,7 +311,7 @@ def _check_lengths(numbers: Mapping[str, np.ndarray], of: Mapping[str, str], nam
 
 def _segments(variable: Variable, size: int, place: str) -> tuple[np.ndarray, list[str]]:
     """A number for each row's segment, and the names by number; one text stands for all rows."""
-    with _told(place):
+    with _naming_place(place):
         texts = variable.texts() if variable.kind in (CHAR, CELL) else [f"{code:g}" for code in variable.numbers()]
     if len(texts) == 1:
         texts = texts * size

@@ -15,7 +15,7 @@ from stimrig.identify.errors import BadRecord, IdentifyError
 from stimrig.identify.records import bounds, columns
 from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.bounds import LARGEST_FILE_BYTES, LARGEST_ROWS
-from stimrig.identify.records.columns import Column, Given
+from stimrig.identify.records.columns import Column, ColumnMap
 from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
 from stimrig.identify.records.record import Record
 
@@ -29,7 +29,7 @@ RATE = "pulse_rate_hz"
 """Entry of the table's metadata that says the pulse rate."""
 
 
-def read_parquet(content: bytes, path: Path, pulse_rate_hz: float | None, given: Given) -> Record:
+def read_parquet(content: bytes, path: Path, pulse_rate_hz: float | None, column_map: ColumnMap) -> Record:
     """Read a record of a Parquet file from its bytes; `path` is how it is called, `given` what `--map` says.
 
     Raises BadRecord: with the file and the column, and what to do; pyarrow is missing.
@@ -44,7 +44,7 @@ def read_parquet(content: bytes, path: Path, pulse_rate_hz: float | None, given:
         file = pq.ParquetFile(pa.BufferReader(content))
         schema = file.schema_arrow
         _check_size(file.metadata, len(schema), name)
-        known = columns.columns(schema.names, given, list(map(_unit, schema)), name)
+        known = columns.columns(schema.names, column_map, list(map(_unit, schema)), name)
         numbers, names = _read_columns(content, schema, known, name)
         pulse_rate_hz = pulse_rate_hz or _pulse_rate(schema.metadata or {}, name)
     except (IdentifyError, MemoryError):

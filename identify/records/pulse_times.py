@@ -15,7 +15,7 @@ from stimrig.identify.records import bounds
 from stimrig.identify.records.record import FORGOTTEN_S, Pulses
 
 SENT_AND_ACKNOWLEDGED, RESTS, DROPPED, REFUSED, ON_ITS_WAY = range(5)
-"""What became of a pulse, `/pulses/status` of a recording."""
+"""Outcome of a pulse, `/pulses/status` of a recording."""
 PROMPT = 0.05
 """Lateness counts from this quantile of a recording's pulses: a lag that all share is a delay, which the fit finds."""
 LEAST_LATE_S = 1e-3
@@ -23,19 +23,19 @@ LEAST_LATE_S = 1e-3
 LONGEST_LATE_S = bounds.LARGEST["late_s"]
 """More is a clock gone wrong: the pulse is doubted."""
 UNSURE = 0.5
-"""Of a pulse interval: one that may have been felt as far off may as well have been felt in another's place."""
+"""Share of a pulse interval; a pulse with a larger uncertainty may belong to the next interval."""
 SYNC_SHARE = 0.9
 """So many of the acknowledged pulses must show on the sync line, and so few edges be left over, for it to be believed.
 
 A line that is not connected, or that means something else, shows few; a rig that loses pulses on their way still most.
 """
 REACH = 0.25
-"""Of a pulse interval: so far outside of writing and acknowledgement an edge is still its pulse's (clocks differ)."""
+"""Share of a pulse interval by which an edge may lie outside of writing and acknowledgement (clocks differ)."""
 
 
 @dataclass(frozen=True)
 class Sent:
-    """What the host knows of all planned pulses, shape (P,): times in s, NaN where there is none; widths, 0: none."""
+    """All planned pulses as the host logged them, shape (P,): times in s, NaN where there is none; widths, 0: none."""
 
     planned_s: np.ndarray
     width_us: np.ndarray
@@ -67,7 +67,7 @@ def locate_pulses(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[Pul
     unsure = may & (unsure | wild)
     late = np.where(may & ~wild & (np.abs(late) >= LEAST_LATE_S), late, 0.0)
     slot = sent.planned_s + lag
-    # An acknowledgement that came late tells by when the pulse was felt at the latest.
+    # A late acknowledgement bounds the time at which the pulse was felt.
     latest = _by(sent.acknowledged_s, slot)[unsure]
     lost = np.isin(sent.status, (DROPPED, REFUSED))
     spans = np.r_[slot[unsure], extra_s], np.r_[latest, extra_s] + FORGOTTEN_S
@@ -75,24 +75,24 @@ def locate_pulses(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[Pul
 
 
 def _pulse_lateness(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Lateness of each pulse behind the promptest, s; whether it is unsure; times of pulses that nobody asked for."""
+    """Lateness of each pulse behind the promptest, s; whether it is unsure; times of unplanned pulses."""
     late, unsure = _host_lateness(sent)
-    seen = _edges(time_s, sync)
-    found = None if seen is None else _matched(sent, *seen)
-    if seen is None or found is None:
+    sync_edges = _edges(time_s, sync)
+    match = None if sync_edges is None else _matched(sent, *sync_edges)
+    if sync_edges is None or match is None:
         return late, unsure, np.zeros(0)
-    edge, extra_s = found
-    shown = edge >= 0
-    earliest, newest = (side[np.maximum(edge, 0)] for side in seen)
-    # The line tells the sample, the host's clock where in it.
-    shift = float(np.median((0.5 * (earliest + newest) - sent.written_s)[shown]))
-    felt = np.clip(sent.written_s + shift, earliest, newest)
-    prompt = shown & sent.sound
-    base = float(np.quantile((felt - sent.planned_s)[prompt], PROMPT))
-    # Where the cell lost samples the line shows nothing, and the host's word stands.
+    edge, extra_s = match
+    on_line = edge >= 0
+    earliest, newest = (side[np.maximum(edge, 0)] for side in sync_edges)
+    # The line gives the sample, the host's clock the time within it.
+    shift = float(np.median((0.5 * (earliest + newest) - sent.written_s)[on_line]))
+    felt_s = np.clip(sent.written_s + shift, earliest, newest)
+    prompt = on_line & sent.sound
+    base = float(np.quantile((felt_s - sent.planned_s)[prompt], PROMPT))
+    # Where the cell lost samples the line shows nothing, and the host's times are used.
     watched = _watched(sent, time_s)
-    late = np.where(shown, felt - sent.planned_s - base, late)
-    return late, np.where(shown, False, unsure | watched), extra_s
+    late = np.where(on_line, felt_s - sent.planned_s - base, late)
+    return late, np.where(on_line, False, unsure | watched), extra_s
 
 
 def _host_lateness(sent: Sent) -> tuple[np.ndarray, np.ndarray]:
@@ -129,24 +129,24 @@ def _matched(sent: Sent, earliest: np.ndarray, newest: np.ndarray) -> tuple[np.n
     place = np.minimum(after, centre.size - 1)
     good = may & (after < centre.size) & (centre[place] <= stop)
     edge = np.full(place.size, -1)
-    found, first = np.unique(np.where(good, place, -1), return_index=True)
-    edge[first] = found  # an edge is that of the first pulse that can have made it
-    left = np.setdiff1d(np.arange(centre.size), edge)
-    asked = int(np.sum(may & sent.sound))
-    shown = int(np.sum((edge >= 0) & sent.sound))
-    if not asked or shown < SYNC_SHARE * asked or left.size > (1 - SYNC_SHARE) * asked:
+    edge_index, first = np.unique(np.where(good, place, -1), return_index=True)
+    edge[first] = edge_index  # an edge is that of the first pulse that can have made it
+    unmatched = np.setdiff1d(np.arange(centre.size), edge)
+    expected = int(np.sum(may & sent.sound))
+    matched = int(np.sum((edge >= 0) & sent.sound))
+    if not expected or matched < SYNC_SHARE * expected or unmatched.size > (1 - SYNC_SHARE) * expected:
         return None
-    return edge, newest[left]
+    return edge, newest[unmatched]
 
 
 def _by(acknowledged_s: np.ndarray, begin_s: np.ndarray) -> np.ndarray:
-    """When a pulse was felt at the latest, s; its begin where it was not acknowledged."""
+    """Latest time at which a pulse was felt, s; its begin where it was not acknowledged."""
     known = np.isfinite(acknowledged_s)
     return np.where(known, np.clip(acknowledged_s, begin_s, begin_s + LONGEST_LATE_S), begin_s)
 
 
 def _watched(sent: Sent, time_s: np.ndarray) -> np.ndarray:
-    """Whether the cell sampled all the while in which a pulse can have been felt."""
+    """bool, shape (P,): pulses during whose possible time the cell lost no sample."""
     period_s = float(np.median(np.diff(time_s)))
     holes = np.flatnonzero(np.diff(time_s) >= 1.5 * period_s)
     start = np.where(np.isfinite(sent.written_s), sent.written_s, sent.planned_s)

@@ -1,7 +1,7 @@
-"""Which samples of a record are readings of their own: recorders hold, round, interpolate and smooth.
+"""Independent readings behind the samples of a record: recorders hold, round, interpolate and smooth.
 
-The white noise of a sample is told from differences of neighbours. Of held or interpolated samples most differences
-are zero, of smoothed ones nearly so: there the noise is that of the readings behind them.
+The white noise of a sample is estimated from differences of neighbours. Most differences of held or interpolated
+samples are zero, those of smoothed ones nearly so: there the noise is that of the readings behind them.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ CALM_S = 1.0
 CHANGED = 0.05
 """Change of the pulse width, as a share of the largest, that the torque follows."""
 RISE, FLAT = 2.0, 1.3
-"""Differences of every other sample that are larger by `RISE` tell smoothing (white noise gives 1, the slowest noise of
+"""Differences of every other sample that are larger by `RISE` show smoothing (white noise gives 1, the slowest noise of
 first order 1.4); where wider ones are larger by less than `FLAT`, they are of readings apart."""
-LEAST = 64
-"""Fewer differences tell nothing."""
+LEAST_DIFFERENCES = 64
+"""Fewer differences give no estimate."""
 BLOCK = 32
 WIDEST = 256
 """Samples between those that are compared, at most."""
@@ -66,12 +66,12 @@ def find_readings(torque_nm: np.ndarray) -> Readings | None:
     if changes.size < BLOCK:
         return None
     if np.mean(same[changes[1:] - 2]) > REPEATED:
-        return _held(torque_nm.size, changes, np.abs(step[changes - 1]))
+        return _held_or_coarse(torque_nm.size, changes, np.abs(step[changes - 1]))
     bend = np.abs(np.diff(step))
     real = bend > ROUNDING * float(np.max(np.abs(torque_nm)))
     straight = ~real | (bend <= STRAIGHT * np.quantile(bend[real], 0.9)) if real.any() else ~real
     bends = np.flatnonzero(~straight)
-    if bends.size < LEAST or np.mean(straight[bends[1:] - 1]) < BENDS:
+    if bends.size < LEAST_DIFFERENCES or np.mean(straight[bends[1:] - 1]) < BENDS:
         return None
     # A bend between two samples shows at both: the larger one is nearer.
     follows = np.diff(bends) == 1
@@ -81,11 +81,11 @@ def find_readings(torque_nm: np.ndarray) -> Readings | None:
     return Readings("interpolated", at, torque_nm.size / at.size)
 
 
-def _held(size: int, changes: np.ndarray, step_nm: np.ndarray) -> Readings:
+def _held_or_coarse(size: int, changes: np.ndarray, step_nm: np.ndarray) -> Readings:
     count_nm = float(step_nm.min())
     if np.quantile(step_nm, 0.25) > COUNTS * count_nm:
         return Readings("held", np.r_[0, changes], size / (changes.size + 1.0))
-    # Of coarse values two readings may be equal: each lasts as long as the shortest, but for a few.
+    # Two coarse readings may be equal: each lasts as long as the shortest, but for a few.
     lasts = max(int(np.quantile(np.diff(changes), 0.02, method="lower")), 1)
     edges = np.r_[0, changes, size]
     number = np.maximum(np.round(np.diff(edges) / lasts).astype(np.int64), 1)
@@ -95,21 +95,21 @@ def _held(size: int, changes: np.ndarray, step_nm: np.ndarray) -> Readings:
 
 
 def smoothed_readings(torque_nm: np.ndarray, rests: np.ndarray) -> Readings | None:
-    """Readings apart of a torque whose noise was smoothed; None if it was not, or if that cannot be told.
+    """Readings apart of a torque whose noise was smoothed; None if it was not, or if that cannot be decided.
 
     `torque_nm`: shape (N,); torque without mains hum, N·m. `rests`: shape (N,); samples at which the muscle rests.
     """
-    found, apart = [], 1
+    spreads_nm, apart = [], 1
     while 3 * apart < torque_nm.size and apart <= WIDEST:
         y, end = torque_nm, torque_nm.size
         size = y[3 * apart :] - 3.0 * (y[2 * apart : end - apart] - y[apart : end - 2 * apart]) - y[: end - 3 * apart]
         size = size[rests[3 * apart :] & rests[: end - 3 * apart]]
-        if size.size < LEAST:
+        if size.size < LEAST_DIFFERENCES:
             break
-        found.append(float(np.median(np.abs(size))))
-        if len(found) == 2 and not found[1] > RISE * found[0]:
+        spreads_nm.append(float(np.median(np.abs(size))))
+        if len(spreads_nm) == 2 and not spreads_nm[1] > RISE * spreads_nm[0]:
             break
-        if len(found) > 2 and found[-1] < FLAT * found[-2]:
+        if len(spreads_nm) > 2 and spreads_nm[-1] < FLAT * spreads_nm[-2]:
             return Readings("smoothed", np.arange(0, end, apart), float(apart))
         apart *= 2
     return None
@@ -120,10 +120,10 @@ def contrasts(at: np.ndarray, values: np.ndarray, order: int) -> np.ndarray:
     size = at.size - order
     places = [at[k : k + size].astype(float) for k in range(order + 1)]
     total, power = np.zeros(size), np.zeros(size)
-    for k, own in enumerate(places):
+    for k, place in enumerate(places):
         weight = np.ones(size)
         for other in (*places[:k], *places[k + 1 :]):
-            weight /= own - other
+            weight /= place - other
         total += weight * values[k : k + size]
         power += weight**2
     return total / np.sqrt(power)
@@ -148,7 +148,7 @@ def noise_of_readings(torque_nm: np.ndarray, calm: np.ndarray, readings: Reading
         return float(np.std(torque_nm))
     size = contrasts(at, torque_nm[at], order)
     quiet = calm[at[order:]] & calm[at[:-order]]
-    size = size[quiet] if quiet.sum() >= LEAST else size
+    size = size[quiet] if quiet.sum() >= LEAST_DIFFERENCES else size
     if not readings.count_nm:
         return float(np.sqrt(np.median(size**2) / 0.4549))
     # The median of whole counts jumps: means of blocks do not.

@@ -38,7 +38,7 @@ class Source:
     parts: tuple[Source, ...] = ()
     notes: tuple[str, ...] = ()
     participant: str = ""
-    """Whose it is, as a sealed recording says; empty where the file does not say."""
+    """Participant named in a sealed recording; empty for other files."""
     current_ma: float | None = None
     """With what current it was made, as a sealed recording says; None where the file does not say."""
 
@@ -200,8 +200,8 @@ class Record(Summarised):
 
     def columns(self) -> dict[str, np.ndarray]:
         """The optional columns that this record has, by name."""
-        found = {name: getattr(self, name) for name in OPTIONAL}
-        return {name: column for name, column in found.items() if column is not None}
+        optional = {name: getattr(self, name) for name in OPTIONAL}
+        return {name: column for name, column in optional.items() if column is not None}
 
     def samples(self) -> dict[str, np.ndarray]:
         """Times, pulse widths, torques and the optional columns, by name."""
@@ -219,19 +219,19 @@ class Record(Summarised):
             parts=self._parts_of(np.arange(self.time_s.size)[rows]),
         )
 
-    def _parts_of(self, kept: np.ndarray) -> list[Part]:
+    def _parts_of(self, kept_rows: np.ndarray) -> list[Part]:
         """The parts of some of its rows; one that goes as a whole is a pause."""
-        first = np.searchsorted(kept, [part.first for part in self.parts])
-        found: list[Part] = []
+        first = np.searchsorted(kept_rows, [part.first for part in self.parts])
+        parts: list[Part] = []
         pause_s = folded_s = 0.0
-        for part, start, end in zip(self.parts, first, [*first[1:], kept.size], strict=True):
+        for part, start, end in zip(self.parts, first, [*first[1:], kept_rows.size], strict=True):
             pause_s, folded_s = pause_s + part.pause_s, folded_s + part.folded_s
             if start < end:
-                moved_s = float(self.time_s[kept[start]] - self.time_s[part.first])
-                before = (pause_s, folded_s) if found else (0.0, 0.0)
-                found.append(Part(int(start), part.own_s + moved_s, part.begun_s, *before))
+                moved_s = float(self.time_s[kept_rows[start]] - self.time_s[part.first])
+                before = (pause_s, folded_s) if parts else (0.0, 0.0)
+                parts.append(Part(int(start), part.own_s + moved_s, part.begun_s, *before))
                 pause_s = folded_s = 0.0
-        return found or [Part()]
+        return parts or [Part()]
 
     @cached_property
     def sample_rate_hz(self) -> float:
@@ -244,7 +244,7 @@ class Record(Summarised):
 
     @cached_property
     def motion(self) -> JointMotion | None:
-        """How the joint moved, by the angles alone, each part smoothed by itself; None without an angle."""
+        """Motion of the joint from the angles alone, each part smoothed by itself; None without an angle."""
         if self.angle_rad is None:
             return None
         from stimrig.identify.records.joint_motion import JointMotion  # here, so that reading a file imports no numba
@@ -252,7 +252,7 @@ class Record(Summarised):
         return JointMotion.of(self.time_s, self.angle_rad, [part.first for part in self.parts])
 
     def knows(self, name: str) -> bool:
-        """Whether it has an optional column; the velocity of the joint follows from its angle."""
+        """Return true if the record has an optional column; the velocity of the joint follows from its angle."""
         return getattr(self, name) is not None or (name == "velocity_rad_s" and self.angle_rad is not None)
 
     @cached_property
@@ -275,7 +275,7 @@ class Record(Summarised):
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was assumed when it was read, in sentences; with the part's name where it is one of several."""
+        """Assumptions made in reading, in sentences; with the part's name where it is one of several."""
         of_parts = (f"{part.name}: {note}" for part in self.source.parts for note in part.notes)
         return tuple(dict.fromkeys((*self.source.notes, *of_parts)))
 
@@ -310,7 +310,7 @@ def _coded(
     known = [HELD_OUT if name.strip().lower() == HELD_OUT else str(name) for name in names]
     first = {name: index for index, name in reversed(list(enumerate(known)))}
     same = np.array([first[name] for name in known], np.int64)
-    other = dict.fromkeys(name for name, own in zip(names, known, strict=True) if name != own)
+    other = dict.fromkeys(name for name, canonical in zip(names, known, strict=True) if name != canonical)
     note = f"segment {', '.join(map(repr, other))} is taken as {HELD_OUT}" if other else ""
     return same[np.asarray(segment, np.int64)], known, note
 

@@ -47,7 +47,7 @@ def _sent(file: StrictFile, interval_s: float) -> Sent:
 
 
 def attributes(path: Path, names: Sequence[str]) -> dict[str, str]:
-    """What a sealed recording says of itself, by the names of its root's attributes.
+    """Read root attributes of a sealed recording by name.
 
     Raises BadRecord: unreadable, no sealed recording, or one of them is not there.
     """
@@ -57,7 +57,7 @@ def attributes(path: Path, names: Sequence[str]) -> dict[str, str]:
 
 
 def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = None) -> Record:
-    """A sealed recording from its bytes; `path` is how it is called.
+    """Read a sealed recording from its bytes; `path` names it in messages.
 
     The width in force at a sample is that of the last pulse due before it, and how late that was felt stands beside
     it; a pulse that was dropped or refused counts as none. Samples outside every segment are left out. An angle
@@ -76,16 +76,16 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
     if (bad := np.flatnonzero(inside & ~(np.abs(torque) <= bounds.LARGEST["torque_nm"]))).size:
         what = "is not finite" if not np.isfinite(torque[bad[0]]) else f"{torque[bad[0]]:g} N·m is no measurement"
         raise BadRecord(f"torque {what}", place=f"{file.name}, /torque/torque_nm, sample {bad[0]}", fix=FIX)
-    pulses, doubts = read_pulses(file, time_s, rate)
+    pulses, doubted = read_pulses(file, time_s, rate)
     width, late = in_force(pulses, time_s, rate)
     angles, unknown, note = _read_angle(file, time_s, inside)
-    doubts = doubts | unknown
+    doubted = doubted | unknown
     bounds.check_span(time_s[inside], f"{file.name}, /torque/time_s")
-    identity, digest, whose = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
+    identity, digest, participant = (file.text(key, "") for key in ("recording_id", "content_sha256", "participant"))
     current_ma = file.number("current_ma", np.nan)
     columns: dict[str, Any] = {"time_s": time_s, "pulse_width_us": width, "torque_nm": torque} | angles
     columns |= {"late_s": late} if pulses.late_s.any() else {}
-    columns |= {"doubted": doubts} if doubts.any() else {}
+    columns |= {"doubted": doubted} if doubted.any() else {}
     return Record.from_arrays(
         **{label: column[inside] for label, column in columns.items()},
         segment=code[inside],
@@ -97,7 +97,7 @@ def read_recording(content: bytes, path: Path, pulse_rate_hz: float | None = Non
             recording_id=identity,
             sha256=digest,
             notes=(note,) if note else (),
-            participant=whose,
+            participant=participant,
             current_ma=current_ma if current_ma > 0.0 else None,
         ),
     )

@@ -91,7 +91,7 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
     first = [part.first for part in record.parts]
     told = earlier_trial.time_s, earlier_trial.angle_rad
     motion = JointMotion.until_then(record.time_s, record.angle_rad, first, told)
-    moved = _moved(problem, motion.ahead(problem.setup.angle_late_s), angle_late_s=0.0)
+    moved = _moved(problem, motion.extrapolated(problem.setup.angle_late_s), angle_late_s=0.0)
     return _refuse_runaway(model, record, _foreseen(model, record, moved, theta))
 
 

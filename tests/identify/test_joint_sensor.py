@@ -91,7 +91,7 @@ def test_a_late_angle_is_told_ahead():
     time_s, angle, velocity = moved()
     late_s = 0.02
     read = np.interp(time_s - late_s, time_s, angle)
-    now = JointMotion.until_then(time_s, read, [0], (time_s, read)).ahead(late_s)
+    now = JointMotion.until_then(time_s, read, [0], (time_s, read)).extrapolated(late_s)
     settled = time_s > 1.0
     assert rms((now.angle_rad - angle)[settled]) < 0.1 * rms((read - angle)[settled])
     slope = np.gradient(read, time_s)
