@@ -40,7 +40,7 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
     white, ar1 = _innovations(residual, known)
     # At the times at which the pulses truly came: late pulses on even slots would spread a correlation over lags.
     width = grid.pulse_width_us
-    signals = {"u": grid.held(width), "u2": grid.held(width**2), "y": torque - residual}
+    signals = {"u": grid.interval_means(width), "u2": grid.interval_means(width**2), "y": torque - residual}
     filtered = {name: _filtered(signal, ar1, known) for name, signal in signals.items()}
     functions = {"residual": _auto(residual)} | {name: _cross(white, signal) for name, signal in filtered.items()}
     bands = _bands(filtered, known)

@@ -53,25 +53,25 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     BadRecord, NotIdentifiable
         The record gives no model in the plain structure either.
     """
-    say = progress or silent
-    say(0.05, LAST)
+    report = progress or silent
+    report(0.05, LAST)
     grid, raw = prepare(record)
     plain = fit_plain(grid, fitted_rows(grid, None))
     plain_model = finish(METHOD, plain)
     refused = _refused(model)
     if refused is not None:
         return _result(model, [plain_model], [], False, refused)
-    last, judged = still_needed(plain, model, raw, lambda share, text: say(0.2 + 0.65 * share, text))
+    last, judged = still_needed(plain, model, raw, lambda share, text: report(0.2 + 0.65 * share, text))
     rows = [judged[str(entry["id"])] for entry in model.effects]
     if not effect_names(last):
         return _result(model, [plain_model], rows, False, _nothing(rows))
-    say(0.85, f"{LAST}: bands and tests of the residual")
+    report(0.85, f"{LAST}: bands and tests of the residual")
     last = renewed_curve(last)
     carried_model = finish(METHOD, last, [f"effects carried over: {', '.join(effect_names(last))}"])
     better, because = _verdict(plain, last, raw)
     if better and (against := _less_usable(plain_model, carried_model)):
         better, because = False, against
-    say(1.0, "done")
+    report(1.0, "done")
     return _result(model, [plain_model, carried_model], rows, better, because)
 
 
@@ -111,42 +111,42 @@ class Judged:
     gain: float | None = None
 
 
-def still_needed(plain: Fitted, model: Model, raw: Raw, say: Progress) -> tuple[Fitted, dict[str, Judged]]:
+def still_needed(plain: Fitted, model: Model, raw: Raw, report: Progress) -> tuple[Fitted, dict[str, Judged]]:
     """The plain model with those effects of an earlier one that the record asks for, and the verdict on each.
 
     `plain` is the plain structure on the new record, `raw` what its samples show before any fit; `model`, the earlier
     one, lends its effects and their forms.
     """
     judged: dict[str, Judged] = {}
-    full = _add_all(plain, model, raw, judged, lambda share, text: say(0.6 * share, text))
-    last = _reduced(full, raw, judged, lambda share, text: say(0.6 + 0.4 * share, text))
-    if residual_structure(last, quiet_rows(last)).left:
+    full = _add_all(plain, model, raw, judged, lambda share, text: report(0.6 * share, text))
+    last = _reduced(full, raw, judged, lambda share, text: report(0.6 + 0.4 * share, text))
+    if residual_structure(last, quiet_rows(last)).significant:
         judged = {name: _undecided(verdict) for name, verdict in judged.items()}
     return last, judged
 
 
-def _add_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
+def _add_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], report: Progress) -> Fitted:
     """The plain model with all effects of the earlier one that this record can hold; the others are judged.
 
     The effect that explains most is added first, then the next: a weak one that is fitted alone takes what belongs to
     the strong one. So the order in which the earlier model lists them does not matter.
     """
-    fitted, left = plain, {str(entry["id"]): entry for entry in model.effects}
-    while left:
-        names = ", ".join(find_effect(name).name.lower() for name in left)
-        say(1.0 - len(left) / len(model.effects), f"{LAST}: {names}")
-        held: dict[str, Fitted] = {}
-        for name, entry in left.items():
+    fitted, remaining = plain, {str(entry["id"]): entry for entry in model.effects}
+    while remaining:
+        names = ", ".join(find_effect(name).name.lower() for name in remaining)
+        report(1.0 - len(remaining) / len(model.effects), f"{LAST}: {names}")
+        fits: dict[str, Fitted] = {}
+        for name, entry in remaining.items():
             try:
-                held[name] = add_effect(fitted, find_effect(name), _form_of(entry), raw)
+                fits[name] = add_effect(fitted, find_effect(name), _form_of(entry), raw)
             except NotIdentifiable as error:
-                seen = Reason("not-seen", f"{error.message[:1].upper()}{error.message[1:]}.")
-                judged[name] = Judged(find_effect(name), False, seen)
-        if not held:
+                reason = Reason("not-seen", f"{error.message[:1].upper()}{error.message[1:]}.")
+                judged[name] = Judged(find_effect(name), False, reason)
+        if not fits:
             return fitted
-        strongest = max(held, key=lambda name: (held[name].log_evidence, name))
-        fitted = held[strongest]
-        left = {name: entry for name, entry in left.items() if name in held and name != strongest}
+        strongest = max(fits, key=lambda name: (fits[name].log_evidence, name))
+        fitted = fits[strongest]
+        remaining = {name: entry for name, entry in remaining.items() if name in fits and name != strongest}
     return fitted
 
 
@@ -156,15 +156,15 @@ def _form_of(entry: Mapping[str, Any]) -> str:
     return name if name in {known.name for known in forms} and not any(known.grows for known in forms) else ""
 
 
-def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], say: Progress) -> Fitted:
+def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], report: Progress) -> Fitted:
     """The model without the effects that are not needed: the weakest is dropped, then the others are judged anew."""
-    shown = {effect for effect, _, _ in detected_effects(raw)}
+    detected = {effect for effect, _, _ in detected_effects(raw)}
     last, first_count, tried = full, len(effect_names(full)), set[str]()
-    while held := effect_names(last):
-        say(1.0 - len(held) / (first_count + 1), f"{LAST}: which of its effects are still needed")
-        found = [_judged(find_effect(name), last, name in shown) for name in held]
-        judged.update({verdict.effect.id: verdict for verdict, _ in found})
-        weak = [pair for pair in found if not pair[0].needed]
+    while present := effect_names(last):
+        report(1.0 - len(present) / (first_count + 1), f"{LAST}: which of its effects are still needed")
+        verdicts = [_judged(find_effect(name), last, name in detected) for name in present]
+        judged.update({verdict.effect.id: verdict for verdict, _ in verdicts})
+        weak = [pair for pair in verdicts if not pair[0].needed]
         if not weak:
             break
         worst, last = min(weak, key=lambda pair: pair[0].gain or 0.0)
@@ -175,9 +175,9 @@ def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], say: Progress) -
     return last
 
 
-def _judged(effect: Effect, fitted: Fitted, shown: bool) -> tuple[Judged, Fitted]:
+def _judged(effect: Effect, fitted: Fitted, detected: bool) -> tuple[Judged, Fitted]:
     """What the record says of an effect of a model, and the model without it."""
-    if shown:
+    if detected:
         return Judged(effect, True, Reason("in-samples", "The samples show it directly, before any fit.")), fitted
     without = without_effect(fitted, effect.id)
     gain = fitted.log_evidence - without.log_evidence + prior(effect)
@@ -209,24 +209,24 @@ def _undecided(verdict: Judged) -> Judged:
 
 def _nothing(judged: list[Judged]) -> Reason:
     """Why no effect is left."""
-    if any(one.needed is None for one in judged):
+    if any(verdict.needed is None for verdict in judged):
         return Reason("undecided", "Something else than the effects of the earlier model is missing in this record.")
     return Reason("nothing-needed", "The plain structure is enough for this record.")
 
 
 def _verdict(plain: Fitted, last: Fitted, raw: Raw) -> tuple[bool, Reason]:
     """Whether the carried structure as a whole is better than the plain one, and why."""
-    held = effect_names(last)
+    carried_effects = effect_names(last)
     # The log evidence says little of an effect that the samples show.
-    in_samples = any(effect in held for effect, _, _ in detected_effects(raw))
-    total = last.log_evidence - plain.log_evidence + sum(prior(find_effect(name)) for name in held)
+    in_samples = any(effect in carried_effects for effect, _, _ in detected_effects(raw))
+    total = last.log_evidence - plain.log_evidence + sum(prior(find_effect(name)) for name in carried_effects)
     if total < FIRST_MARGIN and not in_samples:
         text = f"Together the effects change the log evidence by {total:+.1f}; at least {FIRST_MARGIN:g} is required."
         return False, Reason("no-gain", text)
     risen = rise(plain, last)
     if risen is not None:
         return False, risen
-    names = "; ".join(find_effect(name).name.lower() for name in held)
+    names = "; ".join(find_effect(name).name.lower() for name in carried_effects)
     if in_samples:
         return True, Reason("better", f"This record asks for: {names}.")
     text = f"This record asks for: {names}. Log evidence is higher by {total:.0f} than without effects."
@@ -243,29 +243,29 @@ def _less_usable(plain: Model, carried: Model) -> Reason | None:
 
 def _result(model: Model, models: list[Model], judged: list[Judged], better: bool, because: Reason) -> Carried:
     forms = {str(entry["id"]): entry.get("form") for entry in models[-1].effects}
-    models[1:] = [one.with_(extra=one.extra | {"parent": models[0].model_id}) for one in models[1:]]
+    models[1:] = [later.with_(extra=later.extra | {"parent": models[0].model_id}) for later in models[1:]]
     rows = [
         {
-            "effect": one.effect.id,
-            "name": one.effect.name,
-            "form": forms.get(one.effect.id),
-            "needed": one.needed,
-            "log_evidence_gain": one.gain,
+            "effect": verdict.effect.id,
+            "name": verdict.effect.name,
+            "form": forms.get(verdict.effect.id),
+            "needed": verdict.needed,
+            "log_evidence_gain": verdict.gain,
             "required": FIRST_MARGIN,
-            "why": one.because.why,
-            "reason": one.because.reason,
+            "why": verdict.because.why,
+            "reason": verdict.because.reason,
         }
-        for one in judged
+        for verdict in judged
     ]
     return Carried(
         carried_from=model.model_id,
         offered="carried" if better else "plain",
         why=because.why,
         reason=because.reason,
-        still_needed=tuple(one.effect.id for one in judged if one.needed),
-        no_longer_needed=tuple(one.effect.id for one in judged if one.needed is False),
-        undecided=tuple(one.effect.id for one in judged if one.needed is None),
+        still_needed=tuple(verdict.effect.id for verdict in judged if verdict.needed),
+        no_longer_needed=tuple(verdict.effect.id for verdict in judged if verdict.needed is False),
+        undecided=tuple(verdict.effect.id for verdict in judged if verdict.needed is None),
         effects=tuple(rows),
-        figures=tuple({key: one.fit.get(key) for key in FIGURES} for one in models),
+        figures=tuple({key: fitted.fit.get(key) for key in FIGURES} for fitted in models),
         models=tuple(models),
     )

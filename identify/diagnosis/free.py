@@ -16,7 +16,7 @@ import numpy as np
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import residual_structure, vetoed
 from stimrig.identify.diagnosis.search import (
-    MOST,
+    MAX_EFFECTS,
     EffectSearch,
     Progress,
     helpful,
@@ -73,7 +73,7 @@ def searched(
     progress: Progress | None = None,
     *,
     rows: np.ndarray | None = None,
-    most: int = MOST,
+    max_effects: int = MAX_EFFECTS,
     structure: Sequence[str] = (),
 ) -> tuple[EffectSearch, Verdict]:
     """The search for effects of the library, and then, where structure is left, for free ones; and its verdict.
@@ -81,31 +81,33 @@ def searched(
     As `search_effects`; by default on all rows that may be fitted. A free effect is no name: where one is needed, the
     verdict stays that structure is left.
     """
-    say = progress or silent
+    report = progress or silent
     rows = fitted_rows(grid, None) if rows is None else rows
-    search = search_effects(grid, raw, rows, lambda done, text: say(0.7 * done, text), most=most, structure=structure)
+    search = search_effects(
+        grid, raw, rows, lambda done, text: report(0.7 * done, text), max_effects=max_effects, structure=structure
+    )
     verdict = judge(search)
-    if most == 0 or verdict.kind == "nothing_missing":
+    if max_effects == 0 or verdict.kind == "nothing_missing":
         return search, verdict
-    believed = _believed(search)
-    named = verdict.kind == "effect_missing" and bool(believed or not search.added)
-    if named and not _doubted(verdict, search.residuals[-1].left):
+    accepted = _accepted_effects(search)
+    named = verdict.kind == "effect_missing" and bool(accepted or not search.added)
+    if named and not _doubted(verdict, search.residuals[-1].significant):
         return search, verdict
-    freely = explain_freely(search, believed, named, lambda done, text: say(0.7 + 0.25 * done, text))
+    freely = explain_freely(search, accepted, named, lambda done, text: report(0.7 + 0.25 * done, text))
     if not freely.free:
         return search, verdict
     return freely, judge_free(freely, verdict, named)
 
 
-def _believed(search: EffectSearch) -> list[str]:
+def _accepted_effects(search: EffectSearch) -> list[str]:
     """The effects that were added before the first against which held-out pulses speak."""
     return search.added[: len(helpful(search)[0]) - 1 - len(search.detected)]
 
 
-def _doubted(verdict: Verdict, left: bool) -> bool:
+def _doubted(verdict: Verdict, structure_left: bool) -> bool:
     """Whether free effects are tried beside named ones."""
     error = verdict.held_out_error
-    return left or (error is not None and error.ratio > thresholds.NAMED_BUT)
+    return structure_left or (error is not None and error.ratio > thresholds.NAMED_BUT)
 
 
 def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, progress: Progress) -> EffectSearch:
@@ -117,26 +119,26 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     """
     count = len(names)
     whole = Chain(tuple(search.chain[: count + 1]), tuple(search.left_out[: count + 1]), tuple(names))
-    kept = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
-    alone = [] if named or kept == names else [_with_only(search, kept)]
+    unpredictable = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
+    alone = [] if named or unpredictable == names else [_with_only(search, unpredictable)]
     stays = whole.left_out[-1]
     first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
-    found = _extended([*alone, whole], progress, further if named else first)
-    found = [chain for chain in found if _asked_for(stays, chain, further if named else ANY)]
-    return _with_chain(search, found[-1]) if found else search
+    chains = _extended([*alone, whole], progress, further if named else first)
+    chains = [chain for chain in chains if _asked_for(stays, chain, further if named else ANY)]
+    return _with_chain(search, chains[-1]) if chains else search
 
 
-def _with_only(search: EffectSearch, kept: Sequence[str]) -> Chain:
+def _with_only(search: EffectSearch, retained: Sequence[str]) -> Chain:
     """The chain of models with only some of the effects that were added."""
     last = search.last
     for effect in search.added:
-        if effect not in kept:
+        if effect not in retained:
             last = without_effect(last, effect)
     models = [last]
-    for effect in reversed(kept):
+    for effect in reversed(retained):
         models.append(without_effect(models[-1], effect))
     models.reverse()
-    return Chain(tuple(models), tuple(leave_out(one) for one in models), tuple(kept))
+    return Chain(tuple(models), tuple(leave_out(model) for model in models), tuple(retained))
 
 
 def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, float]) -> list[Chain]:
@@ -145,7 +147,7 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
     The likeliest few of each length are extended: which effect is best alone does not say which is best beside others.
     Held-out rows choose none: where they speak against the best, it ends there.
     """
-    found: list[Chain] = []
+    best_chains: list[Chain] = []
     beam = list(bases)
     for number in range(thresholds.MOST_FREE):
         longer: list[Chain] = []
@@ -157,16 +159,16 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
         reference = bases[0].left_out[-1]
         longer.sort(key=lambda chain: -chain.better(reference).gain)
         best = _likeliest(longer)
-        if found and not _asked_for(found[-1].left_out[-1], best, thresholds.FURTHER_FREE):
+        if best_chains and not _asked_for(best_chains[-1].left_out[-1], best, thresholds.FURTHER_FREE):
             break
         if any(vetoed(*link) for link in best.links):  # of the second best, extended, the first was not yet asked about
             break
-        found.append(best)
+        best_chains.append(best)
         unlike: dict[str, Chain] = {}  # of each effect its best form
         for chain in longer:
             unlike.setdefault(chain.added[-1], chain)
         beam, first = [*unlike.values()][: thresholds.BEAM], thresholds.FURTHER_FREE
-    return found
+    return best_chains
 
 
 def _likeliest(chains: Sequence[Chain]) -> Chain:
@@ -174,11 +176,12 @@ def _likeliest(chains: Sequence[Chain]) -> Chain:
 
     Likelihoods are compared where the noise is of one kind.
     """
-    held = chains[0].models[-1].noise.held
+    noise_is_fixed = chains[0].models[-1].noise.held
     near = [
         chain
         for chain in chains
-        if chain.models[-1].noise.held == held and chains[0].better(chain.left_out[-1]).errors < thresholds.BETTER
+        if chain.models[-1].noise.held == noise_is_fixed
+        and chains[0].better(chain.left_out[-1]).errors < thresholds.BETTER
     ]
     return min(near, key=lambda chain: (len(chain.names), -chain.models[-1].log_evidence))
 
@@ -188,8 +191,8 @@ def _within(progress: Progress, begin: float, part: float, done: float, text: st
 
 
 def _asked_for(before: LeftOut, chain: Chain, required: tuple[float, float]) -> bool:
-    seen = chain.better(before)
-    return seen.errors >= required[0] and seen.gain >= required[1]
+    comparison = chain.better(before)
+    return comparison.errors >= required[0] and comparison.gain >= required[1]
 
 
 def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> list[Chain]:
@@ -200,27 +203,28 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
         if _applicable(effect, base):
             listed += [replace(effect, forms=(form,)) for form in effect.forms] if effect.shape else [effect]
     tried = scan(base, listed, WORTHLESS, [], partial(_within, progress, 0.0, 0.6))
-    gains = {one.effect.id: one.gain for one in tried}
-    likely = [
-        one
-        for one in tried
-        if one.effect.shape
-        and one.gain >= max(thresholds.NEXT_MARGIN, gains.get(ZERO.get(one.effect.id, ""), thresholds.NEXT_MARGIN))
+    gains = {candidate.effect.id: candidate.gain for candidate in tried}
+    promising = [
+        candidate
+        for candidate in tried
+        if candidate.effect.shape
+        and candidate.gain
+        >= max(thresholds.NEXT_MARGIN, gains.get(ZERO.get(candidate.effect.id, ""), thresholds.NEXT_MARGIN))
     ]
 
     def judged(number: int) -> tuple[Fitted, LeftOut]:
         """Without the problem: it holds functions, which cannot be sent between processes."""
-        fitted = trusted(likely[number].fitted)
+        fitted = trusted(promising[number].fitted)
         return replace(fitted, problem=None), leave_out(fitted)  # type: ignore
 
-    able: dict[int, Chain] = {}
-    for done, (number, (fitted, left_out)) in enumerate(side_by_side(judged, len(likely)), start=1):
-        one = likely[number]
-        progress(0.6 + 0.4 * done / len(likely), f"tried {one.effect.name.lower()}")
-        longer = chain.with_(replace(fitted, problem=one.fitted.problem), left_out, one.effect.id)
+    accepted: dict[int, Chain] = {}
+    for done, (number, (fitted, left_out)) in enumerate(side_by_side(judged, len(promising)), start=1):
+        candidate = promising[number]
+        progress(0.6 + 0.4 * done / len(promising), f"tried {candidate.effect.name.lower()}")
+        longer = chain.with_(replace(fitted, problem=candidate.fitted.problem), left_out, candidate.effect.id)
         if _asked_for(unseen, longer, required):
-            able[number] = longer
-    return [able[number] for number in sorted(able)]
+            accepted[number] = longer
+    return [accepted[number] for number in sorted(accepted)]
 
 
 def _applicable(effect: Effect, base: Fitted) -> bool:
@@ -235,16 +239,16 @@ def _applicable(effect: Effect, base: Fitted) -> bool:
 
 def _with_chain(search: EffectSearch, chain: Chain) -> EffectSearch:
     """The search that ends with this chain. Where an effect is no longer there, round 1 says what was refused."""
-    kept = [search.added.index(name) for name in chain.names]
-    refused = slice(len(kept), None) if len(kept) == len(search.added) else slice(1)
+    kept_rounds = [search.added.index(name) for name in chain.names]
+    refused = slice(len(kept_rounds), None) if len(kept_rounds) == len(search.added) else slice(1)
     return replace(
         search,
         added=[*chain.names, *chain.added],
         chain=list(chain.models),
         left_out=list(chain.left_out),
         residuals=[residual_structure(fitted, search.quiet) for fitted in chain.models],
-        rounds=[*(search.rounds[place] for place in kept), *search.rounds[refused]],
-        margins=[*(search.margins[place] for place in kept), *search.margins[refused]],
+        rounds=[*(search.rounds[place] for place in kept_rounds), *search.rounds[refused]],
+        margins=[*(search.margins[place] for place in kept_rounds), *search.margins[refused]],
         losses={},
         free=list(chain.added),
     )

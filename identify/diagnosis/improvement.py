@@ -9,7 +9,7 @@ from stimrig.identify.criticism import compare
 from stimrig.identify.diagnosis import diagnose, structure_of
 from stimrig.identify.diagnosis.free import searched
 from stimrig.identify.diagnosis.result import diagnosis_of
-from stimrig.identify.diagnosis.search import MOST, EffectSearch, Progress, Step, helpful, silent
+from stimrig.identify.diagnosis.search import MAX_EFFECTS, EffectSearch, Progress, Step, helpful, silent
 from stimrig.identify.diagnosis.thresholds import RISE
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import find_effect
@@ -64,10 +64,10 @@ def improve(
     """
     for effect in force:
         find_effect(effect)
-    most = MOST if max_effects is None else min(max_effects, MOST)
+    limit = MAX_EFFECTS if max_effects is None else min(max_effects, MAX_EFFECTS)
     structure = structure_of(model)
     grid, raw = prepare(record)
-    search, verdict = searched(grid, raw, progress, most=most, structure=structure)
+    search, verdict = searched(grid, raw, progress, max_effects=limit, structure=structure)
     return _improvement_of(search, verdict, max_effects, force)
 
 
@@ -89,15 +89,15 @@ def explain(record: Record, progress: Progress | None = None, model: Model | Non
     BadRequest, NotIdentifiable
         As `improve` and `diagnose` raise them.
     """
-    say = progress or silent
-    found, improvement = diagnose_and_improve(record, lambda share, text: say(0.6 * share, text), model)
+    report = progress or silent
+    diagnosis, improvement = diagnose_and_improve(record, lambda share, text: report(0.6 * share, text), model)
     first, last = improvement.models[0], improvement.models[-1]
-    left = found
+    remaining = diagnosis
     if last is not first:  # a further search tries all forms beside what was added, as one of the last model would
-        left = diagnose(record, last, lambda share, text: say(0.6 + 0.4 * share, text))
-    before, after = (compare(one, record) for one in (first, last))
-    say(1.0, "done")
-    return Explanation(diagnosis=found, improvement=improvement, left=left, before=before, after=after)
+        remaining = diagnose(record, last, lambda share, text: report(0.6 + 0.4 * share, text))
+    before, after = (compare(compared, record) for compared in (first, last))
+    report(1.0, "done")
+    return Explanation(diagnosis=diagnosis, improvement=improvement, left=remaining, before=before, after=after)
 
 
 def diagnose_and_improve(
@@ -126,14 +126,14 @@ def _improvement_of(
     row, against = helpful(search)
     if max_effects is not None:
         row = row[: max_effects + 1]
-    asked = len(row)
+    supported_steps = len(row)
     for effect in force:
         step = _forced(row[-1], effect, search.raw)
         if step is not None:
             row.append(step)
     models = _models(row)
-    reasons = [_reason(search, *three) for three in zip(row[:asked], [row[0], *row], models, strict=False)]
-    reasons += ["Added on request. The evidence does not ask for it."] * (len(row) - asked)
+    reasons = [_reason(search, *three) for three in zip(row[:supported_steps], [row[0], *row], models, strict=False)]
+    reasons += ["Added on request. The evidence does not ask for it."] * (len(row) - supported_steps)
     return Improvement(
         noise_sd_nm=search.raw.noise_sd_nm,
         verdict=verdict.kind,
@@ -154,20 +154,20 @@ _PLAIN = "The plain structure: recruitment curve and linear dynamics."
 
 def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str:
     if step.added is None:
-        held = ", ".join(find_effect(name).name.lower() for name in effect_names(search.base))
-        base = f"The given structure, with {held}." if held else _PLAIN
+        base_names = ", ".join(find_effect(name).name.lower() for name in effect_names(search.base))
+        base = f"The given structure, with {base_names}." if base_names else _PLAIN
         return " ".join([base, *words(step.fitted, search.rows)])
     if step.added in search.detected:
         return "The samples show it directly, before any fit."
     number = search.added.index(step.added)
-    seen = difference(search.left_out[number], search.left_out[number + 1])
+    comparison = difference(search.left_out[number], search.left_out[number + 1])
     if step.added in search.free:
-        told = next(effect["shape"]["words"] for effect in model.effects if effect["id"] == step.added)
-        return " ".join([told, seen.words_of_choice, FREE])
+        description = next(effect["shape"]["words"] for effect in model.effects if effect["id"] == step.added)
+        return " ".join([description, comparison.words_of_choice, FREE])
     gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
     reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
     unasked = [] if find_effect(step.added).predictable else ["It cannot be foreseen: it need not predict."]
-    return " ".join([reason, seen.words, *unasked, *_rising(before.statistics, step.statistics)])
+    return " ".join([reason, comparison.words, *unasked, *_rising(before.statistics, step.statistics)])
 
 
 def _rising(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:

@@ -30,8 +30,9 @@ class ResidualStructure:
     scale_nm: float  # the record's largest torque
 
     @property
-    def left(self) -> bool:
-        """Whether work and rest differ, and by as much as matters: enough samples make every trifle significant."""
+    def significant(self) -> bool:
+        """True if work and rest differ statistically and by an amount that matters: in a long record every trifle is
+        significant."""
         excess_nm = max(self.busy_nm**2 - self.white_nm**2, 0.0) ** 0.5
         return self.ratio > STRUCTURE and excess_nm > STRUCTURE_SHARE * self.scale_nm
 
@@ -64,8 +65,8 @@ def _ideal(fitted: np.ndarray, resting: tuple, white: float, size: int) -> float
     return min(at_white, resting[3] / size * total)
 
 
-def _long(flags: np.ndarray, least: int) -> list[slice]:
-    return [run for run in runs(flags) if run.stop - run.start >= least]
+def _long(flags: np.ndarray, min_rows: int) -> list[slice]:
+    return [run for run in runs(flags) if run.stop - run.start >= min_rows]
 
 
 def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, float, float]:
@@ -87,7 +88,7 @@ def quiet_rows(fitted: Fitted) -> np.ndarray:
     part = setup.part_of(at_samples=False)
     baseline = physical[problem.baselines.start : problem.baselines.stop]
     torque = problem.run(fitted.theta)[0] - (baseline[0] if part is None else baseline[part])
-    drive = setup.grid.held(physical[problem.coefficients] @ setup.design)
+    drive = setup.grid.interval_means(physical[problem.coefficients] @ setup.design)
     level = QUIET * setup.scale_nm
     still = (np.abs(torque) < level) & (np.abs(drive) < level)
     # The half second after the last torque counts as work: slow tails belong to it.
@@ -114,15 +115,17 @@ class HeldOutError:
         return self.rms_nm / self.allowed_nm
 
 
-def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | None = None) -> HeldOutError | None:
+def held_out_error(
+    fitted: Fitted, form: float = FORM_ERROR, compared_with: Fitted | None = None
+) -> HeldOutError | None:
     """The error of a model on the held-out intervals; None if there are too few, or if there is a tremor.
 
     Only rows count whose pulse widths, and those of the seconds before, are near fitted ones: elsewhere the recruitment
     curve is a guess. Efforts cannot be predicted, but they are rare: if one of the models has one, the median of the
     error counts instead of its root mean square.
 
-    `form` is the error allowed because the model's form is inexact, as a share of the largest torque, `beside` a model
-    that this one is compared with.
+    `form` is the error allowed because the model's form is inexact, as a share of the largest torque;
+    `compared_with` a model that this one is compared with.
     """
     setup = fitted.problem.setup
     rows = np.isfinite(hold_out(fitted).error_nm)
@@ -134,7 +137,10 @@ def held_out_error(fitted: Fitted, form: float = FORM_ERROR, beside: Fitted | No
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
     allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
-    if not any(find_effect(effect).sporadic for effect, _ in [*fitted.effects, *(beside.effects if beside else [])]):
+    if not any(
+        find_effect(effect).sporadic
+        for effect, _ in [*fitted.effects, *(compared_with.effects if compared_with else [])]
+    ):
         return HeldOutError(float(np.sqrt(np.mean(residual**2))), float(allowed))
     return HeldOutError(float(np.median(np.abs(residual)) / MEDIAN), float(allowed))
 

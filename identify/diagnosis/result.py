@@ -43,7 +43,7 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     final = row[-1].statistics
     residual = record.torque_nm - predict_fitted(search.base)[0]
     where = worst_places(record, residual, raw.noise_sd_nm, rows=search.base.problem.setup.grid.counted)
-    found: dict[str, Any] = {
+    fields: dict[str, Any] = {
         "noise_sd_nm": raw.noise_sd_nm,
         "slow_noise": {
             "sd_nm": search.last.noise.sd_nm * float(np.sqrt(min(search.last.noise.share, 1.0))),
@@ -64,17 +64,18 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
         "unseen": None
         if verdict.held_out_error is None
         else {"rms_nm": verdict.held_out_error.rms_nm, "allowed_nm": verdict.held_out_error.allowed_nm},
-        "candidates": tuple([_candidate(one) for one in tried] for tried in search.rounds),
+        "candidates": tuple([_candidate(candidate) for candidate in tried] for tried in search.rounds),
         "notes": tuple(verdict.notes),
     }
-    found["deciding_experiment"] = _deciding(search, verdict, found)
-    return Diagnosis(**found, plain=tuple(_plain(search, found, row[-1 - len(free)].statistics)))
+    fields["deciding_experiment"] = _deciding(search, verdict, fields)
+    return Diagnosis(**fields, plain=tuple(_plain(search, fields, row[-1 - len(free)].statistics)))
 
 
 def _ranked(search: EffectSearch, verdict: Verdict) -> list[str]:
     """Effects by probability, those that the samples show first; then by the log evidence lost without each."""
     return sorted(
-        verdict.found, key=lambda e: (e not in search.detected, -verdict.found[e], -search.losses.get(e, 0.0))
+        verdict.probabilities,
+        key=lambda e: (e not in search.detected, -verdict.probabilities[e], -search.losses.get(e, 0.0)),
     )
 
 
@@ -85,7 +86,7 @@ def _missing(
     before, after = row[number - 1].statistics, row[number].statistics
     fitted = search.last.written
     index = [e for e, _ in fitted.effects].index(effect)
-    own = describe_parameters(fitted, index, covariance)
+    parameters = describe_parameters(fitted, index, covariance)
     rivals = verdict.rivals.get(effect, {})
     named = _close(search, effect)
     ranked = sorted((name for name in rivals if name and name != effect), key=lambda name: -rivals[name])
@@ -96,7 +97,7 @@ def _missing(
         "effect": effect,
         "name": described.name,
         "part": described.part,
-        "probability": verdict.found[effect],
+        "probability": verdict.probabilities[effect],
         "rms_before_nm": before["rms_nm"],
         "rms_after_nm": after["rms_nm"],
         "held_out_rms_before_nm": before["held_out_rms_nm"],
@@ -106,7 +107,7 @@ def _missing(
         "next_experiment_plan": experiment and _plan(experiment),
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
-        "parameters": dict(list(own.items())[:MOST_PARAMETERS]),
+        "parameters": dict(list(parameters.items())[:MOST_PARAMETERS]),
         "objection": verdict.objections.get(effect),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
@@ -117,11 +118,11 @@ def _plan(experiment: Experiment) -> dict[str, Any]:
     return {key: value for key, value in experiment.to_dict().items() if key != "rivals"}
 
 
-def _deciding(search: EffectSearch, verdict: Verdict, found: dict[str, Any]) -> dict[str, Any] | None:
+def _deciding(search: EffectSearch, verdict: Verdict, diagnosis: dict[str, Any]) -> dict[str, Any] | None:
     """The test for what is left, or for an effect that the record neither names nor excludes."""
     if _undecided(search, verdict):
         return _plan(plan_further(search.record, search.last))
-    best = search.rounds[0][0] if only_open(found) else None
+    best = search.rounds[0][0] if only_open(diagnosis) else None
     if best is None or best.effect.band or best.effect.sporadic:
         return None
     return _plan(plan(search.record, {best.effect.id: best.fitted, NOTHING: search.last}))
@@ -166,16 +167,16 @@ def _close(search: EffectSearch, effect: str) -> set[str]:
         return set()
     round_ = search.rounds[search.added.index(effect)]
     gains = {c.effect.id: c.gain for c in round_ if c.refused is None}
-    alike = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(find_effect(effect).resembles)
-    return {name for name in alike if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
+    similar = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(find_effect(effect).resembles)
+    return {name for name in similar if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
 
 
 def _experiment(search: EffectSearch, effect: str, confused: list[str]) -> Experiment | None:
     """The shortest test that separates an effect from its first rival, both as fitted in the same round."""
     if not confused or effect not in search.added:
         return None
-    found = {c.effect.id: c.fitted for c in search.rounds[search.added.index(effect)]}
-    rivals = {name: found[name] for name in (effect, confused[0]) if name in found and not find_effect(name).band}
+    fits = {c.effect.id: c.fitted for c in search.rounds[search.added.index(effect)]}
+    rivals = {name: fits[name] for name in (effect, confused[0]) if name in fits and not find_effect(name).band}
     return plan(search.record, rivals) if len(rivals) == 2 else None
 
 
@@ -187,28 +188,32 @@ PARTS = {
 }
 
 
-def _candidate(one: Candidate) -> dict[str, Any]:
+def _candidate(candidate: Candidate) -> dict[str, Any]:
     return {
-        "effect": one.effect.id,
-        "name": one.effect.name,
-        "form": one.form.name,
-        "log_evidence_gain": one.gain,
-        "rms_nm": one.fitted.rms_nm,
-        "forms": one.forms,
-        "refusal": one.refusal,
+        "effect": candidate.effect.id,
+        "name": candidate.effect.name,
+        "form": candidate.form.name,
+        "log_evidence_gain": candidate.gain,
+        "rms_nm": candidate.fitted.rms_nm,
+        "forms": candidate.forms,
+        "refusal": candidate.refusal,
     }
 
 
-def _plain(search: EffectSearch, found: dict[str, Any], named: dict[str, Any]) -> list[str]:
-    base, missing = found["base"], found["missing"]
-    held = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
-    said = conclude(found)
+def _plain(search: EffectSearch, diagnosis: dict[str, Any], named: dict[str, Any]) -> list[str]:
+    base, missing = diagnosis["base"], diagnosis["missing"]
+    base_names = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
+    conclusion = conclude(diagnosis)
     lines = [
-        f"The model {f'with {held}' if held else 'without effects'} fits {base['fit_percent']:.1f} %; the noise of "
-        f"{found['noise_sd_nm']:.3g} N·m allows {base['ceiling_percent']:.1f} % at most.",
-        f"{said.title}. {said.words}",
-        *[f"Most of it is here: {place['text']}." for place in found["where"][:1] if said.kind == "unexplained"],
-        *[f"{row['words']} {row['left_out']}" for row in found["free"]],
+        f"The model {f'with {base_names}' if base_names else 'without effects'} fits {base['fit_percent']:.1f} %; the "
+        f"noise of {diagnosis['noise_sd_nm']:.3g} N·m allows {base['ceiling_percent']:.1f} % at most.",
+        f"{conclusion.title}. {conclusion.words}",
+        *[
+            f"Most of it is here: {place['text']}."
+            for place in diagnosis["where"][:1]
+            if conclusion.kind == "unexplained"
+        ],
+        *[f"{row['words']} {row['left_out']}" for row in diagnosis["free"]],
     ]
     for entry in missing:
         chance = entry["probability"]
@@ -219,9 +224,9 @@ def _plain(search: EffectSearch, found: dict[str, Any], named: dict[str, Any]) -
             others = ", ".join(find_effect(name).name.lower() for name in entry["confused_with"])
             text += f" This record cannot clearly separate it from: {others}. To decide: {entry['next_experiment']}"
         lines.append(text)
-    if missing and found["verdict"] == "effect_missing":
+    if missing and diagnosis["verdict"] == "effect_missing":
         lines.append(
             f"With {'it' if len(missing) == 1 else 'them'} the error on held-out pulses falls from "
             f"{base['held_out_rms_nm']:.3g} to {named['held_out_rms_nm']:.3g} N·m."
         )
-    return [*lines, *found["notes"], said.advice]
+    return [*lines, *diagnosis["notes"], conclusion.advice]

@@ -40,7 +40,7 @@ from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 
-MOST = 3
+MAX_EFFECTS = 3
 """Effects at most."""
 FORMS = 3
 """Forms of an effect that are tried beside another effect."""
@@ -78,7 +78,7 @@ class EffectSearch:
     free: list[str] = field(default_factory=list)  # of `added` the last ones, which describe what no other explains
 
     @property
-    def held(self) -> list[str]:
+    def base_effects(self) -> list[str]:
         """Effects of the structure that is examined."""
         return effect_names(self.base)
 
@@ -101,13 +101,14 @@ def search_effects(
     rows: np.ndarray,
     progress: Progress | None = None,
     *,
-    most: int = MOST,
+    max_effects: int = MAX_EFFECTS,
     structure: Sequence[str] = (),
 ) -> EffectSearch:
     """Try all effects on a record, add the best, and continue while the evidence is sufficient.
 
-    `grid` and `raw` are as `prepare` makes them, `rows` the pulse intervals to fit. `most`: effects to add at most.
-    `structure`: effects, "id" or "id:form", that the examined model already has. `progress` may raise `Cancelled`.
+    `grid` and `raw` are as `prepare` makes them, `rows` the pulse intervals to fit. At most `max_effects` effects are
+    added. `structure`: effects, "id" or "id:form", that the examined model already has. `progress` may raise
+    `Cancelled`.
 
     Raises NotIdentifiable: less than `thresholds.LEAST_S` may be fitted, or as `fit_plain`.
     """
@@ -119,7 +120,7 @@ def search_effects(
     start = _add_detected(search)
     search.quiet = quiet_rows(start)
     search.append(start)
-    for number in range(most):
+    for number in range(max_effects):
         if number and _exhausted(search):
             break
         best = _best_of_round(search, progress or silent, number)
@@ -137,9 +138,9 @@ def search_effects(
 def _add_detected(search: EffectSearch) -> Fitted:
     """The base model with the effects that the samples show beyond doubt."""
     base = search.base
-    for effect, shown, values in detected_effects(search.raw):
+    for effect, detected_form, values in detected_effects(search.raw):
         if effect not in effect_names(base):
-            base = fit_from(base, effect, shown, values)
+            base = fit_from(base, effect, detected_form, values)
             search.detected.append(effect)
             search.with_detected.append(base)
     return base
@@ -148,31 +149,31 @@ def _add_detected(search: EffectSearch) -> Fitted:
 def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tuple[Candidate, LeftOut] | None:
     """The likeliest candidate of a round that predicts left-out blocks better; None if none does."""
     before = search.rounds[0] if search.rounds else []
-    listed, least = _worth_a_fit(search)
-    tried = scan(search.last, listed, least, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
+    listed, min_gain = _worth_a_fit(search)
+    tried = scan(search.last, listed, min_gain, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
     candidates = sorted((_discounted(search, c) for c in tried), key=_by_gain)
     search.rounds.append(candidates)
     if not number and (lawless := try_effect(FREE_GAIN, search.last)) is not None:
         search.free_gain = lawless.gain
     search.margins.append(_margin(search, len(search.added)))
-    able = []
+    accepted = []
     for place, candidate in enumerate(candidates[: thresholds.JUDGED]):
         if candidate.gain < search.margins[-1]:
             break
-        if candidate.gain < least:
+        if candidate.gain < min_gain:
             candidate = candidates[place] = _fitted_to_its_end(candidate)
         unseen = leave_out(candidate.fitted)
-        seen, required = difference(search.left_out[-1], unseen), required_errors(search, candidate)
-        if not seen.errors >= required:
-            candidates[place] = replace(candidate, refused=seen, required=required)
+        comparison, required = difference(search.left_out[-1], unseen), required_errors(search, candidate)
+        if not comparison.errors >= required:
+            candidates[place] = replace(candidate, refused=comparison, required=required)
             continue
-        able.append((seen.gain, candidate, unseen))
+        accepted.append((comparison.gain, candidate, unseen))
         if not search.last.distrusted:
             break
     candidates.sort(key=_by_gain)  # a fit that was continued gains more
-    if not able:
+    if not accepted:
         return None
-    _, candidate, unseen = max(able, key=lambda one: one[0])
+    _, candidate, unseen = max(accepted, key=lambda entry: entry[0])
     free = released(candidate.fitted)
     return (candidate, unseen) if free is candidate.fitted else (replace(candidate, fitted=free), leave_out(free))
 
@@ -203,8 +204,8 @@ def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iter
         find_effect(name).shape
         or name in effect.resembles
         or effect.id in find_effect(name).resembles
-        or (stage in thresholds.DYNAMIC and own.stage in thresholds.DYNAMIC)
-        for name, own in before.effects
+        or (stage in thresholds.DYNAMIC and present_form.stage in thresholds.DYNAMIC)
+        for name, present_form in before.effects
         if name not in detected
     )
 
@@ -234,7 +235,7 @@ def _worth_a_fit(search: EffectSearch) -> tuple[list[Effect], float]:
     if _exhausted(search):
         return listed, WORTHLESS
     firsts = [fit_form(e, e.forms[0], base, base.residual_nm, {}, np.inf) for e in listed if not e.band]
-    gains = [found.log_evidence - base.log_evidence for found in firsts if found is not None]
+    gains = [fitted.log_evidence - base.log_evidence for fitted in firsts if fitted is not None]
     return listed, max(WORTHLESS, NO_RIVAL * max(gains, default=0.0))
 
 
@@ -246,7 +247,7 @@ def _fitted_to_its_end(candidate: Candidate) -> Candidate:
 
 
 def scan(
-    base: Fitted, listed: list[Effect], least: float, before: list[Candidate], progress: Progress
+    base: Fitted, listed: list[Effect], min_gain: float, before: list[Candidate], progress: Progress
 ) -> list[Candidate]:
     """Add each of some effects to a model; best first. `before` holds the candidates of an earlier round."""
     earlier = {candidate.effect.id: candidate for candidate in before}
@@ -254,12 +255,12 @@ def scan(
     def tried(number: int) -> tuple[str, Fitted, float, dict[str, float]] | None:
         """Without the problem: it holds functions, which cannot be sent between processes."""
         effect = listed[number]
-        found = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)), least)
-        if found is None:
+        candidate = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)), min_gain)
+        if candidate is None:
             return None
-        return found.form.name, replace(found.fitted, problem=None), found.gain, found.forms  # type: ignore
+        return candidate.form.name, replace(candidate.fitted, problem=None), candidate.gain, candidate.forms  # type: ignore
 
-    found: list[Candidate] = []
+    candidates: list[Candidate] = []
     for done, (number, result) in enumerate(side_by_side(tried, len(listed)), start=1):
         effect = listed[number]
         progress(done / len(listed), f"tried {effect.name.lower()}")
@@ -267,8 +268,8 @@ def scan(
             name, fitted, gain, forms = result
             added = [] if effect.band else [(effect.id, effect.form(name))]
             problem = Problem(base.problem.setup, [*base.effects, *added])
-            found.append(Candidate(effect, effect.form(name), replace(fitted, problem=problem), gain, forms))
-    return sorted(found, key=_by_gain)
+            candidates.append(Candidate(effect, effect.form(name), replace(fitted, problem=problem), gain, forms))
+    return sorted(candidates, key=_by_gain)
 
 
 def _by_gain(candidate: Candidate) -> tuple[float, str]:
@@ -284,10 +285,10 @@ def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     """
     grid = base.problem.setup.grid
     record, jumps = grid.record, base.heavy_tails and grid.readings is not None
-    asked = not effect.raw and not effect.shape and effect.id not in present
-    asked = asked and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
-    asked = asked and not replaced_by(base.effects, effect.forms)
-    return asked and all(record.knows(need) for need in effect.needs)
+    applicable = not effect.raw and not effect.shape and effect.id not in present
+    applicable = applicable and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
+    applicable = applicable and not replaced_by(base.effects, effect.forms)
+    return applicable and all(record.knows(need) for need in effect.needs)
 
 
 def _likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:
@@ -347,16 +348,16 @@ def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
 
 def _margin(search: EffectSearch, number: int) -> float:
     """Log evidence that an effect must gain in a round."""
-    return thresholds.NEXT_MARGIN if number or search.held else FIRST_MARGIN
+    return thresholds.NEXT_MARGIN if number or search.base_effects else FIRST_MARGIN
 
 
 def _exhausted(search: EffectSearch) -> bool:
     """Whether no further effect can gain enough: the residual is nearly as small and as white as noise can be."""
-    left, last = search.residuals[-1], search.last
-    if last.noise.ar1 > thresholds.SLOWEST_AR1 and left.slow_nm > left.white_nm:
+    structure, last = search.residuals[-1], search.last
+    if last.noise.ar1 > thresholds.SLOWEST_AR1 and structure.slow_nm > structure.white_nm:
         return False  # such slow noise may be a drift: the rests cannot tell how small the residual could be
     near = thresholds.NEAR_IDEAL if last.noise.is_white else thresholds.NEXT_MARGIN
-    return left.ideal - last.log_likelihood < near and left.ratio < thresholds.NEXT_MARGIN
+    return structure.ideal - last.log_likelihood < near and structure.ratio < thresholds.NEXT_MARGIN
 
 
 def prior(effect: Effect) -> float:
@@ -380,10 +381,10 @@ def _exchange(search: EffectSearch) -> None:
         for rival in rivals:
             if rival.gain < 0.5 * search.rounds[index][0].gain or rival.effect.band:
                 continue
-            found = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
-            if found is not None and found.log_evidence > last.log_evidence + 2.0:
+            refitted = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
+            if refitted is not None and refitted.log_evidence > last.log_evidence + 2.0:
                 search.added[index] = rival.effect.id
-                _rebuild(search, found, index, found.log_evidence - last.log_evidence)
+                _rebuild(search, refitted, index, refitted.log_evidence - last.log_evidence)
                 return
 
 
@@ -400,31 +401,33 @@ def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0
         fitted = last if number == len(wanted) - 1 else _part(last, before, [*effect_names(before), effect])
         known = next((c.forms for c in tried[number] if c.effect.id == effect), {})
         gain = fitted.log_evidence - before.log_evidence + described.prior - (BAND_COST if described.band else 0.0)
-        own = dict(fitted.effects).get(effect, described.forms[0])
-        found = _discounted(search, Candidate(described, own, fitted, gain, known | {own.name: gain}))
+        added_form = dict(fitted.effects).get(effect, described.forms[0])
+        candidate = _discounted(search, Candidate(described, added_form, fitted, gain, known | {added_form.name: gain}))
         unseen = leave_out(fitted)
-        seen = difference(search.left_out[-1], unseen)
-        if found.gain < _margin(search, number) or not seen.errors >= required_errors(search, found):
+        comparison = difference(search.left_out[-1], unseen)
+        if candidate.gain < _margin(search, number) or not comparison.errors >= required_errors(search, candidate):
             return  # beside the other effects it no longer gains enough
         # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
-        most = found.gain - (won if number == index else 0.0)
-        rivals = [replace(c, gain=min(c.gain, most)) for c in tried[number] if c.effect.id != effect]
-        search.rounds.append(sorted([found, *rivals], key=_by_gain))
+        highest_gain = candidate.gain - (won if number == index else 0.0)
+        rivals = [replace(c, gain=min(c.gain, highest_gain)) for c in tried[number] if c.effect.id != effect]
+        search.rounds.append(sorted([candidate, *rivals], key=_by_gain))
         search.margins.append(_margin(search, number))
         search.append(fitted, effect, unseen)
 
 
-def _part(last: Fitted, before: Fitted, kept: list[str]) -> Fitted:
+def _part(last: Fitted, before: Fitted, retained: list[str]) -> Fitted:
     """The last model with only some of its effects, fitted from their present values."""
-    problem = Problem(last.problem.setup, [(effect, own) for effect, own in last.effects if effect in kept])
-    noise = last.noise if any(find_effect(name).band for name in kept) else before.noise
+    problem = Problem(
+        last.problem.setup, [(effect, effect_form) for effect, effect_form in last.effects if effect in retained]
+    )
+    noise = last.noise if any(find_effect(name).band for name in retained) else before.noise
     return solve(problem, start_from(problem, last, {}), noise)
 
 
 def without_effect(fitted: Fitted, effect: str) -> Fitted:
     """The model refitted without one of its effects."""
     noise = fitted.noise
-    others = [(name, own) for name, own in fitted.effects if name != effect]
+    others = [(name, effect_form) for name, effect_form in fitted.effects if name != effect]
     if len(others) == len(fitted.effects):
         noise = NoiseLevel(noise.ar1, noise.share, noise.sd_nm)
     problem = Problem(fitted.problem.setup, others)

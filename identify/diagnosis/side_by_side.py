@@ -32,9 +32,9 @@ def side_by_side(work: Callable[[int], Any], count: int, processes: int = 0) -> 
     `work`: called with the number of a task. `count`: of tasks, 256 at most: each number is one byte. `processes`:
     processes that share the tasks, this one included; 0 for `WORKERS`.
     """
-    numbers, put = os.pipe()
-    os.write(put, bytes(range(count)))
-    os.close(put)
+    numbers, write_end = os.pipe()
+    os.write(write_end, bytes(range(count)))
+    os.close(write_end)
     copies: list[Copy] = []
     waiting = set(range(count))
     try:
@@ -74,11 +74,13 @@ def _copy(work: Callable[[int], Any], numbers: int) -> Copy | None:
         return None
     import fcntl  # not there on every system
 
-    results, put = multiprocessing.Pipe(duplex=False)
+    results, result_writer = multiprocessing.Pipe(duplex=False)
     with contextlib.suppress(OSError):
         # Room for one or two results, so that a copy need not wait until this process has finished its own task.
-        fcntl.fcntl(put.fileno(), fcntl.F_SETPIPE_SZ, ROOM_BYTES)
-    process = multiprocessing.get_context("fork").Process(target=_work, args=(work, numbers, put), daemon=True)
+        fcntl.fcntl(result_writer.fileno(), fcntl.F_SETPIPE_SZ, ROOM_BYTES)
+    process = multiprocessing.get_context("fork").Process(
+        target=_work, args=(work, numbers, result_writer), daemon=True
+    )
     try:
         # If another thread held the compiler lock during the fork, the copy would wait for it for ever.
         with global_compiler_lock:
@@ -87,11 +89,11 @@ def _copy(work: Callable[[int], Any], numbers: int) -> Copy | None:
         results.close()
         return None
     finally:
-        put.close()
+        result_writer.close()
     return process, results
 
 
-def _work(work: Callable[[int], Any], numbers: int, put: Any) -> None:
+def _work(work: Callable[[int], Any], numbers: int, result_writer: Any) -> None:
     """Main function of a copy: do tasks while there are any and the parent process lives."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     # The copy must not keep the parent's output streams open: their reader would wait for the copy to end.
@@ -109,4 +111,4 @@ def _work(work: Callable[[int], Any], numbers: int, put: Any) -> None:
     signal.setitimer(signal.ITIMER_REAL, LOOKS_S, LOOKS_S)
     while number := os.read(numbers, 1):
         end_with_parent()
-        put.send((number[0], work(number[0])))
+        result_writer.send((number[0], work(number[0])))

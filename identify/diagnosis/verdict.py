@@ -10,7 +10,7 @@ from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, vetoed
 from stimrig.identify.diagnosis.search import EffectSearch, resembles_earlier, seen_at_rest
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.candidates import doubts
+from stimrig.identify.estimation.candidates import likelihood_warnings
 from stimrig.identify.estimation.effect_fit import Candidate
 from stimrig.identify.estimation.joint import Fitted
 
@@ -20,7 +20,7 @@ class Verdict:
     """The verdict on a search for effects."""
 
     kind: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
-    found: dict[str, float]  # probability by effect, of those added
+    probabilities: dict[str, float]  # by effect, of those added
     rivals: dict[str, dict[str, float]]  # for each effect found: probabilities of all effects tried in the same round
     explained: float  # share of the explainable log-likelihood that the effects explain
     structure: float  # log-likelihood by which the residuals at work and at rest still differ
@@ -30,17 +30,17 @@ class Verdict:
     objections: dict[str, str] = field(default_factory=dict)  # by effect: what held-out pulses say against it
 
 
-def shares(candidates: list[Candidate], most: float = np.inf) -> dict[str, float]:
+def shares(candidates: list[Candidate], max_gain: float = np.inf) -> dict[str, float]:
     """Probability of each candidate, and under the key "" that none of them is there.
 
-    No gain counts for more than `most`, that of the effect which was added: where the likelihood decides nothing, one
-    that is likelier is a rival, not more.
+    Gains are limited to `max_gain`, that of the effect which was added: where the likelihood decides nothing, a
+    likelier candidate is only a rival.
     """
     if not candidates:
         return {"": 1.0}
-    top = min(candidates[0].gain, most)
+    top = min(candidates[0].gain, max_gain)
     spread = thresholds.TEMPERATURE + thresholds.RELATIVE * max(top, 0.0)
-    weights = {c.effect.id: float(np.exp(max((min(c.gain, most) - top) / spread, -60.0))) for c in candidates}
+    weights = {c.effect.id: float(np.exp(max((min(c.gain, max_gain) - top) / spread, -60.0))) for c in candidates}
     # An effect whose gain equals the margin has a probability of one half.
     weights[""] = float(np.exp(np.clip(thresholds.FIRST_MARGIN - top, -60.0, 60.0)))
     total = sum(weights.values())
@@ -112,16 +112,18 @@ def _explained(search: EffectSearch, first: Fitted) -> float:
 
 def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
     """The verdict with free effects. They name nothing: what was `named` of the library's effects stays."""
-    first, last = search.plain if search.held else search.chain[0], search.last
+    first, last = search.plain if search.base_effects else search.chain[0], search.last
     errors = [held_out_error(fitted, thresholds.FORM_ERROR_WITH_EFFECTS, last) for fitted in (first, last)]
     readings = search.raw.readings
-    notes = [*([] if readings is None else [readings.words]), *doubts(last)]
+    notes = [*([] if readings is None else [readings.words]), *likelihood_warnings(last)]
     if errors[1] is not None and _contradicted(errors[0], errors[1]):
         notes.append(_beyond(errors[1]))
     return replace(
         before,
         kind=before.kind if named else "unexplained_structure",
-        found={effect: p for effect, p in before.found.items() if effect in (*search.detected, *search.added)},
+        probabilities={
+            effect: p for effect, p in before.probabilities.items() if effect in (*search.detected, *search.added)
+        },
         explained=_explained(search, first),
         structure=search.residuals[-1].ratio,
         held_out_error=errors[1],
@@ -131,49 +133,55 @@ def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
 
 def judge(search: EffectSearch) -> Verdict:
     """The verdict on a search for effects."""
-    first, last = search.plain if search.held else search.chain[0], search.last
-    effects = [*search.held, *search.added]
-    left = search.residuals[-1]
+    first, last = search.plain if search.base_effects else search.chain[0], search.last
+    effects = [*search.base_effects, *search.added]
+    residual = search.residuals[-1]
     explained = _explained(search, first) if effects else 0.0
     readings = search.raw.readings
-    notes = [*([] if readings is None else [readings.words]), *doubts(last)]
-    found: dict[str, float] = dict.fromkeys(search.detected, 0.99)
+    notes = [*([] if readings is None else [readings.words]), *likelihood_warnings(last)]
+    probabilities: dict[str, float] = dict.fromkeys(search.detected, 0.99)
     rivals: dict[str, dict[str, float]] = {}
     objections: dict[str, str] = {}
     rounds = [[c for c in tried if c.refused is None] for tried in search.rounds]
     for number, effect in enumerate(search.added):
-        beside = [c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added]
-        rivals[effect] = shares(beside, next((c.gain for c in beside if c.effect.id == effect), np.inf))
+        competitors = [c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added]
+        rivals[effect] = shares(competitors, next((c.gain for c in competitors if c.effect.id == effect), np.inf))
         # A later effect is at most as probable as those before it.
-        found[effect] = min([rivals[effect].get(effect, 0.5), *(found[e] for e in search.added[:number] if e in found)])
+        probabilities[effect] = min(
+            [rivals[effect].get(effect, 0.5), *(probabilities[e] for e in search.added[:number] if e in probabilities)]
+        )
         stage = dict(search.chain[number + 1].effects).get(effect, find_effect(effect).forms[0]).stage
         if resembles_earlier(search.chain[number], find_effect(effect), stage, search.detected):
-            found[effect] = min(found[effect], thresholds.REPAIR_PROBABILITY)
+            probabilities[effect] = min(probabilities[effect], thresholds.REPAIR_PROBABILITY)
         if _only_at_work(search, number):
-            found[effect] = min(found[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
+            probabilities[effect] = min(probabilities[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
         if objection := vetoed(search.chain[number], search.chain[number + 1]):
             objections[effect] = objection
-            found[effect] = min(found[effect], thresholds.DOUBTED)
+            probabilities[effect] = min(probabilities[effect], thresholds.DOUBTED)
             notes.append(f"The error on held-out pulses rises with this effect: {find_effect(effect).name}.")
-    structure = left.ratio
+    structure = residual.ratio
     if last.noise.band > 0.0:
         # The narrow band itself is not structure: what counts is what remains beside it.
-        before = max(search.residuals[0].busy_nm ** 2 - left.white_nm**2, 1e-12)
-        explained = 1.0 - max(left.busy_nm**2 - left.white_nm**2, 0.0) / before
+        before = max(search.residuals[0].busy_nm ** 2 - residual.white_nm**2, 1e-12)
+        explained = 1.0 - max(residual.busy_nm**2 - residual.white_nm**2, 0.0) / before
     strange = readings is not None and readings.held_s > thresholds.LONGEST_HELD_S
     if effects:
-        strange = strange or (explained < thresholds.LEAST_EXPLAINED and left.left)
-        lawless = any(search.free_gain > one[0].gain + thresholds.FREE_GAIN_MARGIN for one in search.rounds[:1] if one)
+        strange = strange or (explained < thresholds.LEAST_EXPLAINED and residual.significant)
+        lawless = any(
+            search.free_gain > first_round[0].gain + thresholds.FREE_GAIN_MARGIN
+            for first_round in search.rounds[:1]
+            if first_round
+        )
         strange = strange or (lawless and explained < thresholds.EXPLAINED_BY_LAWS)
         if find_effect(effects[0]).band:
             strange = strange or (
                 explained < thresholds.LEAST_EXPLAINED_BY_BAND and structure > thresholds.STRUCTURE_BESIDE_BAND
             )
         elif search.added and find_effect(search.added[0]).sporadic:
-            strange = strange or _everywhere(search) or _no_effort(search, explained, left.left)
+            strange = strange or _everywhere(search) or _no_effort(search, explained, residual.significant)
     else:
         refused = max((c.gain for tried in search.rounds for c in tried if c.refused), default=0.0)
-        strange = strange or left.left or (refused > thresholds.REFUSED and not last.heavy_tails)
+        strange = strange or residual.significant or (refused > thresholds.REFUSED and not last.heavy_tails)
     # Naming an effect claims more than naming none, so less error is allowed.
     form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR
     before, after = (held_out_error(fitted, form, last) for fitted in (first, last))
@@ -181,12 +189,21 @@ def judge(search: EffectSearch) -> Verdict:
         strange = True
         notes.append(_beyond(after))
     if strange:
-        found = {effect: min(p, thresholds.DOUBTED) for effect, p in found.items()}
+        probabilities = {effect: min(p, thresholds.DOUBTED) for effect, p in probabilities.items()}
         kind = "unexplained_structure"
         probability = 0.9
-    elif found:
-        kind, probability = "effect_missing", max(found.values())
+    elif probabilities:
+        kind, probability = "effect_missing", max(probabilities.values())
     else:
         kind, probability = "nothing_missing", _nothing(search.rounds[0] if search.rounds else [])
-    told = float(explained), float(structure), float(probability)
-    return Verdict(kind, found, rivals, *told, after, notes, objections)
+    return Verdict(
+        kind,
+        probabilities,
+        rivals,
+        explained=float(explained),
+        structure=float(structure),
+        probability=float(probability),
+        held_out_error=after,
+        notes=notes,
+        objections=objections,
+    )

@@ -85,11 +85,13 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
     """
     rows, size = drive.shape
     torque, rate = np.zeros((rows, size + 1)), np.zeros((rows, size + 1))
-    kept = np.empty((size, 8))  # of row 0: (y, a) after each interval by (y, a) before and the drive, second lag, zero
+    transitions = np.empty(
+        (size, 8)
+    )  # of row 0: (y, a) after each interval by (y, a) before and the drive, second lag, zero
     h = step_s / PARTS
     for m in range(rows):
         p = law[m]
-        alike = m > 0 and np.all(core[m] == core[0]) and np.all(p == law[0])
+        same_law = m > 0 and np.all(core[m] == core[0]) and np.all(p == law[0])
         root = np.sqrt(max(core[m, 1] * core[m, 1] - 1.0, 0.0))
         first_s = core[m, 0] * (max(core[m, 1], 1.0) - root)
         second_s = core[m, 0] * (max(core[m, 1], 1.0) + root)
@@ -115,12 +117,12 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
             w = drive[m, last] if last >= 0 else 0.0
             if gated and last >= 0:
                 w /= on[last]
-            if alike:
+            if same_law:
                 y, a = (
-                    kept[k, 0] * y + kept[k, 1] * a + kept[k, 4] * w,
-                    kept[k, 2] * y + kept[k, 3] * a + kept[k, 5] * w,
+                    transitions[k, 0] * y + transitions[k, 1] * a + transitions[k, 4] * w,
+                    transitions[k, 2] * y + transitions[k, 3] * a + transitions[k, 5] * w,
                 )
-                torque[m, k + 1], rate[m, k + 1] = y + kept[k, 7], (a - y) / kept[k, 6]
+                torque[m, k + 1], rate[m, k + 1] = y + transitions[k, 7], (a - y) / transitions[k, 6]
                 continue
             strength, quick = 1.0, 0.0
             if slow:
@@ -166,7 +168,12 @@ def run_free(drive, on, rest_s, core, law, begins, initial, scale_nm, step_s):  
                         b21 * yw + b22 * aw + b2 * share,
                     )
             if m == 0:
-                kept[k, 0], kept[k, 1], kept[k, 2], kept[k, 3] = yy, ya, ay, aa
-                kept[k, 4], kept[k, 5], kept[k, 6], kept[k, 7] = yw, aw, two_s, p[FreeLaw.ZERO] * s * scale_nm
+                transitions[k, 0], transitions[k, 1], transitions[k, 2], transitions[k, 3] = yy, ya, ay, aa
+                transitions[k, 4], transitions[k, 5], transitions[k, 6], transitions[k, 7] = (
+                    yw,
+                    aw,
+                    two_s,
+                    p[FreeLaw.ZERO] * s * scale_nm,
+                )
             torque[m, k + 1], rate[m, k + 1] = y + p[FreeLaw.ZERO] * s * scale_nm, (a - y) / two_s
     return torque, rate

@@ -131,7 +131,7 @@ class Grid:
         """Contiguous runs of some intervals, each within one part. Noise is correlated only within a run."""
         return [run for index in range(len(self.record.parts)) for run in runs(rows & (self.part == index))]
 
-    def held(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
+    def interval_means(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
         """The mean drive of each interval, with late pulses at their true time.
 
         If a pulse is late by less than `FUSED` of an interval, the drive before it lasts that much longer; if it is
@@ -149,8 +149,8 @@ class Grid:
         if moved.size:
             result[moved] = 0.0
         base = result[np.r_[rows, np.maximum(rows - 1, 0), np.minimum(rows + 1, self.size - 1)]]
-        own, before, after = np.split(base, 3)
-        result[rows] = (1.0 - late - early)[lift] * own + late[lift] * before + early[lift] * after
+        current, before, after = np.split(base, 3)
+        result[rows] = (1.0 - late - early)[lift] * current + late[lift] * before + early[lift] * after
         for target, part in zip(at, share, strict=True):
             inside = (target >= 0) & (target < self.size)
             np.add.at(result, target[inside], part[inside][lift] * drive[moved[inside]])
@@ -180,7 +180,7 @@ class Grid:
 
     def response(self, core: Core, delay_s: float, drive_nm: np.ndarray) -> np.ndarray:
         """Interval means of the delayed response from rest to a drive on even slots, shape (K,) or (K, M), N·m."""
-        states = boundary_states(*core, self.step_s, self.held(drive_nm))
+        states = boundary_states(*core, self.step_s, self.interval_means(drive_nm))
         torque, rate = (np.ascontiguousarray(np.atleast_2d(state.T)) for state in states)
         mean = read_means(torque, rate, *self.mean_weights(delay_s, self.curve(core)))
         return mean[0] if drive_nm.ndim == 1 else mean.T
@@ -220,13 +220,13 @@ class Grid:
             offset = np.floor(shifted).astype(np.int64)
             four = curve_weights(shifted - offset, self.step_s, *(core or CUBIC))
             interval, count = self.interval, self.count
-            if self._alike:  # one row holds for all intervals
+            if self._evenly_sampled:  # one row holds for all intervals
                 place, interval, count = np.arange(places.size), np.zeros(places.size, np.int64), count[:1]
             self._weights[delay_s, core] = mean_weights(four, offset, place, interval, count)
         return self._weights[delay_s, core]
 
     @cached_property
-    def _alike(self) -> bool:
+    def _evenly_sampled(self) -> bool:
         """Whether all intervals are sampled at the same places."""
         each = int(self.count[0])
         if not each or np.any(self.count != each):
@@ -237,7 +237,7 @@ class Grid:
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
         """Places of samples within an interval, shape (U,), and the index of each sample's place, shape (N,)."""
-        if self._alike:
+        if self._evenly_sampled:
             each = int(self.count[0])
             return self.fraction[:each], np.tile(np.arange(each), self.size)
         places, place = np.unique(np.round(self.fraction, 8), return_inverse=True)
@@ -352,9 +352,9 @@ def _applied(
         place = np.round((known.time_s - start_s) / step_s).astype(np.int64)
         inside = (place >= 0) & (place < width.size)
         for target, values in ((width, known.width_us), (late, known.late_s)):
-            told = np.zeros(width.size)
-            told[place[inside]] = values[inside]
-            target[gaps] = told[gaps]
+            pulse_values = np.zeros(width.size)
+            pulse_values[place[inside]] = values[inside]
+            target[gaps] = pulse_values[gaps]
     elif gaps.any():
         for gap in runs(gaps):
             if not (width[gap.start - 1] or _moved(record, middle, gap)):

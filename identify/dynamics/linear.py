@@ -112,15 +112,15 @@ class Discrete:
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
-        held = grid.held(drive_nm)
+        mean_nm = grid.interval_means(drive_nm)
         if abs(grid.step_s - self.step_s) <= 1e-9:
-            return self.filter(held)
+            return self.filter(mean_nm)
         # On a grid with another pulse interval it runs at its own, and is then interpolated.
-        own = np.arange(int(np.ceil(grid.size * grid.step_s / self.step_s))) * self.step_s
-        source = np.clip(np.floor((own + 1e-9) / grid.step_s).astype(np.int64), 0, grid.size - 1)
-        response = self.filter(held[source])
+        time_s = np.arange(int(np.ceil(grid.size * grid.step_s / self.step_s))) * self.step_s
+        source = np.clip(np.floor((time_s + 1e-9) / grid.step_s).astype(np.int64), 0, grid.size - 1)
+        response = self.filter(mean_nm[source])
         at = (np.arange(grid.size) + self.centre) * grid.step_s
-        columns = [np.interp(at, own + self.centre * self.step_s, column) for column in np.atleast_2d(response.T)]
+        columns = [np.interp(at, time_s + self.centre * self.step_s, column) for column in np.atleast_2d(response.T)]
         return columns[0] if response.ndim == 1 else np.stack(columns, axis=1)
 
     def filter(self, drive_nm: np.ndarray) -> np.ndarray:

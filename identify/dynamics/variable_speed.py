@@ -122,7 +122,7 @@ def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, 
     changes the speed: ten times faster, and good enough for the fit.
     """
     rows, size = drive.shape
-    given = multiplier.shape[0]
+    factor_rows = multiplier.shape[0]
     torque = np.zeros((rows, size + 1))
     rate = np.zeros((rows, size + 1))
     first, none, even = np.empty((4, size)), np.empty((4, 0)), np.zeros((rows, 4))
@@ -133,12 +133,12 @@ def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, 
         quick_s = 2.0 * damping[m] * base - slow_s
         both, slow, quick = law[m, Lag.BOTH], law[m, Lag.SLOW], law[m, Lag.QUICK]
         on_both, on_slow, on_quick = np.any(both != 0.0), np.any(slow != 0.0), np.any(quick != 0.0)
-        alike = m > 0 and base == time_constant_s[0] and damping[m] == damping[0] and np.all(law[m] == law[0])
+        same_law = m > 0 and base == time_constant_s[0] and damping[m] == damping[0] and np.all(law[m] == law[0])
         y, v, bound, part = 0.0, 0.0, 0.0, 0
         slow_second, quick_second, last = _is_second(slow), _is_second(quick), 1.0
         forget = np.exp(-step_s / PARTS / max(quick_s if slow[SpeedLaw.CALCIUM] != 0.0 else slow_s, 1e-4))
-        kind = 1 if alike and varied else 0
-        if kind or not (on_both or on_slow or on_quick or given > 0):
+        kind = 1 if same_law and varied else 0
+        if kind or not (on_both or on_slow or on_quick or factor_rows > 0):
             kinds[m] = kind
             even[m, 0], even[m, 1], even[m, 2], even[m, 3] = step_matrix(base, damping[m], step_s)
             continue
@@ -149,7 +149,7 @@ def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, 
                 torque[m, k], rate[m, k] = y, v
                 part += 1
             w = drive[m, k]
-            given_f = multiplier[m, k] if given > 0 else 1.0
+            given_factor = multiplier[m, k] if factor_rows > 0 else 1.0
             p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
             # The law is evaluated several times in an interval, since its sign may change within it.
             for _ in range(PARTS):
@@ -158,12 +158,12 @@ def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, 
                 q = _factor(quick, w, y, v, scale_nm, slow_s, bound) if on_quick else 1.0
                 turned = 1.0
                 if slow_second or quick_second:
-                    own, lag_s = (slow, last * slow_s) if slow_second else (quick, last * quick_s)
-                    second = _second(own, y, v, lag_s, scale_nm)
+                    second_law, lag_s = (slow, last * slow_s) if slow_second else (quick, last * quick_s)
+                    second = _second(second_law, y, v, lag_s, scale_nm)
                     d, q = (d * second, q) if slow_second else (d, q * second)
                     turned, last = last / second, second
                 v *= turned  # y' = (a - y) / lag: a stays the same when the lag changes
-                f *= given_f
+                f *= given_factor
                 # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
                 t = base * f * np.sqrt(d * q)
                 z = 0.5 * f * (quick_s * q + slow_s * d) / t

@@ -25,14 +25,14 @@ GROUP = "stimrig.effects"
 _NOT_EFFECTS = {"base", "own_file", "use"}
 
 
-def _own() -> list[Effect]:
+def _library() -> list[Effect]:
     names = sorted(module.name for module in pkgutil.iter_modules(__path__) if module.name not in _NOT_EFFECTS)
     return [importlib.import_module(f"{__name__}.{name}").EFFECT for name in names]
 
 
 @lru_cache(maxsize=8)
 def _everything(folder: str) -> dict[str, Effect]:
-    found = {effect.id: effect for effect in _own()}
+    effects = {effect.id: effect for effect in _library()}
     added = [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]
     places: dict[str, str] = {}
     for place, effect in added:
@@ -40,8 +40,8 @@ def _everything(folder: str) -> dict[str, Effect]:
             message = f"the effect {effect.id!r} is also in {places[effect.id]}"
             raise BadEffect(message, place=place, fix="Give one of them another id.")
         places[effect.id] = place
-        found[effect.id] = effect
-    return found
+        effects[effect.id] = effect
+    return effects
 
 
 def _from_packages() -> Iterator[tuple[str, Effect]]:

@@ -49,11 +49,11 @@ EFFECT = Effect(
             "calcium_quick_lag", "faster lag times (1 + slope·c), c: bound calcium", Lag.QUICK, Law.CALCIUM, -0.9, 12.0
         ),
         *(
-            _two_lags(f"{name}_{own}_lag", f"a' = (w - a)/{other}, y' = (a - y){words}", lag, law, source)
-            for lag, own, other in ((Lag.SLOW, "slow", "fast"), (Lag.QUICK, "quick", "slow"))
+            _two_lags(f"{name}_{varied}_lag", f"a' = (w - a)/{other}, y' = (a - y){words}", lag, law, source)
+            for lag, varied, other in ((Lag.SLOW, "slow", "fast"), (Lag.QUICK, "quick", "slow"))
             for name, words, law, source in (
-                ("activation", f"/({own} (1 + slope·a/y_max))", Law.SECOND_ACTIVATION, _BOUND),
-                ("attached", f"(1 + slope·y/y_max)/{own}", Law.SECOND_ATTACHED, _ATTACHED),
+                ("activation", f"/({varied} (1 + slope·a/y_max))", Law.SECOND_ACTIVATION, _BOUND),
+                ("attached", f"(1 + slope·y/y_max)/{varied}", Law.SECOND_ATTACHED, _ATTACHED),
             )
         ),
         *(

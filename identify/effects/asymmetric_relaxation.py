@@ -63,12 +63,13 @@ EFFECT = Effect(
             Form(
                 name,
                 "speed",
-                f"{own}·ratio·c^-power while the drive is below the torque, else {own}·c^power; c = 0.5 + 1.5 y/y_max",
+                f"{lag_name}·ratio·c^-power while the drive is below the torque, else {lag_name}·c^power; "
+                "c = 0.5 + 1.5 y/y_max",
                 (_RATIO, Parameter("power", "1", 0.1, 2.0, 0.0, (0.5, 1.0), about="influence of the level")),
                 law={"ratio": (lag, SpeedLaw.RATIO_BY_DRIVE), "power": (lag, SpeedLaw.LEVEL)},
                 source="Winters 1995; Thelen 2003",
             )
-            for name, own, lag in (("by_level", "T", Lag.BOTH), ("slow_lag_by_level", "slower lag", Lag.SLOW))
+            for name, lag_name, lag in (("by_level", "T", Lag.BOTH), ("slow_lag_by_level", "slower lag", Lag.SLOW))
         ),
         kinetics,
         kinetics_by_level,

@@ -157,8 +157,8 @@ class Scene:
 
 def weighted(weights: Sequence[Any], columns: np.ndarray) -> np.ndarray:
     """Sum of columns (n, K) by n weights, each of shape (M, 1), or a number: shape (M, K), or (K,)."""
-    found = np.array(weights, float)
-    return (found if found.ndim == 1 else found[:, :, 0].T) @ columns
+    factors = np.array(weights, float)
+    return (factors if factors.ndim == 1 else factors[:, :, 0].T) @ columns
 
 
 Values = dict[str, Any]
@@ -364,12 +364,12 @@ def form(stage: str, equation: str, *parameters: Parameter, name: str = "", **mo
         Other fields of `Form`.
     """
 
-    def made(apply: Apply) -> Form:
-        found = Form(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
+    def make_form(apply: Apply) -> Form:
+        new_form = Form(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
         apply.__qualname__ += ".apply"  # under the function's name stands the form: so a pickle finds the function
-        return found
+        return new_form
 
-    return made
+    return make_form
 
 
 def slow_gain(
@@ -447,10 +447,12 @@ def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> s
     """
     against = {"lags": "speed", "speed": "lags"}
     stages, alone = {against.get(form.stage, "") for form in forms}, set().union(*map(_alone, forms))
-    return next((name for name, own in present if own.stage in stages or alone & _alone(own)), None)
+    return next(
+        (name for name, present_form in present if present_form.stage in stages or alone & _alone(present_form)), None
+    )
 
 
 def _alone(form: Form) -> set[int]:
     """What one form of free lags alone can set: all but the rates, whose logarithms add up."""
     columns = [*form.law.values(), *form.held] if form.stage == "lags" else []
-    return {one for one in columns if isinstance(one, FreeLaw) and one > FreeLaw.COUPLING}
+    return {column for column in columns if isinstance(column, FreeLaw) and column > FreeLaw.COUPLING}

@@ -37,15 +37,15 @@ _BEFORE = Form(
 )
 
 
-def _shape(own: Form, values: Mapping[str, float]) -> Shape:
+def _shape(effect_form: Form, values: Mapping[str, float]) -> Shape:
     driver = "torque (share of the largest)"
-    if own.name == "before":
+    if effect_form.name == "before":
         share = values["feedback"]
         words = f"At full torque the drive by the same pulse has changed by {percent(share)}."
         return Shape("drive", "torque", words, driver, LEVEL, "drive, at rest: 1", {"drive": 1.0 + share * LEVEL})
-    found = LEVEL + _bent(LEVEL, dict(values))
-    words = f"Half of the torque arrives changed by {percent(found[20] / 0.5 - 1.0)}, behind the dynamics."
-    return Shape("output", "torque", words, driver, LEVEL, "torque that arrives (share)", {"torque": found})
+    torque = LEVEL + _bent(LEVEL, dict(values))
+    words = f"Half of the torque arrives changed by {percent(torque[20] / 0.5 - 1.0)}, behind the dynamics."
+    return Shape("output", "torque", words, driver, LEVEL, "torque that arrives (share)", {"torque": torque})
 
 
 EFFECT = Effect(

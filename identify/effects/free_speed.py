@@ -36,7 +36,7 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
             )
         )
     swing = {way: float(np.ptp(np.log(line)) + abs(np.mean(np.log(line)))) for way, line in lines.items()}
-    own = {lag: sum(abs(values[f"{lag}_{what}"]) for what in ("direction", "rising", "falling")) for lag in _LAGS}
+    influence = {lag: sum(abs(values[f"{lag}_{what}"]) for what in ("direction", "rising", "falling")) for lag in _LAGS}
     middle, low = LEVEL.size // 2, LEVEL.size // 4
     ratio = lines["rising"][middle] / lines["falling"][middle]
     rise, fall = (line[-1] / line[low] for line in lines.values())
@@ -46,7 +46,7 @@ def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
         f"{fall:.2g}-fold."
     )
     enters = "rate of rise" if swing["rising"] >= swing["falling"] else "rate of fall"
-    driven = "activation" if own["first"] >= own["second"] else "torque"
+    driven = "activation" if influence["first"] >= influence["second"] else "torque"
     return Shape(enters, driven, words, "torque (share of the largest)", LEVEL, "speed, of the plain model: 1", lines)
 
 
@@ -62,11 +62,14 @@ EFFECT = Effect(
             "lags",
             "a' = k1 (w - a + κ(a - y)), y' = k2 (a - y); ln k = ln k0 ± direction/2 + power·ln((level + 1/4)/(5/4)), "
             f"each power for rise and fall; {words}",
-            tuple(Parameter(one, "1", -1.5, 1.5, 0.0, (0.0,), about=_ABOUT[one.rpartition("_")[2]]) for one in _LAW),
+            tuple(
+                Parameter(parameter, "1", -1.5, 1.5, 0.0, (0.0,), about=_ABOUT[parameter.rpartition("_")[2]])
+                for parameter in _LAW
+            ),
             law=_LAW,
-            held=held,
+            held=fixed_laws,
         )
-        for name, words, held in (
+        for name, words, fixed_laws in (
             ("quick_first", "the quicker lag first", {}),
             ("slow_first", "the slower lag first", {FreeLaw.SWAPPED: 1.0}),
         )

@@ -43,9 +43,9 @@ EFFECT = Effect(
             + {"by_torque": "torque", "by_pulses": "1 under pulses", "by_drive": "f(u)"}[name],
             _PARAMETERS,
             law=STATE | {"gain": FreeLaw.GAIN, "rate": FreeLaw.RATE},
-            held=held,
+            held=fixed_laws,
         )
-        for name, held in BY.items()
+        for name, fixed_laws in BY.items()
     ),
     signature="Early and late answers to the same pulses differ in size, and in speed.",
     resembles=("free_ways", "free_zero"),

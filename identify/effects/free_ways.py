@@ -29,9 +29,15 @@ def _share(level: np.ndarray, p: Values) -> np.ndarray:
     "x' = a (1 - x)/fill - (1 - a) x/empty, a: the way's own drive",
     *(
         Parameter(
-            one, "1", 0.0, 1.0, 0.0, (0.3, 0.6), about=f"share of the slow way at {100 * level:.0f} % of the level"
+            share_name,
+            "1",
+            0.0,
+            1.0,
+            0.0,
+            (0.3, 0.6),
+            about=f"share of the slow way at {100 * level:.0f} % of the level",
         )
-        for one, level in zip(_SHARES, LEVELS, strict=True)
+        for share_name, level in zip(_SHARES, LEVELS, strict=True)
     ),
     Parameter("ratio", "1", 1.2, 12.0, 1.0, (2.0, 4.0), "log", about="slow time constant over the quick one"),
     Parameter("loss_quick", "1", -0.9, 0.95, 0.0, (0.1,), about="share that the quick way loses with use"),
@@ -41,18 +47,18 @@ def _share(level: np.ndarray, p: Values) -> np.ndarray:
 )
 def parallel(drive: np.ndarray, p: Values, scene: Scene) -> list:
     share = _share(np.clip(np.abs(drive) / scene.scale_nm, 0.0, 1.0), p)
-    found = []
-    for own, loss, slower in (
+    branches = []
+    for way_drive, loss, slower in (
         ((1.0 - share) * drive, p["loss_quick"], np.ones_like(p["ratio"])),
         (share * drive, p["loss_slow"], p["ratio"]),
     ):
         if np.any(loss):
-            use = np.minimum(np.abs(own) / scene.scale_nm, 1.0)
-            own = own * (
+            use = np.minimum(np.abs(way_drive) / scene.scale_nm, 1.0)
+            way_drive = way_drive * (
                 1.0 - loss * adapt(use, p["fill_s"][:, 0], p["empty_s"][:, 0], False, scene.step_s, scene.rest_s)[0]
             )
-        found.append((own, slower))
-    return found
+        branches.append((way_drive, slower))
+    return branches
 
 
 def _shape(_form: Form, values: Mapping[str, float]) -> Shape:

@@ -13,10 +13,10 @@ from stimrig.identify.effects.use import BY, DRIVER, EMPTY, FILL, STATE, TIME_S,
 
 def _shape(_form: Form, values: Mapping[str, float]) -> Shape:
     added = values["zero"] * course(values)
-    most = float(added[np.argmax(np.abs(added))])
+    largest = float(added[np.argmax(np.abs(added))])
     words = (
-        f"20 s of full work add {percent(most)} of the largest torque, which goes away at rest with a time constant of "
-        f"{seconds(values['empty_s'])}."
+        f"20 s of full work add {percent(largest)} of the largest torque, which goes away at rest with a time constant "
+        f"of {seconds(values['empty_s'])}."
     )
     axes = DRIVER, TIME_S, "torque added (share of the largest)"
     return Shape("zero", "sum of the past", words, *axes, {"torque added": added})

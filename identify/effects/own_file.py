@@ -48,8 +48,8 @@ def effect_of(path: Path) -> Effect:
 
 def in_one_line(error: BaseException) -> str:
     """An error of somebody's code in one line."""
-    told = error.msg if isinstance(error, SyntaxError) else str(error)
-    return f"{type(error).__name__}: {' '.join(told.split())[:200]}"
+    message = error.msg if isinstance(error, SyntaxError) else str(error)
+    return f"{type(error).__name__}: {' '.join(message.split())[:200]}"
 
 
 def _place(path: Path, error: BaseException) -> str:
@@ -87,10 +87,10 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
     return effect
 
 
-def text_of(effect: Effect, form: Form, found: Mapping[str, tuple[float, float]], name: str) -> str:
+def text_of(effect: Effect, form: Form, estimates: Mapping[str, tuple[float, float]], name: str) -> str:
     """A file of one's own that holds what a free effect was found to be, to be edited and named.
 
-    `found`: by parameter, its value and its standard deviation: where a fit starts, and how far it may go (`REACH`).
+    `estimates`: by parameter, its value and standard deviation: where a fit starts, and how far it may go (`REACH`).
     `name`: the id of the effect in the file.
 
     Raises BadRequest: the name is none, or the free effect's.
@@ -98,17 +98,17 @@ def text_of(effect: Effect, form: Form, found: Mapping[str, tuple[float, float]]
     if not re.fullmatch(ID, name) or name == effect.id:
         fix = "Use small letters, digits and _, beginning with a letter, and another name than the free effect's."
         raise BadRequest(f"no name for an effect: {name!r}", place="name", fix=fix)
-    if not np.isfinite([*found.values()]).all():
+    if not np.isfinite([*estimates.values()]).all():
         raise BadRequest("a value that is no number", place=effect.id, fix="Fit the record again.")
-    rows = "".join(f"                {_row(one, *found[one.name])},\n" for one in form.parameters)
+    rows = "".join(f"                {_row(parameter, *estimates[parameter.name])},\n" for parameter in form.parameters)
     law = ", ".join(f'"{key}": FreeLaw.{FreeLaw(value).name}' for key, value in form.law.items())  # type: ignore
-    held = ", ".join(f"FreeLaw.{key.name}: {value}" for key, value in form.held.items())
-    more = [f"law={{{law}}}"] * bool(law) + [f"held={{{held}}}"] * bool(held)
+    fixed_laws = ", ".join(f"FreeLaw.{key.name}: {value}" for key, value in form.held.items())
+    more = [f"law={{{law}}}"] * bool(law) + [f"held={{{fixed_laws}}}"] * bool(fixed_laws)
     lines = ["from stimrig.effects import Effect, Form, FreeLaw, Parameter" if law else HEAD]
     if form.apply is not None:
         lines.append(f"from stimrig.identify.effects.{effect.id} import {form.name}")
         more = [f"apply={form.name}.apply", "batched=True"]
-    ends = "".join(f"            {one},\n" for one in more)
+    ends = "".join(f"            {argument},\n" for argument in more)
     return (
         f'"""What {effect.id} was found to be: edit it, name it, and let it be fitted (docs/add-an-effect.md)."""\n\n'
         + "\n".join(lines)
@@ -124,10 +124,10 @@ def _row(parameter: Parameter, value: float, sd: float) -> str:
     """A parameter that starts at what was found, as Python writes it."""
     reach = max(REACH * sd, 0.1 * abs(value), 0.02 * (parameter.upper - parameter.lower))
     lower, upper = max(parameter.lower, value - reach), min(parameter.upper, value + reach)
-    told = [f"{one:.6g}" for one in (lower, upper, parameter.neutral, value)]
-    told[3] = f"({min(max(float(told[3]), float(told[0])), float(told[1])):.6g},)"
+    numbers = [f"{number:.6g}" for number in (lower, upper, parameter.neutral, value)]
+    numbers[3] = f"({min(max(float(numbers[3]), float(numbers[0])), float(numbers[1])):.6g},)"
     return (
-        f"Parameter({parameter.name!r}, {parameter.unit!r}, {', '.join(told)}, {parameter.scale!r}, "
+        f"Parameter({parameter.name!r}, {parameter.unit!r}, {', '.join(numbers)}, {parameter.scale!r}, "
         f"about={parameter.about!r})"
     )
 
@@ -156,21 +156,21 @@ def _check_form(form: Form, place: str, path: Path | None) -> None:
 def _check_laws(form: Form, names: list[str], where: str) -> None:
     """Of "lags" each parameter sets what is free there; of "speed" what it likes."""
     for what in ("law", "held"):
-        told = getattr(form, what)
-        if not isinstance(told, dict):
+        mapping = getattr(form, what)
+        if not isinstance(mapping, dict):
             raise BadEffect(
-                f"{what} is a {type(told).__name__}", place=where, fix="Give a dictionary, or leave it out."
+                f"{what} is a {type(mapping).__name__}", place=where, fix="Give a dictionary, or leave it out."
             )
     free = form.stage == "lags"
-    for name, own in form.law.items():
-        kinds = [*map(type, own)] if isinstance(own, tuple) else [type(own)]
+    for name, law in form.law.items():
+        kinds = [*map(type, law)] if isinstance(law, tuple) else [type(law)]
         if name not in names or kinds != ([FreeLaw] if free else [Lag, SpeedLaw]):
-            given = "FreeLaw} of free_lags" if free else "(Lag, SpeedLaw)}, both of variable_speed"
-            fix = f"Give law={{parameter: {given} in stimrig.identify.dynamics."
-            raise BadEffect(f"law {name!r}: {own!r}", place=where, fix=fix)
+            expected = "FreeLaw} of free_lags" if free else "(Lag, SpeedLaw)}, both of variable_speed"
+            fix = f"Give law={{parameter: {expected} in stimrig.identify.dynamics."
+            raise BadEffect(f"law {name!r}: {law!r}", place=where, fix=fix)
     if free and set(form.law) != set(names):
         raise BadEffect("a parameter without a law", place=where, fix="Give law={parameter: FreeLaw} for each.")
-    if form.held and not (free and all(isinstance(one, FreeLaw) for one in form.held)):
+    if form.held and not (free and all(isinstance(key, FreeLaw) for key in form.held)):
         raise BadEffect(f"held {dict(form.held)!r}", place=where, fix='Give held={FreeLaw: number}, for "lags" only.')
     if free:
         _check_free(form, where)
@@ -179,25 +179,25 @@ def _check_laws(form: Form, names: list[str], where: str) -> None:
 def _check_free(form: Form, where: str) -> None:
     """What the kernel can take: each law set once, and numbers in its range over the whole of the bounds."""
     ranges: dict[Any, tuple[float, float]] = {
-        one: (float(value), float(value)) for one, value in form.held.items() if _is_number(value)
+        law: (float(value), float(value)) for law, value in form.held.items() if _is_number(value)
     }
     if len(ranges) < len(form.held):
         raise BadEffect(f"held {dict(form.held)!r}", place=where, fix="Give finite numbers.")
     for parameter in form.parameters:
-        own = form.law[parameter.name]
-        if own in ranges:
-            raise BadEffect(f"{own!r} is set twice", place=where, fix="Give each FreeLaw once, in law or in held.")
-        ranges[own] = parameter.lower, parameter.upper
-    idle = [own for own in OF_STATE if own in ranges and FreeLaw.FILL_S not in ranges]
+        law = form.law[parameter.name]
+        if law in ranges:
+            raise BadEffect(f"{law!r} is set twice", place=where, fix="Give each FreeLaw once, in law or in held.")
+        ranges[law] = parameter.lower, parameter.upper
+    idle = [law for law in OF_STATE if law in ranges and FreeLaw.FILL_S not in ranges]
     if idle:
         raise BadEffect(
             f"{idle[0]!r} without FILL_S", place=where, fix="It does nothing: give FILL_S and EMPTY_S, too."
         )
     if (FreeLaw.FILL_S in ranges) != (FreeLaw.EMPTY_S in ranges):
         raise BadEffect("FILL_S without EMPTY_S, or EMPTY_S without FILL_S", place=where, fix="Give both or none.")
-    for own, least in POSITIVE.items():
-        if own in ranges and not ranges[own][0] > least:
-            raise BadEffect(f"{own!r} from {ranges[own][0]:g}", place=where, fix=f"Give values above {least:g}.")
+    for law, bound in POSITIVE.items():
+        if law in ranges and not ranges[law][0] > bound:
+            raise BadEffect(f"{law!r} from {ranges[law][0]:g}", place=where, fix=f"Give values above {bound:g}.")
 
 
 POSITIVE = {FreeLaw.FILL_S: 0.0, FreeLaw.EMPTY_S: 0.0, FreeLaw.GATE_S: 0.0, FreeLaw.BEND: -1.0}
@@ -219,13 +219,13 @@ def _check_parameter(parameter: Parameter, where: str) -> None:
         fix = f"scale is one of {', '.join(SCALES)}; relative one of {', '.join(RELATIVE[1:])}, or left out."
         raise BadEffect(message, place=place, fix=fix)
     starts = parameter.start if isinstance(parameter.start, tuple) else ()
-    given = [parameter.lower, parameter.upper, *starts]
-    if not all(isinstance(one, (int, float)) for one in (*given, parameter.neutral)):
+    values = [parameter.lower, parameter.upper, *starts]
+    if not all(isinstance(value, (int, float)) for value in (*values, parameter.neutral)):
         message = "a bound or a start that is no number"
         raise BadEffect(message, place=place, fix="Give lower, upper, neutral, and a tuple of starts.")
     if len(starts) > MOST_STARTS:
         raise BadEffect(f"{len(starts)} starts", place=place, fix=f"Give {MOST_STARTS} at most: each is a fit.")
-    numbers = np.array(given, float)
+    numbers = np.array(values, float)
     if not np.isfinite(numbers).all() or not parameter.lower < parameter.upper or numbers.size < 3:
         message = f"bounds {parameter.lower} to {parameter.upper}, starts {parameter.start}"
         raise BadEffect(message, place=place, fix="Give finite bounds, the lower one first, and at least one start.")
@@ -244,12 +244,12 @@ def _try_out(form: Form, where: str, path: Path | None) -> None:
     x = {"pulse_width": width_us, "additive": None, "delay": None}.get(form.stage, 8.0 * np.abs(np.sin(turn)))
     values = {p.name: np.full((1, 1), p.on(scene).start[0]) for p in form.parameters}
     try:
-        found = np.asarray(form.call(x if x is None else x[None, :], values, scene), float)
+        result = np.asarray(form.call(x if x is None else x[None, :], values, scene), float)
     except Exception as error:
         place = where if path is None else f"{_place(path, error)}, form {form.name!r}"
         raise BadEffect(f"apply fails: {in_one_line(error)}", place=place, fix=FIX) from error
-    if found.shape not in ((1, ROWS), (1, 1)):
-        message = f"apply gives {found.size} numbers, not one for each of {ROWS} pulses"
+    if result.shape not in ((1, ROWS), (1, 1)):
+        message = f"apply gives {result.size} numbers, not one for each of {ROWS} pulses"
         raise BadEffect(message, place=where, fix=FIX)
-    if not np.isfinite(found).all():
+    if not np.isfinite(result).all():
         raise BadEffect("apply gives numbers that are none", place=where, fix="Check it at the starting values.")

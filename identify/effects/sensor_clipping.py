@@ -44,10 +44,12 @@ def both(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 
 def _detect(raw: Any) -> tuple[str, dict[str, float]] | None:
     levels = {"ceiling": raw.ceiling_nm, "floor": raw.floor_nm}
-    found = {name: value for name, value in levels.items() if value is not None}
-    if not found:
+    clipped = {name: value for name, value in levels.items() if value is not None}
+    if not clipped:
         return None
-    return "both" if len(found) == 2 else next(iter(found)), {f"{name}_nm": value for name, value in found.items()}
+    return "both" if len(clipped) == 2 else next(iter(clipped)), {
+        f"{name}_nm": value for name, value in clipped.items()
+    }
 
 
 EFFECT = Effect(

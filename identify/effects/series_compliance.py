@@ -108,8 +108,8 @@ def inertia(x: Motion, p: Values, scene: Scene) -> Motion:
         return x
     omega, damping = 2 * np.pi * p["resonance_hz"], p["damping"]
     speeding = omega**2 * (y - z) - 2 * damping * omega * z_rate
-    taken = (y - z) - 2 * damping * z_rate / omega
-    return y - share * taken, y_rate - share * (y_rate - z_rate - 2 * damping * speeding / omega)
+    mass_torque = (y - z) - 2 * damping * z_rate / omega
+    return y - share * mass_torque, y_rate - share * (y_rate - z_rate - 2 * damping * speeding / omega)
 
 
 SPRING_PARTS = 12
@@ -134,11 +134,11 @@ def _follow_curved(
     size, rows = x0.shape
     h = step_s / SPRING_PARTS
     out, rate = np.zeros((size, rows)), np.zeros((size, rows))
-    q, v, keep, give = np.zeros(rows), np.zeros(rows), np.zeros(rows), np.zeros(rows)
+    q, v, retained, push = np.zeros(rows), np.zeros(rows), np.zeros(rows), np.zeros(rows)
     for m in range(rows):
         q[m] = out[0, m] = x0[0, m]
         c = damping[m] * omega[m] * h
-        keep[m], give[m] = (1.0 - c) / (1.0 + c), h * omega[m] * omega[m] / (1.0 + c)
+        retained[m], push[m] = (1.0 - c) / (1.0 + c), h * omega[m] * omega[m] / (1.0 + c)
     for k in range(size - 1):
         for i in range(SPRING_PARTS):
             s = (i + 0.5) / SPRING_PARTS
@@ -148,7 +148,7 @@ def _follow_curved(
                 x = a * x0[k, m] + b * v0[k, m] + d * x0[k + 1, m] + e * v0[k + 1, m]
                 z = q[m] + 0.5 * h * v[m]
                 force = x - z * (1.0 + curved[m] * z * z) if toe else (1.0 + curved[m] * abs(z)) * (x - z)
-                v[m] = keep[m] * v[m] + give[m] * force
+                v[m] = retained[m] * v[m] + push[m] * force
                 q[m] = z + 0.5 * h * v[m]
         for m in range(rows):
             if not abs(q[m]) < 1e6:
@@ -165,8 +165,8 @@ def _curved(x: Motion, p: Values, scene: Scene, toe: bool) -> Motion:
         return x
     beta = p["stiffening"][:, 0] / scene.scale_nm ** (2 if toe else 1)
     x0, v0 = np.ascontiguousarray(x[0].T), np.ascontiguousarray((x[1] * scene.step_s).T)
-    found = _follow_curved(x0, v0, 2 * np.pi * frequency, p["damping"][:, 0], beta, toe, scene.step_s)
-    return np.ascontiguousarray(found[0].T), np.ascontiguousarray(found[1].T)
+    states = _follow_curved(x0, v0, 2 * np.pi * frequency, p["damping"][:, 0], beta, toe, scene.step_s)
+    return np.ascontiguousarray(states[0].T), np.ascontiguousarray(states[1].T)
 
 
 @form(

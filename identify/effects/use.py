@@ -21,12 +21,12 @@ DRIVER = "time, full work for 20 s, then rest (s)"
 
 def course(values: Mapping[str, float]) -> np.ndarray:
     """The slow state at `TIME_S`, 0 to 1."""
-    state, found = 0.0, []
+    state, levels = 0.0, []
     for at in TIME_S:
-        found.append(state)
+        levels.append(state)
         up, down = (1.0 / values["fill_s"], 0.0) if at < WORK_S else (0.0, 1.0 / values["empty_s"])
         state = filled(state, up, down, STEP_S)
-    return np.array(found)
+    return np.array(levels)
 
 
 def percent(share: float) -> str:

@@ -10,7 +10,7 @@ from numba import njit
 
 from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values
 
-MOST = 6
+MAX_BUMPS = 6
 """Largest number of bumps: more of them could imitate any error."""
 Kernels = dict[float, tuple[np.ndarray, int]]
 """Shapes by their duration, s, each with the place in it that its `centre` is."""
@@ -21,19 +21,19 @@ def _forms(
     equation: Callable[[int], str],
     apply: Callable[[Values, Scene, int], np.ndarray],
     shared: Parameter,
-    own: tuple[Parameter, Parameter, Parameter],
+    bump_parameters: tuple[Parameter, Parameter, Parameter],
     kernels: Callable[[float], Kernels],
     sign: float = 1.0,
     proposals: int = 1,
 ) -> list[Form]:
     """A chain of forms: one bump, two bumps, …, each with parameters of its own beside a shared one.
 
-    Of a bump its `own` parameters are centre, duration and height; `kernels(step_s)` are the shapes that are looked for
-    in a residual, in the direction of `sign`.
+    `bump_parameters` are the centre, the duration and the height of one bump; `kernels(step_s)` are the shapes to
+    search for in a residual, in the direction of `sign`.
     """
 
     def parts(i: int) -> tuple[Parameter, ...]:
-        return tuple(replace(p, name=p.name.format(i)) for p in own)
+        return tuple(replace(p, name=p.name.format(i)) for p in bump_parameters)
 
     def form(count: int) -> Form:
         centre, duration, height = (p.name for p in parts(count - 1))
@@ -51,7 +51,7 @@ def _forms(
             """Only bumps in fitted rows: in other rows they could only repair errors in the rows beside them."""
             if scene.fitted is None:
                 return True
-            at = np.array([p[own[0].name.format(i)] for i in range(count)])
+            at = np.array([p[bump_parameters[0].name.format(i)] for i in range(count)])
             place = np.clip(np.searchsorted(scene.time_s, at), 0, scene.time_s.size - 1)
             return bool(np.all(scene.fitted[place]))
 
@@ -67,23 +67,23 @@ def _forms(
             grows=count > 1,
         )
 
-    return [form(count) for count in range(1, MOST + 1)]
+    return [form(count) for count in range(1, MAX_BUMPS + 1)]
 
 
 def _matches(residual_nm: np.ndarray, sign: float, kernels: Kernels) -> list[tuple[float, float, int, float]]:
     """Score, duration, s, interval and height, N·m, of shapes where each matches a residual best; the best first."""
     known = np.isfinite(residual_nm)
     value = sign * np.where(known, residual_nm, 0.0)
-    found = []
+    matches = []
     for duration_s, (kernel, place) in kernels.items():
         after = kernel.size - 1 - place
-        own = slice(after, after + known.size)  # not "same": of a record shorter than the kernel it is longer
-        match = np.convolve(value, kernel[::-1])[own]
-        power = np.convolve(known.astype(float), (kernel**2)[::-1])[own] + 0.3 * np.sum(kernel**2)
+        aligned = slice(after, after + known.size)  # not "same": of a record shorter than the kernel it is longer
+        match = np.convolve(value, kernel[::-1])[aligned]
+        power = np.convolve(known.astype(float), (kernel**2)[::-1])[aligned] + 0.3 * np.sum(kernel**2)
         score = np.where(match > 0, match**2 / power, 0.0)
         at = int(np.argmax(score))
-        found.append((float(score[at]), duration_s, at, float(match[at] / power[at])))
-    return [one for one in sorted(found, reverse=True) if one[0] > 0.0]
+        matches.append((float(score[at]), duration_s, at, float(match[at] / power[at])))
+    return [candidate for candidate in sorted(matches, reverse=True) if candidate[0] > 0.0]
 
 
 # ---- bumps ----
@@ -115,11 +115,11 @@ def _bumps(p: Values, scene: Scene, count: int) -> np.ndarray:
 
 
 def _bump_kernels(step_s: float) -> Kernels:
-    found = {}
+    kernels = {}
     for width_s in (0.2, 0.5, 1.2):
         half = int(np.ceil(3 * width_s / step_s))
-        found[width_s] = np.exp(-0.5 * (np.arange(-half, half + 1) * step_s / width_s) ** 2), half
-    return found
+        kernels[width_s] = np.exp(-0.5 * (np.arange(-half, half + 1) * step_s / width_s) ** 2), half
+    return kernels
 
 
 def _bump_forms(name: str, words: str, sign: float) -> list[Form]:
@@ -157,12 +157,12 @@ def _spasms(p: Values, scene: Scene, count: int) -> np.ndarray:
 
 
 def _spasm_kernels(step_s: float) -> Kernels:
-    found = {}
+    kernels = {}
     for decay_s in (0.3, 0.8, 1.8):
         age = np.arange(int(np.ceil(4 * decay_s / step_s))) * step_s
         kernel = np.exp(-age / decay_s) - np.exp(-age / (0.1 * decay_s))
-        found[decay_s] = kernel / kernel.max(), 0
-    return found
+        kernels[decay_s] = kernel / kernel.max(), 0
+    return kernels
 
 
 EFFECT = Effect(

@@ -33,12 +33,12 @@ NEAR_SIGMOID_OPTIONS = {"recruitment", "earlier", "order"}
 class Averaged(Fitted):
     """A solved problem whose parameters are the mean of draws."""
 
-    shown: float = 0.0  # effective number of parameters that the data determine
+    effective_parameters: float = 0.0  # effective number of parameters that the data determine
 
     @property
     def freedom(self) -> float:
         """Effective number of parameters."""
-        return self.shown
+        return self.effective_parameters
 
 
 def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
@@ -48,7 +48,7 @@ def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
     """
     setup = _setup(short)
     draws = _parameters(short, setup)
-    theta = draws.mean(axis=0) if mean_of_draws else _likely(short, setup)
+    theta = draws.mean(axis=0) if mean_of_draws else _most_probable(short, setup)
     first = Problem(setup, [])
     mean, slopes = first.run(np.clip(theta, first.lower, first.upper), derivatives=True)
     assert slopes is not None
@@ -59,10 +59,10 @@ def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
     covariance[at, at] += (LEAST_SD * short.plateau_nm) ** 2 * np.eye(short.basis.size)
     hessian = _inverse(covariance)
     # The draws' centre is where data and prior balance: nothing pulls the curve away from it.
-    own = setup.with_(roughness=positive((hessian - information)[at, at]), curve_nm=theta[at])
-    problem = Problem(own, [])
+    centred = setup.with_(roughness=positive((hessian - information)[at, at]), curve_nm=theta[at])
+    problem = Problem(centred, [])
     residual = setup.target_nm - mean
-    shown = float(np.trace(np.linalg.solve(hessian + 1e-12 * np.diag(np.diag(hessian)), information)))
+    effective_parameters = float(np.trace(np.linalg.solve(hessian + 1e-12 * np.diag(np.diag(hessian)), information)))
     return Averaged(
         problem=problem,
         theta=np.clip(theta, first.lower, first.upper),
@@ -72,7 +72,7 @@ def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
         residual_nm=residual,
         slopes=slopes,
         hessian=hessian,
-        shown=min(shown, float(theta.size)),
+        effective_parameters=min(effective_parameters, float(theta.size)),
     )
 
 
@@ -102,11 +102,11 @@ def _parameters(short: Short, setup: Setup) -> np.ndarray:
     return np.c_[np.log(short.dynamics[:, :2]), short.dynamics[:, 2], others, short.coefficients_nm]
 
 
-def _likely(short: Short, setup: Setup) -> np.ndarray:
-    others = short.likely[short.basis.size :].copy()
+def _most_probable(short: Short, setup: Setup) -> np.ndarray:
+    others = short.most_probable[short.basis.size :].copy()
     others[: setup.grid.begins.size] -= setup.sign * setup.zero_nm
     t, z = short.linear.core
-    return np.r_[np.log(t), np.log(z), short.linear.delay_s, others, np.cumsum(short.likely[: short.basis.size])]
+    return np.r_[np.log(t), np.log(z), short.linear.delay_s, others, np.cumsum(short.most_probable[: short.basis.size])]
 
 
 def _inverse(covariance: np.ndarray) -> np.ndarray:

@@ -44,12 +44,15 @@ def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
     """
     if not best.distrusted:
         return best
-    own, unseen = alike_rows(grid, rows), leave_out(best)
-    for asked, white in ((rows, True), *(((own, False), (own, True)) if own is not None else ())):
-        other = fit(asked, white)
-        found = leave_out(other, np.where(other.problem.setup.fitted, unseen.block, -1))
-        if difference(unseen, found).errors >= BETTER:
-            best, unseen = other, found
+    similar_rows, unseen = alike_rows(grid, rows), leave_out(best)
+    for choice, white in (
+        (rows, True),
+        *(((similar_rows, False), (similar_rows, True)) if similar_rows is not None else ()),
+    ):
+        other = fit(choice, white)
+        left_out = leave_out(other, np.where(other.problem.setup.fitted, unseen.block, -1))
+        if difference(unseen, left_out).errors >= BETTER:
+            best, unseen = other, left_out
     return best
 
 
@@ -65,32 +68,36 @@ def trusted(base: Fitted) -> Fitted:
     if not (any_free(name for name, _ in base.effects) or knows_joint(base)):
         return base
     white = solve(base.problem, base.theta, WHITE)
-    again = solve(white.problem, white.theta, NoiseLevel(0.0, 0.5, white.noise.sd_nm))
-    if again.log_evidence > base.log_evidence:
-        return again
+    refitted = solve(white.problem, white.theta, NoiseLevel(0.0, 0.5, white.noise.sd_nm))
+    if refitted.log_evidence > base.log_evidence:
+        return refitted
     return white if difference(leave_out(base), leave_out(white)).errors >= BETTER else base
 
 
 def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
     """What was chosen and why, in words; nothing where the noise is usual and all rows were fitted."""
-    own, found = fitted.problem.setup.fitted, []
-    if own.sum() < rows.sum():
-        count, all_rows = int(own.sum()), int(rows.sum())
-        found.append(f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted.")
+    fitted_rows, sentences = fitted.problem.setup.fitted, []
+    if fitted_rows.sum() < rows.sum():
+        count, all_rows = int(fitted_rows.sum()), int(rows.sum())
+        sentences.append(
+            f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted."
+        )
     if fitted.noise.held:
-        found.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
-    return [*found, *doubts(fitted)]
+        sentences.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
+    return [*sentences, *likelihood_warnings(fitted)]
 
 
-def doubts(fitted: Fitted) -> list[str]:
+def likelihood_warnings(fitted: Fitted) -> list[str]:
     """Why the likelihood of a fit is no evidence, in words; nothing where it is."""
-    found = []
+    sentences = []
     if fitted.noise.at_bound:
-        found.append("The slow noise is as slow as it may be: left-out parts of the record decide, not the likelihood.")
+        sentences.append(
+            "The slow noise is as slow as it may be: left-out parts of the record decide, not the likelihood."
+        )
     if fitted.heavy_tails:
         kurtosis = f"{fitted.excess_kurtosis:.0f}"
-        found.append(f"A few jumps hold most of the noise: left-out parts decide (excess kurtosis {kurtosis}).")
-    return found
+        sentences.append(f"A few jumps hold most of the noise: left-out parts decide (excess kurtosis {kurtosis}).")
+    return sentences
 
 
 def alike_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
@@ -105,17 +112,21 @@ def alike_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
     wanted = {kinds[bout] for bout in np.unique(number[grid.held_out])} - {None}
     if len(wanted) != 1:
         return None
-    alike = [bout for bout, kind in kinds.items() if kind in wanted and np.any(rows & (number == bout))]
-    own = rows & np.isin(number, alike)
-    ahead = grid.held_out & (grid.pulse_width_us > 0)
-    if len(alike) < LEAST_BOUTS or own.sum() == rows.sum() or np.mean(near_widths(grid, own)[ahead]) < COVERED:
+    similar_bouts = [bout for bout, kind in kinds.items() if kind in wanted and np.any(rows & (number == bout))]
+    similar_rows = rows & np.isin(number, similar_bouts)
+    predicted = grid.held_out & (grid.pulse_width_us > 0)
+    if (
+        len(similar_bouts) < LEAST_BOUTS
+        or similar_rows.sum() == rows.sum()
+        or np.mean(near_widths(grid, similar_rows)[predicted]) < COVERED
+    ):
         return None
-    return own | (rows & relaxed(grid, FORGOTTEN_S))
+    return similar_rows | (rows & relaxed(grid, FORGOTTEN_S))
 
 
-def _smooth(grid: Grid, own: np.ndarray) -> bool | None:
+def _smooth(grid: Grid, bout_rows: np.ndarray) -> bool | None:
     """Whether the width of a bout moves smoothly, as in a ramp, not in jumps; None of a bout too short to tell."""
-    widths_us = grid.pulse_width_us[own]
+    widths_us = grid.pulse_width_us[bout_rows]
     steps_us = np.abs(np.diff(widths_us[np.flatnonzero(widths_us)]))
     if steps_us.size * grid.step_s < LONG_S:
         return None

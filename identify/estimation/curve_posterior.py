@@ -17,7 +17,7 @@ from scipy.linalg import lapack, solve_triangular
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.recruitment.near_shape import NearShape
 
-DAMPING = Damping(first=1e-4, less=8.0, more=8.0, least=1e-7)
+DAMPING = Damping(first=1e-4, less=8.0, more=8.0, smallest=1e-7)
 STEPS = 40
 """Newton steps at most."""
 ENOUGH = 0.02
@@ -131,18 +131,18 @@ class CurvePosterior:
 
     def modes(self, z: np.ndarray, near: Sequence[Mode] = ()) -> list[Mode]:
         """The mode for each kind of deviation, each started from the one before, or from `near`."""
-        found: list[Mode] = []
+        modes: list[Mode] = []
         for kind in range(len(self.prior.deviations)):
             if near:
                 z = np.r_[near[kind].z[: 3 + self.n], z[3 + self.n :]]
-            elif found:
+            elif modes:
                 moved = self.prior.roots[kind - 1] @ z[3 : 3 + self.n]
-                own = np.asarray(solve_triangular(self.prior.roots[kind], moved, lower=True))
+                rescaled = np.asarray(solve_triangular(self.prior.roots[kind], moved, lower=True))
                 # What is rough in one kind may be all but impossible in another: its share is left out.
-                z = np.r_[z[:3], own if own @ own < self.n else np.zeros(self.n), z[3 + self.n :]]
-            found.append(self.mode(z, kind))
-            z = found[-1].z
-        return found
+                z = np.r_[z[:3], rescaled if rescaled @ rescaled < self.n else np.zeros(self.n), z[3 + self.n :]]
+            modes.append(self.mode(z, kind))
+            z = modes[-1].z
+        return modes
 
     def draws(self, modes: Sequence[Mode], weights: np.ndarray, count: int, seed: int) -> np.ndarray:
         """Draws of x, averaged over the modes, shape (count, N); always the same for the same data."""

@@ -18,7 +18,7 @@ class Damping:
     first: float  # at the first step
     less: float  # a step that helped divides it by this
     more: float  # one that did not help multiplies it by this
-    least: float = 0.0  # after a step that helped it is this at the smallest
+    smallest: float = 0.0  # lower bound of the damping after a step that helped
     raised: float = 0.0  # after one that did not help it is this at least
     patience: int = 1000
     """Steps in a row that do not help, after which the search ends; it also ends where the damping is above 1e8."""
@@ -36,20 +36,20 @@ class Search(Generic[Point]):
     """Whether the search ends after a step that gained so much; with the step's number. By default it never does."""
 
 
-def descend(search: Search[Point], at: Point, most: int) -> tuple[Point, int]:
+def descend(search: Search[Point], at: Point, max_steps: int) -> tuple[Point, int]:
     """Search from a point, in at most so many steps: where it ends, and the number of steps begun until then."""
     rule = search.damping
     damping = rule.first
-    for step in range(1, most + 1):
+    for step in range(1, max_steps + 1):
         trial = search.trials(at, step, damping)
-        found, gain, failed = None, None, 0
+        candidate, gain, failed = None, None, 0
         while trial is not None and failed < rule.patience and damping < 1e8:
-            if (found := trial(damping)) is None or (gain := search.gain(at, found)) is not None:
+            if (candidate := trial(damping)) is None or (gain := search.gain(at, candidate)) is not None:
                 break
             damping, failed = max(rule.more * damping, rule.raised), failed + 1
-        if found is None or gain is None:
+        if candidate is None or gain is None:
             return at, step
-        at, damping = found, max(damping / rule.less, rule.least)
+        at, damping = candidate, max(damping / rule.less, rule.smallest)
         if search.settled(gain, step):
             return at, step
-    return at, most
+    return at, max_steps

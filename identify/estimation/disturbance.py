@@ -42,7 +42,7 @@ def disturbed(short: Short, white_nm: float, mains_hz: float | None) -> tuple[Fi
     white = setup.whitened(np.vstack([fitted.residual_nm, slopes]), noise)
     hessian = gram(white[1:]) + problem.prior[1]
     step = np.linalg.solve(hessian, white[1:] @ white[0])
-    found = replace(
+    solved = replace(
         fitted,
         problem=problem,
         theta=np.r_[fitted.theta, np.zeros(len(waves))] + step,
@@ -51,21 +51,21 @@ def disturbed(short: Short, white_nm: float, mains_hz: float | None) -> tuple[Fi
         slopes=slopes,
         hessian=hessian,
     )
-    return found, setup.sign * (step[fitted.theta.size :] @ waves)
+    return solved, setup.sign * (step[fitted.theta.size :] @ waves)
 
 
-def unsure(short: Short, beside: Fitted) -> Short:
+def unsure(short: Short, with_disturbance: Fitted) -> Short:
     """The fit of a record without its disturbance, its draws as far apart as the disturbance leaves the muscle open."""
-    own, at = short.basis.size, beside.problem.coefficients
+    size, at = short.basis.size, with_disturbance.problem.coefficients
     known = np.r_[0:3, at.start : at.stop]
     muscle = np.arange(at.stop)
-    whole = np.linalg.inv(beside.hessian)[np.ix_(known, known)]
-    alone = np.linalg.inv(beside.hessian[np.ix_(muscle, muscle)])[np.ix_(known, known)]
+    whole = np.linalg.inv(with_disturbance.hessian)[np.ix_(known, known)]
+    alone = np.linalg.inv(with_disturbance.hessian[np.ix_(muscle, muscle)])[np.ix_(known, known)]
     normal = np.random.default_rng(len(short.dynamics)).standard_normal((len(short.dynamics), known.size))
     moved = normal @ square_root(whole - alone)
     dynamics = short.dynamics * np.c_[np.exp(moved[:, :2]), np.ones(len(moved))]
     dynamics[:, 2] = np.clip(dynamics[:, 2] + moved[:, 2], *short.grid.delay_bounds_s)
-    return replace(short, dynamics=dynamics, coefficients_nm=short.coefficients_nm + moved[:, -own:])
+    return replace(short, dynamics=dynamics, coefficients_nm=short.coefficients_nm + moved[:, -size:])
 
 
 def _waves(time_s: np.ndarray, step_s: float, mains_hz: float | None) -> np.ndarray:
@@ -74,10 +74,10 @@ def _waves(time_s: np.ndarray, step_s: float, mains_hz: float | None) -> np.ndar
     place = (time_s - time_s[0] + 0.5 * step_s) / span_s
     number = np.arange(1, int(2.0 * QUICKEST_HZ * span_s) + 1)[:, None]
     sizes = np.minimum((2.0 * SLOW_HZ * span_s / number) ** FALL, 1.0)
-    found = [place[None, :] - 0.5, sizes * np.cos(np.pi * number * place)]
+    waves = [place[None, :] - 0.5, sizes * np.cos(np.pi * number * place)]
     if mains_hz is not None:
         turns = {round(abs((h * mains_hz * step_s + 0.5) % 1.0 - 0.5), 2) for h in range(1, HARMONICS + 1)}
         each_hz = [t / step_s + side / span_s for t in turns if t > 2.0 * step_s for side in (-1.0, 0.0, 1.0)]
         turned = 2.0 * np.pi * np.array(each_hz)[:, None] * time_s
-        found += [np.cos(turned), np.sin(turned)]
-    return LARGEST * np.vstack(found)
+        waves += [np.cos(turned), np.sin(turned)]
+    return LARGEST * np.vstack(waves)

@@ -39,7 +39,7 @@ class Change:
 
 
 USUAL = Change()
-BELIEVED = 3.0
+USUAL_WEIGHT = 3.0
 """The usual change counts like this many differences between sessions of the person's own."""
 
 
@@ -57,7 +57,7 @@ def learn_change(models: Sequence[Model]) -> Change:
         return USUAL
     squares = np.sum(np.diff(np.array(known), axis=0) ** 2, axis=0)
     usual = np.array([USUAL.gain_log, USUAL.middle_us, USUAL.width_log, USUAL.time_constant_log, USUAL.damping_log])
-    sd = np.sqrt((BELIEVED * usual**2 + squares) / (BELIEVED + len(known) - 1))
+    sd = np.sqrt((USUAL_WEIGHT * usual**2 + squares) / (USUAL_WEIGHT + len(known) - 1))
     return Change(*(float(value) for value in sd), sessions=len(known))
 
 
@@ -138,13 +138,13 @@ class Earlier:
         rise = max(high - low, 0.02 * largest_us)
         basis = SplineBasis(dense_knots(largest_us, middle, rise, knots))
         sd = np.array([self.change.gain_log, self.change.middle_us, self.change.width_log])
-        own = np.array([self._sd("plateau_nm") / self._marks[0], 0.0, 0.0])
-        plateau = float(self.mean[0]), 2.0 * float(np.hypot(sd[0], own[0]))
-        precision = np.diag(1.0 / (sd**2 + own**2))
+        model_sd = np.array([self._sd("plateau_nm") / self._marks[0], 0.0, 0.0])
+        plateau = float(self.mean[0]), 2.0 * float(np.hypot(sd[0], model_sd[0]))
+        precision = np.diag(1.0 / (sd**2 + model_sd**2))
         prior = NearShape(basis, self.shape, self.mean, precision, plateau, rise, EARLIER_DEVIATIONS)
-        return replace(prior, doubt=self._doubt(prior))
+        return replace(prior, doubt=self._step_covariance(prior))
 
-    def _doubt(self, prior: NearShape) -> np.ndarray | None:
+    def _step_covariance(self, prior: NearShape) -> np.ndarray | None:
         """Covariance of the logs of the steps, from that of the last curve's coefficients.
 
         Where a step may as well be many times as large, as below the widths that were played, its logarithm has no
@@ -153,21 +153,21 @@ class Earlier:
         known = self.model.covariance
         if known is None:
             return None
-        own = self.model.recruitment.basis
+        basis = self.model.recruitment.basis
         chosen = [i for i, name in enumerate(known.names) if name.startswith("recruitment_")]
-        slopes = np.diff(own.design(np.minimum(prior.places_us, own.largest_us)), axis=0)
+        slopes = np.diff(basis.design(np.minimum(prior.places_us, basis.largest_us)), axis=0)
         covariance = slopes @ known.matrix[np.ix_(chosen, chosen)] @ slopes.T
         steps = np.exp(prior.log_steps(prior.mean))
         size = np.maximum(prior.blurred(steps), 1e-9 * steps.sum())
-        told = np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= MOST_DOUBT * size
-        return np.where(told[:, None] & told[None, :], covariance / size[:, None] / size[None, :], 0.0)
+        determined = np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= MOST_DOUBT * size
+        return np.where(determined[:, None] & determined[None, :], covariance / size[:, None] / size[None, :], 0.0)
 
     def dynamics(self, delay_sd_s: float) -> tuple[np.ndarray, np.ndarray]:
         """Mean and precision of (log T, log ζ, delay)."""
         t, z = self.linear.core
-        own = np.array([self._sd("time_constant_s") / t, self._sd("damping") / z, 0.0])
+        model_sd = np.array([self._sd("time_constant_s") / t, self._sd("damping") / z, 0.0])
         sd = np.array([self.change.time_constant_log, self.change.damping_log, delay_sd_s])
-        return np.array([np.log(t), np.log(z), 0.0]), np.diag(1.0 / (sd**2 + own**2))
+        return np.array([np.log(t), np.log(z), 0.0]), np.diag(1.0 / (sd**2 + model_sd**2))
 
     def _sd(self, name: str) -> float:
         return float(self.model.figures()[name]["sd"] or 0.0)

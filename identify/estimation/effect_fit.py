@@ -56,11 +56,11 @@ class Candidate:
 
 
 def try_effect(
-    effect: Effect, base: Fitted, forms: Iterable[Form] | None = None, least: float = WORTHLESS
+    effect: Effect, base: Fitted, forms: Iterable[Form] | None = None, min_gain: float = WORTHLESS
 ) -> Candidate | None:
     """Add the best form of an effect to a model; None if there is nothing to start from.
 
-    A fit that promises to gain less than `least`, in log evidence, is not continued to its end.
+    A fit that promises to gain less than `min_gain`, in log evidence, is not continued to its end.
     """
     if effect.band:
         return try_band(effect, base)
@@ -76,18 +76,18 @@ def try_effect(
         elif idle >= PATIENCE:
             continue
         # The next form of a chain starts from this one, which must therefore be fitted to its end.
-        whole = form.propose is not None or least == -np.inf
-        floor = max(base.log_evidence + least - effect.prior, best.log_evidence if best else -np.inf)
-        found = fit_form(effect, form, base, residual, previous, -np.inf if whole else floor)
-        if found is None:
+        whole = form.propose is not None or min_gain == -np.inf
+        floor = max(base.log_evidence + min_gain - effect.prior, best.log_evidence if best else -np.inf)
+        fitted = fit_form(effect, form, base, residual, previous, -np.inf if whole else floor)
+        if fitted is None:
             idle = PATIENCE
             continue
-        gain = found.log_evidence - base.log_evidence + effect.prior
+        gain = fitted.log_evidence - base.log_evidence + effect.prior
         idle, top = (0, gain) if gain > max(top, 0.0) else (idle + 1, top)
         gains[form.name] = gain
-        previous, residual = found.parameters_of(effect.id), found.residual_nm
-        if best is None or found.log_evidence > best.log_evidence:
-            best, best_form = found, form
+        previous, residual = fitted.parameters_of(effect.id), fitted.residual_nm
+        if best is None or fitted.log_evidence > best.log_evidence:
+            best, best_form = fitted, form
     if best is None or best_form is None:
         return None
     return Candidate(effect, best_form, best, gains[best_form.name], gains)
@@ -99,9 +99,9 @@ def try_band(effect: Effect, base: Fitted) -> Candidate | None:
     noise, log_likelihood = find_band(base.residual_nm, setup.stretches, setup.grid.step_s)
     if log_likelihood - base.log_likelihood < BAND_COST:
         return None
-    found = solve(base.problem, base.theta, noise)
-    gain = found.log_evidence - base.log_evidence - BAND_COST + effect.prior
-    return Candidate(effect, effect.forms[0], found, gain, {"narrow_band": gain})
+    fitted = solve(base.problem, base.theta, noise)
+    gain = fitted.log_evidence - base.log_evidence - BAND_COST + effect.prior
+    return Candidate(effect, effect.forms[0], fitted, gain, {"narrow_band": gain})
 
 
 def fit_form(
@@ -123,12 +123,12 @@ def fit_form(
         if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
             continue  # the lags of the base model already differ
         theta = start_from(problem, base, {len(base.effects): start})
-        found = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor)
-        if form.accept is not None and not form.accept(found.parameters_of(effect.id), scene):
+        fitted = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor)
+        if form.accept is not None and not form.accept(fitted.parameters_of(effect.id), scene):
             continue
-        if best is None or found.log_evidence > best.log_evidence:
-            best = found
-            floor = max(floor, found.log_evidence)
+        if best is None or fitted.log_evidence > best.log_evidence:
+            best = fitted
+            floor = max(floor, fitted.log_evidence)
     return best
 
 
@@ -153,15 +153,15 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
     if (other := replaced_by(base.effects, forms)) is not None:
         message = f"{effect.id} and {other} both set the speed of the lags, or their slow state: one would be ignored"
         raise BadRequest(message, place="effects", fix="Leave one of them out.")
-    for identifier, seen, values in detected_effects(raw):
+    for identifier, detected_form, values in detected_effects(raw):
         if identifier == effect.id:
-            return fit_from(base, identifier, seen, values)
+            return fit_from(base, identifier, detected_form, values)
     # An effect that is found in the samples only is absent if they do not show it.
     # A requested effect is fitted to its end, whatever it gains.
-    found = None if any(form.fixed for form in forms) else try_effect(effect, base, forms, -np.inf)
-    if found is None:
+    candidate = None if any(form.fixed for form in forms) else try_effect(effect, base, forms, -np.inf)
+    if candidate is None:
         raise NotIdentifiable(f"the record shows nothing that looks like {effect.id}", fix="Leave this effect out.")
-    return found.fitted
+    return candidate.fitted
 
 
 def fit_from(base: Fitted, identifier: str, form: Form, values: dict[str, float]) -> Fitted:
@@ -172,33 +172,33 @@ def fit_from(base: Fitted, identifier: str, form: Form, values: dict[str, float]
 
 def detected_effects(raw: Raw) -> list[tuple[str, Form, dict[str, float]]]:
     """Effects that the samples show before any fit (mains hum, clipping), each with its form and parameters."""
-    found = []
+    detected = []
     for effect in sorted(registry().values(), key=lambda effect: STAGES.index(effect.stage)):
-        shown = effect.detect(raw) if effect.detect is not None else None
-        if shown is not None:
-            found.append((effect.id, effect.form(shown[0]), shown[1]))
-    return found
+        detection = effect.detect(raw) if effect.detect is not None else None
+        if detection is not None:
+            detected.append((effect.id, effect.form(detection[0]), detection[1]))
+    return detected
 
 
-def add_effects(base: Fitted, wanted: Sequence[str], raw: Raw, tell: Callable[[str], None] | None = None) -> Fitted:
+def add_effects(base: Fitted, wanted: Sequence[str], raw: Raw, report: Callable[[str], None] | None = None) -> Fitted:
     """The model with the named effects, each in its most likely form or in the one given after a colon.
 
     Of several forms, `id:one|another`, the first is fitted; when all effects are there, the likeliest of them is
-    taken. `tell` is called with the id of each effect before it is fitted. Raises BadRequest, NotIdentifiable: as
+    taken. `report` is called with the id of each effect before it is fitted. Raises BadRequest, NotIdentifiable: as
     `add_effect`; or no effect has that name.
     """
     chosen = [(identifier, forms.split("|")) for identifier, _, forms in (name.partition(":") for name in wanted)]
     for identifier, forms in chosen:
-        if tell is not None:
-            tell(identifier)
+        if report is not None:
+            report(identifier)
         base = add_effect(base, find_effect(identifier), forms[0], raw)
         if find_effect(identifier).shape:
             base = trusted(base)  # as the search for free effects does after each
     base = with_angle_delay(trusted(base))
     for identifier, forms in chosen:
         for form in forms[1:]:
-            if tell is not None:
-                tell(identifier)
+            if report is not None:
+                report(identifier)
             other = in_form(base, identifier, form)
             base = max(base, other, key=lambda fitted: fitted.log_evidence)
     return with_angle_delay(trusted(base))
@@ -210,7 +210,9 @@ def in_form(base: Fitted, effect: str, form: str) -> Fitted:
     Raises BadRequest: the effect has no such form.
     """
     other = _form(find_effect(effect), form)
-    problem = Problem(base.problem.setup, [(name, other if name == effect else own) for name, own in base.effects])
+    problem = Problem(
+        base.problem.setup, [(name, other if name == effect else present_form) for name, present_form in base.effects]
+    )
     return solve(problem, start_from(problem, base, {}), base.noise, tolerance=TOLERANCE)
 
 

@@ -127,11 +127,11 @@ def _covariance(fitted: Fitted, matrix: np.ndarray, known: int) -> Covariance:
 def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
     chosen = fitted.problem.chosen[index]
     setup = fitted.problem.setup
-    own = fitted.unforeseen.get(chosen.effect)
+    unpredictable = fitted.unpredictable_torque.get(chosen.effect)
     shape = shape_of(fitted, index, matrix)
     joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
     joint |= {"angle_late_s": setup.angle_late_s or None}
-    told = {
+    entry = {
         "id": chosen.effect,
         "form": chosen.form.name,
         "stage": chosen.form.stage,
@@ -146,11 +146,11 @@ def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
         }
         | {name: value for name, value in joint.items() if value is not None},
     }
-    if own is not None:
-        told["unforeseen"] = {"mean_nm": own[0], "rms_nm": own[1]}
+    if unpredictable is not None:
+        entry["unforeseen"] = {"mean_nm": unpredictable[0], "rms_nm": unpredictable[1]}
     if shape is not None:
-        told["shape"] = shape
-    return told
+        entry["shape"] = shape
+    return entry
 
 
 def describe_parameters(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, dict[str, Any]]:
@@ -180,9 +180,9 @@ def finish_discrete(
 ) -> Model:
     """The model of a method that gives a discrete block and a curve, but no covariance."""
     if extra and "narx" in extra:
-        response = run_narx(extra["narx"], grid.held(grid.pulse_width_us))
+        response = run_narx(extra["narx"], grid.interval_means(grid.pulse_width_us))
     else:
-        response = block.filter(grid.held(curve(grid.pulse_width_us)))
+        response = block.filter(grid.interval_means(curve(grid.pulse_width_us)))
     residual = np.nan_to_num(grid.torque_nm) - np.nan_to_num(response, nan=1e6, posinf=1e6, neginf=-1e6)
     baseline = float(np.mean(residual[rows]))
     free = curve.basis.size + len(block.a) + len(block.b)

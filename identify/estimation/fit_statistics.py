@@ -66,8 +66,8 @@ def white_sd(grid: Grid, predicted_nm: np.ndarray, block_sd_nm: float, freedom: 
         at = grid.readings.at
         jump, known = contrasts(at, residual[at], 2), rows[at]
     jump = jump[known[2:] & known[1:-1] & known[:-2]]
-    alike = abs(block_sd_nm * np.sqrt(grid.readings_in(grid.fitted)) / max(plain, 1e-300) - 1.0) < 0.2
-    if white and alike and plain < BEYOND_NOISE * grid.noise_sd_nm:
+    consistent = abs(block_sd_nm * np.sqrt(grid.readings_in(grid.fitted)) / max(plain, 1e-300) - 1.0) < 0.2
+    if white and consistent and plain < BEYOND_NOISE * grid.noise_sd_nm:
         return plain
     return plain if jump.size < 16 else float(min(np.sqrt(np.mean(jump**2)), plain))
 
@@ -108,9 +108,9 @@ def fit_statistics(
     """
     record = grid.record
     measured = record.torque_nm
-    foreseen = predicted_nm if foreseen_nm is None else foreseen_nm
+    judged_nm = predicted_nm if foreseen_nm is None else foreseen_nm
     used = rows[grid.interval] & ~record.held_out & grid.counted
-    held = record.held_out & grid.counted
+    judged = record.held_out & grid.counted
     result: dict[str, Any] = {
         **figures(measured[used], predicted_nm[used], sd_nm),
         "noise_sd_nm": sd_nm,
@@ -119,19 +119,19 @@ def fit_statistics(
         "held_out_rms_nm": None,
         "held_out_by": "none",
         "samples": int(used.sum()),
-        "held_out_samples": int(held.sum()),
-        "segments": segment_statistics(grid, np.where(record.held_out, foreseen, predicted_nm), sd_nm),
+        "held_out_samples": int(judged.sum()),
+        "segments": segment_statistics(grid, np.where(record.held_out, judged_nm, predicted_nm), sd_nm),
     }
-    left_out, by = foreseen, HELD_OUT
+    left_out, by = judged_nm, HELD_OUT
     if held_out_change is not None:
-        left_out = foreseen + held_out_change[grid.interval]
-        held, by = (held, by) if held.any() else (used, "cross-validation")
-    if held.any():
-        beside_noise = rms((measured - left_out)[held]) ** 2 - sd_nm**2
-        unforeseen = min(rms((predicted_nm - foreseen)[held]), float(np.sqrt(max(beside_noise, 0.0))))
-        result |= figures(measured[held], left_out[held], float(np.hypot(sd_nm, unforeseen)), "held_out_")
-        result |= {"held_out_by": by, "held_out_samples": int(held.sum())}
-        result |= {"unforeseen_nm": unforeseen} if unforeseen > 0.0 else {}
+        left_out = judged_nm + held_out_change[grid.interval]
+        judged, by = (judged, by) if judged.any() else (used, "cross-validation")
+    if judged.any():
+        beside_noise = rms((measured - left_out)[judged]) ** 2 - sd_nm**2
+        unpredictable_nm = min(rms((predicted_nm - judged_nm)[judged]), float(np.sqrt(max(beside_noise, 0.0))))
+        result |= figures(measured[judged], left_out[judged], float(np.hypot(sd_nm, unpredictable_nm)), "held_out_")
+        result |= {"held_out_by": by, "held_out_samples": int(judged.sum())}
+        result |= {"unforeseen_nm": unpredictable_nm} if unpredictable_nm > 0.0 else {}
     return result | {"repetition": repetition(grid, block_means(grid, measured - left_out), rows)}
 
 
@@ -164,10 +164,10 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     setup = fitted.problem.setup
     grid = setup.grid
     change = held_out_change(fitted)
-    predicted, foreseen = predict_fitted(fitted)
+    predicted, predictable = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
-    found = fit_statistics(grid, setup.fitted, predicted, noise, change, foreseen)
-    return found | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
+    statistics = fit_statistics(grid, setup.fitted, predicted, noise, change, predictable)
+    return statistics | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
 
 
 def held_out_change(fitted: Fitted) -> np.ndarray:
@@ -184,16 +184,16 @@ def held_out_change(fitted: Fitted) -> np.ndarray:
     rows = setup.fitted
     block = max(round(BLOCK_S / grid.step_s), 2)
     fold = (np.cumsum(rows) // block) % FOLDS
-    kept = np.delete(np.arange(problem.size), problem.initials)
+    refitted = np.delete(np.arange(problem.size), problem.initials)
     mean, precision = problem.prior
-    pull = (precision @ (fitted.theta - mean))[kept]
-    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian)[kept], 1e-300))
-    slopes = fitted.slopes[kept] * scale[:, None]
-    penalty = precision[np.ix_(kept, kept)] * scale[:, None] * scale[None, :] + 1e-9 * np.eye(kept.size)
+    pull = (precision @ (fitted.theta - mean))[refitted]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian)[refitted], 1e-300))
+    slopes = fitted.slopes[refitted] * scale[:, None]
+    penalty = precision[np.ix_(refitted, refitted)] * scale[:, None] * scale[None, :] + 1e-9 * np.eye(refitted.size)
     both = np.vstack([np.where(rows, fitted.residual_nm, 0.0), slopes]) / setup.spread
-    foreseen = np.ones(problem.size, bool)
+    predictable = np.ones(problem.size, bool)
     for chosen in problem.chosen:
-        foreseen[chosen.places] = find_effect(chosen.effect).predictable
+        predictable[chosen.places] = find_effect(chosen.effect).predictable
     change = np.zeros(grid.size)
     for number in range(FOLDS):
         left_out = rows & (fold == number)
@@ -201,5 +201,5 @@ def held_out_change(fitted: Fitted) -> np.ndarray:
             continue
         white = whitened(both, ends_of(grid.stretches(rows & ~left_out)), fitted.noise)
         step = np.linalg.solve(white[1:] @ white[1:].T + penalty, white[1:] @ white[0] - scale * pull)
-        change[left_out] = (step * foreseen[kept]) @ slopes[:, left_out]
+        change[left_out] = (step * predictable[refitted]) @ slopes[:, left_out]
     return change

@@ -30,7 +30,7 @@ def gram(rows):  # pragma: no cover
     return out
 
 
-DAMPING = Damping(first=1e-3, less=6.0, more=8.0, least=1e-7, raised=1e-3, patience=6)
+DAMPING = Damping(first=1e-3, less=6.0, more=8.0, smallest=1e-7, raised=1e-3, patience=6)
 LARGEST_FIRST = 1e-3
 """Damping of the step by which the promised gain is judged, at most."""
 HEAVY_TAILS = 10.0
@@ -103,17 +103,17 @@ class Fitted:
         return {}
 
     @cached_property
-    def unforeseen(self) -> dict[str, tuple[float, float]]:
-        """As `stimrig.identify.simulation.predict.unforeseen`."""
+    def unpredictable_torque(self) -> dict[str, tuple[float, float]]:
+        """As `stimrig.identify.simulation.predict.unpredictable_torque`."""
         problem, grid = self.problem, self.problem.setup.grid
         rows = self.problem.setup.fitted[grid.interval] & ~grid.record.held_out & grid.counted
-        found = {}
+        sizes = {}
         for effect in (find_effect(name) for name, _ in self.effects):
             if not effect.predictable:
-                left = problem.at_samples(self.theta) - problem.at_samples(self.theta, frozenset([effect.id]))
-                mean = 0.0 if effect.sporadic else float(np.mean(left[rows]))
-                found[effect.id] = mean, float(np.sqrt(np.mean(left[rows] ** 2)))
-        return found
+                added_nm = problem.at_samples(self.theta) - problem.at_samples(self.theta, frozenset([effect.id]))
+                mean = 0.0 if effect.sporadic else float(np.mean(added_nm[rows]))
+                sizes[effect.id] = mean, float(np.sqrt(np.mean(added_nm[rows] ** 2)))
+        return sizes
 
     @cached_property
     def written(self) -> Fitted:
@@ -137,15 +137,15 @@ def solve(
     theta: np.ndarray,
     noise: NoiseLevel,
     *,
-    most: int = 20,
+    max_steps: int = 20,
     tolerance: float = 0.02,
     floor: float | None = None,
     profiled: bool = True,
 ) -> Fitted:
     """Find the most probable parameters, from a start `theta` on the scale on which parameters are varied.
 
-    It stops after `most` steps, when the log posterior rises by less than `tolerance`, or after the first step if the
-    log evidence `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on; else it
+    It stops after `max_steps` steps, when the log posterior rises by less than `tolerance`, or after the first step if
+    the log evidence `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on; else it
     stays as given.
     """
     start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
@@ -174,7 +174,7 @@ def solve(
         return trial.value - at.value if trial.value > at.value - 1e-9 else None
 
     search = Search(DAMPING, trials, gain, lambda gained, step: gained < tolerance and step >= 2)
-    at, steps = descend(search, start, most)
+    at, steps = descend(search, start, max_steps)
     return Fitted(
         problem=problem,
         theta=at.theta,
@@ -184,7 +184,7 @@ def solve(
         residual_nm=at.residual,
         slopes=at.slopes,
         hessian=at.hessian,
-        converged=most == 0 or steps < most,
+        converged=max_steps == 0 or steps < max_steps,
     )
 
 
@@ -349,7 +349,9 @@ def predict_fitted(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
     """Free-run torque of a candidate at its own record's samples, N·m, shape (N,): as fitted, and as it could have been
     foreseen."""
     fitted = fitted.written
-    whole, own = fitted.problem.at_samples(fitted.theta), fitted.unforeseen
-    if not own:
+    whole, unpredictable = fitted.problem.at_samples(fitted.theta), fitted.unpredictable_torque
+    if not unpredictable:
         return whole, whole
-    return whole, fitted.problem.at_samples(fitted.theta, frozenset(own)) + sum(mean for mean, _ in own.values())
+    return whole, fitted.problem.at_samples(fitted.theta, frozenset(unpredictable)) + sum(
+        mean for mean, _ in unpredictable.values()
+    )

@@ -30,12 +30,12 @@ def with_angle_delay(base: Fitted) -> Fitted:
         if abs(late_s - best.problem.setup.angle_late_s) < SETTLED_S:
             break
         problem = Problem(best.problem.setup.with_(angle_late_s=late_s), best.effects)
-        found = solve(problem, theta, best.noise, most=SEARCH)
-        if not found.log_evidence > best.log_evidence:
+        refitted = solve(problem, theta, best.noise, max_steps=SEARCH)
+        if not refitted.log_evidence > best.log_evidence:
             break
-        best = found
-    least = 0.0 if base.problem.setup.angle_late_s else LEAST_GAIN
-    return best if best.log_evidence > base.log_evidence + least else base
+        best = refitted
+    min_gain = 0.0 if base.problem.setup.angle_late_s else LEAST_GAIN
+    return best if best.log_evidence > base.log_evidence + min_gain else base
 
 
 def _step(fitted: Fitted) -> tuple[float, np.ndarray]:
@@ -81,9 +81,9 @@ def words(sensor: dict[str, float]) -> list[str]:
         return []
     noise, cost = f"{math.degrees(sensor['noise_rad']):.2f}", f"{sensor['cost_nm']:.2g}"
     step, late = f"{math.degrees(sensor['step_rad']):.2g}", f"{1e3 * sensor['delay_s']:.0f}"
-    told = [f"The angle strays by {noise}°; smoothed, that still costs {cost} N·m of torque."]
+    sentences = [f"The angle strays by {noise}°; smoothed, that still costs {cost} N·m of torque."]
     if sensor["step_rad"]:
-        told.append(f"The sensor tells the angle in steps of {step}°.")
+        sentences.append(f"The sensor tells the angle in steps of {step}°.")
     if sensor["delay_s"]:
-        told.append(f"The sensor tells the angle {late} ms late.")
-    return told
+        sentences.append(f"The sensor tells the angle {late} ms late.")
+    return sentences

@@ -69,23 +69,23 @@ def blocks(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """
     ends, count = np.r_[np.flatnonzero(np.diff(bouts(grid))) + 1, grid.size], np.r_[0, np.cumsum(rows)]
     piece, edges = max(count[-1] / PIECES, LEAST_S / grid.step_s), [0]
-    least = 0.5 * piece if ends.size > MOST_BOUTS else 0.0
+    min_rows = 0.5 * piece if ends.size > MOST_BOUTS else 0.0
     for end in ends.tolist():
-        if count[end] - count[edges[-1]] >= least:
+        if count[end] - count[edges[-1]] >= min_rows:
             edges.append(end)
     edges = [*edges[: max(len(edges) - 1, 1)], grid.size]  # a short rest of the record belongs to the last block
-    found = [np.array(edges)]
+    borders = [np.array(edges)]
     for start, stop in pairwise(edges):
         pieces = max(round((count[stop] - count[start]) / piece), 1)
         inner = count[start] + (count[stop] - count[start]) * np.arange(1, pieces) / pieces
-        found.append(np.searchsorted(count, inner))
-    edges = np.unique(np.concatenate(found))
+        borders.append(np.searchsorted(count, inner))
+    edges = np.unique(np.concatenate(borders))
     return np.where(rows, np.searchsorted(edges, np.arange(grid.size), side="right"), -1)
 
 
-def near_widths(grid: Grid, seen: np.ndarray) -> np.ndarray:
-    """bool, shape (K,): intervals whose width, and all within the muscle's memory before, are near those of `seen`."""
-    widths = np.unique(grid.pulse_width_us[seen])
+def near_widths(grid: Grid, rows: np.ndarray) -> np.ndarray:
+    """bool, shape (K,): intervals whose width, and all within the muscle's memory before, are near those of `rows`."""
+    widths = np.unique(grid.pulse_width_us[rows])
     if widths.size < 2:
         return np.zeros(grid.size, bool)
     after = np.clip(np.searchsorted(widths, grid.pulse_width_us), 1, widths.size - 1)
@@ -106,9 +106,9 @@ class LeftOut:
     wander_nm: float = 0.0
     """Scatter of the torque at rest. A block's mean error is no fault of the model as far as its zero explains it."""
 
-    def square(self, own: np.ndarray) -> float:
+    def square(self, rows: np.ndarray) -> float:
         """Mean square error of some intervals of one block about their zero, N²m²."""
-        error_nm = self.error_nm[own]
+        error_nm = self.error_nm[rows]
         zero_nm = np.clip(error_nm.mean(), -ZERO_SD * self.wander_nm, ZERO_SD * self.wander_nm)
         return float(np.mean((error_nm - zero_nm) ** 2))
 
@@ -146,11 +146,11 @@ def _without(fitted: Fitted, block: np.ndarray) -> LeftOut:
     sporadic = _sporadic(fitted)
     for number in np.unique(block[block >= 0]):
         out = (block == number) & ~opening
-        kept = setup.fitted & ~out
-        judged = out & near_widths(grid, kept)
+        remaining = setup.fitted & ~out
+        judged = out & near_widths(grid, remaining)
         if judged.sum() < LEAST_ROWS:
             continue
-        theta = _refitted(fitted, kept)
+        theta = _refitted(fitted, remaining)
         error[judged] = (setup.target_nm - fitted.problem.run(theta, skip=sporadic)[0])[judged]
     return LeftOut(error, block, *_allowed_nm(fitted))
 
@@ -178,27 +178,27 @@ def _allowed_nm(fitted: Fitted) -> tuple[float, float]:
     grid = setup.grid
     rest = setup.fitted & relaxed(grid, FORGOTTEN_S)
     still, part = setup.target_nm[rest], grid.part[rest]
-    for one in np.unique(part):  # each part has its own zero
-        still[part == one] -= np.median(still[part == one])
+    for number in np.unique(part):  # each part has its own zero
+        still[part == number] -= np.median(still[part == number])
     wander = 1.4826 * float(np.median(np.abs(still))) if still.size else 0.0
     if grid.angle_rad is not None and still.size and np.ptp(grid.angle_rad[rest]) > MOVED_RAD:
         wander = 0.0  # a joint that moves has its passive torque at rest
     return max(grid.mean_noise_nm(setup.fitted), FLOOR_SHARE * setup.scale_nm), wander
 
 
-def _refitted(fitted: Fitted, kept: np.ndarray) -> np.ndarray:
+def _refitted(fitted: Fitted, remaining: np.ndarray) -> np.ndarray:
     """The most probable parameters on some of the fitted rows: one Gauss-Newton step, or more where it is too long."""
     problem, setup = fitted.problem, fitted.problem.setup
-    own = Problem(setup.with_(fitted=kept), fitted.effects)
-    before = log_posterior(own, fitted.theta, fitted.residual_nm, fitted.noise)
-    at = Point(own, fitted.theta, fitted.residual_nm, fitted.slopes, fitted.noise, before, before)
+    reduced = Problem(setup.with_(fitted=remaining), fitted.effects)
+    before = log_posterior(reduced, fitted.theta, fitted.residual_nm, fitted.noise)
+    at = Point(reduced, fitted.theta, fitted.residual_nm, fitted.slopes, fitted.noise, before, before)
     step = newton_step(at, RIDGE)[0]
     for factor in SHORTER:
         theta = np.clip(fitted.theta + factor * step, problem.lower, problem.upper)
-        gained = log_posterior(own, theta, setup.target_nm - problem.run(theta)[0], fitted.noise) - before
+        gained = log_posterior(reduced, theta, setup.target_nm - problem.run(theta)[0], fitted.noise) - before
         if gained >= TRUSTED * factor * 0.5 * float(at.gradient @ step) - 0.5 * SLACK:
             return theta
-    return solve(own, fitted.theta, fitted.noise, most=STEPS, profiled=False).theta
+    return solve(reduced, fitted.theta, fitted.noise, max_steps=STEPS, profiled=False).theta
 
 
 @dataclass(frozen=True)
@@ -239,15 +239,15 @@ def difference(before: LeftOut, after: LeftOut) -> Difference:
     """
     pairs, noise = [], before.floor_nm**2
     for number in np.unique(after.block[after.block >= 0]):
-        own = (after.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
-        if own.any():
-            pairs.append((before.square(own), after.square(own), own.sum()))
+        in_block = (after.block == number) & np.isfinite(before.error_nm) & np.isfinite(after.error_nm)
+        if in_block.any():
+            pairs.append((before.square(in_block), after.square(in_block), in_block.sum()))
     if not pairs:
         return Difference(0.0, float("inf"), 0.0)
     old, new, rows = np.array(pairs).T
     weight = rows * np.maximum(1.0 - noise / np.maximum(np.maximum(old, new), 1e-300), LEAST_WEIGHT)
     ratio = 0.5 * np.log((old + noise) / (new + noise))
     gain = float(weight @ ratio / weight.sum())
-    told = float(weight.sum() ** 2 / (weight @ weight))
+    effective_blocks = float(weight.sum() ** 2 / (weight @ weight))
     sd = float(np.sqrt(np.sum((weight * (ratio - gain)) ** 2)) / weight.sum())
-    return Difference(gain, sd * np.sqrt(told / max(told - 1.0, 1e-9)), told)
+    return Difference(gain, sd * np.sqrt(effective_blocks / max(effective_blocks - 1.0, 1e-9)), effective_blocks)

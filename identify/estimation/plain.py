@@ -61,17 +61,19 @@ def still_rows(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """
     if grid.angle_rad is None or grid.velocity_rad_s is None or not moves(grid, rows):
         return rows
-    own = np.zeros(grid.size, bool)
+    at_one_angle = np.zeros(grid.size, bool)
     still = rows & (np.abs(grid.velocity_rad_s) < STILL_RAD_S)
     if still.any():
-        own = still & (np.abs(grid.angle_rad - _middle(grid.angle_rad, still, grid.pulse_width_us)) < ONE_ANGLE_RAD)
-    widths_us = grid.pulse_width_us[own & (grid.pulse_width_us > 0)]
+        at_one_angle = still & (
+            np.abs(grid.angle_rad - _middle(grid.angle_rad, still, grid.pulse_width_us)) < ONE_ANGLE_RAD
+        )
+    widths_us = grid.pulse_width_us[at_one_angle & (grid.pulse_width_us > 0)]
     enough = (
         widths_us.size * grid.step_s >= LEAST_S
         and np.unique(widths_us).size >= LEAST_WIDTHS
         and widths_us.max() >= WIDEST_SHARE * grid.pulse_width_us[rows].max()
     )
-    return own if enough else rows
+    return at_one_angle if enough else rows
 
 
 def moves(grid: Grid, rows: np.ndarray) -> bool:
@@ -126,17 +128,17 @@ def pilot_solution(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -
 
     Raises NotIdentifiable: the pulse width or the torque never changes.
     """
-    seen = grid.pulse_width_us[rows]
-    if np.ptp(seen) <= 0:
+    widths_us = grid.pulse_width_us[rows]
+    if np.ptp(widths_us) <= 0:
         raise NotIdentifiable("the pulse width never changes in the fitted pulses", fix="Record a PRBS and a ramp.")
     if np.ptp(grid.torque_nm[rows]) <= 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
     basis = SplineBasis(np.linspace(0.0, float(np.max(grid.pulse_width_us)), PILOT_KNOTS))
-    projection = Projection(grid, basis, spline_roughness(basis, order=bending_order(seen)), rows, delay_s)
+    projection = Projection(grid, basis, spline_roughness(basis, order=bending_order(widths_us)), rows, delay_s)
     delay = 0.0 if delay_s is None else delay_s
     starts = [Solution(projection, bounded(projection, SecondOrder(t, 0.9, delay))) for t in STARTS_S]
     best = min(starts, key=lambda start: start.cost)
-    return descend_from(best, most=12, tolerance=0.5)
+    return descend_from(best, max_steps=12, tolerance=0.5)
 
 
 def designed(first: Solution, count: int | None = None) -> tuple[Projection, SecondOrder]:
@@ -151,8 +153,8 @@ def designed(first: Solution, count: int | None = None) -> tuple[Projection, Sec
     basis, roughness = fitting_spline(first.curve, largest_us, count, widths_us)
     for _ in range(2):
         projection = replace(old, basis=basis, roughness=roughness)
-        shown = basis, Solution(projection, first.linear, variance=first.variance).above_rest[: basis.size]
-        basis, roughness = fitting_spline(curve_points(*shown), largest_us, count, widths_us, shown)
+        drawn_curve = basis, Solution(projection, first.linear, variance=first.variance).above_rest[: basis.size]
+        basis, roughness = fitting_spline(curve_points(*drawn_curve), largest_us, count, widths_us, drawn_curve)
     return replace(old, basis=basis, roughness=roughness), first.linear
 
 
@@ -206,51 +208,55 @@ def fit_plain(grid: Grid, rows: np.ndarray) -> Fitted:
     that is over, those of a joint that moves may be chosen again (`renewed_curve`).
     """
 
-    def fit(own: np.ndarray, white: bool) -> Fitted:
-        return to_fitted(estimate(grid, still_rows(grid, own), white=white)[0], own, white=white)
+    def fit(selected: np.ndarray, white: bool) -> Fitted:
+        return to_fitted(estimate(grid, still_rows(grid, selected), white=white)[0], selected, white=white)
 
     return chosen(grid, rows, fit(rows, False), fit)
 
 
 def to_fitted(
-    solution: Solution, rows: np.ndarray, most: int = 20, white: bool = False, coefficients: np.ndarray | None = None
+    solution: Solution,
+    rows: np.ndarray,
+    max_steps: int = 20,
+    white: bool = False,
+    coefficients: np.ndarray | None = None,
 ) -> Fitted:
     """The solution of the joint problem on some rows, with white and slow noise, started from a projected solution.
 
     The projected solution may be of fewer rows, where the joint moves in the others: see `still_rows`. `white`: the
     noise is held white. `coefficients`: in place of the solution's own.
     """
-    found = _fill_zeros(solution.projection, solution.coefficients if coefficients is None else coefficients, rows)
-    setup = _setup_of(solution, found, rows)
+    filled = _fill_zeros(solution.projection, solution.coefficients if coefficients is None else coefficients, rows)
+    setup = _setup_of(solution, filled, rows)
     problem = Problem(setup, [])
     size, linear = solution.projection.basis.size, solution.linear
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
     parts = setup.grid.begins.size
-    values[list(problem.baselines)] = setup.to_muscle(found[size : size + parts])
-    values[list(problem.initials)] = setup.sign * found[size + parts :]
-    values[problem.coefficients] = setup.sign * found[:size]
+    values[list(problem.baselines)] = setup.to_muscle(filled[size : size + parts])
+    values[list(problem.initials)] = setup.sign * filled[size + parts :]
+    values[problem.coefficients] = setup.sign * filled[:size]
     noise = WHITE if white else NoiseLevel(max(solution.ar1, 0.0), 0.5, float(np.sqrt(solution.variance)))
-    fitted = solve(problem, problem.from_physical(values), noise, most=most)
+    fitted = solve(problem, problem.from_physical(values), noise, max_steps=max_steps)
     values = fitted.physical
     quick_s, slow_s = 0.5 * values[0] / values[1], 2.0 * values[0] * values[1]
-    if not most or quick_s > NEGLIGIBLE_LAG_S:
+    if not max_steps or quick_s > NEGLIGIBLE_LAG_S:
         return fitted
     values[0] = np.sqrt(QUICK_S * slow_s)
     values[1:3] = 0.5 * (QUICK_S + slow_s) / values[0], 0.0
     theta = np.clip(problem.from_physical(values), problem.lower, problem.upper)
-    return max(fitted, solve(problem, theta, noise, most=most), key=lambda found: found.log_evidence)
+    return max(fitted, solve(problem, theta, noise, max_steps=max_steps), key=lambda candidate: candidate.log_evidence)
 
 
 def _fill_zeros(projection: Projection, coefficients: np.ndarray, rows: np.ndarray) -> np.ndarray:
     """The coefficients with a zero for parts of which there is no row: the middle of their torque without pulses."""
-    grid, found = projection.grid, coefficients.copy()
+    grid, filled = projection.grid, coefficients.copy()
     for part in range(grid.begins.size):
-        own = rows & (grid.part == part)
-        if own.any() and not np.any(projection.rows & own):
-            rest = own & (grid.pulse_width_us == 0)
-            found[projection.basis.size + part] = np.median(grid.torque_nm[rest if rest.any() else own])
-    return found
+        part_rows = rows & (grid.part == part)
+        if part_rows.any() and not np.any(projection.rows & part_rows):
+            rest = part_rows & (grid.pulse_width_us == 0)
+            filled[projection.basis.size + part] = np.median(grid.torque_nm[rest if rest.any() else part_rows])
+    return filled
 
 
 def _setup_of(solution: Solution, coefficients: np.ndarray, rows: np.ndarray) -> Setup:
@@ -290,16 +296,16 @@ def _spread(grid: Grid) -> np.ndarray | float:
     if parts == 1:
         return 1.0
     record = grid.record
-    kept = grid.counted & ~record.held_out
-    parts_sd = [_part_noise(record, kept & (record.part == part)) for part in range(parts)]
-    own = np.array(parts_sd)
-    known = own[np.isfinite(own)]
+    usable = grid.counted & ~record.held_out
+    parts_sd = [_part_noise(record, usable & (record.part == part)) for part in range(parts)]
+    sd = np.array(parts_sd)
+    known = sd[np.isfinite(sd)]
     if not known.size:
         return 1.0
-    own = np.where(np.isfinite(own), own, known.mean())
+    sd = np.where(np.isfinite(sd), sd, known.mean())
     # Even a very quiet part does not get an unlimited weight.
-    own = np.maximum(own, LEAST_SPREAD * own.max())
-    return (own / own.mean())[grid.part]
+    sd = np.maximum(sd, LEAST_SPREAD * sd.max())
+    return (sd / sd.mean())[grid.part]
 
 
 def _part_noise(record: Record, rows: np.ndarray) -> float:
@@ -337,10 +343,10 @@ def renewed_curve(base: Fitted) -> Fitted:
         return base
     with suppress(np.linalg.LinAlgError):  # then the curve as it is remains the best one known
         for _ in range(TIMES):
-            found = _renewed(base)
-            if not found.log_evidence > base.log_evidence or (base.converged and not found.converged):
+            renewed = _renewed(base)
+            if not renewed.log_evidence > base.log_evidence or (base.converged and not renewed.converged):
                 break
-            base = found
+            base = renewed
     return base
 
 
@@ -375,11 +381,11 @@ def _precision(problem: Problem, theta: np.ndarray, base: Fitted, roughness: np.
     curve = np.arange(place.start, place.stop)
     others = np.delete(np.arange(problem.size), curve)
     # what the curve and the others' changes have to explain: the residual, and the curve itself
-    left = setup.target_nm - mean + theta[place] @ slopes[place]
-    products = gram(setup.whitened(np.vstack([left, slopes[curve], slopes[others]]), base.noise))
+    target = setup.target_nm - mean + theta[place] @ slopes[place]
+    products = gram(setup.whitened(np.vstack([target, slopes[curve], slopes[others]]), base.noise))
     inner = 1 + curve.size
     bound = products[inner:, inner:] + problem.prior[1][np.ix_(others, others)]
-    own = products[:inner, :inner] - products[:inner, inner:] @ np.linalg.solve(bound, products[inner:, :inner])
-    design, moment = ((own + own.T) / 2)[1:, 1:].copy(), own[1:, 0].copy()
-    chosen = choose_weight(design, moment, float(own[0, 0]), int(setup.fitted.sum()), roughness, others.size)
+    projected = products[:inner, :inner] - products[:inner, inner:] @ np.linalg.solve(bound, products[inner:, :inner])
+    design, moment = ((projected + projected.T) / 2)[1:, 1:].copy(), projected[1:, 0].copy()
+    chosen = choose_weight(design, moment, float(projected[0, 0]), int(setup.fitted.sum()), roughness, others.size)
     return chosen.weight / chosen.variance * roughness

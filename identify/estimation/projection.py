@@ -54,16 +54,16 @@ class Projection:
         """Held drive of each interval, one row per coefficient: basis functions, then zeros for the initial states."""
         widths, place = self.grid.widths_us
         rows = np.zeros((self.basis.size + 2 * self.grid.starts.size, self.grid.size))
-        rows[: self.basis.size] = self.grid.held(self.basis.design(widths)[place].T, axis=1)
+        rows[: self.basis.size] = self.grid.interval_means(self.basis.design(widths)[place].T, axis=1)
         return rows
 
     @cached_property
     def beginnings(self) -> np.ndarray:
         """Initial states of each row: zero for the basis functions, then unit torques and unit rates."""
-        found = np.zeros((len(self.rows_nm), self.grid.starts.size, 2))
+        states = np.zeros((len(self.rows_nm), self.grid.starts.size, 2))
         for number in range(self.grid.starts.size):
-            found[self.basis.size + 2 * number :, number][:2] = np.eye(2)
-        return found
+            states[self.basis.size + 2 * number :, number][:2] = np.eye(2)
+        return states
 
     @cached_property
     def levels(self) -> np.ndarray:
@@ -198,9 +198,9 @@ class Solution:
     @cached_property
     def coefficients(self) -> np.ndarray:
         """Recruitment, the record's own baselines, initial states, shape (P + extras,)."""
-        found, size, level_nm = self.above_rest.copy(), self.projection.basis.size, self.projection.rests[0]
-        found[size : size + level_nm.size] += level_nm
-        return found
+        whole, size, level_nm = self.above_rest.copy(), self.projection.basis.size, self.projection.rests[0]
+        whole[size : size + level_nm.size] += level_nm
+        return whole
 
     @cached_property
     def residual_nm(self) -> np.ndarray:
@@ -246,8 +246,8 @@ class Solution:
     def squares(self) -> float:
         """Sum of squared innovations, at least that of rounding errors."""
         c = self.above_rest
-        left = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
-        return max(left, 1e-14 * self.energy, 1e-24 * self.rows)
+        total = self.energy - 2 * float(self.zy @ c) + float(c @ self.zz @ c)
+        return max(total, 1e-14 * self.energy, 1e-24 * self.rows)
 
     @property
     def variance(self) -> float:
@@ -261,7 +261,7 @@ class Solution:
     def step(self, damping: float, curved: np.ndarray) -> np.ndarray:
         """Step in (log T, log ζ, delay) by second derivatives; parameters at a bound do not leave it."""
         gradient = self.gradient
-        free = ~_held(self.projection, self.linear, gradient)
+        free = ~_at_bound(self.projection, self.linear, gradient)
         step = np.zeros(gradient.size)
         if free.any():
             square = curved[np.ix_(free, free)]
@@ -287,26 +287,26 @@ LEAST_BEND = 0.05
 
 
 def search(
-    projection: Projection, start: SecondOrder, *, ar1: float = 0.0, most: int = 25, variance: float | None = None
+    projection: Projection, start: SecondOrder, *, ar1: float = 0.0, max_steps: int = 25, variance: float | None = None
 ) -> Solution:
     """Newton's method on the dynamics with the coefficients projected out, damped where a step fails.
 
     It makes at most so many steps; `ar1` and `variance` are those of `Solution`.
     """
-    return descend_from(Solution(projection, bounded(projection, start), ar1=ar1, variance=variance), most, CLOSE)
+    return descend_from(Solution(projection, bounded(projection, start), ar1=ar1, variance=variance), max_steps, CLOSE)
 
 
-def descend_from(start: Solution, most: int, tolerance: float) -> Solution:
+def descend_from(start: Solution, max_steps: int, tolerance: float) -> Solution:
     """The same from a solution. It ends when a step is smaller than `tolerance` standard errors."""
-    projection, taken, bend = start.projection, 0, _Bend(start)
+    projection, steps, bend = start.projection, 0, _Bend(start)
 
     def trials(at: Solution, _step: int, _damping: float) -> Trial[Solution]:
         curved = bend.at(at)
 
         def trial(damping: float) -> Solution | None:
-            nonlocal taken
-            taken += 1
-            if taken > most:
+            nonlocal steps
+            steps += 1
+            if steps > max_steps:
                 return None
             step = at.step(damping if damping > NEGLIGIBLE else 0.0, curved)
             there = bounded(projection, _moved(at.linear, step))
@@ -315,16 +315,16 @@ def descend_from(start: Solution, most: int, tolerance: float) -> Solution:
             size = float(np.sqrt(max(moved @ at.information @ moved, 0.0) * at.rows / at.squares))
             if size < tolerance or np.max(np.abs(moved)) < 1e-9:
                 return None
-            weight = None if taken <= REWEIGHTED else at.weight
+            weight = None if steps <= REWEIGHTED else at.weight
             return Solution(projection, there, ar1=at.ar1, weight=weight, variance=at.asked_variance)
 
         return trial
 
     def gain(at: Solution, trial: Solution) -> float | None:
-        against = at.cost if taken > REWEIGHTED else at.cost_at(trial.weight)
+        against = at.cost if steps > REWEIGHTED else at.cost_at(trial.weight)
         return against - trial.cost if trial.cost <= against * (1 + 1e-9) else None
 
-    return descend(Search(DAMPING, trials, gain), start, most)[0]
+    return descend(Search(DAMPING, trials, gain), start, max_steps)[0]
 
 
 class _Bend:
@@ -350,8 +350,8 @@ class _Bend:
             self.matrix = self.matrix + np.outer(missing, missing) / along
         curved = there.information + self.matrix
         size = np.sqrt(np.diag(there.information))
-        least = np.linalg.eigvalsh(curved / size / size[:, None])[0]
-        return curved if least > LEAST_BEND else there.information
+        smallest = np.linalg.eigvalsh(curved / size / size[:, None])[0]
+        return curved if smallest > LEAST_BEND else there.information
 
 
 def _solve(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
@@ -374,7 +374,7 @@ def _difference(before: SecondOrder, after: SecondOrder) -> np.ndarray:
     return np.array([longer, np.log(after.damping / before.damping), after.delay_s - before.delay_s])
 
 
-def _held(projection: Projection, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
+def _at_bound(projection: Projection, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
     """Which searched parameters are at a bound and would leave it."""
     values = np.array([linear.time_constant_s, linear.damping, linear.delay_s])[: gradient.size]
     bounds = np.array([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS, projection.grid.delay_bounds_s])[: gradient.size]
@@ -384,8 +384,8 @@ def _held(projection: Projection, linear: SecondOrder, gradient: np.ndarray) -> 
 
 def bounded(projection: Projection, linear: SecondOrder) -> SecondOrder:
     """The dynamics within the bounds of the search, with the delay that is given."""
-    found = linear.bounded(projection.grid.delay_bounds_s)
-    return found if projection.delay_s is None else replace(found, delay_s=projection.delay_s)
+    limited = linear.bounded(projection.grid.delay_bounds_s)
+    return limited if projection.delay_s is None else replace(limited, delay_s=projection.delay_s)
 
 
 LARGEST_AR1 = 0.995
@@ -432,12 +432,12 @@ def best_ar1(residual: np.ndarray, stretches: list[slice]) -> float:
         squares = np.maximum(lead - 2 * ar1 * lag + ar1 * ar1 * inner, 1e-24 * rows)
         return -0.5 * rows * np.log(squares) + 0.5 * len(stretches) * np.log1p(-ar1 * ar1)
 
-    low, high, found = -0.5, LARGEST_AR1, 0.0
+    low, high, optimum = -0.5, LARGEST_AR1, 0.0
     for _ in range(3):  # the score has one maximum: three scans, each finer, find it to 1e-5
         trial = np.linspace(low, high, 61)
         best = int(np.argmax(score(trial)))
-        low, high, found = float(trial[max(best - 1, 0)]), float(trial[min(best + 1, 60)]), float(trial[best])
-    return found
+        low, high, optimum = float(trial[max(best - 1, 0)]), float(trial[min(best + 1, 60)]), float(trial[best])
+    return optimum
 
 
 def ar1_or_white(residual: np.ndarray, stretches: list[slice]) -> tuple[float, float]:

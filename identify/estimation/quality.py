@@ -26,12 +26,12 @@ GOOD_GAP, LARGEST_GAP = 2.0, 8.0
 too much."""
 WITHIN_NOISE = 1.3
 """If the error is at most this many times the noise, it passes as noise, even if the torque hardly changes."""
-OWN = "the fitted pulses"
+FITTED_PULSES = "the fitted pulses"
 ANGLE_SLACK_RAD, VELOCITY_SLACK_RAD_S = 0.09, 0.1
 """Five degrees, and what a hand that holds still may move."""
 LARGEST_MOVE_RAD = math.radians(10)
 """Less is the give of a fixture."""
-SEEN = (0.01, 0.99)
+MOVED_QUANTILES = (0.01, 0.99)
 """Shares of the samples: between these angles the joint moved."""
 NEGLIGIBLE = 5e-4
 """Share of the torque's range below which the kind of an error does not matter."""
@@ -90,7 +90,7 @@ def range_warnings(model: Model, record: Record) -> list[str]:
 
 def _joint_warnings(model: Model, record: Record) -> list[str]:
     """Warnings if the joint was where, or moved as, it did not in the fitted rows."""
-    found, motion = [], record.motion
+    warnings, motion = [], record.motion
     for column, slack, name, unit in (
         (record.angle_rad, ANGLE_SLACK_RAD, "angle", "rad"),
         (record.velocity_rad_s if motion is None else motion.velocity_rad_s, VELOCITY_SLACK_RAD_S, "velocity", "rad/s"),
@@ -100,11 +100,11 @@ def _joint_warnings(model: Model, record: Record) -> list[str]:
             continue
         outside = float(np.mean(~((column >= span[0] - slack) & (column <= span[1] + slack))))
         if outside > 0.0:
-            found.append(
+            warnings.append(
                 f"in {max(100 * outside, 1):.0f} % of the samples the joint's {name} is outside {span[0]:.2f} to "
                 f"{span[1]:.2f} {unit}: the model was fitted there only"
             )
-    return found
+    return warnings
 
 
 def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) -> dict[str, Any]:
@@ -145,8 +145,8 @@ def _words(model: Model, bad: bool, reasons: list[str]) -> str:
     return f"The model fits {reached:.1f} % on {where}; the noise allows about {ceiling:.1f} %."
 
 
-def _gate(passed: bool, severity: str, says: str) -> dict[str, Any]:
-    return {"passed": bool(passed), "severity": severity, "says": "" if passed else says}
+def _gate(passed: bool, severity: str, message: str) -> dict[str, Any]:
+    return {"passed": bool(passed), "severity": severity, "says": "" if passed else message}
 
 
 def _stable(model: Model) -> dict[str, Any]:
@@ -160,11 +160,11 @@ def _stable(model: Model) -> dict[str, Any]:
 def _tame(model: Model) -> bool:
     """Whether held widths keep the torque in bounds: rates that switch can pump energy, though each alone damps."""
     rng, joint = np.random.default_rng(0), Surfaces.of(model.effects)
-    held = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
+    widths_us = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
     curve_nm = float(np.ptp(model.recruitment(np.linspace(0.0, model.recruitment.basis.largest_us, 101))))
-    motion = None if joint is None else Motion.held(joint.reference_rad, held.size)
+    motion = None if joint is None else Motion.still(joint.reference_rad, widths_us.size)
     try:
-        return bool(np.max(np.abs(above_rest(model, held, model.pulse_rate_hz, motion))) < TAME * curve_nm)
+        return bool(np.max(np.abs(above_rest(model, widths_us, model.pulse_rate_hz, motion))) < TAME * curve_nm)
     except RunsAway:
         return False
 
@@ -173,12 +173,12 @@ def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     """Whether stimulation changes the torque by more than the noise."""
     table = model.recruitment(np.linspace(0.0, float(np.max(grid.pulse_width_us)), 101))
     spread = float(np.ptp(table))
-    seen = float(np.ptp(grid.torque_nm[rows]))
-    finite = bool(np.all(np.isfinite(table))) and spread < 50 * max(seen, 1e-12)
+    measured_nm = float(np.ptp(grid.torque_nm[rows]))
+    finite = bool(np.all(np.isfinite(table))) and spread < 50 * max(measured_nm, 1e-12)
     if not finite:
         return _gate(False, "refuse", "the recruitment curve is far outside the measured torque")
-    says = "stimulation hardly changes the torque: check electrodes, current and load cell"
-    return _gate(spread > 4 * model.noise.block_sd_nm, "refuse", says)
+    message = "stimulation hardly changes the torque: check electrodes, current and load cell"
+    return _gate(spread > 4 * model.noise.block_sd_nm, "refuse", message)
 
 
 def _monotone(model: Model) -> dict[str, Any]:
@@ -187,14 +187,16 @@ def _monotone(model: Model) -> dict[str, Any]:
     sign = 1.0 if abs(table.max()) >= abs(table.min()) else -1.0
     dip = float(np.max(np.maximum.accumulate(sign * table) - sign * table))
     share = dip / max(float(np.ptp(table)), 1e-12)
-    says = f"the recruitment curve falls by {100 * share:.0f} % of its range at one place: its inverse jumps there"
-    return _gate(share <= LARGEST_DIP, "care", says)
+    message = f"the recruitment curve falls by {100 * share:.0f} % of its range at one place: its inverse jumps there"
+    return _gate(share <= LARGEST_DIP, "care", message)
 
 
 def _range(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     widths = np.unique(grid.pulse_width_us[rows])
-    says = f"only {widths.size} pulse widths were fitted: between them the recruitment curve is a guess; record a ramp"
-    return _gate(widths.size >= 8, "care", says)
+    message = (
+        f"only {widths.size} pulse widths were fitted: between them the recruitment curve is a guess; record a ramp"
+    )
+    return _gate(widths.size >= 8, "care", message)
 
 
 def _ceiling(model: Model) -> dict[str, Any]:
@@ -215,8 +217,8 @@ def _held_out(model: Model) -> dict[str, Any]:
     error, fitted_error = _statistic(model, "held_out_rms_nm"), _statistic(model, "rms_nm")
     if not np.isfinite(error) or not np.isfinite(fitted_error):
         return _gate(True, "care", "")
-    unforeseen = float(model.fit.get("unforeseen_nm", 0.0))
-    like = float(np.hypot(max(fitted_error, model.noise.white_sd_nm), unforeseen))
+    unpredictable_nm = float(model.fit.get("unforeseen_nm", 0.0))
+    like = float(np.hypot(max(fitted_error, model.noise.white_sd_nm), unpredictable_nm))
     return _gate(
         error <= max(1.5 * like, NEGLIGIBLE * np.ptp(model.valid_for["torque_nm"])),
         "care",
@@ -233,24 +235,24 @@ def _gap(model: Model) -> dict[str, Any]:
     reached, ceiling, where, error = _reach(model)
     gap = ceiling - reached
     noise = float(np.hypot(model.noise.white_sd_nm, model.fit.get("unforeseen_nm", 0.0)))
-    says = f"on {where} the fit is {reached:.1f} %, and the noise allows {ceiling:.1f} %"
+    message = f"on {where} the fit is {reached:.1f} %, and the noise allows {ceiling:.1f} %"
     unseen = _statistic(model, "held_out_rms_nm")
-    if where == OWN and np.isfinite(unseen):
+    if where == FITTED_PULSES and np.isfinite(unseen):
         gap, error = 100.0 * (unseen - noise) * (1.0 - reached / 100.0) / max(error, 1e-300), unseen
         pulses = held_out_pulses(model.fit)
-        says = f"on {pulses}, whose torque is constant, the error is {unseen:.3g} N·m (noise {noise:.3g} N·m)"
+        message = f"on {pulses}, whose torque is constant, the error is {unseen:.3g} N·m (noise {noise:.3g} N·m)"
     if not np.isfinite(gap):
         return _gate(True, "care", "")
     far = gap > LARGEST_GAP and not error <= WITHIN_NOISE * noise
     much = "too much" if far else "something"
-    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{says}: {much} is missing; see the diagnosis")
+    return _gate(gap <= GOOD_GAP, "refuse" if far else "care", f"{message}: {much} is missing; see the diagnosis")
 
 
 def _reach(model: Model) -> tuple[float, float, str, float]:
     """Fit, ceiling, name of the rows and error there: of the held-out pulses, unless the torque is constant there."""
     prefix, where = "held_out_", held_out_pulses(model.fit)
     if not np.isfinite(_statistic(model, "held_out_fit_percent")):
-        prefix, where = "", OWN
+        prefix, where = "", FITTED_PULSES
     names = ("fit_percent", "ceiling_percent", "rms_nm")
     reached, ceiling, error = (_statistic(model, prefix + name) for name in names)
     return reached, ceiling, where, error
@@ -275,17 +277,21 @@ def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray, moving: bool) -> 
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
     little = moved_rad <= LARGEST_MOVE_RAD or _reach(model)[3] <= WITHIN_NOISE * model.noise.white_sd_nm
-    says = f"the joint moved by {math.degrees(moved_rad):.0f}°, and the model is one of a joint at rest"
-    return _gate(little, "care", f"{says}: hold it still, or add what depends on the joint")
+    message = f"the joint moved by {math.degrees(moved_rad):.0f}°, and the model is one of a joint at rest"
+    return _gate(little, "care", f"{message}: hold it still, or add what depends on the joint")
 
 
 def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
     """Whether the joint moved in the tests of a model of a joint that moves."""
     if grid.angle_rad is None or not moving:
         return _gate(True, "care", "")
-    moved_rad = float(np.diff(np.quantile(grid.angle_rad[rows], SEEN))[0])  # one spike of the sensor is no movement
-    says = f"the joint moved by {math.degrees(moved_rad):.0f}° only: what depends on it is a guess; move it in a test"
-    return _gate(moved_rad > LARGEST_MOVE_RAD, "care", says)
+    moved_rad = float(
+        np.diff(np.quantile(grid.angle_rad[rows], MOVED_QUANTILES))[0]
+    )  # one spike of the sensor is no movement
+    message = (
+        f"the joint moved by {math.degrees(moved_rad):.0f}° only: what depends on it is a guess; move it in a test"
+    )
+    return _gate(moved_rad > LARGEST_MOVE_RAD, "care", message)
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:

@@ -58,54 +58,54 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
         intervals). None where it is not known.
     """
     usable = grid.comparable & (rows | grid.held_out)
-    least = LEAST_S / grid.step_s
+    min_rows = LEAST_S / grid.step_s
     group, size = _groups(np.where(usable, grid.repeats, -1))
     at = np.flatnonzero(group >= 0)
-    if at.size - size.size >= least:
+    if at.size - size.size >= min_rows:
         torque = grid.torque_nm[at]
         mean = np.bincount(group[at], torque) / size
         variance = float(np.sum((torque - mean[group[at]]) ** 2)) / (at.size - size.size)
-        found = UNKNOWN | {"found_by": EXACT, "repeats": at.size / size.size}
-        at = _unseen(grid, at, least)
+        result = UNKNOWN | {"found_by": EXACT, "repeats": at.size / size.size}
+        at = _unseen(grid, at, min_rows)
         repeating = float(np.var(mean[group[at]]) - variance * np.mean(1.0 / size[group[at]]))
-        found |= _plain_repetition(grid, error_nm, group, least)
+        result |= _plain_repetition(grid, error_nm, group, min_rows)
     else:
         lowest_us = float(grid.pulse_width_us.min())  # taken as rest where the width never becomes 0
         rests = usable & ~grid.held_out & relaxed(grid, FORGOTTEN_S, lowest_us)
-        at = _unseen(grid, np.flatnonzero(usable & ~rests), least)
+        at = _unseen(grid, np.flatnonzero(usable & ~rests), min_rows)
         variance, free = scatter_at_rest(grid, rests, grid.torque_nm)
-        if free < least or not at.size:
+        if free < min_rows or not at.size:
             return dict(UNKNOWN)
-        found = UNKNOWN | {"found_by": ESTIMATE}
+        result = UNKNOWN | {"found_by": ESTIMATE}
         repeating = float(np.var(grid.torque_nm[at])) - variance
     model = float(np.mean(error_nm[at] ** 2))
-    found |= {"rms_nm": variance**0.5, "model_rms_nm": model**0.5}
-    if floor_nm(found) is not None and repeating > LEAST_SHARE * float(np.var(grid.torque_nm[at])):
+    result |= {"rms_nm": variance**0.5, "model_rms_nm": model**0.5}
+    if floor_nm(result) is not None and repeating > LEAST_SHARE * float(np.var(grid.torque_nm[at])):
         share = 1.0 - (model - variance) / repeating
-        found["explained_percent"] = 100.0 * float(np.clip(share, 0.0, 1.0))
-    return found | {"seconds": at.size * grid.step_s}
+        result["explained_percent"] = 100.0 * float(np.clip(share, 0.0, 1.0))
+    return result | {"seconds": at.size * grid.step_s}
 
 
 def _groups(label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The groups of at least two intervals, numbered from 0 (shape (K,), else -1), and their sizes."""
     labels, place, size = np.unique(label, return_inverse=True, return_counts=True)
-    kept = (labels >= 0) & (size > 1)
-    return np.where(kept, np.cumsum(kept) - 1, -1)[place], size[kept]
+    repeated = (labels >= 0) & (size > 1)
+    return np.where(repeated, np.cumsum(repeated) - 1, -1)[place], size[repeated]
 
 
-def _unseen(grid: Grid, at: np.ndarray, least: float) -> np.ndarray:
+def _unseen(grid: Grid, at: np.ndarray, min_rows: float) -> np.ndarray:
     """Those of some intervals that are in `validate`, if there are enough; else all."""
     unseen = at[grid.held_out[at]]
-    return unseen if unseen.size >= least else at
+    return unseen if unseen.size >= min_rows else at
 
 
-def _plain_repetition(grid: Grid, error_nm: np.ndarray, group: np.ndarray, least: float) -> dict[str, float]:
+def _plain_repetition(grid: Grid, error_nm: np.ndarray, group: np.ndarray, min_rows: float) -> dict[str, float]:
     """The error on `validate` of the mean of the repeats elsewhere, and the model's on the same intervals."""
-    seen, unseen = (np.flatnonzero((group >= 0) & (grid.held_out == held)) for held in (False, True))
-    count = np.bincount(group[seen], minlength=int(group.max()) + 1)
-    mean = np.bincount(group[seen], grid.torque_nm[seen], count.size) / np.maximum(count, 1)
+    fitted, unseen = (np.flatnonzero((group >= 0) & (grid.held_out == is_held_out)) for is_held_out in (False, True))
+    count = np.bincount(group[fitted], minlength=int(group.max()) + 1)
+    mean = np.bincount(group[fitted], grid.torque_nm[fitted], count.size) / np.maximum(count, 1)
     unseen = unseen[count[group[unseen]] > 0]
-    if unseen.size < least:
+    if unseen.size < min_rows:
         return {}
     plain = grid.torque_nm[unseen] - mean[group[unseen]]
     return {

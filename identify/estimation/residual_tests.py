@@ -193,7 +193,7 @@ def _structure(fitted: Fitted, white: np.ndarray, taken: np.ndarray) -> dict[str
     problem, setup = fitted.problem, fitted.problem.setup
     mean = np.nan_to_num(setup.target_nm - fitted.residual_nm)
     # At the times at which the pulses truly came.
-    drive = setup.grid.held(fitted.physical[problem.coefficients] @ setup.design)
+    drive = setup.grid.interval_means(fitted.physical[problem.coefficients] @ setup.design)
     time = np.linspace(-1.0, 1.0, setup.grid.size)
     rate = np.gradient(mean)
     signals = np.stack([time, time * mean, mean**2, np.abs(rate), np.abs(drive - mean) * mean, time * drive])

@@ -27,9 +27,9 @@ def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         since_s = grid.step_s * since_pulse(grid, strongest_us)
         if np.max(since_s[rows]) >= 2.0 * RELAXED_S:
             break
-    found = [_level(grid.torque_nm, since_s, rows & (grid.part == part)) for part in range(grid.begins.size)]
-    known = [pair for pair in found if pair is not None]
-    level_nm, sd_nm = np.array([pair or known[0] for pair in found]).T
+    levels = [_level(grid.torque_nm, since_s, rows & (grid.part == part)) for part in range(grid.begins.size)]
+    known = [pair for pair in levels if pair is not None]
+    level_nm, sd_nm = np.array([pair or known[0] for pair in levels]).T
     return level_nm, sd_nm
 
 
@@ -60,7 +60,7 @@ def since_pulse(grid: Grid, strongest_us: float = 0.0) -> np.ndarray:
 
 def scatter_at_rest(grid: Grid, rests: np.ndarray, values_nm: np.ndarray) -> tuple[float, int]:
     """Variance of some values about a straight line in each rest, (N·m)², and from how many free rows; 0 from none."""
-    own = [rest for rest in grid.stretches(rests) if rest.stop - rest.start > SHORT]
-    left = [np.polyfit(grid.time_s[rest], values_nm[rest], 1, full=True)[1].sum() for rest in own]
-    free = sum(rest.stop - rest.start - 2 for rest in own)
-    return (float(sum(left)) / free if free else 0.0), free
+    long_rests = [rest for rest in grid.stretches(rests) if rest.stop - rest.start > SHORT]
+    squares = [np.polyfit(grid.time_s[rest], values_nm[rest], 1, full=True)[1].sum() for rest in long_rests]
+    free = sum(rest.stop - rest.start - 2 for rest in long_rests)
+    return (float(sum(squares)) / free if free else 0.0), free

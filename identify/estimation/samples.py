@@ -100,16 +100,16 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
     The phase of the hum refers to `start_s`, by default the time of the first sample.
     """
     own_s = record.time_s - (record.time_s[0] if start_s is None else start_s)
-    kept = ~record.held_out if record.doubted is None else ~record.held_out & ~record.doubted
+    usable = ~record.held_out if record.doubted is None else ~record.held_out & ~record.doubted
     torque = record.torque_nm
-    ceiling, floor = _flat(torque[kept]), _flat(-torque[kept])
-    known = runs(kept)
-    hum = find_hum(record, own_s, kept, known)
+    ceiling, floor = _flat(torque[usable]), _flat(-torque[usable])
+    known = runs(usable)
+    hum = find_hum(record, own_s, usable, known)
     if hum is not None:
         torque = torque - line(hum, own_s)
         torque = torque - hum_variation(record, torque, hum["frequency_hz"], known)
-    noise, readings = white_noise(record, kept, torque)
-    noise = min(noise, float(np.std(torque[kept])))  # jumps alone may seem more
+    noise, readings = white_noise(record, usable, torque)
+    noise = min(noise, float(np.std(torque[usable])))  # jumps alone may seem more
     return Raw(torque, noise, hum, ceiling, None if floor is None else -floor, readings)
 
 
@@ -156,10 +156,10 @@ def white_noise(record: Record, rows: np.ndarray, torque_nm: np.ndarray) -> tupl
     return float(np.sqrt(np.median(difference**2) / 0.4549 / gain)), None
 
 
-def find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray, known: list[slice]) -> dict[str, float] | None:
+def find_hum(record: Record, own_s: np.ndarray, usable: np.ndarray, known: list[slice]) -> dict[str, float] | None:
     """Parameters of the mains hum: a line at 50 or 60 Hz and its harmonics; None if there is none."""
     rate_hz = record.sample_rate_hz
-    if rate_hz < 99.0 or kept.sum() < 4 * rate_hz:
+    if rate_hz < 99.0 or usable.sum() < 4 * rate_hz:
         return None
     longest = max(known, key=lambda run: run.stop - run.start)
     # Differences whiten the spectrum of the muscle, so that neighbouring frequencies can be compared.
@@ -180,7 +180,7 @@ def find_hum(record: Record, own_s: np.ndarray, kept: np.ndarray, known: list[sl
     ratio, mains = best
     if ratio < LEAST_LINE or mains > 0.5 * rate_hz + 1e-6:
         return None
-    return _fit_hum(record, own_s, mains, kept)
+    return _fit_hum(record, own_s, mains, usable)
 
 
 def _line(power: np.ndarray, frequency: np.ndarray, centre_hz: float, reach_hz: float) -> float:
@@ -201,7 +201,7 @@ def hum_variation(record: Record, torque: np.ndarray, mains_hz: float, known: li
     width = 2 * max(round(rate_hz / record.pulse_rate_hz), 2) + 1
     box = np.ones(width) / width
     window = np.hanning(max(round(FOLLOWED_S * rate_hz), 8) + 2)[1:-1]
-    found = np.zeros(torque.size)
+    variation = np.zeros(torque.size)
     for run in known:
         part = torque[run]
         if part.size < 2 * window.size:
@@ -215,31 +215,31 @@ def hum_variation(record: Record, torque: np.ndarray, mains_hz: float, known: li
             half = np.pi * h * mains_hz / rate_hz
             passed = 1.0 - (np.sin(width * half) / (width * np.sin(half))) ** 2
             slow = np.convolve(high * np.conj(turn), window, "same") / np.maximum(weight, 1e-9)
-            found[run] += 2.0 * np.real(slow * turn) / passed
+            variation[run] += 2.0 * np.real(slow * turn) / passed
             h += 1
-    return found
+    return variation
 
 
-def _fit_hum(record: Record, time_s: np.ndarray, mains_hz: float, kept: np.ndarray) -> dict[str, float]:
+def _fit_hum(record: Record, time_s: np.ndarray, mains_hz: float, usable: np.ndarray) -> dict[str, float]:
     """Frequency and amplitudes, by least squares on the high-pass filtered torque."""
     rate_hz = record.sample_rate_hz
     width = max(round(rate_hz / record.pulse_rate_hz), 2)
     harmonics = [h for h in range(1, HARMONICS + 1) if h * mains_hz <= 0.5 * rate_hz + 1e-6]
     # Rows next to excluded ones are left out, since the filter would mix them.
-    kept = np.convolve(~kept, np.ones(4 * width + 1), "same") < 0.5
+    usable = np.convolve(~usable, np.ones(4 * width + 1), "same") < 0.5
 
     def smooth_out(values: np.ndarray) -> np.ndarray:
         box = np.ones(2 * width + 1) / (2 * width + 1)
         return values - np.apply_along_axis(lambda c: np.convolve(np.convolve(c, box, "same"), box, "same"), 0, values)
 
-    target = smooth_out(record.torque_nm)[kept]
+    target = smooth_out(record.torque_nm)[usable]
 
     def design(frequency_hz: float) -> np.ndarray:
         turn = 2 * np.pi * frequency_hz * time_s[:, None] * np.array(harmonics)
         return np.concatenate([np.cos(turn), np.sin(turn)], axis=1)
 
     def remaining(frequency_hz: float) -> tuple[float, np.ndarray]:
-        columns = smooth_out(design(frequency_hz))[kept]
+        columns = smooth_out(design(frequency_hz))[usable]
         solution = np.linalg.lstsq(columns, target, rcond=1e-6)[0]
         return float(np.sum((target - columns @ solution) ** 2)), solution
 

@@ -30,19 +30,19 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
     places = list(chosen.places)
     values = fitted.physical[places]
     names = [p.name for p in chosen.parameters]
-    found = shape(chosen.form, dict(zip(names, values.tolist(), strict=True)))
+    fitted_shape = shape(chosen.form, dict(zip(names, values.tolist(), strict=True)))
     normal = np.random.default_rng(0).standard_normal((DRAWS, len(places)))
-    drawn = values + normal @ square_root(matrix[np.ix_(places, places)])
+    draws = values + normal @ square_root(matrix[np.ix_(places, places)])
     bounds = np.array([(p.lower, p.upper) for p in chosen.parameters]).T
-    every = [_lines(shape, chosen.form, names, row) for row in np.clip(drawn, *bounds)]
+    every = [_lines(shape, chosen.form, names, row) for row in np.clip(draws, *bounds)]
     lines = {}
-    for name, line in found.lines.items():
-        lower, upper = np.percentile([one[name] for one in every], PERCENTILES, axis=0)
+    for name, line in fitted_shape.lines.items():
+        lower, upper = np.percentile([drawn_lines[name] for drawn_lines in every], PERCENTILES, axis=0)
         lines[name] = {"value": line.tolist(), "lower": lower.tolist(), "upper": upper.tolist()}
-    told = {key: getattr(found, key) for key in ("enters", "driven_by", "words", "driver", "effect")}
-    return told | {"at": found.at.tolist(), "lines": lines}
+    description = {key: getattr(fitted_shape, key) for key in ("enters", "driven_by", "words", "driver", "effect")}
+    return description | {"at": fitted_shape.at.tolist(), "lines": lines}
 
 
 def _lines(shape: Any, form: Form, names: list[str], row: np.ndarray) -> Mapping[str, np.ndarray]:
-    drawn: Shape = shape(form, dict(zip(names, row.tolist(), strict=True)))
-    return drawn.lines
+    drawn_shape: Shape = shape(form, dict(zip(names, row.tolist(), strict=True)))
+    return drawn_shape.lines

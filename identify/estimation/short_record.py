@@ -36,7 +36,9 @@ class Short:
     modes: tuple[Mode, ...]  # one for each kind of the curve's deviation from the known shape
     weights: np.ndarray  # their probabilities, shape (M,)
     noise: NoiseLevel  # of the intervals' means
-    likely: np.ndarray  # steps of the curve, baselines and initial states at the most probable mode, shape (n + E,)
+    most_probable: (
+        np.ndarray
+    )  # steps of the curve, baselines and initial states at the most probable mode, shape (n + E,)
     rise_us: float  # rise from 10 to 90 % for which the knots were made, µs
     strange: float  # probability that the curve is far from the known shape
 
@@ -109,7 +111,7 @@ def fit_short(
         return search.fit(before.linear, before.three, before.noise, draws)
     if last is not None:
         return search.fit(last.linear, last.mean, search.quiet, draws)
-    _, linear, three = min((search.scan(t) for t in STARTS_S), key=lambda found: found[0])
+    _, linear, three = min((search.scan(t) for t in STARTS_S), key=lambda scanned: scanned[0])
     return search.fit(linear, three, search.quiet, draws)
 
 
@@ -172,10 +174,10 @@ class _Search:
         mean = self.projection(basis).columns(linear) @ np.r_[np.cumsum(x[:n]), x[n:]]
         residual = np.where(self.grid.count > 0, self.sign * self.grid.torque_nm, 0.0) - mean
         sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
-        own = replace(self.quiet, sd_nm=max(sd, self.quiet.sd_nm))
+        white = replace(self.quiet, sd_nm=max(sd, self.quiet.sd_nm))
         slow, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)
         flat = -0.5 * float(self.rows.sum()) * (np.log(2 * np.pi * sd * sd) + 1.0)
-        return replace(slow, sd_nm=max(slow.sd_nm, own.sd_nm)) if likelihood > flat + CORRELATED else own
+        return replace(slow, sd_nm=max(slow.sd_nm, white.sd_nm)) if likelihood > flat + CORRELATED else white
 
     # ---- the curve ----
 
@@ -188,7 +190,7 @@ class _Search:
         rise = float(np.clip(LOGISTIC_RISE * np.exp(three[2]), 0.02 * self.largest_us, 0.8 * self.largest_us))
         middle = float(np.clip(three[1], 0.0, self.largest_us))
         basis = SplineBasis(dense_knots(self.largest_us, middle, rise, self.knots))
-        if self.near is not None and self._on(basis) and self._alike(middle, rise):
+        if self.near is not None and self._on(basis) and self._knots_suit(middle, rise):
             basis, rise = self.near.basis, self.near.rise_us
         else:
             self.near = None
@@ -199,7 +201,7 @@ class _Search:
         near = self.near
         return near is not None and near.largest_us == self.largest_us and near.basis.size == basis.size
 
-    def _alike(self, middle: float, rise: float) -> bool:
+    def _knots_suit(self, middle: float, rise: float) -> bool:
         """Whether the knots of the fit before this one still suit the curve."""
         assert self.near is not None
         moved = abs(middle - self.near.three[1])
@@ -225,10 +227,10 @@ class _Search:
                 inner[0, 0] += 1e-9 * max(inner[0, 0], 1e-300)
                 right = columns.T @ data.moment
                 right[1:] += data.precision @ data.mean
-                found = np.linalg.solve(inner, right)
-                cost = -float(right @ found)
-                if found[0] > 0.0 and cost < best:
-                    best, three = cost, np.array([np.log(found[0]), middle, np.log(width)])
+                solution = np.linalg.solve(inner, right)
+                cost = -float(right @ solution)
+                if solution[0] > 0.0 and cost < best:
+                    best, three = cost, np.array([np.log(solution[0]), middle, np.log(width)])
         return best, linear, three
 
     def fit(self, linear: SecondOrder, three: np.ndarray, noise: NoiseLevel, draws: int) -> Short:
@@ -239,26 +241,26 @@ class _Search:
         near = [] if self.near is None else list(self.near.modes)
         chosen = MIDDLING if self.near is None else int(np.argmax(self.near.weights))
         z = near[chosen].z[: 3 + n + extras] if near else posterior.start(three)
-        found, weights = posterior.mode(z, chosen), np.zeros(0)
+        mode, weights = posterior.mode(z, chosen), np.zeros(0)
         for turn in range(OUTER):
-            x = posterior.linear_of(found)
+            x = posterior.linear_of(mode)
             posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, x))
-            found = posterior.mode(np.r_[found.z[: 3 + n + extras], np.zeros(3)], chosen)
-            x = posterior.linear_of(found)
-            settled = bool(np.max(np.abs(x[n + extras :]) / _dynamics_sd(found)) < SETTLED)
+            mode = posterior.mode(np.r_[mode.z[: 3 + n + extras], np.zeros(3)], chosen)
+            x = posterior.linear_of(mode)
+            settled = bool(np.max(np.abs(x[n + extras :]) / _dynamics_sd(mode)) < SETTLED)
             linear = self.moved(linear, x[n + extras :])
             x = x[: n + extras]
             if not (settled or turn == OUTER - 1):
                 continue
             noise = self.noise(prior.basis, linear, x, noise)
             posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, x))
-            near = posterior.modes(np.r_[found.z[: 3 + n + extras], np.zeros(3)], near)
+            near = posterior.modes(np.r_[mode.z[: 3 + n + extras], np.zeros(3)], near)
             weights = _probabilities(near)
-            likely = int(np.argmax(weights))
-            if likely == chosen or turn == OUTER - 1:
+            kind = int(np.argmax(weights))
+            if kind == chosen or turn == OUTER - 1:
                 break
-            chosen, found = likely, near[likely]
-            linear = self.moved(linear, found.z[-3:])
+            chosen, mode = kind, near[kind]
+            linear = self.moved(linear, mode.z[-3:])
         return self._short(posterior, linear, noise, near, weights, draws)
 
     def _short(
@@ -272,8 +274,8 @@ class _Search:
     ) -> Short:
         prior = posterior.prior
         n, extras = prior.basis.size, self.others_mean.size
-        drawn = posterior.draws(modes, weights, draws, seed=draws)
-        dynamics = np.c_[np.exp(drawn[:, n + extras : -1]) * linear.core, linear.delay_s + drawn[:, -1]]
+        samples = posterior.draws(modes, weights, draws, seed=draws)
+        dynamics = np.c_[np.exp(samples[:, n + extras : -1]) * linear.core, linear.delay_s + samples[:, -1]]
         lower, upper = np.array([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS, self.grid.delay_bounds_s]).T
         best = posterior.linear_of(modes[int(np.argmax(weights))])
         return Short(
@@ -282,13 +284,13 @@ class _Search:
             basis=prior.basis,
             sign=self.sign,
             linear=self.moved(linear, best[n + extras :]),
-            coefficients_nm=np.cumsum(drawn[:, :n], axis=1),
+            coefficients_nm=np.cumsum(samples[:, :n], axis=1),
             dynamics=np.clip(dynamics, lower, upper),
-            others_nm=drawn[:, n : n + extras],
+            others_nm=samples[:, n : n + extras],
             modes=tuple(modes),
             weights=weights,
             noise=noise,
-            likely=best[: n + extras],
+            most_probable=best[: n + extras],
             rise_us=prior.rise_us,
             strange=float(sum(weights[i] for i, kind in enumerate(prior.deviations) if kind.sd > STRANGE)),
         )

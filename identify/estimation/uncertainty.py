@@ -20,7 +20,7 @@ from stimrig.identify.estimation.rests import RELAXED_S, scatter_at_rest, since_
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.joint_surface import POINTWISE
-from stimrig.identify.simulation.predict import same_data, slopes, unforeseen
+from stimrig.identify.simulation.predict import same_data, slopes, unpredictable_torque
 
 BLOCK_S = 3.0
 """Longer than a contraction's rise: within a block, what is wrong stays wrong."""
@@ -46,8 +46,8 @@ def covariance_of(fitted: Fitted) -> np.ndarray:
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
     values, vectors = np.linalg.eigh(fitted.hessian * scale[:, None] * scale[None, :])
-    told = values > 1e-14 * values.max()
-    root = scale[:, None] * vectors[:, told] / np.sqrt(values[told])
+    determined = values > 1e-14 * values.max()
+    root = scale[:, None] * vectors[:, determined] / np.sqrt(values[determined])
     gradients, information = _block_gradients(fitted)
     values, vectors = np.linalg.eigh(_beyond(root.T @ gradients, root.T @ information @ root))
     wider, held_back = root @ vectors * np.sqrt(np.maximum(values, 0.0)), _held_back(fitted)
@@ -63,11 +63,11 @@ def _beyond(gradients: np.ndarray, information: np.ndarray) -> np.ndarray:
     """
     blocks = gradients.shape[1]
     few = blocks / max(blocks - 1, 1)
-    found = few * gradients @ gradients.T
-    usual = information * float(np.trace(found) / max(np.trace(information), 1e-300))
-    scatter = few**2 * float(np.sum(np.sum(gradients**2, axis=0) ** 2)) - float(np.sum(found**2)) / blocks
-    share = np.clip(scatter / max(float(np.sum((found - usual) ** 2)), 1e-300), 0.0, 1.0)
-    return share * usual + (1.0 - share) * found - information
+    block_covariance = few * gradients @ gradients.T
+    usual = information * float(np.trace(block_covariance) / max(np.trace(information), 1e-300))
+    scatter = few**2 * float(np.sum(np.sum(gradients**2, axis=0) ** 2)) - float(np.sum(block_covariance**2)) / blocks
+    share = np.clip(scatter / max(float(np.sum((block_covariance - usual) ** 2)), 1e-300), 0.0, 1.0)
+    return share * usual + (1.0 - share) * block_covariance - information
 
 
 def _block_gradients(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
@@ -87,7 +87,7 @@ def _held_back(fitted: Fitted) -> np.ndarray:
     the smallest width played no further than a rising curve can be from zero.
     """
     mean, precision = fitted.problem.prior
-    at, found = fitted.problem.coefficients, np.zeros(fitted.theta.size)
+    at, largest_change = fitted.problem.coefficients, np.zeros(fitted.theta.size)
     prior = np.zeros_like(precision)
     prior[at, at] = precision[at, at]
     scale = 1.0 / np.sqrt(np.maximum(np.diag(fitted.hessian), 1e-300))
@@ -97,11 +97,11 @@ def _held_back(fitted: Fitted) -> np.ndarray:
     change = (eased @ (EASED * prior @ ((fitted.theta - mean) / scale)))[at]
     usual = eased @ (whole - (1.0 - (1.0 - EASED) ** 2) * prior) @ eased - np.linalg.inv(whole)
     values, vectors = np.linalg.eigh(usual[at, at])
-    told = values > NEGLIGIBLE * max(float(values.max()), 1e-300)
-    ratio = float(np.mean((vectors.T @ change)[told] ** 2 / values[told])) if told.any() else 0.0
+    determined = values > NEGLIGIBLE * max(float(values.max()), 1e-300)
+    ratio = float(np.mean((vectors.T @ change)[determined] ** 2 / values[determined])) if determined.any() else 0.0
     change *= scale[at] * np.sqrt(max(1.0 - 1.0 / max(ratio, 1.0), 0.0))
-    found[at] = _below_played(fitted, change) if change.any() else change
-    return found
+    largest_change[at] = _below_played(fitted, change) if change.any() else change
+    return largest_change
 
 
 def _below_played(fitted: Fitted, change: np.ndarray) -> np.ndarray:
@@ -112,12 +112,12 @@ def _below_played(fitted: Fitted, change: np.ndarray) -> np.ndarray:
     setup = fitted.problem.setup
     played = setup.grid.pulse_width_us[setup.fitted & (setup.grid.pulse_width_us > 0.0)]
     first, basis = float(played.min(initial=setup.basis.largest_us)), setup.basis
-    most = np.abs(basis.design(np.array([first])) @ np.c_[fitted.theta[fitted.problem.coefficients], change]).sum()
+    limit = np.abs(basis.design(np.array([first])) @ np.c_[fitted.theta[fitted.problem.coefficients], change]).sum()
     at_us = np.linspace(0.0, basis.largest_us, PLACES)
     design = basis.design(at_us)
     value = design @ change
-    held = np.where(at_us < first, np.clip(value, -most, most), value)
-    return change if np.array_equal(held, value) else np.linalg.lstsq(design, held, rcond=None)[0]
+    limited = np.where(at_us < first, np.clip(value, -limit, limit), value)
+    return change if np.array_equal(limited, value) else np.linalg.lstsq(design, limited, rcond=None)[0]
 
 
 def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
@@ -131,9 +131,9 @@ def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
     range_nm = float(np.ptp(fitted.problem.setup.grid.torque_nm[rows]))
     error = np.clip((fitted.residual_nm - held_out_change(fitted))[rows], -range_nm, range_nm)
     lever = (fitted.slopes / np.where(fitted.problem.log, fitted.physical, 1.0)[:, None])[:, rows]
-    noise, doubt = _noise_of_intervals(fitted)
+    noise, noise_error = _noise_of_intervals(fitted)
     more = float(np.mean(error**2)) - noise - float(np.sum(matrix * (lever @ lever.T))) / error.size
-    return float(np.sqrt(max(more - (2.0 * doubt) ** 2 / more, 0.0))) if more > 0.0 else 0.0
+    return float(np.sqrt(max(more - (2.0 * noise_error) ** 2 / more, 0.0))) if more > 0.0 else 0.0
 
 
 def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:
@@ -144,16 +144,16 @@ def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:
     """
     setup, noise = fitted.problem.setup, fitted.noise
     grid, rows = setup.grid, setup.fitted
-    alike = 0.0 if noise.is_white else noise.ar1**2
-    single = (1.0 - alike) / (1.0 + alike)
-    most, count = noise.sd_nm**2, single * float(rows.sum())
+    correlation = 0.0 if noise.is_white else noise.ar1**2
+    single = (1.0 - correlation) / (1.0 + correlation)
+    largest, count = noise.sd_nm**2, single * float(rows.sum())
     if noise.is_white:
-        return most, most * np.sqrt(2.0 / count)
+        return largest, largest * np.sqrt(2.0 / count)
     relaxed = rows & (grid.step_s * since_pulse(grid, 0.0) > RELAXED_S)
-    least = setup.noise_sd_nm**2 / float(np.median(grid.count[rows]))
+    smallest = setup.noise_sd_nm**2 / float(np.median(grid.count[rows]))
     at_rest, free = scatter_at_rest(grid, relaxed, fitted.residual_nm)
-    found = float(np.clip(at_rest, least, most)) if free else least
-    return found, found * float(np.sqrt(2.0 / count + 2.0 / max(single * free, 1.0)))
+    variance = float(np.clip(at_rest, smallest, largest)) if free else smallest
+    return variance, variance * float(np.sqrt(2.0 / count + 2.0 / max(single * free, 1.0)))
 
 
 def bands(model: Model) -> dict[str, Any]:
@@ -163,11 +163,11 @@ def bands(model: Model) -> dict[str, Any]:
         return {}
     width = np.linspace(0.0, model.recruitment.basis.largest_us, POINTS)
     time_s = np.linspace(0.0, linear.memory_s, POINTS)
-    found = np.zeros((width.size, len(covariance.names)))
+    curve_slopes = np.zeros((width.size, len(covariance.names)))
     # f's coefficients stand after the dynamics, before the effects (`effect.parameter`).
     last = len(covariance.names) - sum("." in name for name in covariance.names)
-    found[:, last - model.recruitment.basis.size : last] = model.recruitment.basis.design(width)
-    curve = _band(model.recruitment(width), found, covariance)
+    curve_slopes[:, last - model.recruitment.basis.size : last] = model.recruitment.basis.design(width)
+    curve = _band(model.recruitment(width), curve_slopes, covariance)
     step = _band(linear.step_response(time_s), step_slopes(linear, covariance, time_s), covariance)
     return {
         "level_percent": 95,
@@ -202,10 +202,10 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     grid = make_grid(record)
     sd = _sd(slopes(model, grid, covariance.names), covariance)
     middle = grid.start_s + (np.arange(grid.size) + float(np.mean(grid.fraction))) * grid.step_s
-    share = np.sqrt(sum(rms**2 for _, rms in unforeseen(model).values()))
+    share = np.sqrt(sum(rms**2 for _, rms in unpredictable_torque(model).values()))
     sd = np.hypot(sd, model.fit.get("unexplained_nm", 0.0))
-    seen = ~record.held_out if same_data(model, record) else np.zeros(record.time_s.size, bool)
-    half = POINTWISE * np.hypot(np.interp(record.time_s, middle, sd), np.where(seen, 0.0, share))
+    was_fitted = ~record.held_out if same_data(model, record) else np.zeros(record.time_s.size, bool)
+    half = POINTWISE * np.hypot(np.interp(record.time_s, middle, sd), np.where(was_fitted, 0.0, share))
     predicted = model.predict(record)
     return predicted - half, predicted + half
 

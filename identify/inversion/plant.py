@@ -173,7 +173,7 @@ def _later(model: Model, rate_hz: float, widest_us: float) -> float:
     plain = model.with_(effects=())
     half_s = []
     surfaces = Surfaces.of(model.effects)
-    held = None if surfaces is None else Motion.held(surfaces.reference_rad, size)
+    held = None if surfaces is None else Motion.still(surfaces.reference_rad, size)
     for one in (model, plain):
         step = np.abs(above_rest(one, np.full(size, widest_us), rate_hz, held))
         peak = int(np.argmax(step))

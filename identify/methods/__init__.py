@@ -33,8 +33,8 @@ class Method:
 def methods() -> dict[str, Method]:
     """Every method by its id."""
     modules = [import_module(f"{__name__}.{info.name}") for info in pkgutil.iter_modules(__path__)]
-    found = [module.METHOD for module in modules if isinstance(getattr(module, "METHOD", None), Method)]
-    return {method.id: method for method in sorted(found, key=lambda method: method.id)}
+    listed = [module.METHOD for module in modules if isinstance(getattr(module, "METHOD", None), Method)]
+    return {method.id: method for method in sorted(listed, key=lambda method: method.id)}
 
 
 def method_of(name: str) -> Method:

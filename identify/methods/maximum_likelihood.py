@@ -35,7 +35,7 @@ def power_series(first: Solution, order: int | None = None) -> tuple[Solution, s
     """Joint estimate with the power series (6), of given order or of smallest BIC, and the reason."""
     old = first.projection
     largest = float(np.max(old.grid.pulse_width_us))
-    found: dict[int, tuple[float, Solution]] = {}
+    fits: dict[int, tuple[float, Solution]] = {}
     linear = first.linear
     for power in [order] if order else range(1, HIGHEST_POWER + 1):
         basis = PowerBasis(power, largest)
@@ -43,10 +43,10 @@ def power_series(first: Solution, order: int | None = None) -> tuple[Solution, s
         solution = search(problem, linear)
         rows = sum(s.stop - s.start for s in problem.stretches)
         likelihood = log_likelihood(solution.residual_nm, problem.stretches, 0.0)
-        found[power] = (-2 * likelihood + power * np.log(rows), solution)
+        fits[power] = (-2 * likelihood + power * np.log(rows), solution)
         linear = solution.linear
-    best = min(found, key=lambda power: found[power][0])
-    return found[best][1], f"power series of order {best}" + ("" if order else ", by BIC")
+    best = min(fits, key=lambda power: fits[power][0])
+    return fits[best][1], f"power series of order {best}" + ("" if order else ", by BIC")
 
 
 def sigmoid(first: Solution) -> Solution:
@@ -81,8 +81,8 @@ def sigmoid(first: Solution) -> Solution:
     upper = [*bounds[:, 1], latest, np.log(2000.0 / largest), 1.2]
     x0 = [np.log(start.time_constant_s), np.log(start.damping), start.delay_s, steep, middle / largest]
     x0 = np.clip(x0, np.array(lower) + 1e-9, np.array(upper) - 1e-9)
-    found = least_squares(residual, x0, bounds=(lower, upper), x_scale=[0.05, 0.05, 0.005, 0.1, 0.02], xtol=1e-10)
-    return search(problem(found.x), linear(found.x), ar1=first.ar1, most=3)
+    optimum = least_squares(residual, x0, bounds=(lower, upper), x_scale=[0.05, 0.05, 0.005, 0.1, 0.02], xtol=1e-10)
+    return search(problem(optimum.x), linear(optimum.x), ar1=first.ar1, max_steps=3)
 
 
 def monotone(solution: Solution) -> np.ndarray:
@@ -129,8 +129,8 @@ def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fit
     delay_s = float(options["delay_s"]) if "delay_s" in options else None
     knots = int(options["knots"]) if "knots" in options else None
 
-    def solved(own: np.ndarray, white: bool) -> Solution:
-        return estimate(grid, still_rows(grid, own), knots, delay_s, white)[0]
+    def solved(selected: np.ndarray, white: bool) -> Solution:
+        return estimate(grid, still_rows(grid, selected), knots, delay_s, white)[0]
 
     solution = solved(rows, False)
     kind = str(options.get("recruitment", "spline"))
@@ -145,12 +145,12 @@ def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fit
         fix = "Give spline, power-series, sigmoid or near-sigmoid."
         raise BadRequest(f"unknown recruitment {kind!r}", place="recruitment", fix=fix)
     if flag(options.get("monotone", False), "monotone"):
-        fitted = to_fitted(solution, rows, most=0, coefficients=monotone(solution))
+        fitted = to_fitted(solution, rows, max_steps=0, coefficients=monotone(solution))
         return fitted, [reason, "recruitment constrained to be monotone"]
     if kind != "spline":
-        return to_fitted(solution, rows, most=0), [reason]
+        return to_fitted(solution, rows, max_steps=0), [reason]
     known = to_fitted(solution, rows)
-    best = chosen(grid, rows, known, lambda own, white: to_fitted(solved(own, white), own, white=white))
+    best = chosen(grid, rows, known, lambda selected, white: to_fitted(solved(selected, white), selected, white=white))
     return best, [reason, *words(best, rows)]
 
 
@@ -175,9 +175,9 @@ def _why(fitted: Fitted) -> list[str]:
     noise = fitted.noise
     slow = 100 * min(noise.share, 1.0)
     mixed = f"slow and white; {slow:.0f} % of the variance of the residual's means over pulse intervals is slow"
-    said = "white" if noise.is_white else mixed
+    kind = "white" if noise.is_white else mixed
     enough = "a white residual" if noise.is_white else "what is left is not white: slow noise, or see the diagnosis"
     return [
         f"second order: T {time_constant_s:.4g} s, damping {damping:.3g}, delay {1e3 * delay_s:.1f} ms; {enough}",
-        f"noise: {said}",
+        f"noise: {kind}",
     ]

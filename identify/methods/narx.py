@@ -33,13 +33,13 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     torque_scale = float(np.std(grid.torque_nm[rows])) or 1.0
     width_scale = float(np.max(grid.pulse_width_us)) or 1.0
     torque = (np.nan_to_num(grid.torque_nm) - baseline) / torque_scale
-    width = grid.held(grid.pulse_width_us) / width_scale
+    width = grid.interval_means(grid.pulse_width_us) / width_scale
     variables = [(0, lag) for lag in range(1, torque_lags + 1)] + [(1, lag) for lag in range(1, width_lags + 1)]
     degree = int(options.get("degree", 3))
     terms = [c for d in range(1, degree + 1) for c in combinations_with_replacement(range(len(variables)), d)]
     used = with_past(rows, max(torque_lags, width_lags))
-    past = np.stack([np.roll((torque, width)[kind], lag) for kind, lag in variables], axis=1)[used]
-    candidates = np.stack([np.prod(past[:, list(term)], axis=1) for term in terms], axis=1)
+    lagged = np.stack([np.roll((torque, width)[kind], lag) for kind, lag in variables], axis=1)[used]
+    candidates = np.stack([np.prod(lagged[:, list(term)], axis=1) for term in terms], axis=1)
     chosen, weights = forward_regression(candidates, torque[used], int(options.get("terms", MOST_TERMS)))
     recipe = {
         "variables": variables,
@@ -73,23 +73,23 @@ def name_of(term: tuple[int, ...], variables: list[tuple[int, int]]) -> str:
     return "·".join(f"{'yu'[variables[v][0]]}[k-{variables[v][1]}]" for v in term)
 
 
-def forward_regression(candidates: np.ndarray, target: np.ndarray, most: int) -> tuple[list[int], np.ndarray]:
+def forward_regression(candidates: np.ndarray, target: np.ndarray, max_terms: int) -> tuple[list[int], np.ndarray]:
     """Columns in the order of the error that they explain, until BIC rises, and their weights."""
-    rest, left, chosen = candidates.copy(), target.copy(), []
+    rest, residual, chosen = candidates.copy(), target.copy(), []
     size = target.size
-    best = size * np.log(max(float(left @ left) / size, 1e-300))
+    best = size * np.log(max(float(residual @ residual) / size, 1e-300))
     floor = 1e-10 * (rest**2).sum(axis=0)
-    for _ in range(most):
+    for _ in range(max_terms):
         power = (rest**2).sum(axis=0)
-        share = np.where(power > floor, (rest.T @ left) ** 2 / np.maximum(power, 1e-300), 0.0)
+        share = np.where(power > floor, (rest.T @ residual) ** 2 / np.maximum(power, 1e-300), 0.0)
         pick = int(np.argmax(share))
-        trial = max(float(left @ left) - float(share[pick]), 1e-300)
+        trial = max(float(residual @ residual) - float(share[pick]), 1e-300)
         bic = size * np.log(trial / size) + (len(chosen) + 1) * np.log(size)
         if bic >= best:
             break
         best, direction = bic, rest[:, pick] / np.sqrt(power[pick])
         chosen.append(pick)
-        left = left - direction * (direction @ left)
+        residual = residual - direction * (direction @ residual)
         rest = rest - direction[:, None] * (direction @ rest)
     weights = np.linalg.lstsq(candidates[:, chosen], target, rcond=None)[0] if chosen else np.zeros(0)
     return chosen, weights

@@ -82,12 +82,12 @@ def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.n
     columns = basis.design(np.clip((np.arange(grid.size) - first) * grid.step_s, 0.0, span))
     columns[last + 1 :] = 0.0
     # The torque that is left from earlier stimulation at the start of the ramp decays by the same dynamics.
-    left, idle = np.zeros((grid.size, 2)), np.zeros(grid.size - first)
+    decaying, idle = np.zeros((grid.size, 2)), np.zeros(grid.size - first)
     for column, state in enumerate(np.eye(2)):
         states = boundary_states(linear.time_constant_s, linear.damping, grid.step_s, idle, (state[0], state[1]))
-        left[first:, column] = states[0][:-1]
+        decaying[first:, column] = states[0][:-1]
     baseline = quiet_level(grid)
-    design = np.c_[linear.on_grid(grid, columns), left][rows]
+    design = np.c_[linear.on_grid(grid, columns), decaying][rows]
     target = grid.torque_nm[rows] - baseline
     size = basis.size
     gram, moment = design.T @ design, design.T @ target

@@ -38,8 +38,8 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     if rows.sum() <= taps + 4:
         fix = "Record longer, or use fewer taps."
         raise NotIdentifiable(f"{int(rows.sum())} pulse intervals are too few for {taps} taps", fix=fix)
-    seen = grid.pulse_width_us[rows]
-    if not np.ptp(seen) > 0:
+    widths_us = grid.pulse_width_us[rows]
+    if not np.ptp(widths_us) > 0:
         raise NotIdentifiable("the pulse width never changes", fix="Record a PRBS and a ramp.")
     basis, response = separate(grid, rows, taps)
     gain = float(response.sum())
@@ -62,7 +62,7 @@ def separate(grid: Grid, rows: np.ndarray, taps: int) -> tuple[SigmoidBasis, np.
     levels, place = np.unique(width, return_inverse=True)
 
     def design(basis: SigmoidBasis) -> np.ndarray:
-        drive = grid.held(basis.design(levels)[:, 0][place])
+        drive = grid.interval_means(basis.design(levels)[:, 0][place])
         return np.stack([*(shifted(drive, lag)[rows] for lag in range(taps)), np.ones(int(rows.sum()))], axis=1)
 
     def solve(basis: SigmoidBasis) -> tuple[np.ndarray, np.ndarray]:

@@ -39,7 +39,7 @@ from stimrig.identify.recruitment.smoothing import KNOTS, PILOT_KNOTS, adapted_k
 
 LARGEST_POLE = 0.9995
 MOST_DELAYS = 4
-DAMPING = Damping(first=1e-3, less=10.0, more=10.0, least=1e-12)
+DAMPING = Damping(first=1e-3, less=10.0, more=10.0, smallest=1e-12)
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def output_error(
     rows: np.ndarray,
     order: tuple[int, int, int],
     start: np.ndarray | None = None,
-    most: int = 40,
+    max_steps: int = 40,
 ) -> OutputError:
     """Minimise (12) over b, a and a baseline, for a given order (l, n, d): poles, zeros, delay.
 
@@ -144,10 +144,10 @@ def output_error(
         rough = equation_error(torque - _rest_level(torque, drive, rows), drive, rows, order)[1]
         start = _steiglitz_mcbride(target, drive, rows, order, stable(rough), lambda a: solve(a).cost)
     search = Search(DAMPING, trials, gain, lambda gained, _step: not gained > 1e-9)
-    found = descend(search, solve(start), most if poles else 0)[0]
-    theta, count, free = found.theta, int(rows.sum()), poles + zeros + 2
-    bic = count * np.log(max(found.cost / count, 1e-300)) + free * np.log(count)
-    return OutputError(theta[:-1], found.a, delay, float(theta[-1]), float(bic))
+    optimum = descend(search, solve(start), max_steps if poles else 0)[0]
+    theta, count, free = optimum.theta, int(rows.sum()), poles + zeros + 2
+    bic = count * np.log(max(optimum.cost / count, 1e-300)) + free * np.log(count)
+    return OutputError(theta[:-1], optimum.a, delay, float(theta[-1]), float(bic))
 
 
 def _rest_level(torque: np.ndarray, drive: np.ndarray, rows: np.ndarray) -> float:
@@ -221,7 +221,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     order = order_option(options.get("order", "second-order"))
     if order == "second-order" and not literal and not inverse:
         solution, reasons = physical(grid, prbs, ramp, iterations, knots)
-        return finish(METHOD.id, to_fitted(solution, solution.projection.rows, most=0), reasons)
+        return finish(METHOD.id, to_fitted(solution, solution.projection.rows, max_steps=0), reasons)
     return general(METHOD.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
 
 
@@ -296,30 +296,30 @@ def general(
     drive = straight_drive(grid, prbs) if prbs is not ramp else joint_drive(grid, prbs)
     fitted = near_rest(grid, prbs)
 
-    def linear_part(drive: np.ndarray, rows: np.ndarray, asked: str | tuple[int, int, int]) -> OutputError:
-        drive = grid.held(drive)
+    def linear_part(drive: np.ndarray, rows: np.ndarray, requested: str | tuple[int, int, int]) -> OutputError:
+        drive = grid.interval_means(drive)
         if literal:
-            chosen = asked if isinstance(asked, tuple) else (2, 1, 1)
+            chosen = requested if isinstance(requested, tuple) else (2, 1, 1)
             b, a = equation_error(torque - baseline, drive, rows, chosen)
-            gain_free = output_error(torque, drive, rows, chosen, start=stable(a), most=0)
+            gain_free = output_error(torque, drive, rows, chosen, start=stable(a), max_steps=0)
             return replace(gain_free, b=b, a=stable(a), baseline_nm=baseline, bic=0.0)
-        if isinstance(asked, tuple):
-            return output_error(torque, drive, rows, asked)
+        if isinstance(requested, tuple):
+            return output_error(torque, drive, rows, requested)
         best, why = choose_order(torque, drive, rows, earliest)
         reasons.extend(why)
         return best
 
     baseline = quiet_level(grid)
-    found = linear_part(drive, fitted, order)
-    chosen = (len(found.a) - 1, len(found.b) - 1, found.delay_samples)
+    linear_fit = linear_part(drive, fitted, order)
+    chosen = (len(linear_fit.a) - 1, len(linear_fit.b) - 1, linear_fit.delay_samples)
     rows = near_rest(grid, ramp)
     both = fitted | rows
-    curve = _curve_through(grid, found.block(grid.step_s, centre), rows, knots, baseline, inverse)
+    curve = _curve_through(grid, linear_fit.block(grid.step_s, centre), rows, knots, baseline, inverse)
     for _ in range(iterations):
-        found = linear_part(curve(grid.pulse_width_us), both, chosen)
-        curve = _curve_through(grid, found.block(grid.step_s, centre), rows, knots, baseline, inverse)
+        linear_fit = linear_part(curve(grid.pulse_width_us), both, chosen)
+        curve = _curve_through(grid, linear_fit.block(grid.step_s, centre), rows, knots, baseline, inverse)
     reasons.append(f"linear part (l, n, d) = {chosen}")
-    return finish_discrete(method_id, grid, both, found.block(grid.step_s, centre), curve, reasons)
+    return finish_discrete(method_id, grid, both, linear_fit.block(grid.step_s, centre), curve, reasons)
 
 
 def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
@@ -345,7 +345,7 @@ def _curve_through(
         return _from_inverse(grid, block, rows, knots, baseline_nm)
     # Least squares on the output: the columns of the spline are filtered, the torque is not.
     target = grid.torque_nm[rows] - baseline_nm
-    return _penalised(grid, lambda columns: block.filter(grid.held(columns))[rows], target, knots)
+    return _penalised(grid, lambda columns: block.filter(grid.interval_means(columns))[rows], target, knots)
 
 
 def _from_inverse(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
@@ -361,7 +361,7 @@ def _from_inverse(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, bas
     driven[:start] = 0.0
     with np.errstate(over="ignore", invalid="ignore"):
         w = np.clip(np.nan_to_num(recursion(b, driven)), -1e6, 1e6)
-    return _penalised(grid, lambda columns: grid.held(columns)[rows], w[rows], knots)
+    return _penalised(grid, lambda columns: grid.interval_means(columns)[rows], w[rows], knots)
 
 
 def _penalised(grid: Grid, respond, target: np.ndarray, knots: int) -> Curve:

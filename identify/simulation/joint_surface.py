@@ -70,7 +70,7 @@ class Surfaces:
 
         Raises BadModel: an effect or its form is unknown here, or the model does not say its reference angle.
         """
-        acting = [one for one in map(JointEffect.of, effects) if one.effect.moves_with_joint]
+        acting = [joint_effect for joint_effect in map(JointEffect.of, effects) if joint_effect.effect.moves_with_joint]
         if not acting:
             return None
         settings = effects[0].get("settings", {})
@@ -86,7 +86,7 @@ class Surfaces:
     @property
     def inertia_nm_s2_per_rad(self) -> float:
         """What the cell feels of an acceleration, N·m per rad/s², with the record's sign."""
-        return self._sign * sum(one.values.get(INERTIA, 0.0) for one in self.acting)
+        return self._sign * sum(joint_effect.values.get(INERTIA, 0.0) for joint_effect in self.acting)
 
     @cached_property
     def _sign(self) -> float:
@@ -97,9 +97,9 @@ class Surfaces:
         scene = self._scene(angle_rad, velocity_rad_s)
         large = np.full((1, scene.time_s.size), float(self.settings.get("scale_nm", 1.0)))
         torque = large
-        for one in self.acting:
-            if not one.adds:
-                torque = np.asarray(one.form.call(torque, _rows(one.values), scene))
+        for joint_effect in self.acting:
+            if not joint_effect.adds:
+                torque = np.asarray(joint_effect.form.call(torque, _rows(joint_effect.values), scene))
         return (torque / large).reshape(np.shape(angle_rad))
 
     def h_nm(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
@@ -109,9 +109,9 @@ class Surfaces:
         """
         scene = self._scene(angle_rad, velocity_rad_s)
         total = np.zeros((1, scene.time_s.size))
-        for one in self.acting:
-            if one.adds:
-                total = total + np.asarray(one.form.call(None, _rows(one.values), scene))
+        for joint_effect in self.acting:
+            if joint_effect.adds:
+                total = total + np.asarray(joint_effect.form.call(None, _rows(joint_effect.values), scene))
         return self._sign * total.reshape(np.shape(angle_rad))
 
     def _scene(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> Scene:
@@ -133,8 +133,10 @@ class Surfaces:
         """With one parameter, by its name in the covariance, changed."""
         effect, _, parameter = name.partition(".")
         acting = [
-            replace(one, values=one.values | {parameter: value}) if one.effect.id == effect else one
-            for one in self.acting
+            replace(joint_effect, values=joint_effect.values | {parameter: value})
+            if joint_effect.effect.id == effect
+            else joint_effect
+            for joint_effect in self.acting
         ]
         return Surfaces(tuple(acting), self.settings)
 
@@ -142,16 +144,22 @@ class Surfaces:
         self, names: Sequence[str], angle_rad: np.ndarray, velocity_rad_s: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Derivatives of g and of h by named parameters of the model, each of shape (len(names), *inputs' shape)."""
-        own = {f"{one.effect.id}.{name}": value for one in self.acting for name, value in one.values.items()}
-        found = np.zeros((2, len(names), *np.shape(angle_rad)))
+        values = {
+            f"{joint_effect.effect.id}.{name}": value
+            for joint_effect in self.acting
+            for name, value in joint_effect.values.items()
+        }
+        derivatives = np.zeros((2, len(names), *np.shape(angle_rad)))
         for place, name in enumerate(names):
-            if name not in own:
+            if name not in values:
                 continue
-            step = STEP * max(abs(own[name]), 0.01)
-            up, down = self._with(name, own[name] + step), self._with(name, own[name] - step)
-            found[0, place] = (up.g(angle_rad, velocity_rad_s) - down.g(angle_rad, velocity_rad_s)) / (2 * step)
-            found[1, place] = (up.h_nm(angle_rad, velocity_rad_s) - down.h_nm(angle_rad, velocity_rad_s)) / (2 * step)
-        return found[0], found[1]
+            step = STEP * max(abs(values[name]), 0.01)
+            up, down = self._with(name, values[name] + step), self._with(name, values[name] - step)
+            derivatives[0, place] = (up.g(angle_rad, velocity_rad_s) - down.g(angle_rad, velocity_rad_s)) / (2 * step)
+            derivatives[1, place] = (up.h_nm(angle_rad, velocity_rad_s) - down.h_nm(angle_rad, velocity_rad_s)) / (
+                2 * step
+            )
+        return derivatives[0], derivatives[1]
 
 
 def joint_tables(
@@ -179,7 +187,7 @@ def joint_tables(
     shares = np.array(SPEEDS)
     velocities = fastest * np.r_[-shares[:0:-1], shares]
     x, v = np.meshgrid(angles, velocities, indexing="ij")
-    found = {
+    tables = {
         "reference_angle_rad": surfaces.reference_rad,
         "angle_rad": angles,
         "velocity_rad_s": velocities,
@@ -188,13 +196,13 @@ def joint_tables(
         "inertia_nm_s2_per_rad": surfaces.inertia_nm_s2_per_rad,
         "formula": {
             "torque": FORMULA,
-            "g": [one.form.equation for one in surfaces.acting if not one.adds],
-            "h": [one.form.equation for one in surfaces.acting if one.adds],
+            "g": [joint_effect.form.equation for joint_effect in surfaces.acting if not joint_effect.adds],
+            "h": [joint_effect.form.equation for joint_effect in surfaces.acting if joint_effect.adds],
         },
-        "seen_g": _seen(angles, velocities, angle_rad[at_work], velocity_rad_s[at_work]),
-        "seen_h": _seen(angles, velocities, angle_rad, velocity_rad_s),
+        "seen_g": _cell_counts(angles, velocities, angle_rad[at_work], velocity_rad_s[at_work]),
+        "seen_h": _cell_counts(angles, velocities, angle_rad, velocity_rad_s),
     }
-    return found | _bands(surfaces, names, matrix, x, v, found["g"], found["h_nm"])
+    return tables | _bands(surfaces, names, matrix, x, v, tables["g"], tables["h_nm"])
 
 
 def _bands(
@@ -203,15 +211,17 @@ def _bands(
     rows = [place for place, name in enumerate(names) if "." in name]
     matrix = matrix[np.ix_(rows, rows)]
     slopes = surfaces.slopes([names[row] for row in rows], x, v)
-    found: dict[str, Any] = {"level_percent": 95}
+    bands: dict[str, Any] = {"level_percent": 95}
     for name, unit, value, slope in (("g", "", g, slopes[0]), ("h", "_nm", h_nm, slopes[1])):
         variance = np.einsum("iab,ij,jab->ab", slope, matrix, slope, optimize=True)
         half = WIDER[name] * POINTWISE * np.sqrt(np.maximum(variance, 0.0))
-        found |= {f"{name}_lower{unit}": (value - half).round(6), f"{name}_upper{unit}": (value + half).round(6)}
-    return found
+        bands |= {f"{name}_lower{unit}": (value - half).round(6), f"{name}_upper{unit}": (value + half).round(6)}
+    return bands
 
 
-def _seen(angles: np.ndarray, velocities: np.ndarray, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
+def _cell_counts(
+    angles: np.ndarray, velocities: np.ndarray, angle_rad: np.ndarray, velocity_rad_s: np.ndarray
+) -> np.ndarray:
     """Number of the given points nearest to each cell of the table, shape (len(angles), len(velocities))."""
     edges = [np.r_[-np.inf, 0.5 * (axis[1:] + axis[:-1]), np.inf] for axis in (angles, velocities)]
     return np.histogram2d(angle_rad, velocity_rad_s, bins=edges)[0].astype(int)

@@ -62,9 +62,9 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
 
     No measured torque is used: a controller would predict the same. The angle is smoothed both ways, as a whole record
     is there; with an `earlier_trial` of the same movement from what was read until the end of the pulse interval alone,
-    as a controller has it while the joint moves: the earlier trial tells how noisy the sensor is and how the joint
-    moves in general; nothing else asks for one. What cannot be foreseen (`unforeseen`) is included only on the rows
-    that it was fitted on.
+    as a controller has it while the joint moves: the earlier trial shows how noisy the sensor is and how the joint
+    moves in general; it serves no other purpose. Torque that cannot be predicted (`unpredictable_torque`) is included
+    only on the rows that it was fitted on.
 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, the record lacks a column
     it needs, or the torque grows without limit. Raises BadRequest: in the earlier trial no joint moves, or it is
@@ -89,10 +89,10 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
         raise BadRequest("in the earlier trial no joint moves", fix="Give a trial of the same movement and sensor.")
     problem, theta = problem_of(model, grid)
     first = [part.first for part in record.parts]
-    told = earlier_trial.time_s, earlier_trial.angle_rad
-    motion = JointMotion.until_then(record.time_s, record.angle_rad, first, told)
+    earlier_movement = earlier_trial.time_s, earlier_trial.angle_rad
+    motion = JointMotion.until_then(record.time_s, record.angle_rad, first, earlier_movement)
     moved = _moved(problem, motion.extrapolated(problem.setup.angle_late_s), angle_late_s=0.0)
-    return _refuse_runaway(model, record, _foreseen(model, record, moved, theta))
+    return _refuse_runaway(model, record, _predict_samples(model, record, moved, theta))
 
 
 def _tells_movement(angle_rad: np.ndarray) -> bool:
@@ -112,7 +112,9 @@ def _refuse_runaway(model: Muscle, record: Record, torque_nm: np.ndarray) -> np.
 
 def _moved(problem: Problem, motion: JointMotion, **changes: float) -> Problem:
     """The problem with the joint moving in another way."""
-    return Problem(problem.setup.with_(motion=motion, **changes), [(one.effect, one.form) for one in problem.chosen])
+    return Problem(
+        problem.setup.with_(motion=motion, **changes), [(chosen.effect, chosen.form) for chosen in problem.chosen]
+    )
 
 
 def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
@@ -120,26 +122,31 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
     if isinstance(model.linear, Discrete) and not model.effects:
         linear, widths_us, narx = model.linear, grid.pulse_width_us, model.extra.get("narx")
         if narx:
-            return linear.between(grid, run_narx(narx, grid.held(widths_us)) + narx["baseline_nm"])
+            return linear.between(grid, run_narx(narx, grid.interval_means(widths_us)) + narx["baseline_nm"])
         return linear.between(grid, linear.on_grid(grid, model.recruitment(widths_us))) + model.baseline_nm
-    return _foreseen(model, grid.record, *problem_of(model, grid))
+    return _predict_samples(model, grid.record, *problem_of(model, grid))
 
 
-def _foreseen(model: Muscle, record: Record, problem: Problem, theta: np.ndarray) -> np.ndarray:
+def _predict_samples(model: Muscle, record: Record, problem: Problem, theta: np.ndarray) -> np.ndarray:
     """Torque at the samples; on held-out pulses of its own record without what cannot be foreseen."""
-    whole, own = problem.at_samples(theta), unforeseen(model)
-    if not own or not same_data(model, record):
+    whole, unpredictable = problem.at_samples(theta), unpredictable_torque(model)
+    if not unpredictable or not same_data(model, record):
         return whole
-    foreseen = problem.at_samples(theta, frozenset(own)) + sum(mean for mean, _ in own.values())
-    return np.where(record.held_out, foreseen, whole)
+    predictable_nm = problem.at_samples(theta, frozenset(unpredictable)) + sum(
+        mean for mean, _ in unpredictable.values()
+    )
+    return np.where(record.held_out, predictable_nm, whole)
 
 
-def unforeseen(model: Muscle) -> dict[str, tuple[float, float]]:
+def unpredictable_torque(model: Muscle) -> dict[str, tuple[float, float]]:
     """What cannot be foreseen on another record, by effect: its mean in the fitted rows of its own, which stays as a
     zero, and its root mean square there (a zero may also be where it began), N·m.
     """
-    told = {e["id"]: e.get("unforeseen", {}) for e in model.effects if not find_effect(e["id"]).predictable}
-    return {effect: (said.get("mean_nm", 0.0), said.get("rms_nm", 0.0)) for effect, said in told.items()}
+    entries = {e["id"]: e.get("unforeseen", {}) for e in model.effects if not find_effect(e["id"]).predictable}
+    return {
+        effect: (statistics.get("mean_nm", 0.0), statistics.get("rms_nm", 0.0))
+        for effect, statistics in entries.items()
+    }
 
 
 def problem_of(
@@ -177,15 +184,15 @@ def problem_of(
     )
     acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]
     for entry in model.effects:
-        own = JointEffect.of(entry)
-        if not own.effect.predictable and not own_record:
+        joint_effect = JointEffect.of(entry)
+        if not joint_effect.effect.predictable and not own_record:
             baseline_nm += entry.get("unforeseen", {}).get("mean_nm", 0.0)
             continue
-        for need in own.effect.needs:
+        for need in joint_effect.effect.needs:
             if not grid.record.knows(need):
                 fix = "Record this column, or fit without the effect."
-                raise BadModel(f"{own.effect.id} needs the column {need}", place=need, fix=fix)
-        acting.append((own.effect.id, own.form, [*own.values.values()]))
+                raise BadModel(f"{joint_effect.effect.id} needs the column {need}", place=need, fix=fix)
+        acting.append((joint_effect.effect.id, joint_effect.form, [*joint_effect.values.values()]))
     acting += [(form.name, form, values) for form, values in further if form.stage != "gain"]
     _refuse_ignored([(name, form) for name, form, _ in acting])
     problem = Problem(setup, [(name, form) for name, form, _ in acting])
@@ -197,7 +204,7 @@ def problem_of(
         values[np.array(problem.baselines)[grid.part[grid.starts[: len(parts)]]]] = setup.to_muscle(parts[:, 0])
         values[list(problem.initials)[: 2 * len(parts)]] = setup.sign * parts[:, 1:].ravel()
     values[problem.coefficients] = setup.sign * model.recruitment.coefficients_nm
-    values[problem.coefficients.stop :] = [value for *_, given in acting for value in given]
+    values[problem.coefficients.stop :] = [value for *_, form_values in acting for value in form_values]
     return problem, problem.from_physical(values)
 
 
@@ -215,11 +222,11 @@ def _refuse_ignored(acting: Sequence[tuple[str, Form]]) -> None:
 def sensor_cost_nm(problem: Problem, theta: np.ndarray) -> float:
     """Standard deviation of the torque owing to the angle's error, N·m: of the same movement, read another time."""
     grid = problem.setup.grid
-    record, again = grid.record, 0.0
+    record, difference_nm = grid.record, 0.0
     if record.motion is not None:
         motion = record.motion.read_again(record.time_s, [part.first for part in record.parts])
-        again = (_moved(problem, motion).run(theta)[0] - problem.run(theta)[0])[grid.comparable]
-    return float(np.sqrt(np.mean(np.square(again))))
+        difference_nm = (_moved(problem, motion).run(theta)[0] - problem.run(theta)[0])[grid.comparable]
+    return float(np.sqrt(np.mean(np.square(difference_nm))))
 
 
 def _own_angles(model: Muscle, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -240,10 +247,10 @@ def states_of(model: Muscle) -> dict[str, float]:
 
     Raises BadModel: a state is not a number from 0 to 1.
     """
-    given = {entry["id"]: entry["state"] for entry in model.effects if "state" in entry}
-    for effect, value in given.items():
+    states = {entry["id"]: entry["state"] for entry in model.effects if "state" in entry}
+    for effect, value in states.items():
         model_schema.check(value, model_schema.STATE, f"effects.{effect}.state")
-    return given
+    return states
 
 
 def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:

@@ -79,9 +79,9 @@ class Problem:
         table += [Parameter(f"recruitment_{i}_nm", "N·m", -np.inf, np.inf) for i in range(setup.basis.size)]
         self.chosen: list[Chosen] = []
         for effect, form in effects:
-            own = tuple(p.on(setup.scene) for p in form.parameters)
-            self.chosen.append(Chosen(effect, form, own, len(table)))
-            table += own
+            parameters = tuple(p.on(setup.scene) for p in form.parameters)
+            self.chosen.append(Chosen(effect, form, parameters, len(table)))
+            table += parameters
         self.table = table
         self.size = len(table)
         self.log = np.array([p.scale == "log" for p in table])
@@ -91,8 +91,8 @@ class Problem:
     @cached_property
     def names(self) -> tuple[str, ...]:
         """Names of all parameters; those of an effect start with its id: `fatigue.onset_s`."""
-        own = [f"{chosen.effect}.{p.name}" for chosen in self.chosen for p in chosen.parameters]
-        return (*(p.name for p in self.table[: self.coefficients.stop]), *own)
+        effect_parameters = [f"{chosen.effect}.{p.name}" for chosen in self.chosen for p in chosen.parameters]
+        return (*(p.name for p in self.table[: self.coefficients.stop]), *effect_parameters)
 
     def physical(self, theta: np.ndarray) -> np.ndarray:
         """Parameters in their units."""
@@ -160,9 +160,9 @@ class Problem:
 
     def states(self, theta: np.ndarray) -> dict[str, float]:
         """By effect id, the slow state that each effect with one (`Form.state`) has at the record's end, 0 to 1."""
-        found: dict[str, float] = {}
-        _StagePass(self, theta, False).gained(found)
-        return found
+        slow_states: dict[str, float] = {}
+        _StagePass(self, theta, False).gained(slow_states)
+        return slow_states
 
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
         """Torque at the record's samples, with its sign and zero, N·m; what effects in `skip` add is left out."""
@@ -188,10 +188,10 @@ class _StagePass:
     def join(self, places: range) -> np.ndarray:
         """Add a perturbed row for each of some parameters; their values in all rows, in their units, (M, places)."""
         present = len(self.owners) + 1
-        own = self.value[places.start : places.stop]
+        nominal = self.value[places.start : places.stop]
         if not self.derivatives:
-            return np.tile(own, (present, 1))
-        values = np.tile(own, (present + len(places), 1))
+            return np.tile(nominal, (present, 1))
+        values = np.tile(nominal, (present + len(places), 1))
         for i, place in enumerate(places):
             step = self.problem.step[place]
             if self.theta[place] + step > self.problem.upper[place]:
@@ -269,11 +269,13 @@ class _StagePass:
             places = range(problem.coefficients.start, problem.coefficients.stop)
             self.owners += [(place, float(s)) for place, s in zip(places, step, strict=True)]
             drive = np.concatenate([drive, drive[:1] + step[:, None] * design])
-        return setup.grid.held(drive, axis=1)
+        return setup.grid.interval_means(drive, axis=1)
 
     def dynamics(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         core, initial = self.join(range(2)), self.join(self.problem.initials)
-        speeds, lags = ([(one, self.join(one.places)) for one in self.forms(stage)] for stage in ("speed", "lags"))
+        speeds, lags = (
+            [(chosen, self.join(chosen.places)) for chosen in self.forms(stage)] for stage in ("speed", "lags")
+        )
         branches = [(drive, np.ones((len(drive), 1)))]
         for chosen, p in self.joined("branch"):
             branches = [
@@ -285,22 +287,22 @@ class _StagePass:
         self.cores, initial = self.grown(core), self.grown(initial)
         if lags and np.any(np.concatenate([values for _, values in lags], axis=None)):
             return self.respond_freely(branches, self.free_laws(lags, len(initial)), initial)
-        law, given = np.zeros((len(initial), len(Lag), len(SpeedLaw))), []
+        law, custom_laws = np.zeros((len(initial), len(Lag), len(SpeedLaw))), []
         for chosen, values in speeds:
             p = self.named(chosen, self.grown(values))
             if not chosen.form.law:
-                given.append((chosen.form, p))
-            for one in chosen.parameters:
-                column = chosen.form.law.get(one.name)
+                custom_laws.append((chosen.form, p))
+            for parameter in chosen.parameters:
+                column = chosen.form.law.get(parameter.name)
                 if isinstance(column, tuple):
-                    value = p[one.name][:, 0]
-                    law[:, *column] += np.log(value) if one.scale == "log" else value
+                    value = p[parameter.name][:, 0]
+                    law[:, *column] += np.log(value) if parameter.scale == "log" else value
         torque, rate = self.respond(branches, law, initial, np.zeros((0, 1)))
         # A speed law given as a Python function needs the torque: it is iterated, starting from the torque without it.
-        for _ in range(4 if given else 0):
+        for _ in range(4 if custom_laws else 0):
             drive, middle = self.grown(drive), 0.5 * (torque[:, 1:] + torque[:, :-1])
             factor = np.ones_like(drive)
-            for form, p in given:
+            for form, p in custom_laws:
                 factor = factor * np.asarray(form.call((drive, middle), p, self.setup.scene))
             if np.all(factor == 1.0):
                 break
@@ -316,8 +318,8 @@ class _StagePass:
         for part, slower in branches:
             core = self.cores * np.c_[slower, np.ones_like(slower)]
             drive = np.ascontiguousarray(part)
-            found = run_free(drive, setup.present, setup.scene.rest_s, core, laws, *shared)
-            torque, rate = torque + found[0], rate + found[1]
+            response = run_free(drive, setup.present, setup.scene.rest_s, core, laws, *shared)
+            torque, rate = torque + response[0], rate + response[1]
         return torque, rate
 
     def free_laws(self, lags: list[tuple[Chosen, np.ndarray]], rows: int) -> np.ndarray:
@@ -326,8 +328,8 @@ class _StagePass:
         for chosen, values in lags:
             for column, value in chosen.form.held.items():
                 laws[:, column] = value
-            for one, value in zip(chosen.parameters, self.grown(values).T, strict=True):
-                laws[:, chosen.form.law[one.name]] += value  # type: ignore
+            for parameter, value in zip(chosen.parameters, self.grown(values).T, strict=True):
+                laws[:, chosen.form.law[parameter.name]] += value  # type: ignore
         return laws
 
     def respond(
@@ -349,8 +351,10 @@ class _StagePass:
         self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray, present: int
     ) -> tuple[np.ndarray, np.ndarray]:
         """An output stage that multiplies: rows with the same parameters, the first `present` ones, share a factor."""
-        ends, own = self.setup.scene_at_ends, np.r_[0, np.arange(present, len(values))]
-        factor = np.asarray(chosen.form.call(np.ones((1, ends.time_s.size)), self.named(chosen, values[own]), ends))
+        ends, distinct = self.setup.scene_at_ends, np.r_[0, np.arange(present, len(values))]
+        factor = np.asarray(
+            chosen.form.call(np.ones((1, ends.time_s.size)), self.named(chosen, values[distinct]), ends)
+        )
         scaled = []
         for rows in (torque, rate):
             rows = rows.copy()
@@ -367,22 +371,22 @@ class _StagePass:
         bent = np.asarray(form.call(torque, p, ends))
         if np.array_equal(bent, torque):
             return bent, rate
-        ahead = self.setup.grid.step_s / 32.0
-        later = np.asarray(form.call(torque + ahead * rate, p, ends))
-        sooner = np.asarray(form.call(torque - ahead * rate, p, ends))
-        return bent, (later - sooner) / (2 * ahead)
+        lead_s = self.setup.grid.step_s / 32.0
+        later = np.asarray(form.call(torque + lead_s * rate, p, ends))
+        sooner = np.asarray(form.call(torque - lead_s * rate, p, ends))
+        return bent, (later - sooner) / (2 * lead_s)
 
     def read(self, torque: np.ndarray, rate: np.ndarray, delay: np.ndarray, owned: np.ndarray) -> np.ndarray:
         grid = self.setup.grid
         mean = np.empty((delay.size, grid.size))
-        alike: dict[tuple[float, Core | None], list[int]] = {}
+        rows_by_reading: dict[tuple[float, Core | None], list[int]] = {}
         for row, read in enumerate(zip(delay.tolist(), self.curves(), strict=True)):
-            alike.setdefault(read, []).append(row)
-        for (lag, core), rows in alike.items():
-            own = owned[rows]
-            if own[-1] - own[0] + 1 == own.size and np.all(np.diff(own) == 1):
-                own = slice(own[0], own[-1] + 1)
-            mean[rows] = read_means(torque[own], rate[own], *grid.mean_weights(lag, core))
+            rows_by_reading.setdefault(read, []).append(row)
+        for (lag, core), rows in rows_by_reading.items():
+            states = owned[rows]
+            if states[-1] - states[0] + 1 == states.size and np.all(np.diff(states) == 1):
+                states = slice(states[0], states[-1] + 1)
+            mean[rows] = read_means(torque[states], rate[states], *grid.mean_weights(lag, core))
         return mean
 
     def curves(self) -> list[Core | None]:
@@ -401,12 +405,12 @@ class _StagePass:
             if chosen.effect in skip:
                 continue
             # An added torque does not depend on the signal: rows with the same parameters share one evaluation.
-            own = np.r_[0, np.arange(present, len(value))]
+            distinct = np.r_[0, np.arange(present, len(value))]
             fine = chosen.form.fine and scene is self.setup.scene
             at = self.setup.scene_within if fine else scene
-            added = np.asarray(chosen.form.call(None, self.named(chosen, values[own]), at))
+            added = np.asarray(chosen.form.call(None, self.named(chosen, values[distinct]), at))
             if fine:
-                added = added.reshape(len(own), -1, WITHIN).mean(axis=2)
+                added = added.reshape(len(distinct), -1, WITHIN).mean(axis=2)
             value[:present] += added[:1]
             value[present:] += added[1:]
         return value
@@ -417,7 +421,7 @@ class _StagePass:
             value = self.grown(value)
             if chosen.effect in skip or (scene is None and chosen.form.fixed):  # the target was corrected for it
                 continue
-            seen = self.setup.to_record(value)
-            shown = np.asarray(chosen.form.call(seen, p, scene or self.setup.scene))
-            value = np.where(shown == seen, value, self.setup.to_muscle(shown))
+            record_nm = self.setup.to_record(value)
+            sensor_nm = np.asarray(chosen.form.call(record_nm, p, scene or self.setup.scene))
+            value = np.where(sensor_nm == record_nm, value, self.setup.to_muscle(sensor_nm))
         return value

@@ -28,12 +28,12 @@ class Motion:
     def of(cls, angle_rad: np.ndarray, pulse_rate_hz: float) -> Motion:
         """From the angles alone, as the sensor told or would tell them, late if it is late: smoothed both ways."""
         angle = np.asarray(angle_rad, float)
-        found = JointMotion.of(np.arange(angle.size) / pulse_rate_hz, angle)
-        return cls(found.angle_rad, found.velocity_rad_s)
+        motion = JointMotion.of(np.arange(angle.size) / pulse_rate_hz, angle)
+        return cls(motion.angle_rad, motion.velocity_rad_s)
 
     @classmethod
-    def held(cls, angle_rad: float, size: int) -> Motion:
-        """A joint that is held."""
+    def still(cls, angle_rad: float, size: int) -> Motion:
+        """A joint that is held at one angle."""
         return cls(np.full(size, angle_rad), np.zeros(size))
 
     def columns(self, rest: int) -> dict[str, np.ndarray]:
@@ -66,11 +66,13 @@ def above_rest(
         raise BadModel("the model depends on the angle of the joint", place="angle_rad", fix=fix)
 
     def torque_of(widths_us: np.ndarray, moved: Motion | None) -> np.ndarray:
-        held = np.repeat(np.r_[np.zeros(rest), widths_us], SAMPLES_A_PULSE)
-        time_s = np.arange(held.size) / (SAMPLES_A_PULSE * pulse_rate_hz)
+        sample_widths_us = np.repeat(np.r_[np.zeros(rest), widths_us], SAMPLES_A_PULSE)
+        time_s = np.arange(sample_widths_us.size) / (SAMPLES_A_PULSE * pulse_rate_hz)
         columns: dict[str, Any] = {} if moved is None else moved.columns(rest)
-        record = Record.from_arrays(time_s, held, np.zeros(held.size), pulse_rate_hz=pulse_rate_hz, **columns)
+        record = Record.from_arrays(
+            time_s, sample_widths_us, np.zeros(sample_widths_us.size), pulse_rate_hz=pulse_rate_hz, **columns
+        )
         return predict(model, record).reshape(-1, SAMPLES_A_PULSE).mean(axis=1)[rest:]
 
-    at_rest = None if motion is None else Motion.held(float(motion.angle_rad[0]), widths.size)
+    at_rest = None if motion is None else Motion.still(float(motion.angle_rad[0]), widths.size)
     return torque_of(widths, motion) - torque_of(np.zeros(widths.size), at_rest)

@@ -77,7 +77,7 @@ class Setup:
     @cached_property
     def present(self) -> np.ndarray:
         """Share of each interval in which a pulse acts, late pulses at their true time, shape (K,)."""
-        return np.minimum(self.grid.held(self.scene.acting), 1.0)
+        return np.minimum(self.grid.interval_means(self.scene.acting), 1.0)
 
     @cached_property
     def _middle(self) -> np.ndarray:
@@ -137,7 +137,9 @@ class Setup:
         # What was read at a time had been so before; a delay leads out of no part.
         read_s = np.clip(time_s + self.angle_late_s, starts_s[part], ends_s[part])
         columns = {name: getattr(motion, name, None) for name in MOTION}
-        return {name: np.interp(read_s, record.time_s, one) for name, one in columns.items() if one is not None}
+        return {
+            name: np.interp(read_s, record.time_s, column) for name, column in columns.items() if column is not None
+        }
 
     @cached_property
     def design(self) -> np.ndarray:

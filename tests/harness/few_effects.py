@@ -14,7 +14,7 @@ def only(*names: str) -> Iterator[None]:
     """In this process the library holds these effects alone."""
     kept = [effects.find_effect(name) for name in names]
     try:
-        with mock.patch.object(effects, "_own", lambda: kept):
+        with mock.patch.object(effects, "_library", lambda: kept):
             effects._everything.cache_clear()
             yield
     finally:

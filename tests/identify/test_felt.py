@@ -298,18 +298,18 @@ def grid_of(late: dict[int, float], widths: np.ndarray | None = None) -> Grid:
 
 def test_held_leaves_the_drive_before_standing():
     drive = np.random.default_rng(0).random((40, 3))
-    held = grid_of({10: 0.15, 20: -0.1}).held(drive)
+    held = grid_of({10: 0.15, 20: -0.1}).interval_means(drive)
     assert held[10] == pytest.approx(0.85 * drive[10] + 0.15 * drive[9])
     assert held[19] == pytest.approx(0.9 * drive[19] + 0.1 * drive[20])
     rest = np.delete(np.arange(40), [10, 19])
     assert np.array_equal(held[rest], drive[rest])
-    assert np.array_equal(grid_of({10: 0.15, 20: -0.1}).held(drive.T, axis=1), held.T)
-    assert np.array_equal(grid_of({10: 0.15, 20: -0.1}).held(drive[:, 1]), held[:, 1])
+    assert np.array_equal(grid_of({10: 0.15, 20: -0.1}).interval_means(drive.T, axis=1), held.T)
+    assert np.array_equal(grid_of({10: 0.15, 20: -0.1}).interval_means(drive[:, 1]), held[:, 1])
 
 
 def test_a_pulse_that_is_later_acts_whole_but_later():
     drive = np.random.default_rng(0).random(40)
-    held = grid_of({10: 0.4, 20: 1.3}).held(drive)
+    held = grid_of({10: 0.4, 20: 1.3}).interval_means(drive)
     assert held[10] == pytest.approx(0.6 * drive[10])
     assert held[11] == pytest.approx(drive[11] + 0.4 * drive[10])
     assert held[20] == 0.0
@@ -402,7 +402,7 @@ def test_correlations_are_taken_with_what_was_felt():
     widths, late_s, _ = late_pulses(rng.uniform(0.0, 300.0, 1200), rng)
     record = Record.from_arrays(np.arange(1200) / 40, widths, np.zeros(1200), late_s=late_s)
     grid = make_grid(record)
-    error_nm = grid.held(widths)[grid.interval]
+    error_nm = grid.interval_means(widths)[grid.interval]
     found = {test["with"]: test for test in correlation_tests(grid, error_nm)["tests"]}
     assert found["u"]["values"][0] == pytest.approx(1.0)
     assert not found["u"]["passed"]

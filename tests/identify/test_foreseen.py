@@ -13,7 +13,7 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.uncertainty import prediction_band
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
-from stimrig.identify.simulation.predict import problem_of, unforeseen
+from stimrig.identify.simulation.predict import problem_of, unpredictable_torque
 from tests.identify import hidden_muscles
 
 EFFECTS = ("mains_hum", "baseline_drift", "voluntary_effort", "tremor")
@@ -39,7 +39,7 @@ def case(request):
 
 def test_another_record_is_predicted_as_without_the_effect(case):
     effect, record, plain, model = case
-    mean_nm, rms_nm = unforeseen(model)[effect]
+    mean_nm, rms_nm = unpredictable_torque(model)[effect]
     other = hidden_muscles.record(seed=7, noise_nm=0.0)
     without = model.with_(effects=(), baseline_nm=model.baseline_nm + mean_nm)
     np.testing.assert_allclose(model.predict(other), without.predict(other), atol=1e-9)
@@ -60,7 +60,7 @@ def test_no_model_with_such_an_effect_predicts_worse_than_the_plain_one(case):
 
 def test_its_size_is_in_the_band_of_another_record_and_of_held_out_rows(case):
     effect, record, _, model = case
-    rms_nm = unforeseen(model)[effect][1]
+    rms_nm = unpredictable_torque(model)[effect][1]
     for one, rows in ((hidden_muscles.record(seed=7), slice(None)), (record, record.held_out)):
         lower, upper = prediction_band(model, one)
         half = 0.5 * (upper - lower)[rows]

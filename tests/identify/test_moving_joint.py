@@ -196,7 +196,7 @@ def test_widths_follow_a_torque_while_the_joint_moves():
     wanted = passive + 0.4 * surfaces(model()).g(motion.angle_rad, motion.velocity_rad_s) * 8.0 * bell
     found = invert(model(), Reference.of(wanted, angle_rad=angle))
     assert found.fit_percent is not None and found.fit_percent > 97.0
-    still = Motion.held(float(angle[0]), 400)
+    still = Motion.still(float(angle[0]), 400)
     as_if_still = above_rest(model(), found.pulse_width_us, 40.0, still)
     moving = above_rest(model(), found.pulse_width_us, 40.0, motion)
     assert np.sqrt(np.mean((as_if_still - wanted) ** 2)) > 5 * np.sqrt(np.mean((moving - wanted) ** 2))
@@ -318,7 +318,7 @@ def test_the_number_of_knots_that_somebody_asks_for_is_kept():
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():
     with few_effects.only("passive_torque"):
         grid, raw = prepare(whole())
-        search = search_effects(grid, raw, fitted_rows(grid, None), most=1)
+        search = search_effects(grid, raw, fitted_rows(grid, None), max_effects=1)
         plain, found = steps(search)
     assert plain.fitted is search.base and found.added == "passive_torque"
     assert found.fitted.log_evidence > search.last.log_evidence

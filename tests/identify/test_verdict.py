@@ -119,7 +119,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
 
 def test_nothing_missing(made: Made):
     found = made.judged()
-    assert (found.kind, found.found, found.rivals, found.notes) == ("nothing_missing", {}, {}, [])
+    assert (found.kind, found.probabilities, found.rivals, found.notes) == ("nothing_missing", {}, {}, [])
     assert (found.explained, found.structure) == (0.0, 0.0)
     assert found.held_out_error is None
     assert found.probability == pytest.approx(1 / (1 + np.exp(1.0 - 4.5)))
@@ -150,8 +150,8 @@ def test_an_effect_missing(made: Made):
     assert found.explained == pytest.approx(0.8)
     assert found.structure == 3.0
     assert found.rivals == {FIRST: shares([candidate(FIRST, 50.0), candidate("potentiation", 48.0)])}
-    assert found.found == {FIRST: found.rivals[FIRST][FIRST]}
-    assert found.probability == found.found[FIRST]
+    assert found.probabilities == {FIRST: found.rivals[FIRST][FIRST]}
+    assert found.probability == found.probabilities[FIRST]
     assert made.forms == [0.003, 0.003], "who names an effect is held to more"
 
 
@@ -160,21 +160,21 @@ def test_what_was_added_later_stands_on_what_was_added_before(made: Made):
     made.work.rounds[0].append(candidate(SECOND, 49.0))  # taken in another round, so no rival in this one
     found = made.judged()
     assert found.rivals[SECOND][SECOND] > 0.9
-    assert found.found[SECOND] == found.found[FIRST] == found.rivals[FIRST][FIRST] < 0.5
+    assert found.probabilities[SECOND] == found.probabilities[FIRST] == found.rivals[FIRST][FIRST] < 0.5
     assert set(found.rivals[FIRST]) == {FIRST, "potentiation", ""}
-    assert found.probability == found.found[FIRST]
+    assert found.probability == found.probabilities[FIRST]
 
 
 def test_an_effect_that_was_exchanged_counts_as_half(made: Made):
     made.add(FIRST, 50.0, 90.0)
     made.work.rounds[0] = [candidate("potentiation", 20.0)]
-    assert made.judged().found[FIRST] == 0.5
+    assert made.judged().probabilities[FIRST] == 0.5
 
 
 def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
     made.work.detected = ["mains_hum"]
     found = made.judged()
-    assert (found.kind, found.found, found.probability) == ("effect_missing", {"mains_hum": 0.99}, 0.99)
+    assert (found.kind, found.probabilities, found.probability) == ("effect_missing", {"mains_hum": 0.99}, 0.99)
     made.work.chain = [fitted(30.0, "mains_hum")]
     made.add(FIRST, 50.0, 65.0)
     assert made.judged().explained == pytest.approx(35.0 / 70.0), "what was given counts as known"
@@ -243,7 +243,7 @@ def test_every_rule_at_both_sides(made: Made, rule: str, values: tuple[Any, ...]
     found = made.judged()
     assert (found.kind == "unexplained_structure") is strange
     assert not strange or found.probability == 0.9
-    assert not strange or all(probability <= 0.45 for probability in found.found.values())
+    assert not strange or all(probability <= 0.45 for probability in found.probabilities.values())
 
 
 def test_what_is_left_is_told(made: Made):
@@ -260,8 +260,8 @@ def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
     made.add(FIRST, 50.0, 80.0).add(SECOND, 50.0, 90.0)
     made.rises = {1}
     found = made.judged()
-    assert found.found[SECOND] == 0.45
-    assert found.found[FIRST] > 0.9
+    assert found.probabilities[SECOND] == 0.45
+    assert found.probabilities[FIRST] > 0.9
     assert len(found.notes) == 1
     assert found.notes[0].endswith(f": {find_effect(SECOND).name}.")
 
@@ -318,26 +318,26 @@ def test_efforts_seen_nowhere_at_rest_are_less_certain(
     found = made.judged()
     assert found.kind == kind
     if probability == 0.85:
-        assert found.found[EFFORT] == 0.85
+        assert found.probabilities[EFFORT] == 0.85
     elif probability:
-        assert found.found[EFFORT] > 0.85
+        assert found.probabilities[EFFORT] > 0.85
 
 
 def test_efforts_are_looked_for_in_the_model_to_which_they_were_added(made: Made):
     made.at_rest = 0.14
     found = made.add(EFFORT, 50.0, 80.0, **EFFORTS).add(FIRST, 50.0, 90.0).judged()
-    assert found.found == {EFFORT: 0.85, FIRST: 0.85}
+    assert found.probabilities == {EFFORT: 0.85, FIRST: 0.85}
 
 
 def test_an_effort_that_was_exchanged_is_looked_for_nowhere(made: Made):
     made.add(EFFORT, 50.0, 90.0)
     made.work.chain[1].effects = ()
-    assert made.judged().found[EFFORT] > 0.9
+    assert made.judged().probabilities[EFFORT] > 0.9
 
 
 def test_a_law_that_shows_nothing_at_rest_is_as_certain_as_ever(made: Made):
     made.at_rest = 0.0
-    assert made.add("baseline_drift", 50.0, 90.0).judged().found["baseline_drift"] > 0.9
+    assert made.add("baseline_drift", 50.0, 90.0).judged().probabilities["baseline_drift"] > 0.9
 
 
 def test_a_structure_that_holds_effects_is_measured_from_the_plain_one(made: Made):
