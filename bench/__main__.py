@@ -22,7 +22,7 @@ def main() -> int:
     from importlib import import_module
 
     cut = next((at for at, word in enumerate(sys.argv) if word.startswith("-")), len(sys.argv))
-    names, given = sys.argv[1:cut] or list(NAMES), sys.argv[cut:]
+    names, options = sys.argv[1:cut] or list(NAMES), sys.argv[cut:]
     unknown = [name for name in names if name not in NAMES]
     if unknown:
         print(f"no bench {unknown[0]!r}; there are {', '.join(NAMES)}", file=sys.stderr)
@@ -34,7 +34,7 @@ def main() -> int:
             os.sched_setaffinity(0, cores)
         elif cores:
             os.sched_setaffinity(0, {max(cores)})
-        import_module(f"bench.{name}").run(*([given or OPTIONS[name]] if name in OPTIONS else []))
+        import_module(f"bench.{name}").run(*([options or OPTIONS[name]] if name in OPTIONS else []))
     return 0
 
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import keep_lines, parser, table
+from bench.common import bench_parser, table, write_json_lines
 from stimrig import identify
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import draw_scenario, rng_of
@@ -52,9 +52,9 @@ def paper_test(top_us: float, protocol: str = "paper", held_out: bool = False) -
         settings = dict(segment.settings)
         if segment.sequence != "rest":
             settings.setdefault("max_pulse_width_us", top_us)
-        own = build(segment.sequence, settings, 40.0)
-        widths.append(own)
-        names += [segment.name] * own.size
+        segment_us = build(segment.sequence, settings, 40.0)
+        widths.append(segment_us)
+        names += [segment.name] * segment_us.size
     return np.concatenate(widths), names
 
 
@@ -79,14 +79,14 @@ def row(muscle: Any, widths: np.ndarray, covered: tuple[bool, bool], unseen: flo
 
 
 def covered_by(known: Knowledge, muscle: Any) -> tuple[bool, bool]:
-    """Whether the bands contain both true curves."""
-    away = np.abs(muscle.curve(known.curve.at) / known.plateau_nm - known.curve.value)
-    beside = np.abs(muscle.step(known.step.at) - known.step.value)
-    return bool(np.all(away <= known.curve.half)), bool(np.all(beside <= known.step.half))
+    """Return for each of the two true curves whether the bands contain it."""
+    curve_error = np.abs(muscle.curve(known.curve.at) / known.plateau_nm - known.curve.value)
+    step_error = np.abs(muscle.step(known.step.at) - known.step.value)
+    return bool(np.all(curve_error <= known.curve.half)), bool(np.all(step_error <= known.step.half))
 
 
 def covered_by_model(model: Model, muscle: Any) -> tuple[bool, bool]:
-    """The same of a model's own whole bands."""
+    """Return the same for the simultaneous bands of a model."""
     curve, step = model.bands["recruitment"], model.bands["step_response"]
     true = muscle.curve(np.asarray(curve["pulse_width_us"]))
     slack = 1e-6 * float(np.max(true))
@@ -110,38 +110,38 @@ def adaptive(
 
     def timed(call: Callable[[], Any]) -> Any:
         began = time.process_time()
-        found = call()
+        result = call()
         spent.append(time.process_time() - began)
-        return found
+        return result
 
     known = {} if earlier is None else {"earlier": Earlier(earlier)}
     limits = {"left_s": LONGEST_S / 2.0, "left_nm_s": float(np.sum(muscle.curve(paper_test(muscle.top_us)[0]))) / 40.0}
-    made = play(muscle, noise, TARGET, timed=timed, **limits, **known)
-    result, model = finished(muscle, made, noise, seed, {} if earlier is None else {"earlier": earlier})
+    played = play(muscle, noise, TARGET, timed=timed, **limits, **known)
+    result, model = finished(muscle, played, noise, seed, {} if earlier is None else {"earlier": earlier})
     return result | {"cpu_s": [round(s, 4) for s in spent[2:]]}, model
 
 
 def finished(
-    muscle: Any, made: Played, noise: np.ndarray, seed: int, known: dict[str, Model]
+    muscle: Any, played: Played, noise: np.ndarray, seed: int, known: dict[str, Model]
 ) -> tuple[dict[str, Any], Model]:
     """The row and the model of a test that ended; where the structure fits badly, the paper's test comes after it."""
-    assert made.record is not None
-    if made.decision.kind == "misfit":
+    assert played.record is not None
+    if played.decision.kind == "misfit":
         widths, names = paper_test(muscle.top_us)
-        widths = np.r_[made.widths_us, widths]
-        model = identify.fit(recorded(muscle, widths, made.names + names, noise, RATE_HZ))
+        widths = np.r_[played.widths_us, widths]
+        model = identify.fit(recorded(muscle, widths, played.names + names, noise, RATE_HZ))
         covered = covered_by_model(model, muscle)
     else:
-        widths = made.widths_us
-        model = identify.fit(made.record, recruitment="near-sigmoid", **known)
-        assert made.decision.knowledge is not None
-        covered = covered_by(made.decision.knowledge, muscle)
+        widths = played.widths_us
+        model = identify.fit(played.record, recruitment="near-sigmoid", **known)
+        assert played.decision.knowledge is not None
+        covered = covered_by(played.decision.knowledge, muscle)
     unseen = unseen_percent(muscle, model.predict, seed)
-    return row(muscle, widths, covered, unseen, ended=made.decision.kind), model
+    return row(muscle, widths, covered, unseen, ended=played.decision.kind), model
 
 
-def one(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
-    """The wanted peers on one patient."""
+def compare_tests(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
+    """Play the wanted peers on one patient."""
     muscle = KINDS[kind](seed)
     noise = np.random.default_rng([seed, 5]).standard_normal(int((LONGEST_S + 30.0) * RATE_HZ)) * NOISE_NM
     other = np.random.default_rng([seed, 6]).standard_normal(noise.size) * NOISE_NM
@@ -152,14 +152,14 @@ def one(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
         "ours, new": lambda: adaptive(muscle, noise, seed)[0],
         "ours, known": lambda: adaptive(muscle, noise, seed, earlier=adaptive(day, other, seed)[1])[0],
     }
-    found = {peer: play_peer() for peer, play_peer in peers.items() if peer in wanted or peer == "paper"}
-    paper = found["paper"]
+    peer_rows = {peer: play_peer() for peer, play_peer in peers.items() if peer in wanted or peer == "paper"}
+    paper = peer_rows["paper"]
     return [
         line
         | {"peer": peer, "kind": kind, "shape": muscle.name, "seed": seed}
         | {"dose_share": line["dose"] / paper["dose"], "time_share": line["seconds"] / paper["seconds"]}
         | {"unseen_gain": line["unseen"] - paper["unseen"]}
-        for peer, line in found.items()
+        for peer, line in peer_rows.items()
     ]
 
 
@@ -176,31 +176,31 @@ def hidden_muscle(seed: int) -> tuple[str, str, Hidden]:
 
 
 def hidden(seed: int) -> dict[str, Any]:
-    """What the diagnosis names of one hidden effect: after our test, the paper's test, and the paper's test twice."""
+    """Diagnose one hidden effect after our test, after the paper's test, and after the paper's test played twice."""
     workers.WORKERS = 1
     effect, strength, muscle = hidden_muscle(seed)
     noise = np.random.default_rng([seed, 5]).standard_normal(int(3 * LONGEST_S * RATE_HZ)) * NOISE_NM
     paper = paper_test(muscle.top_us, held_out=True)
     dose = float(np.sum(muscle.curve(paper[0]))) / 40.0
-    made = play(muscle, noise, TARGET, left_s=LONGEST_S / 2.0, left_nm_s=dose)
-    own = made.widths_us, made.names
-    if made.decision.kind == "misfit":
-        own = np.r_[own[0], paper[0]], own[1] + paper[1]
-    tests = {"ours": own, "paper": paper, "paper twice": (np.tile(paper[0], 2), paper[1] * 2)}
-    line: dict[str, Any] = {"seed": seed, "effect": effect, "strength": strength, "ended": made.decision.kind}
+    played = play(muscle, noise, TARGET, left_s=LONGEST_S / 2.0, left_nm_s=dose)
+    adaptive_test = played.widths_us, played.names
+    if played.decision.kind == "misfit":
+        adaptive_test = np.r_[adaptive_test[0], paper[0]], adaptive_test[1] + paper[1]
+    tests = {"ours": adaptive_test, "paper": paper, "paper twice": (np.tile(paper[0], 2), paper[1] * 2)}
+    line: dict[str, Any] = {"seed": seed, "effect": effect, "strength": strength, "ended": played.decision.kind}
     for name, test in tests.items():
-        found = diagnose(recorded(muscle, *test, noise, RATE_HZ))
+        diagnosis = diagnose(recorded(muscle, *test, noise, RATE_HZ))
         line[name] = {
-            "verdict": found.verdict,
-            "named": [entry["effect"] for entry in found.missing],
-            "group": found.missing[0]["confused_with"] if found.missing else [],
+            "verdict": diagnosis.verdict,
+            "named": [entry["effect"] for entry in diagnosis.missing],
+            "group": diagnosis.missing[0]["confused_with"] if diagnosis.missing else [],
             "dose_share": round(float(np.sum(muscle.curve(test[0]))) / 40.0 / dose, 3),
         }
     return line
 
 
-def told_of_hidden(rows: list[dict[str, Any]]) -> list[str]:
-    """How often each test let the diagnosis name the effect."""
+def hidden_table(rows: list[dict[str, Any]]) -> list[str]:
+    """Count for each test the diagnoses that name the effect."""
     lines = []
     for test in ("ours", "paper", "paper twice"):
         first = sum(line[test]["named"][:1] == [line["effect"]] for line in rows)
@@ -218,23 +218,24 @@ def medians(rows: list[dict[str, Any]]) -> list[str]:
     cells = []
     for kind in dict.fromkeys(line["kind"] for line in rows):
         for peer in dict.fromkeys(line["peer"] for line in rows):
-            own = [line for line in rows if line["kind"] == kind and line["peer"] == peer]
-            if not own:
+            peer_rows = [line for line in rows if line["kind"] == kind and line["peer"] == peer]
+            if not peer_rows:
                 continue
-            mid = {key: float(np.median([line[key] for line in own])) for key in own[0] if _number(own[0][key])}
-            curve, step = (sum(line[key] for line in own) for key in ("curve_covered", "step_covered"))
+            numbers = [key for key, value in peer_rows[0].items() if _number(value)]
+            mid = {key: float(np.median([line[key] for line in peer_rows])) for key in numbers}
+            curve, step = (sum(line[key] for line in peer_rows) for key in ("curve_covered", "step_covered"))
             fit = [f"{mid['unseen']:.2f}", f"{mid['unseen_gain']:+.2f}"]
             took = [f"{mid['dose']:.1f}", f"{100 * mid['dose_share']:.0f} %"]
             took += [f"{mid['seconds']:.1f}", f"{100 * mid['time_share']:.0f} %"]
-            covered = [f"{count} ({100 * count / len(own):.0f} %)" for count in (curve, step)]
-            cells.append([kind, peer, len(own), *fit, *took, *covered])
+            covered = [f"{count} ({100 * count / len(peer_rows):.0f} %)" for count in (curve, step)]
+            cells.append([kind, peer, len(peer_rows), *fit, *took, *covered])
     lines = table([*heads.split("; "), "f covered", "step covered"], cells)
     ended = [line["ended"] for line in rows if line["peer"] == "ours, new"]
     lines.append(f"\nOurs, new, ended: {', '.join(f'{e} {ended.count(e)}' for e in dict.fromkeys(ended))}.")
     cpu = np.array([s for line in rows if line["peer"].startswith("ours") for s in line.get("cpu_s", [])])
     if cpu.size:
-        half, most = np.quantile(cpu, [0.5, 0.99])
-        lines.append(f"`decide`: {1e3 * half:.0f} ms of processor time in the middle, p99 {1e3 * most:.0f} ms.")
+        median_s, p99_s = np.quantile(cpu, [0.5, 0.99])
+        lines.append(f"`decide`: {1e3 * median_s:.0f} ms of processor time in the middle, p99 {1e3 * p99_s:.0f} ms.")
     return lines
 
 
@@ -244,27 +245,27 @@ def _number(value: Any) -> bool:
 
 def main() -> None:
     """Print the tables."""
-    made = parser(__doc__)
-    made.add_argument("--patients", type=int, default=150, help="of each kind")
-    made.add_argument("--seeds", type=int, default=80_000, help="the first")
-    made.add_argument("--kinds", default="sigmoid,shaped")
-    made.add_argument("--peers", default="paper; short; ours, new; ours, known")
-    made.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
-    made.add_argument("--json", type=Path, help="every row goes here, one a line")
-    settings = made.parse_args()
+    parser = bench_parser(__doc__)
+    parser.add_argument("--patients", type=int, default=150, help="of each kind")
+    parser.add_argument("--seeds", type=int, default=80_000, help="the first")
+    parser.add_argument("--kinds", default="sigmoid,shaped")
+    parser.add_argument("--peers", default="paper; short; ours, new; ours, known")
+    parser.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
+    parser.add_argument("--json", type=Path, help="every row goes here, one a line")
+    settings = parser.parse_args()
     warnings.filterwarnings("ignore", category=RuntimeWarning)
     rows: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.patients):
         for kind in settings.kinds.split(","):
-            rows += one(kind, seed, settings.peers)
+            rows += compare_tests(kind, seed, settings.peers)
             print(seed, kind, file=sys.stderr, flush=True)
-        keep_lines(settings.json, rows)
+        write_json_lines(settings.json, rows)
     print(*(medians(rows) if rows else []), sep="\n")
-    found: list[dict[str, Any]] = []
+    hidden_rows: list[dict[str, Any]] = []
     for seed in range(settings.seeds, settings.seeds + settings.hidden):
-        found.append(hidden(seed))
-        print(json.dumps(found[-1]), file=sys.stderr, flush=True)
-    print(*(told_of_hidden(found) if found else []), sep="\n")
+        hidden_rows.append(hidden(seed))
+        print(json.dumps(hidden_rows[-1]), file=sys.stderr, flush=True)
+    print(*(hidden_table(hidden_rows) if hidden_rows else []), sep="\n")
 
 
 if __name__ == "__main__":

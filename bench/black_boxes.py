@@ -48,12 +48,12 @@ class Scaled:
         return float(fitted.mean()), float(fitted.std())
 
 
-def several(fits: Iterator[tuple[float, np.ndarray]]) -> np.ndarray:
-    """The parameters of the start with the smallest cost, within the budget."""
+def best_start(fits: Iterator[tuple[float, np.ndarray]]) -> np.ndarray:
+    """Return the parameters of the start with the smallest cost, within the budget."""
     end = time.perf_counter() + BUDGET_S
     best = (np.inf, np.empty(0))
-    for cost, found in fits:
-        best = (cost, found) if cost < best[0] else best
+    for cost, parameters in fits:
+        best = (cost, parameters) if cost < best[0] else best
         if time.perf_counter() > end:
             break
     return best[1]
@@ -107,11 +107,11 @@ def hammerstein_wiener(task: Task) -> Predict:
                 def residual(x: np.ndarray, order: int = order, start: np.ndarray = start, tie=tie) -> np.ndarray:
                     return np.r_[(simulate(x, order) - y)[fitted], tie * (x - start)]
 
-                found = least_squares(residual, start, method="trf", x_scale=0.3, max_nfev=60)
+                solution = least_squares(residual, start, method="trf", x_scale=0.3, max_nfev=60)
                 rows = int(fitted.sum())
-                yield rows * np.log(2 * found.cost / rows) + np.log(rows) * start.size, np.r_[order, found.x]
+                yield rows * np.log(2 * solution.cost / rows) + np.log(rows) * start.size, np.r_[order, solution.x]
 
-    best = several(fits())
+    best = best_start(fits())
     return lambda: scaled.back(simulate(best[1:], int(best[0])))
 
 
@@ -129,8 +129,8 @@ def gaussian_process(task: Task) -> Predict:
     """
     scaled = Scaled(task)
     y, fitted = scaled.y, np.flatnonzero(task.fitted)
-    past = scaled.u[np.maximum(np.arange(y.size)[:, None] - np.arange(EDGES[-1] + 1), 0)]
-    x = np.stack([past[:, a : max(b, a + 1)].mean(axis=1) for a, b in pairwise(EDGES)], axis=1)
+    lagged_inputs = scaled.u[np.maximum(np.arange(y.size)[:, None] - np.arange(EDGES[-1] + 1), 0)]
+    x = np.stack([lagged_inputs[:, a : max(b, a + 1)].mean(axis=1) for a, b in pairwise(EDGES)], axis=1)
     some = fitted[np.linspace(0, fitted.size - 1, min(SEARCHED, fitted.size)).astype(int)]
 
     def kernel(p: np.ndarray, a: np.ndarray, b: np.ndarray) -> np.ndarray:
@@ -147,11 +147,12 @@ def gaussian_process(task: Task) -> Predict:
         return float(0.5 * fit + np.log(np.diag(factor[0])).sum() + 0.05 * np.sum((p - start) ** 2))
 
     start = np.r_[0.0, 0.0, -2.0, np.zeros(x.shape[1])]
-    found = minimize(cost, start, method="L-BFGS-B", bounds=[(-6.0, 4.0)] * start.size, options={"maxiter": 25}).x
-    kept = fitted[np.linspace(0, fitted.size - 1, min(INDUCING, fitted.size)).astype(int)]
-    root = np.linalg.cholesky(kernel(found, x[kept], x[kept]) + 1e-6 * np.eye(kept.size))
-    rows = solve_triangular(root, kernel(found, x[kept], x), lower=True)
-    noise = np.exp(2 * found[2]) + 1e-6
-    inner = rows[:, fitted] @ rows[:, fitted].T + noise * np.eye(kept.size)
+    bounds = [(-6.0, 4.0)] * start.size
+    hyperparameters = minimize(cost, start, method="L-BFGS-B", bounds=bounds, options={"maxiter": 25}).x
+    inducing = fitted[np.linspace(0, fitted.size - 1, min(INDUCING, fitted.size)).astype(int)]
+    root = np.linalg.cholesky(kernel(hyperparameters, x[inducing], x[inducing]) + 1e-6 * np.eye(inducing.size))
+    rows = solve_triangular(root, kernel(hyperparameters, x[inducing], x), lower=True)
+    noise = np.exp(2 * hyperparameters[2]) + 1e-6
+    inner = rows[:, fitted] @ rows[:, fitted].T + noise * np.eye(inducing.size)
     weights = np.linalg.solve(inner, rows[:, fitted] @ y[fitted])
     return lambda: scaled.back(weights @ rows)

@@ -1,4 +1,4 @@
-"""What a cohort costs: throughput of one worker and of two, memory over the records, cost of a record, and a plan.
+"""Measure a cohort: throughput of one worker and of two, memory over the records, cost of a record, and a plan.
 
     python -m bench.cohort --records 10000 [--pairs 200] [--costs 12] [--json FILE]
 
@@ -23,7 +23,7 @@ from typing import Any
 import psutil
 import pyarrow.parquet as pq
 
-from bench.common import keep, parser, table, written_by
+from bench.common import bench_parser, table, write_json, written_by
 from stimrig.api.cohort.cluster import connect
 from stimrig.api.cohort.results import Results
 from stimrig.api.cohort.run import run_records
@@ -124,20 +124,20 @@ def once(client: Any, folder: Path, output: Path, verb: str, every: int = 0) -> 
 def throughput(folder: Path, place: Path, verb: str, count: int, **more: Any) -> dict[str, Any]:
     """Records a second with one worker and with two, in turn, so that other work on the machine meets both."""
     here = folder / f"pairs-{len(list(folder.iterdir()))}"
-    given, warm = make(here / "records", count, **more), make(here / "warm", 8, **more)
+    records, warm = make(here / "records", count, **more), make(here / "warm", 8, **more)
     paces: dict[int, list[float]] = {1: [], 2: []}
     for turn in range(2):
         for workers in (1, 2):
             output = place / f"{here.name}-{workers}-{turn}.parquet"
-            paces[workers].append(count / run(given, output, verb, workers, warm=warm)[1])
+            paces[workers].append(count / run(records, output, verb, workers, warm=warm)[1])
     ratio = statistics.median(paces[2]) / statistics.median(paces[1])
     return {"records": count, "one_per_s": paces[1], "two_per_s": paces[2], "ratio": ratio}
 
 
 def memory(folder: Path, place: Path, count: int) -> dict[str, Any]:
     """Memory over many records with two workers: of the first tenth and of the last."""
-    many = make(folder / "many", count)
-    rows, took_s, samples = run(many, place / "many.parquet", "fit", 2, every=max(1, count // 100))
+    records = make(folder / "many", count)
+    rows, took_s, samples = run(records, place / "many.parquet", "fit", 2, every=max(1, count // 100))
     rows.sort(key=lambda row: row["computed_utc"])
     sizes = [row["worker_memory_mb"] for row in rows]
     tenth = max(1, count // 10)
@@ -164,13 +164,13 @@ def ends(samples: list[dict[str, float]], name: str) -> list[float]:
 def costs(folder: Path, place: Path, count: int) -> dict[str, Any]:
     """Processor time, time and bytes of a recording as the rig seals it, for fit and diagnose."""
     full = make(folder / "full", count, **SEALED)
-    found = {}
+    figures = {}
     for verb in ("fit", "diagnose"):
         rows = run(full, place / f"{verb}.parquet", verb, 1)[0]
         rows = [row for row in rows if row["status"] == "ok"]
         rows.sort(key=lambda row: row["computed_utc"])
         rows = rows[1:]  # the first one loads what was compiled
-        found[verb] = {
+        figures[verb] = {
             "records": len(rows),
             "processor_s": statistics.fmean(row["processor_s"] for row in rows),
             "longest_processor_s": max(row["processor_s"] for row in rows),
@@ -178,7 +178,7 @@ def costs(folder: Path, place: Path, count: int) -> dict[str, Any]:
             "read_mb": statistics.fmean(row["bytes"] for row in rows) / MB,
             "memory_mb": max(row["worker_memory_mb"] for row in rows),
         }
-    return found
+    return figures
 
 
 def plan(cost: dict[str, Any]) -> dict[str, float]:
@@ -189,20 +189,20 @@ def plan(cost: dict[str, Any]) -> dict[str, float]:
             "read_mb_per_s": read_tb * 1e6 / (3600 * hours / CORES)}  # fmt: skip
 
 
-def report(found: dict[str, Any]) -> list[str]:
+def report(figures: dict[str, Any]) -> list[str]:
     """The figures as a page."""
-    pace, mem, cost = found["throughput"], found["memory"], found["costs"]
-    load = ", ".join(f"{value:.1f}" for value in found["load"])
+    pace, mem, cost = figures["throughput"], figures["memory"], figures["costs"]
+    load = ", ".join(f"{value:.1f}" for value in figures["load"])
     return [
-        f"{found['processors']} processors, load average {load} at the start and "
-        f"{', '.join(f'{value:.1f}' for value in found['load_after'])} at the end.",
+        f"{figures['processors']} processors, load average {load} at the start and "
+        f"{', '.join(f'{value:.1f}' for value in figures['load_after'])} at the end.",
         "",
         *table(
             ["throughput, records a second, two runs each", *pace],
             [
-                *([words, *(both(one[name]) for one in pace.values())] for words, name in PACES.items()),
-                ["ratio (goal 1.8)", *(format(one["ratio"], ".2f") for one in pace.values())],
-                ["recordings a run", *(one["records"] for one in pace.values())],
+                *([words, *(both(case[name]) for case in pace.values())] for words, name in PACES.items()),
+                ["ratio (goal 1.8)", *(format(case["ratio"], ".2f") for case in pace.values())],
+                ["recordings a run", *(case["records"] for case in pace.values())],
             ],
         ),
         "",
@@ -215,14 +215,15 @@ def report(found: dict[str, Any]) -> list[str]:
         "",
         *of_verbs("cost of a recording (48 s at 1600 samples/s)", cost, COSTS),
         "",
-        *of_verbs(f"{PLANNED:,}".replace(",", " ") + " such recordings, on paper", found["plan"], ON_PAPER),
+        *of_verbs(f"{PLANNED:,}".replace(",", " ") + " such recordings, on paper", figures["plan"], ON_PAPER),
     ]
 
 
-def of_verbs(title: str, found: dict[str, Any], rows: dict[str, str]) -> list[str]:
+def of_verbs(title: str, figures: dict[str, Any], rows: dict[str, str]) -> list[str]:
     """Figures of both verbs."""
     verbs = ("fit", "diagnose")
-    return table([title, *verbs], ([words, *(f"{found[v][name]:.3g}" for v in verbs)] for words, name in rows.items()))
+    cells = ([words, *(f"{figures[verb][name]:.3g}" for verb in verbs)] for words, name in rows.items())
+    return table([title, *verbs], cells)
 
 
 def both(values: list[float]) -> str:
@@ -232,28 +233,28 @@ def both(values: list[float]) -> str:
 
 def main() -> None:
     """Print the page."""
-    made = parser(__doc__)
-    made.add_argument("--records", type=int, default=10_000, help="of the run over which memory is looked at")
-    made.add_argument("--pairs", type=int, default=200, help="of each run that compares one worker with two")
-    made.add_argument("--costs", type=int, default=12, help="recordings as sealed, fitted and diagnosed")
-    made.add_argument("--json", type=Path, help="write the figures here, too")
-    options = made.parse_args()
+    parser = bench_parser(__doc__)
+    parser.add_argument("--records", type=int, default=10_000, help="of the run over which memory is looked at")
+    parser.add_argument("--pairs", type=int, default=200, help="of each run that compares one worker with two")
+    parser.add_argument("--costs", type=int, default=12, help="recordings as sealed, fitted and diagnosed")
+    parser.add_argument("--json", type=Path, help="write the figures here, too")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-bench-cohort-") as scratch:
         folder, place = Path(scratch) / "records", Path(scratch) / "results"
         place.mkdir()
-        found: dict[str, Any] = {"load": os.getloadavg(), "processors": os.cpu_count()}
-        found["costs"] = costs(folder, place, options.costs)
-        found["throughput"] = {
+        figures: dict[str, Any] = {"load": os.getloadavg(), "processors": os.cpu_count()}
+        figures["costs"] = costs(folder, place, options.costs)
+        figures["throughput"] = {
             "fit, as sealed": throughput(folder, place, "fit", options.pairs, **SEALED),
             "fit, short": throughput(folder, place, "fit", options.pairs),
             "diagnose, short": throughput(folder, place, "diagnose", max(4, options.pairs // 10)),
         }
-        found["memory"] = memory(folder, place, options.records)
-    found["plan"] = {verb: plan(cost) for verb, cost in found["costs"].items()}
-    found["load_after"] = os.getloadavg()
+        figures["memory"] = memory(folder, place, options.records)
+    figures["plan"] = {verb: plan(cost) for verb, cost in figures["costs"].items()}
+    figures["load_after"] = os.getloadavg()
     command = f"python -m bench.cohort --records {options.records} --pairs {options.pairs} --costs {options.costs}"
-    print(written_by(command), "", *report(found), sep="\n")
-    keep(options.json, found)
+    print(written_by(command), "", *report(figures), sep="\n")
+    write_json(options.json, figures)
 
 
 if __name__ == "__main__":

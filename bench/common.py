@@ -1,4 +1,4 @@
-"""What benches share: options, seeds in processes, tables, services with their clients, and what wrote a figure."""
+"""Helpers of the benches: options, seeds in processes, tables, services with their clients, and provenance lines."""
 
 from __future__ import annotations
 
@@ -32,47 +32,47 @@ def written_by(command: str) -> str:
     return f"Written by `{command}` on {datetime.now(UTC):%Y-%m-%d}, commit {commit()}. Do not edit."
 
 
-def parser(doc: str | None, seeds: str = "", name: str = "--seeds") -> argparse.ArgumentParser:
-    """A bench's options, to which it adds its own; with seeds a range of them, and a file for the rows."""
+def bench_parser(doc: str | None, seeds: str = "", name: str = "--seeds") -> argparse.ArgumentParser:
+    """Make a bench's parser, to which it adds its own options; with `seeds`, it takes a range of them and `--json`."""
     called = f"python -m bench.{Path(sys.argv[0]).stem}"
-    made = argparse.ArgumentParser(prog=called, description=(doc or "").partition("\n")[0])
+    parser = argparse.ArgumentParser(prog=called, description=(doc or "").partition("\n")[0])
     if seeds:
-        made.add_argument(name, type=seed_range, default=seeds, help="first:last, last not included")
-        made.add_argument("--json", type=Path, help="write every row here")
-    return made
+        parser.add_argument(name, type=seed_range, default=seeds, help="first:last, last not included")
+        parser.add_argument("--json", type=Path, help="write every row here")
+    return parser
 
 
 def seed_range(text: str) -> range:
-    """Of `first:last`, or of one seed alone."""
+    """Parse `first:last`, or one seed alone."""
     first, _, last = text.partition(":")
     return range(int(first), int(last or int(first) + 1))
 
 
 def in_processes(work: Callable[[Any], Any], jobs: Iterable[Any], workers: int | None = 2) -> Iterator[Any]:
-    """What becomes of each job, in their order."""
+    """Do each job in a process of a pool and yield the results in the order of the jobs."""
     with ProcessPoolExecutor(workers) as pool:
         yield from pool.map(work, jobs)
 
 
-def keep(path: Path | None, rows: Any, indent: int | None = 1) -> None:
-    """Write rows as JSON, where that is asked for."""
+def write_json(path: Path | None, rows: Any, indent: int | None = 1) -> None:
+    """Write rows as JSON, unless `path` is None."""
     if path is not None:
         path.write_text(json.dumps(rows, indent=indent, default=float))
 
 
-def keep_lines(path: Path | None, rows: Iterable[Any]) -> None:
-    """The same, a row a line."""
+def write_json_lines(path: Path | None, rows: Iterable[Any]) -> None:
+    """Write rows as JSON, one a line, unless `path` is None."""
     if path is not None:
         path.write_text("".join(json.dumps(row) + "\n" for row in rows))
 
 
 def table(heads: Sequence[str], rows: Iterable[Iterable[object]]) -> list[str]:
-    """Lines of a Markdown table."""
+    """Return the lines of a Markdown table."""
     return [line(heads), "|---" * len(heads) + "|", *map(line, rows)]
 
 
 def line(cells: Iterable[object]) -> str:
-    """One line of it."""
+    """Return one line of a Markdown table."""
     return f"| {' | '.join(map(str, cells))} |"
 
 
@@ -90,7 +90,7 @@ def services(*emulator: str) -> Iterator[Any]:
 
 
 def reveal(seed: int, *more: str) -> dict[str, Any]:
-    """What the emulator hides, asked after the verdict; `more` are the emulator's options that change it."""
+    """Return the emulator's hidden truth, read after the verdict; `more` are its options that change that truth."""
     command = [sys.executable, "-m", "stimrig.hardware_sim", "--reveal", str(seed), *more]
     return json.loads(subprocess.run(command, capture_output=True, text=True, check=True, cwd=ROOT).stdout)
 

@@ -1,4 +1,4 @@
-"""Who is compared: ours, peers from PyPI, black boxes, the oracle. Each fits the same rows and predicts in free run."""
+"""Contenders: ours, peers from PyPI, black boxes, the oracle. Each fits the same rows and predicts in free run."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Contender:
     what: str
     fit: Callable[[Task], Callable[[], np.ndarray]]
     fine: bool = False
-    """Whether it takes more than one sample a pulse."""
+    """It takes more than one sample a pulse."""
 
 
 def spline_inputs(task: Task) -> np.ndarray:
@@ -63,8 +63,8 @@ def oracle(task: Task) -> Callable[[], np.ndarray]:
 
     measured = task.record.torque_nm[fitted]
     start = np.array([6.9 * 1.2, 0.041 * 0.8, 190.0 * 1.1, 0.5284 * 0.8, 0.6369 * 1.2])
-    found = least_squares(lambda x: simulate(x)[fitted] - measured, start, x_scale=np.abs(start), xtol=1e-10)
-    return lambda: simulate(found.x)
+    solution = least_squares(lambda x: simulate(x)[fitted] - measured, start, x_scale=np.abs(start), xtol=1e-10)
+    return lambda: simulate(solution.x)
 
 
 def sippy(task: Task) -> Callable[[], np.ndarray]:
@@ -78,13 +78,13 @@ def sippy(task: Task) -> Callable[[], np.ndarray]:
     rows = slice(0, int(np.flatnonzero(names == "prbs")[-1]) + 1)
     level = task.record.pulse_width_us[rows] / np.max(task.record.pulse_width_us)
     measured = task.record.torque_nm
-    found = system_identification(measured[rows][None], level[None], "N4SID", SS_fixed_order=2, SS_A_stability=True)
+    system = system_identification(measured[rows][None], level[None], "N4SID", SS_fixed_order=2, SS_A_stability=True)
 
     def respond(columns: np.ndarray) -> np.ndarray:
         state, response = np.zeros((2, columns.shape[1])), np.empty_like(columns)
         for k, u in enumerate(columns):
-            response[k] = (found.C @ state + found.D * u)[0]
-            state = found.A @ state + found.B * u
+            response[k] = (system.C @ state + system.D * u)[0]
+            state = system.A @ state + system.B * u
         return response
 
     columns = respond(spline_inputs(task))

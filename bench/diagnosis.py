@@ -1,4 +1,4 @@
-"""What the diagnosis says of muscles with something hidden: tables, confusions, calibration; see docs/diagnosis.md.
+"""Score the diagnosis on muscles with something hidden: tables, confusions, calibration; see docs/diagnosis.md.
 
     python -m bench.diagnosis --seeds 1003:1004 [--only single,nothing,…] [--recorder plain,real] [--json FILE]
 
@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import in_processes, keep, parser
+from bench.common import bench_parser, in_processes, write_json
 from bench.muscles.hidden_records import generate
 from bench.muscles.recorders import recorded
 from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS
@@ -33,7 +33,7 @@ from tests.harness.carried_sessions import as_record
 
 SETS = ("single", "nothing", "outside", "two", "slow", "rates")
 JOINED_AFTER_S = 60.0
-SURE = 0.9
+SURE_PROBABILITY = 0.9
 """Probability above which an effect counts as named for sure."""
 STRENGTHS = ("weak", "middle", "strong")
 PAIRS = (
@@ -48,15 +48,15 @@ PAIRS = (
 )
 
 
-def as_joined(made: dict[str, Any], kind: str, seed: int) -> Record:
+def as_joined(generated: dict[str, Any], kind: str, seed: int) -> Record:
     """Two tests of one patient, each as its own recorder gives it, as one record."""
-    time_s = made["time_s"]
+    time_s = generated["time_s"]
     cut = int(np.argmax(np.diff(time_s))) + 1
     records, begun_s = [], []
     for number, rows in enumerate((slice(0, cut), slice(cut, None))):
         part = {
             key: value[rows] if isinstance(value, np.ndarray | list) and len(value) == time_s.size else value
-            for key, value in made.items()
+            for key, value in generated.items()
         }
         part = recorded(part, kind, seed + 2 * number)
         records.append(as_record(part))
@@ -64,8 +64,8 @@ def as_joined(made: dict[str, Any], kind: str, seed: int) -> Record:
     return join(records, begun_s)
 
 
-def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
-    """One record diagnosed; None where the generator can't make it."""
+def diagnose_record(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
+    """Diagnose one record; None where the generator can't make it."""
     workers.WORKERS = 1
     effect, strength, seed, options = job
     names = tuple(effect.split("+")) if effect else None
@@ -76,11 +76,11 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         settings["again_after_s"] = JOINED_AFTER_S
         kinds.remove("joined")
     try:
-        made, kind = generate(names, strength, seed, **settings), "+".join(kinds) or "plain"
+        generated, kind = generate(names, strength, seed, **settings), "+".join(kinds) or "plain"
     except ValueError:
         return None
     joined = "again_after_s" in settings
-    record = as_joined(made, kind, seed) if joined else as_record(recorded(made, kind, seed))
+    record = as_joined(generated, kind, seed) if joined else as_record(recorded(generated, kind, seed))
     cpu = time.process_time()
     result = diagnose(record)
     first = result.missing[0] if result.missing else None
@@ -90,7 +90,7 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "seed": seed,
         "options": {key: value for key, value in options.items() if key != "recorder"},
         "recorder": recorder,
-        "truth": made["truth"]["effects"],
+        "truth": generated["truth"]["effects"],
         "verdict": result.verdict,
         "named": [entry["effect"] for entry in result.missing],
         "probabilities": [entry["probability"] for entry in result.missing],
@@ -98,20 +98,20 @@ def one(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any] | None:
         "before": result.base["held_out_rms_nm"],
         "after": result.with_all["held_out_rms_nm"],
         "noise": result.noise_sd_nm,
-        "structure said": _structure_said(result.to_dict()),
+        "structure said": _reports_structure(result.to_dict()),
         "cpu_seconds": time.process_time() - cpu,
     }
 
 
-def _structure_said(result: dict[str, Any]) -> bool:
-    """Whether structure is said to be left in any way: verdict, figure or words."""
+def _reports_structure(result: dict[str, Any]) -> bool:
+    """Return true where verdict, figure or words report structure that is left."""
     words = " ".join([*result["plain"], *result["notes"]]).lower()
-    left = result["verdict"] == "unexplained_structure" or result["structure_left"] > STRUCTURE
-    return bool(left or "structure left" in words)
+    unexplained = result["verdict"] == "unexplained_structure" or result["structure_left"] > STRUCTURE
+    return bool(unexplained or "structure left" in words)
 
 
 def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str, Any]]]:
-    """What a set is made of."""
+    """Return the records of a set: effect, strength, seed and settings of each."""
     seeds = list(seeds)
     if kind == "single":
         return [(e, s, seed, {}) for e in EFFECTS for s in STRENGTHS for seed in seeds]
@@ -129,9 +129,9 @@ def jobs(kind: str, seeds: Iterable[int]) -> list[tuple[str, str, int, dict[str,
         chosen = ("fatigue", "asymmetric_relaxation", "electromechanical_delay", "output_saturation", "catch_like")
         return [(e, "middle", seed, options) for e in chosen for options in sets for seed in seeds[:1]]
     if kind == "nothing":
-        many = range(min(seeds), min(seeds) + 12 * len(seeds))
+        many_seeds = range(min(seeds), min(seeds) + 12 * len(seeds))
         sets = [{}, {"noise": "ar1"}, {"steep": True}, {"noise": "slow"}]
-        return [("", "middle", seed, options) for options in sets for seed in many]
+        return [("", "middle", seed, options) for options in sets for seed in many_seeds]
     raise SystemExit(f"no set {kind!r}")
 
 
@@ -140,8 +140,8 @@ def share(flags: list[bool]) -> str:
     return f"{100 * np.mean(flags):.0f} % ({sum(flags)}/{len(flags)})" if flags else "none"
 
 
-def tell(kind: str, rows: list[dict[str, Any]]) -> None:
-    """The figures of a set, one column a recorder."""
+def print_figures(kind: str, rows: list[dict[str, Any]]) -> None:
+    """Print the figures of a set, one column a recorder."""
     by: dict[str, list[dict[str, Any]]] = defaultdict(list)
     for row in rows:
         by[row["recorder"]].append(row)
@@ -157,49 +157,52 @@ def tell(kind: str, rows: list[dict[str, Any]]) -> None:
 
 
 def figures(kind: str, rows: list[dict[str, Any]]) -> dict[str, str]:
-    """The figures of a set by one recorder: what they are, and how large."""
-    told: dict[str, str] = {"records": str(len(rows))}
+    """Return the figures of a set by one recorder, as text by label."""
+    by_label: dict[str, str] = {"records": str(len(rows))}
     if kind in ("single", "slow", "rates"):
         for strengths in (("middle", "strong"), ("weak",)):
             some = [r for r in rows if r["strength"] in strengths]
             if some:
                 which = " and ".join(strengths)
-                told[f"named first, {which}"] = share([_first(r) for r in some])
-                told[f"named first or in its group, {which}"] = share(
+                by_label[f"named first, {which}"] = share([_first(r) for r in some])
+                by_label[f"named first or in its group, {which}"] = share(
                     [not {*r["truth"]}.isdisjoint(r["group"]) for r in some]
                 )
-                told[f"verdict 'effect missing', {which}"] = share([r["verdict"] == "effect_missing" for r in some])
-        told |= _calibration(rows)
+                by_label[f"verdict 'effect missing', {which}"] = share([r["verdict"] == "effect_missing" for r in some])
+        by_label |= _calibration(rows)
         gone = [_removed(r) for r in rows if _first(r) and r["before"] > 1.2 * r["noise"] and _foreseeable(r)]
         if gone:
-            told["held-out error above noise removed, efforts and tremor aside"] = (
+            by_label["held-out error above noise removed, efforts and tremor aside"] = (
                 f"median {100 * np.median(gone):.0f} %"
             )
-        told |= _confusions(rows)
+        by_label |= _confusions(rows)
     elif kind == "nothing":
         by: dict[str, list[bool]] = defaultdict(list)
         for r in rows:
             by[json.dumps(r["options"])].append(r["verdict"] == "nothing_missing")
-        told |= {f"nothing missing, {options}": share(flags) for options, flags in by.items()}
+        by_label |= {f"nothing missing, {options}": share(flags) for options, flags in by.items()}
     elif kind == "outside":
-        sure = [max(r["probabilities"], default=0.0) > SURE for r in rows]
-        left = [r["verdict"] == "unexplained_structure" for r in rows]
-        told["verdict 'structure left'"] = share(left)
-        told["told: that, or structure said to be left and no effect for sure"] = share(
-            [verdict or (r["structure said"] and not s) for r, verdict, s in zip(rows, left, sure, strict=True)]
+        confident = [max(r["probabilities"], default=0.0) > SURE_PROBABILITY for r in rows]
+        structure_left = [r["verdict"] == "unexplained_structure" for r in rows]
+        by_label["verdict 'structure left'"] = share(structure_left)
+        by_label["told: that, or structure said to be left and no effect for sure"] = share(
+            [
+                verdict or (r["structure said"] and not named)
+                for r, verdict, named in zip(rows, structure_left, confident, strict=True)
+            ]
         )
-        told[f"an effect named above {SURE:g}"] = share(sure)
+        by_label[f"an effect named above {SURE_PROBABILITY:g}"] = share(confident)
         for effect in sorted({r["effect"] for r in rows}):
-            own = [r for r in rows if r["effect"] == effect]
-            said = Counter(r["named"][0] if r["verdict"] == "effect_missing" else r["verdict"] for r in own)
-            told[f"  {effect}"] = ", ".join(f"{what} {count}" for what, count in said.most_common())
+            effect_rows = [r for r in rows if r["effect"] == effect]
+            answers = Counter(r["named"][0] if r["verdict"] == "effect_missing" else r["verdict"] for r in effect_rows)
+            by_label[f"  {effect}"] = ", ".join(f"{what} {count}" for what, count in answers.most_common())
     elif kind == "two":
-        told["both named"] = share([set(r["truth"]) <= set(r["named"]) for r in rows])
-        told["one named"] = share([bool(set(r["truth"]) & set(r["named"])) for r in rows])
-        told |= {f"  {r['effect']} {r['seed']}": f"{', '.join(r['named'])} ({r['verdict']})" for r in rows}
+        by_label["both named"] = share([set(r["truth"]) <= set(r["named"]) for r in rows])
+        by_label["one named"] = share([bool(set(r["truth"]) & set(r["named"])) for r in rows])
+        by_label |= {f"  {r['effect']} {r['seed']}": f"{', '.join(r['named'])} ({r['verdict']})" for r in rows}
     cpu = [r["cpu_seconds"] for r in rows]
-    told["processor seconds a record"] = f"median {np.median(cpu):.1f}, largest {max(cpu):.1f}"
-    return told
+    by_label["processor seconds a record"] = f"median {np.median(cpu):.1f}, largest {max(cpu):.1f}"
+    return by_label
 
 
 def _first(row: dict[str, Any]) -> bool:
@@ -218,15 +221,15 @@ def _removed(row: dict[str, Any]) -> float:
 
 
 def _calibration(rows: list[dict[str, Any]]) -> dict[str, str]:
-    told = {}
+    by_label = {}
     named = [r for r in rows if r["named"] and r["verdict"] == "effect_missing"]
     for low, high in ((0.0, 0.6), (0.6, 0.85), (0.85, 0.97), (0.97, 1.01)):
         some = [r for r in named if low <= r["probabilities"][0] < high]
         if some:
             stated = np.mean([r["probabilities"][0] for r in some])
             right = share([_first(r) for r in some])
-            told[f"right where {low:g} to {min(high, 1):g} is stated"] = f"{right}, mean stated {stated:.2f}"
-    return told
+            by_label[f"right where {low:g} to {min(high, 1):g} is stated"] = f"{right}, mean stated {stated:.2f}"
+    return by_label
 
 
 def _confusions(rows: list[dict[str, Any]]) -> dict[str, str]:
@@ -235,25 +238,25 @@ def _confusions(rows: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def run(arguments: list[str] | None = None) -> None:
-    """Make, diagnose, tell."""
-    made = parser(__doc__, "1003:1004")
-    made.add_argument("--only", default=",".join(SETS))
-    made.add_argument("--recorder", default="plain", help="with commas: joined, or as in bench.muscles.recorders")
-    settings = made.parse_args(arguments)
+    """Diagnose the records of each set and print its figures."""
+    parser = bench_parser(__doc__, "1003:1004")
+    parser.add_argument("--only", default=",".join(SETS))
+    parser.add_argument("--recorder", default="plain", help="with commas: joined, or as in bench.muscles.recorders")
+    settings = parser.parse_args(arguments)
     everything = {}
     for kind in settings.only.split(","):
-        asked = [
+        run_jobs = [
             (effect, strength, seed, options | {"recorder": recorder})
             for effect, strength, seed, options in jobs(kind, settings.seeds)
             for recorder in settings.recorder.split(",")
         ]
-        rows = [row for row in in_processes(one, asked) if row is not None]
+        rows = [row for row in in_processes(diagnose_record, run_jobs) if row is not None]
         print(f"{kind}, seeds {settings.seeds.start} to {settings.seeds.stop - 1}, {len(rows)} records")
         if rows:
-            tell(kind, rows)
+            print_figures(kind, rows)
         sys.stdout.flush()
         everything[kind] = rows
-        keep(settings.json, everything, None)
+        write_json(settings.json, everything, None)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import ROOT, parser, pyplot, reveal, services, table, written_by
+from bench.common import ROOT, bench_parser, pyplot, reveal, services, table, written_by
 from examples import ilc_controller as ilc
 
 SEEDS = (59, 29)
@@ -72,11 +72,11 @@ def one_run(
     reference = ilc.Reference.reach(0.6 * float(model["recruitment"]["inverse"]["torque_nm"][-1]))
     used = ramp_deconvolution(service, test) if method else model
     done = ilc.learn(service, used, reference, law, trials, static)
-    found: dict[str, Any] = {"reference": reference, "trials": done}
+    outcome: dict[str, Any] = {"reference": reference, "trials": done}
     if not static:
-        again = [service.play(done[-1].widths_us)[0] for _ in range(3)]
-        found["floor"] = 100 * float(np.sqrt(np.mean(np.var(again, axis=0, ddof=1)))) / reference.rms_nm
-    return found | {"repeated": service.repeated}
+        repeats = [service.play(done[-1].widths_us)[0] for _ in range(3)]
+        outcome["floor"] = 100 * float(np.sqrt(np.mean(np.var(repeats, axis=0, ddof=1)))) / reference.rms_nm
+    return outcome | {"repeated": service.repeated}
 
 
 RUNS = {
@@ -112,14 +112,14 @@ def knowing(service: Patient, test: dict[str, Any], trials: int, peak_nm: float,
 
 def main() -> None:
     """All cases, the page and the drawing."""
-    made = parser(__doc__)
-    made.add_argument("--speed", type=float, default=1.0)
-    made.add_argument("--trials", type=int, default=10)
-    made.add_argument("--seeds", type=int, nargs="*", default=list(SEEDS))
-    made.add_argument("--out", type=Path, default=ROOT / "docs")
-    made.add_argument("--jobs", type=int, default=2, help="rigs at a time")
-    made.add_argument("--only-hidden", action="store_true")
-    options = made.parse_args()
+    parser = bench_parser(__doc__)
+    parser.add_argument("--speed", type=float, default=1.0)
+    parser.add_argument("--trials", type=int, default=10)
+    parser.add_argument("--seeds", type=int, nargs="*", default=list(SEEDS))
+    parser.add_argument("--out", type=Path, default=ROOT / "docs")
+    parser.add_argument("--jobs", type=int, default=2, help="rigs at a time")
+    parser.add_argument("--only-hidden", action="store_true")
+    options = parser.parse_args()
     began = time.time()
     wanted: dict[str, dict[str, Any]] = {}
     if not options.only_hidden:
@@ -152,11 +152,11 @@ def play_all(wanted: dict[str, dict[str, Any]], options: argparse.Namespace) -> 
         if future.exception() is not None:
             print(f"{name}, {run}: {future.exception()}", file=sys.stderr)
             continue
-        found = future.result()
-        case_ = cases.setdefault(name, {"reference": found["reference"], "runs": {}, "repeated": 0})
-        case_["runs"][run] = found["trials"]
-        case_["repeated"] += found["repeated"]
-        case_ |= {"floor": found["floor"]} if "floor" in found else {}
+        outcome = future.result()
+        case_ = cases.setdefault(name, {"reference": outcome["reference"], "runs": {}, "repeated": 0})
+        case_["runs"][run] = outcome["trials"]
+        case_["repeated"] += outcome["repeated"]
+        case_ |= {"floor": outcome["floor"]} if "floor" in outcome else {}
     return cases
 
 
@@ -176,19 +176,19 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
         "",
         "![Error over trials](../img/ilc.svg)",
     ]
-    for name, found in cases.items():
+    for name, outcome in cases.items():
         lines += ["", f"## {name[0].upper()}{name[1:]}", ""]
-        lines.append(f"Reference {found['reference'].rms_nm:.2f} N·m rms.")
-        if "floor" in found:
+        lines.append(f"Reference {outcome['reference'].rms_nm:.2f} N·m rms.")
+        if "floor" in outcome:
             lines.append(
-                f"The same pulses played three times differ by {found['floor']:.2f} %: nothing is learnt below that."
+                f"The same pulses played three times differ by {outcome['floor']:.2f} %: nothing is learnt below that."
             )
-        lost = sum(trial.lost_pulses for trials in found["runs"].values() for trial in trials)
+        lost = sum(trial.lost_pulses for trials in outcome["runs"].values() for trial in trials)
         lines.append(
-            f"Pulses dropped because the host was late: {lost}; trials repeated after a fault: {found['repeated']}."
+            f"Pulses dropped because the host was late: {lost}; trials repeated after a fault: {outcome['repeated']}."
         )
-        count = len(next(iter(found["runs"].values())))
-        errors = [[run, *(f"{one.error_percent:.2f}" for one in trials)] for run, trials in found["runs"].items()]
+        count = len(next(iter(outcome["runs"].values())))
+        errors = [[run, *(f"{trial.error_percent:.2f}" for trial in trials)] for run, trials in outcome["runs"].items()]
         lines += ["", *table(["trial", *map(str, range(1, count + 1))], errors)]
     return "\n".join(lines) + "\n"
 
@@ -196,14 +196,14 @@ def page(cases: dict[str, dict[str, Any]], speed: float, seconds: float) -> str:
 def draw(path: Path, cases: dict[str, dict[str, Any]]) -> None:
     """Error over trials, a panel for each muscle."""
     figure, axes = pyplot().subplots(1, len(cases), figsize=(3.6 * len(cases) + 2, 3.8), sharey=True, squeeze=False)
-    for axis, (name, found) in zip(axes[0], cases.items(), strict=True):
-        for run, trials in found["runs"].items():
+    for axis, (name, outcome) in zip(axes[0], cases.items(), strict=True):
+        for run, trials in outcome["runs"].items():
             dashes = "--" if STATIC in run else "-"
             errors = [trial.error_percent for trial in trials]
             axis.semilogy(range(1, len(errors) + 1), errors, f"o{dashes}", ms=3, lw=1.2, label=run)
         axis.axhline(5, color="grey", lw=0.8)
-        if "floor" in found:
-            axis.axhspan(0.1, found["floor"], color="#eee")
+        if "floor" in outcome:
+            axis.axhspan(0.1, outcome["floor"], color="#eee")
         axis.set_title(name.replace(" (", "\n("), fontsize=9)
         axis.set_xlabel("trial")
         axis.legend(fontsize=6.5)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import ROOT, in_processes, keep, parser, written_by
+from bench.common import ROOT, bench_parser, in_processes, write_json, written_by
 from bench.moving_joint import MOVING_JOINT, as_record, guided_tests, joined
 from bench.muscles.arm_patient import ArmPatient, arm_patient
 from bench.muscles.arm_records import record
@@ -28,11 +28,11 @@ from ilc_moving_joint import learn_moving
 
 FINE_HZ = 1600
 NOISE_NM = 0.07
-LATE_S, FASTER, BESIDE_RAD = 0.08, 0.03, 0.035
+LATE_S, FASTER, OFFSET_RAD = 0.08, 0.03, 0.035
 
 
 class Simulated:
-    """Stands where the service stands: the arm plays a trial, the model foretells it."""
+    """Takes the place of the service: the arm plays a trial, the model predicts it."""
 
     def __init__(self, arm: ArmPatient, model: Model, seed: int) -> None:
         self.arm, self.model, self.rng = arm, model, np.random.default_rng(seed)
@@ -47,9 +47,9 @@ class Simulated:
         """One trial of the arm, with its own lateness, speed and place."""
         each = FINE_HZ // 40
         late_s, faster = self.rng.uniform(-LATE_S, LATE_S), 1 + self.rng.uniform(-FASTER, FASTER)
-        beside = self.rng.uniform(-BESIDE_RAD, BESIDE_RAD)
+        offset_rad = self.rng.uniform(-OFFSET_RAD, OFFSET_RAD)
         time_s = np.arange(-FINE_HZ, widths_us.size * each) / FINE_HZ  # a second of rest before it
-        angle = self.movement((time_s - late_s) * faster) + beside
+        angle = self.movement((time_s - late_s) * faster) + offset_rad
         velocity = np.gradient(angle, 1 / FINE_HZ)
         width = np.r_[np.zeros(FINE_HZ), np.repeat(widths_us, each)]
         arm = self.arm
@@ -62,37 +62,37 @@ class Simulated:
         return trial.reshape(-1, each).mean(axis=1) - rest, widths_us, read
 
     def foretell(self, model: dict[str, Any], widths_us: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-        """What the model gives."""
+        """Predict the torque along these angles, N·m above rest."""
         motion = Motion.of(angle_rad, 40.0) if model.get("joint") else None
         return above_rest(self.model, widths_us, 40.0, motion)
 
 
-def one(job: tuple[int, int]) -> dict[str, Any]:
-    """Both models on one arm: tracking error in % of each trial."""
+def learn_arm(job: tuple[int, int]) -> dict[str, Any]:
+    """Learn with both models on one arm; return the tracking error of each trial in %."""
     seed, trials = job
     arm = arm_patient(seed)
     isometric = record(arm, "isometric", seed)
     alone = fit(as_record(isometric))
     whole = fit(joined([isometric, *guided_tests(arm, alone, isometric, seed)]), effects=MOVING_JOINT)
     shape = Reference.reach(0.45 * float(arm.recruitment_nm(arm.largest_width_us)))
-    found: dict[str, Any] = {"seed": seed}
+    errors: dict[str, Any] = {"seed": seed}
     for name, model in (("with g and h", whole), ("without", alone)):
         service = Simulated(arm, model, seed)
-        meant = service.movement((np.arange(shape.torque_nm.size) + 0.5) / 40)
-        # What is wanted is wanted beside what the joint gives by itself: as a therapist would set it.
-        passive = above_rest(whole, np.zeros(meant.size), 40.0, Motion.of(meant, 40.0))
-        reference = Reference(shape.torque_nm * np.clip(arm.g(meant, 0.0), 0.2, 1.0) + passive)
-        done = learn_moving(service, model.to_dict(), reference, meant, trials)
-        found[name] = [trial.error_percent * reference.rms_nm / shape.rms_nm for trial in done]
-    return found
+        planned_rad = service.movement((np.arange(shape.torque_nm.size) + 0.5) / 40)
+        # The reference is added to the passive torque of the joint, as a therapist would set it.
+        passive = above_rest(whole, np.zeros(planned_rad.size), 40.0, Motion.of(planned_rad, 40.0))
+        reference = Reference(shape.torque_nm * np.clip(arm.g(planned_rad, 0.0), 0.2, 1.0) + passive)
+        done = learn_moving(service, model.to_dict(), reference, planned_rad, trials)
+        errors[name] = [trial.error_percent * reference.rms_nm / shape.rms_nm for trial in done]
+    return errors
 
 
 def main() -> None:
     """Run."""
-    made = parser(__doc__, "1100:1108", "--arms")
-    made.add_argument("--trials", type=int, default=8)
-    options = made.parse_args()
-    rows = list(in_processes(one, [(seed, options.trials) for seed in options.arms]))
+    parser = bench_parser(__doc__, "1100:1108", "--arms")
+    parser.add_argument("--trials", type=int, default=8)
+    options = parser.parse_args()
+    rows = list(in_processes(learn_arm, [(seed, options.trials) for seed in options.arms]))
     arms = f"{options.arms.start}:{options.arms.stop}"
     print(written_by(f"python -m bench.ilc_moving_joint --arms {arms} --trials {options.trials}"))
     print("error in % of the stimulated torque's rms, median over arms (largest)")
@@ -100,7 +100,7 @@ def main() -> None:
     for number in range(options.trials):
         cells = [np.array([row[name][number] for row in rows]) for name in ("with g and h", "without")]
         print(f"{number + 1:5d}  " + "  ".join(f"{np.median(cell):6.2f} ({cell.max():6.2f})" for cell in cells))
-    keep(options.json, rows)
+    write_json(options.json, rows)
 
 
 if __name__ == "__main__":

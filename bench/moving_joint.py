@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import in_processes, keep, parser, written_by
+from bench.common import bench_parser, in_processes, write_json, written_by
 from bench.muscles.arm_patient import ArmPatient, arm_patient
 from bench.muscles.arm_records import ENCODER, AngleSensor, record
 from stimrig.api.sessions import joint_plan
@@ -45,33 +45,33 @@ EARLIER = 1_000_000
 """Added to the seed of a trial that comes before the unseen one."""
 
 
-def torque_time_nms(arm: ArmPatient, made: dict[str, Any]) -> float:
-    """Of the active torque, N·m·s."""
-    truth = made["truth"]
+def torque_time_nms(arm: ArmPatient, simulated: dict[str, Any]) -> float:
+    """Integrate the active torque over time, N·m·s."""
+    truth = simulated["truth"]
     active = arm.g(truth["angle_rad"], truth["velocity_rad_s"]) * truth["isometric_nm"]
-    return float(np.sum(np.abs(active)) * (made["time_s"][1] - made["time_s"][0]))
+    return float(np.sum(np.abs(active)) * (simulated["time_s"][1] - simulated["time_s"][0]))
 
 
-def one(seed: int) -> dict[str, Any]:
-    """One arm: what was found of it, beside the truth."""
+def identify_arm(seed: int) -> dict[str, Any]:
+    """Identify one arm and return the errors against its truth."""
     arm = arm_patient(seed)
     isometric = record(arm, "isometric", seed)
     alone = fit(as_record(isometric))
     guided = guided_tests(arm, alone, isometric, seed)
     unseen = record(arm, "unseen", seed, duration_s=UNSEEN_S)
     dose = {"paper": torque_time_nms(arm, isometric), "guided": sum(torque_time_nms(arm, each) for each in guided)}
-    told = {"seed": seed, "laws": laws(arm), "dose": dose}
-    told["isometric"] = active_errors(arm, alone, arm.reference_rad)
-    for name, made in (("guided", guided), ("all", [isometric, *guided])):
+    row = {"seed": seed, "laws": laws(arm), "dose": dose}
+    row["isometric"] = active_errors(arm, alone, arm.reference_rad)
+    for name, records in (("guided", guided), ("all", [isometric, *guided])):
         began = time.process_time()
-        model = fit(joined(made), effects=MOVING_JOINT)
-        told[name] = {"cpu_s": time.process_time() - began, **judged(arm, Model.from_json(model.to_json()), unseen)}
-    return told
+        model = fit(joined(records), effects=MOVING_JOINT)
+        row[name] = {"cpu_s": time.process_time() - began, **judged(arm, Model.from_json(model.to_json()), unseen)}
+    return row
 
 
-def one_by_sensors(seed: int, names: tuple[str, ...]) -> dict[str, Any]:
-    """One arm whose angle is read by each of some sensors, in its tests and in the unseen trial."""
-    arm, told = arm_patient(seed), {}
+def identify_by_sensors(seed: int, names: tuple[str, ...]) -> dict[str, Any]:
+    """Identify one arm once for each named sensor, which reads the angle in its tests and in the unseen trial."""
+    arm, by_sensor = arm_patient(seed), {}
     alone = fit(as_record(record(arm, "isometric", seed)))
     for name in names:
         sensor = SENSORS[name]
@@ -80,13 +80,13 @@ def one_by_sensors(seed: int, names: tuple[str, ...]) -> dict[str, Any]:
         began = time.process_time()
         model = fit(tests, effects=MOVING_JOINT)
         unseen = record(arm, "unseen", seed, duration_s=UNSEEN_S, sensor=sensor)
-        told[name] = {"cpu_s": time.process_time() - began, **model.data["joint_sensor"]}
-        told[name] |= {"error": over_noise(model, unseen)}
+        by_sensor[name] = {"cpu_s": time.process_time() - began, **model.data["joint_sensor"]}
+        by_sensor[name] |= {"error": over_noise(model, unseen)}
         cost_nm = sensor_cost_nm(*problem_of(model, make_grid(as_record(unseen))))
-        told[name]["cost"] = cost_nm / unseen["truth"]["noise_sd_nm"]
+        by_sensor[name]["cost"] = cost_nm / unseen["truth"]["noise_sd_nm"]
         if name == "clean":
-            told["predict"] = {kind: noise_costs(arm, model, kind, seed) for kind in ("unseen", "reaching")}
-    return {"seed": seed, "sensors": told}
+            by_sensor["predict"] = {kind: noise_costs(arm, model, kind, seed) for kind in ("unseen", "reaching")}
+    return {"seed": seed, "sensors": by_sensor}
 
 
 def noise_costs(arm: ArmPatient, model: Model, kind: str, seed: int) -> dict[str, float]:
@@ -96,10 +96,10 @@ def noise_costs(arm: ArmPatient, model: Model, kind: str, seed: int) -> dict[str
         make(seed=number, sensor=SENSORS[name])
         for number, name in ((seed, "clean"), (seed, "noise"), (seed + EARLIER, "noise"))
     )
-    beside = over_noise(model, clean)
+    clean_error = over_noise(model, clean)
     return {
-        "both ways": over_noise(model, noisy) / beside,
-        "causal": over_noise(model, noisy, as_record(earlier)) / beside,
+        "both ways": over_noise(model, noisy) / clean_error,
+        "causal": over_noise(model, noisy, as_record(earlier)) / clean_error,
     }
 
 
@@ -118,11 +118,11 @@ def guided_tests(
     curve = joint_plan.curve_of({"pulse_width_us": list(width_us), "torque_nm": list(torque_nm)}, top_us, None)
     every = round(isometric["time_s"].size / (isometric["time_s"][-1] * RATE_HZ))
     layout = joint_plan.layout(arm.range_rad, curve, top_us, isometric["pulse_width_us"][::every], RATE_HZ)
-    made = [record(arm, "passive", seed, duration_s=PASSIVE_S, sensor=sensor)]
+    records = [record(arm, "passive", seed, duration_s=PASSIVE_S, sensor=sensor)]
     for place, x in enumerate(layout.targets_rad):
-        held = record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held), sensor=sensor)
-        made.append(held)
-    return [*made, record(arm, "moving", seed, parts=parts_of(layout.moving), sensor=sensor)]
+        held_record = record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held), sensor=sensor)
+        records.append(held_record)
+    return [*records, record(arm, "moving", seed, parts=parts_of(layout.moving), sensor=sensor)]
 
 
 def parts_of(segments: list[dict[str, Any]]) -> list[tuple[str, np.ndarray]]:
@@ -130,44 +130,44 @@ def parts_of(segments: list[dict[str, Any]]) -> list[tuple[str, np.ndarray]]:
     return [(each["name"], np.array(each["settings"]["pulse_width_us"])) for each in segments]
 
 
-def joined(made: list[dict[str, Any]]) -> Record:
+def joined(records: list[dict[str, Any]]) -> Record:
     """The records as the parts of one, two minutes apart."""
-    return join([as_record(each) for each in made], [120.0 * place for place in range(len(made))])
+    return join([as_record(each) for each in records], [120.0 * place for place in range(len(records))])
 
 
 def laws(arm: ArmPatient) -> dict[str, Any]:
-    """Which laws the arm has."""
+    """Return the names of the arm's laws."""
     return {place: arm.truth[place]["law"] for place in ("passive", "torque_angle", "torque_velocity")}
 
 
 def judged(arm: ArmPatient, model: Model, unseen: dict[str, Any]) -> dict[str, Any]:
-    """Errors of g and h where they were seen, what their bands hold, and an unseen trial's error over its noise."""
+    """Return the errors of g and h where data were measured, the coverage of their bands, and the unseen error."""
     known = {name: np.asarray(value) for name, value in model.joint.items() if name != "formula"}
     reference = float(known["reference_angle_rad"])
     x, v = np.meshgrid(known["angle_rad"], known["velocity_rad_s"], indexing="ij")
     truth = {"h": arm.h_nm(x, v) - arm.h_nm(reference, 0.0), "g": arm.g(x, v) / arm.g(reference, 0.0)}
-    found: dict[str, Any] = {"reference_rad": reference}
+    figures: dict[str, Any] = {"reference_rad": reference}
     for name, unit in (("h", "_nm"), ("g", "")):
-        seen = known[f"seen_{name}"] > 0
-        error = (known[f"{name}{unit}"] - truth[name])[seen]
-        scale = float(np.ptp(truth[name][seen])) if name == "h" else 1.0
+        visited = known[f"seen_{name}"] > 0
+        error = (known[f"{name}{unit}"] - truth[name])[visited]
+        scale = float(np.ptp(truth[name][visited])) if name == "h" else 1.0
         inside = (truth[name] >= known[f"{name}_lower{unit}"]) & (truth[name] <= known[f"{name}_upper{unit}"])
-        found[name] = {
+        figures[name] = {
             "rms": float(np.sqrt(np.mean(error**2))) / scale,
             "p95": float(np.percentile(np.abs(error), 95)) / scale,
-            "covered": float(np.mean(inside[seen])),
+            "covered": float(np.mean(inside[visited])),
         }
     error_nm = unseen["torque_nm"] - predict(model, as_record(unseen))
     # The sensor's zero of another day is not the model's.
     error_nm = error_nm - np.median(error_nm)
     noise_sd_nm = unseen["truth"]["noise_sd_nm"]
-    found["unseen_over_noise"] = float(np.sqrt(np.mean(error_nm**2))) / noise_sd_nm
+    figures["unseen_over_noise"] = float(np.sqrt(np.mean(error_nm**2))) / noise_sd_nm
     stimulated_rad = known["angle_rad"][np.any(known["seen_g"] > 0, axis=1)]
     angle_rad = unseen["truth"]["angle_rad"]
     inside = (angle_rad >= stimulated_rad.min()) & (angle_rad <= stimulated_rad.max())
-    found["unseen_outside"] = float(np.mean(~inside))
-    found["unseen_inside_over_noise"] = float(np.sqrt(np.mean(error_nm[inside] ** 2))) / noise_sd_nm
-    return found | active_errors(arm, model, reference)
+    figures["unseen_outside"] = float(np.mean(~inside))
+    figures["unseen_inside_over_noise"] = float(np.sqrt(np.mean(error_nm[inside] ** 2))) / noise_sd_nm
+    return figures | active_errors(arm, model, reference)
 
 
 def active_errors(arm: ArmPatient, model: Model, reference_rad: float) -> dict[str, float]:
@@ -183,8 +183,8 @@ def active_errors(arm: ArmPatient, model: Model, reference_rad: float) -> dict[s
     }
 
 
-def tell(rows: list[dict[str, Any]]) -> None:
-    """The goals, each beside what was measured."""
+def print_goals(rows: list[dict[str, Any]]) -> None:
+    """Print each goal beside the measured figure."""
     for name in ("guided", "all"):
         print(f"{'three guided tests' if name == 'guided' else 'and the isometric test'}, {len(rows)} arms")
         for part, goal in (("h", 0.05), ("g", 0.07)):
@@ -214,13 +214,13 @@ def tell(rows: list[dict[str, Any]]) -> None:
     print(f"torque-time of the three over the paper's test: median {np.median(share):.2f}, largest {share.max():.2f}")
 
 
-def tell_sensors(rows: list[dict[str, Any]], names: tuple[str, ...]) -> None:
-    """What each sensor costs."""
+def print_sensor_costs(rows: list[dict[str, Any]], names: tuple[str, ...]) -> None:
+    """Print the error and its part that is the sensor's, for each sensor."""
     for name in names:
-        own = [row["sensors"][name] for row in rows]
-        error, cost, cpu_s = (np.array([each[key] for each in own]) for key in ("error", "cost", "cpu_s"))
+        sensor_rows = [row["sensors"][name] for row in rows]
+        error, cost, cpu_s = (np.array([each[key] for each in sensor_rows]) for key in ("error", "cost", "cpu_s"))
         apart = np.sqrt(np.maximum(error**2 - cost**2, 0.0))
-        late_ms = 1e3 * np.array([each["delay_s"] for each in own])
+        late_ms = 1e3 * np.array([each["delay_s"] for each in sensor_rows])
         print(
             f"{name}: error {np.median(error):.2f} x noise (median), worst {error.max():.2f}, within 1.3: "
             f"{np.sum(error <= 1.3)} of {error.size}; without the sensor's own cost ({np.median(cost):.2f}) "
@@ -239,27 +239,27 @@ def tell_sensors(rows: list[dict[str, Any]], names: tuple[str, ...]) -> None:
 
 def main() -> None:
     """Run."""
-    made = parser(__doc__, "1000:1050", "--arms")
-    made.add_argument("--workers", type=int, default=2)
-    made.add_argument("--sensors", default="", help=f"some of {','.join(SENSORS)}")
-    options = made.parse_args()
+    parser = bench_parser(__doc__, "1000:1050", "--arms")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--sensors", default="", help=f"some of {','.join(SENSORS)}")
+    options = parser.parse_args()
     if options.sensors:
         names = tuple(options.sensors.split(","))
-        rows = list(in_processes(partial(one_by_sensors, names=names), options.arms, options.workers))
-        asked = f"--arms {options.arms.start}:{options.arms.stop} --sensors {options.sensors}"
-        print(written_by(f"python -m bench.moving_joint {asked}"))
-        tell_sensors(rows, names)
-        keep(options.json, rows)
+        rows = list(in_processes(partial(identify_by_sensors, names=names), options.arms, options.workers))
+        arguments = f"--arms {options.arms.start}:{options.arms.stop} --sensors {options.sensors}"
+        print(written_by(f"python -m bench.moving_joint {arguments}"))
+        print_sensor_costs(rows, names)
+        write_json(options.json, rows)
         return
     rows = []
-    for row in in_processes(one, options.arms, options.workers):
+    for row in in_processes(identify_arm, options.arms, options.workers):
         rows.append(row)
         errors = [row["all"]["h"]["rms"], row["all"]["g"]["rms"]]
-        told = f"{errors[0]:.3f} {errors[1]:.3f} {row['all']['unseen_over_noise']:.2f}"
-        print(f"arm {row['seed']}: {row['laws']} {told}", file=sys.stderr, flush=True)
+        errors_text = f"{errors[0]:.3f} {errors[1]:.3f} {row['all']['unseen_over_noise']:.2f}"
+        print(f"arm {row['seed']}: {row['laws']} {errors_text}", file=sys.stderr, flush=True)
     print(written_by(f"python -m bench.moving_joint --arms {options.arms.start}:{options.arms.stop}"))
-    tell(rows)
-    keep(options.json, rows)
+    print_goals(rows)
+    write_json(options.json, rows)
 
 
 if __name__ == "__main__":

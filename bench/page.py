@@ -19,7 +19,7 @@ import httpx
 from playwright.sync_api import sync_playwright
 from sqlalchemy import select
 
-from bench.common import parser
+from bench.common import bench_parser
 from stimrig.api.jobs.worker import Worker
 from stimrig.api.store.tables import Analysis, Approval, Model, Note, Participant, Recording, Test
 from tests.api.browser import ARGUMENTS, CHROMIUM, NAME, PASSWORD
@@ -54,9 +54,9 @@ def seed(service: Service, done: dict[str, Any]) -> list[str]:
     with store.read() as session:
         rows = [session.get(Participant, "P1"), session.get(Recording, done["recording_id"]),
                 session.get(Test, done["id"]), session.get(Model, done["model_id"])]  # fmt: skip
-        found = session.scalars(select(Analysis).where(Analysis.model_id == done["model_id"])).all()
+        stored_analyses = session.scalars(select(Analysis).where(Analysis.model_id == done["model_id"])).all()
         whole, recording, test, model = (row.as_dict() for row in rows if row is not None)
-        analyses = [row.as_dict() for row in found]
+        analyses = [row.as_dict() for row in stored_analyses]
     ids = []
     with store.write() as session:
         session.add(Participant(**{**whole, "code": "P200"}))
@@ -86,7 +86,7 @@ def times(browser: Any, service: Service, ids: list[str], runs: int) -> dict[str
         "trend": "/participants/P200/trend", "compare": f"/compare?model={ids[-1]}&model={ids[-2]}&model={ids[-3]}",
         "test": f"/tests/t{SESSIONS - 1:04d}", "administration": "/administration",
     }  # fmt: skip
-    found = {}
+    by_page = {}
     for name, path in paths.items():
         took = []
         for _ in range(runs + 1):
@@ -94,10 +94,10 @@ def times(browser: Any, service: Service, ids: list[str], runs: int) -> dict[str
             took.append(page.evaluate(LOADED))
         warm = sorted(took[1:])
         size = page.evaluate(WEIGHT)[1]
-        found[name] = {"median_ms": round(statistics.median(warm)), "p95_ms": round(warm[int(0.95 * (runs - 1) + 0.5)]),
-                       "kB": round(size / 1000, 1)}  # fmt: skip
+        p95_ms = round(warm[int(0.95 * (runs - 1) + 0.5)])
+        by_page[name] = {"median_ms": round(statistics.median(warm)), "p95_ms": p95_ms, "kB": round(size / 1000, 1)}
     page.context.close()
-    return found
+    return by_page
 
 
 def pages(browser: Any, service: Service, done: dict[str, Any], runs: int) -> dict[str, Any]:
@@ -131,10 +131,10 @@ def pages(browser: Any, service: Service, done: dict[str, Any], runs: int) -> di
 
 def main() -> None:
     """Measure and say."""
-    made = parser(__doc__)
-    made.add_argument("--runs", type=int, default=5)
-    made.add_argument("--looks", type=int, default=20, help="at each page of the participant with many sessions")
-    options = made.parse_args()
+    parser = bench_parser(__doc__)
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--looks", type=int, default=20, help="at each page of the participant with many sessions")
+    options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="stimrig-page-") as folder:
         for service in run_service(Path(folder), Path(folder), Worker):
             with service.client() as http:
@@ -145,11 +145,11 @@ def main() -> None:
                 http.get(f"/models/{done['model_id']}")
             with sync_playwright() as driver:
                 browser = driver.chromium.launch(executable_path=str(CHROMIUM), args=ARGUMENTS)
-                found = pages(browser, service, done, options.runs)
-                found |= {"page_ms": times(browser, service, seed(service, done), options.looks)}
+                figures = pages(browser, service, done, options.runs)
+                figures |= {"page_ms": times(browser, service, seed(service, done), options.looks)}
                 browser.close()
-            told = {**found, "runs": options.runs, "load_average": os.getloadavg(), "cores": os.cpu_count()}
-            print(json.dumps(told))
+            figures |= {"runs": options.runs, "load_average": os.getloadavg(), "cores": os.cpu_count()}
+            print(json.dumps(figures))
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-from bench.common import ROOT, line, parser, table
+from bench.common import ROOT, bench_parser, line, table
 from tests.harness.planted import copy_tree, places, plant, read_faults
 
 LONGEST_S = 1200.0
@@ -40,9 +40,9 @@ def finds(tree: Path, command: tuple[str, ...]) -> bool:
 
 def main() -> None:
     """Plant each fault and print the table."""
-    made = parser(__doc__)
-    made.add_argument("--only", default="", help="only faults whose names hold these words")
-    only = made.parse_args().only
+    parser = bench_parser(__doc__)
+    parser.add_argument("--only", default="", help="only faults whose names hold these words")
+    only = parser.parse_args().only
     totals = dict.fromkeys(SUITES, 0)
     print(*table(["fault", *SUITES], []), sep="\n")
     for fault in read_faults():
@@ -53,10 +53,10 @@ def main() -> None:
             copy_tree(ROOT, tree)
             for place in places(fault):
                 plant(tree, *place)
-            found = {name: finds(tree, command) for name, command in SUITES.items()}
-        for name, one in found.items():
-            totals[name] += one
-        print(line([fault["name"], *("found" if one else "not found" for one in found.values())]), flush=True)
+            detected = {name: finds(tree, command) for name, command in SUITES.items()}
+        for name, caught in detected.items():
+            totals[name] += caught
+        print(line([fault["name"], *("found" if caught else "not found" for caught in detected.values())]), flush=True)
     print(line(["**found**", *totals.values()]))
 
 

@@ -1,7 +1,7 @@
 """`python -m bench rivals [--only WORD,WORD]`: ours, peers, black boxes and the oracle, side by side.
 
 Task by contender: error in free run on rows that nobody fitted, and seconds of the fit. Each sees the same record, on
-the same machine, in the same run. A package that is not installed is told so.
+the same machine, in the same run. A package that is not installed is reported.
 `--only` takes words of tasks or contenders; `--write` puts the table into docs/results/bench.md.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 
 from bench import black_boxes
 from bench.black_boxes import BUDGET_S
-from bench.common import RESULTS, parser, table, written_by
+from bench.common import RESULTS, bench_parser, table, written_by
 from bench.contenders import CONTENDERS, Contender, Passes
 from bench.tasks import Task, makers
 from stimrig.identify.diagnosis import side_by_side
@@ -29,8 +29,8 @@ RUNS_AWAY = 1e4
 Row = list[str]
 
 
-def one(contender: Contender, task: Task, warm: bool) -> str:
-    """Error and seconds; or why there are none."""
+def score_contender(contender: Contender, task: Task, warm: bool) -> str:
+    """Return error and seconds as text, or the reason why there are none."""
     if task.fine and not contender.fine:
         return "–"
     try:
@@ -46,12 +46,12 @@ def one(contender: Contender, task: Task, warm: bool) -> str:
         return f"not installed ({missing.name})"
     except (IdentifyError, ValueError, ArithmeticError, np.linalg.LinAlgError, IndexError) as failed:
         return f"failed ({type(failed).__name__}: {' '.join(str(failed).split())[:60]})"
-    told = f"{error:.3g}" if error < RUNS_AWAY else "runs away"
-    return f"{told}, {seconds:.2g} s"
+    error_text = f"{error:.3g}" if error < RUNS_AWAY else "runs away"
+    return f"{error_text}, {seconds:.2g} s"
 
 
 def wanted(only: Sequence[str], name: str, names: Sequence[str]) -> bool:
-    """Whether a word names it, or none of the words names one of its kind."""
+    """Return true where a word of `only` is in `name`, or none of them is in any of `names`."""
     mine = [word for word in only if any(word in other for other in names)]
     return not mine or any(word in name for word in mine)
 
@@ -67,7 +67,7 @@ def measure(seed: int, only: Sequence[str]) -> tuple[list[Contender], list[Row]]
         task = make()
         rows.append([task.name, task.unit])
         for contender in chosen:
-            rows[-1].append(one(contender, task, warm=len(rows) == 1 and black_boxes.BUDGET_S > 0))
+            rows[-1].append(score_contender(contender, task, warm=len(rows) == 1 and black_boxes.BUDGET_S > 0))
             print(f"{task.name}, {contender.name}: {rows[-1][-1]} ({task.unit})", flush=True)
     return chosen, rows
 
@@ -94,15 +94,15 @@ boxes have fixed settings and choose on fitted rows alone; who tunes them for on
 
 def run(arguments: Sequence[str] | None = None) -> None:
     """Measure, and print the table."""
-    made = parser(__doc__)
-    made.prog = "python -m bench rivals"
-    made.add_argument("--only", default="", help="words of tasks or contenders, separated by commas")
-    made.add_argument(
+    parser = bench_parser(__doc__)
+    parser.prog = "python -m bench rivals"
+    parser.add_argument("--only", default="", help="words of tasks or contenders, separated by commas")
+    parser.add_argument(
         "--budget", type=float, default=BUDGET_S, help="s in which a box looks for better starts; 0: one, cold"
     )
-    made.add_argument("--seed", type=int, default=SEED)
-    made.add_argument("--write", action="store_true", help=f"write docs/results/{TARGET.name}")
-    options = made.parse_args(arguments)
+    parser.add_argument("--seed", type=int, default=SEED)
+    parser.add_argument("--write", action="store_true", help=f"write docs/results/{TARGET.name}")
+    options = parser.parse_args(arguments)
     warnings.filterwarnings("ignore")
     black_boxes.BUDGET_S, side_by_side.WORKERS = options.budget, 1
     text = document(options.seed, *measure(options.seed, [w for w in options.only.split(",") if w]))

@@ -1,4 +1,4 @@
-"""What is learnt of muscles that no library holds: error on what no fit was given.
+"""Score what `improve` learns of muscles that are not in the library, on a record that was not fitted.
 
     python -m bench.strange --set physics|further|places|plain --seeds 1000:1004
 
@@ -16,14 +16,14 @@ from typing import Any
 
 import numpy as np
 
-from bench.common import in_processes, keep, line, parser, table
+from bench.common import bench_parser, in_processes, line, table, write_json
 from bench.muscles.physics_records import DISTURBED, SETS, record_of_physics
 from stimrig import identify
 from stimrig.identify.diagnosis import side_by_side as workers
 from tests.harness.carried_sessions import as_record
 
-SURE = 0.9
-"""Probability from which a name counts as told for sure."""
+SURE_PROBABILITY = 0.9
+"""Probability from which an effect counts as named for sure."""
 WORSE, CLOSE = 1.02, 1.3
 PICTURE = {"enters": "where they enter", "driven_by": "what drives them"}
 REST_S = 1.9
@@ -35,78 +35,80 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def score(made: dict[str, Any], model: identify.Model) -> float:
-    """The model's error on what no fit was given, over the noise."""
-    unseen = made["unseen"]
+def score(generated: dict[str, Any], model: identify.Model) -> float:
+    """Return the model's error on the unseen record, over the noise."""
+    unseen = generated["unseen"]
     off = identify.predict(model, as_record(unseen)) - unseen["torque_nm"]
-    return rms(off - np.mean(off[unseen["time_s"] < REST_S])) / made["truth"]["noise_sd_nm"]
+    return rms(off - np.mean(off[unseen["time_s"] < REST_S])) / generated["truth"]["noise_sd_nm"]
 
 
-def look(job: tuple[str, int, bool]) -> dict[str, Any]:
-    """One record of a set and a seed: its plain fit, `improve` and, where wanted, the names of `diagnose`."""
+def identify_record(job: tuple[str, int, bool]) -> dict[str, Any]:
+    """Score one record of a set and a seed: its plain fit, `improve` and, where wanted, the names of `diagnose`."""
     kind, seed, with_names = job
-    made = record_of_physics(kind, seed)
+    generated = record_of_physics(kind, seed)
     workers.WORKERS = 1
-    record = as_record(made)
+    record = as_record(generated)
     began = time.perf_counter()
     plain = identify.fit(record)
     improved = identify.improve(record)
     seconds = time.perf_counter() - began
     missing = identify.diagnose(record).missing if with_names else ()
     named = {row["effect"]: row["probability"] for row in missing}
+    sure_names = [name for name, probability in named.items() if probability >= SURE_PROBABILITY]
     return {
-        "seed": made["truth"]["seed"],
-        "kind": made["truth"]["kind"],
-        "disturbed": made["truth"]["disturbed"],
-        "plain": score(made, plain),
-        "improved": score(made, improved.models[-1]),
+        "seed": generated["truth"]["seed"],
+        "kind": generated["truth"]["kind"],
+        "disturbed": generated["truth"]["disturbed"],
+        "plain": score(generated, plain),
+        "improved": score(generated, improved.models[-1]),
         "added": [step["added"] for step in improved.steps if step["added"]],
         "named": named,
-        "untrue": [name for name, sure in named.items() if sure >= SURE and name not in made["truth"]["true"]],
+        "untrue": [name for name in sure_names if name not in generated["truth"]["true"]],
         "verdict": improved.verdict,
-        "pictured": pictured(made, improved.models[-1]),
+        "pictured": pictured(generated, improved.models[-1]),
         "seconds": seconds,
     }
 
 
-def pictured(made: dict[str, Any], model: identify.Model) -> dict[str, Any]:
-    """By `PICTURE`: what the first free effect of a model says, and what would be right; empty without one."""
-    found = next((effect["shape"] for effect in model.effects if "shape" in effect), None)
-    truth = made["truth"]
-    if found is None:
+def pictured(generated: dict[str, Any], model: identify.Model) -> dict[str, Any]:
+    """Return for each key of `PICTURE` the answer of a model's first free effect and the right ones; empty without."""
+    shape = next((effect["shape"] for effect in model.effects if "shape" in effect), None)
+    truth = generated["truth"]
+    if shape is None:
         return {}
-    return {key: (found[key], truth[key]) for key in PICTURE}
+    return {key: (shape[key], truth[key]) for key in PICTURE}
 
 
-def tell_pictures(rows: list[dict[str, Any]]) -> Iterable[str]:
-    """In how many a picture is right, beside the one answer that would be right most often, always given."""
-    told = [row["pictured"] for row in rows if row["pictured"]]
-    for key, words in PICTURE.items() if told else ():
-        right = sum(said in truth for said, truth in (one[key] for one in told))
-        words_there = {word for one in told for word in one[key][1]}
-        always = max((sum(word in one[key][1] for one in told) for word in words_there), default=0)
-        yield f"free effects {len(told)}: {words} right in {right}; with the best one word every time {always}"
+def picture_lines(rows: list[dict[str, Any]]) -> Iterable[str]:
+    """Count the right answers of free effects, beside the score of the one word that is right most often."""
+    pictures = [row["pictured"] for row in rows if row["pictured"]]
+    for key, words in PICTURE.items() if pictures else ():
+        right = sum(answer in truth for answer, truth in (picture[key] for picture in pictures))
+        words_there = {word for picture in pictures for word in picture[key][1]}
+        always = max((sum(word in picture[key][1] for picture in pictures) for word in words_there), default=0)
+        yield f"free effects {len(pictures)}: {words} right in {right}; with the best one word every time {always}"
 
 
-def tell(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
-    """The summary."""
+def summary_lines(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
+    """Yield the lines of the summary."""
     plain, improved = (np.array([row[name] for row in rows]) for name in ("plain", "improved"))
     yield f"median error over noise: plain {np.median(plain):.2f}, improved {np.median(improved):.2f}"
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
     yield f"improved better by 10 % and more: {np.sum(improved <= 0.9 * plain)} of {len(rows)}"
-    yield from tell_pictures(rows)
-    yield f"records with a name that is untrue with {SURE} and more: {sum(bool(row['untrue']) for row in rows)}"
+    yield from picture_lines(rows)
+    untrue_count = sum(bool(row["untrue"]) for row in rows)
+    yield f"records with a name that is untrue with {SURE_PROBABILITY} and more: {untrue_count}"
     if kind == "plain":
-        asked = [(row, one) for row in rows for one in row["disturbed"] if DISTURBED[one]]
-        told = sum(DISTURBED[one] in {*row["added"], *row["named"]} for row, one in asked)
-        yield f"hum and slow zero told: {told} of {len(asked)}"
+        disturbed_rows = [(row, name) for row in rows for name in row["disturbed"] if DISTURBED[name]]
+        named_count = sum(DISTURBED[name] in {*row["added"], *row["named"]} for row, name in disturbed_rows)
+        yield f"hum and slow zero told: {named_count} of {len(disturbed_rows)}"
 
 
 def cells(row: dict[str, Any]) -> list[str]:
     """A record's line."""
     over = f" + {', '.join(row['disturbed'])}" if row["disturbed"] else ""
-    names = ", ".join(f"{name} {sure:.2f}" for name, sure in row["named"].items())
+    names = ", ".join(f"{name} {probability:.2f}" for name, probability in row["named"].items())
     return [
         f"{row['seed']} {row['kind']}{over}",
         f"{row['plain']:.2f}",
@@ -119,21 +121,22 @@ def cells(row: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    """Make, fit, improve, tell."""
-    made = parser(__doc__, "1000:1004")
-    made.add_argument("--set", choices=SETS, required=True)
-    made.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")
-    made.add_argument("--jobs", type=int, default=1, help="processes")
-    asked = made.parse_args()
-    jobs = [(asked.set, seed, not asked.no_names) for seed in asked.seeds]
-    found = in_processes(look, jobs, asked.jobs) if asked.jobs > 1 else map(look, jobs)
+    """Score every record and print the table."""
+    parser = bench_parser(__doc__, "1000:1004")
+    parser.add_argument("--set", choices=SETS, required=True)
+    parser.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    options = parser.parse_args()
+    jobs = [(options.set, seed, not options.no_names) for seed in options.seeds]
+    results = in_processes(identify_record, jobs, options.jobs) if options.jobs > 1 else map(identify_record, jobs)
     rows = []
     print(*table(HEADS, []), sep="\n", flush=True)
-    for row in found:
+    for row in results:
         rows.append(row)
         print(line(cells(row)), flush=True)
-    print(f"\n{asked.set}, seeds {asked.seeds.start} to {asked.seeds.stop - 1}", *tell(asked.set, rows), sep="\n")
-    keep(asked.json, rows)
+    title = f"\n{options.set}, seeds {options.seeds.start} to {options.seeds.stop - 1}"
+    print(title, *summary_lines(options.set, rows), sep="\n")
+    write_json(options.json, rows)
 
 
 if __name__ == "__main__":

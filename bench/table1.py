@@ -41,17 +41,17 @@ def fits(noise_nm: float, method: str, rate_hz: float = 40.0, trials: int = FEW,
     return {key: float(np.median([s[key] for s in scores])) for key in scores[0]}
 
 
-def shown(value: float) -> str:
+def format_score(value: float) -> str:
     return f"{value:.2f}" if value > -100 else "runs away"
 
 
-def both(found: dict[str, float]) -> str:
-    """Clean ramp and unseen input."""
-    return f"{shown(found['clean'])} / {shown(found['unseen'])}"
+def both(scores: dict[str, float]) -> str:
+    """Return the scores on the clean ramp and on the unseen input."""
+    return f"{format_score(scores['clean'])} / {format_score(scores['unseen'])}"
 
 
 def main_table() -> list[str]:
-    found = paper.table1(TRIALS)
+    scores = paper.table1(TRIALS)
     lines = [
         "# Table I, ours beside the paper's",
         "",
@@ -65,7 +65,7 @@ def main_table() -> list[str]:
         "",
     ]
     rows = []
-    for row in found["rows"]:
+    for row in scores["rows"]:
         printed = "–" if row["paper"] is None else f"{row['paper']:.2f} ± {row['paper_sd']:.2f}"
         ours = f"{row['ours']:.2f} ± {row['ours_sd']:.2f}"
         others = [f"{row[name]:.2f}" for name in ("ceiling", "clean", "unseen")]
@@ -164,7 +164,7 @@ def where_noise_enters() -> list[str]:
                 rows.append([*poles_as_constants(block), scores["clean"], scores["unseen"]])
             t, z, ramp, unseen = np.median(rows, axis=0)
             place = "through 1/A, as (9)" if through_a else "at the output, as section V"
-            cells.append([place, linear, f"{t:.3f}", f"{z:.3f}", shown(ramp), shown(unseen)])
+            cells.append([place, linear, f"{t:.3f}", f"{z:.3f}", format_score(ramp), format_score(unseen)])
     lines += table(["noise", "linear stage", "Tω, s", "ζ", "clean ramp", "unseen"], cells)
     return [*lines, "", "The output-error linear stage is right in both; it is the default."]
 
@@ -243,8 +243,8 @@ def natural_frequency() -> list[str]:
         ("1/Tω of the muscle", 1 / paper.TIME_CONSTANT_S),
         ("same slow-input lag as the muscle, 1/(ζTω)", 1 / (paper.DAMPING * paper.TIME_CONSTANT_S)),
     ):
-        found = fits(0.0, "ramp-deconvolution", natural_frequency_rad_s=frequency)
-        cells.append([label, f"{1 / frequency:.3f}", f"{found['clean']:.2f}", f"{found['unseen']:.2f}"])
+        scores = fits(0.0, "ramp-deconvolution", natural_frequency_rad_s=frequency)
+        cells.append([label, f"{1 / frequency:.3f}", f"{scores['clean']:.2f}", f"{scores['unseen']:.2f}"])
     return [
         *lines,
         *table(["natural frequency", "Tω, s", "ramp", "unseen"], cells),
@@ -256,9 +256,9 @@ def natural_frequency() -> list[str]:
 
 def iterations() -> list[str]:
     lines = ["## One iteration or more", "", "Two-stage, noise 0.10 N·m, 40 Hz: clean ramp / unseen.", ""]
-    found: dict[object, dict[str, float]] = {n: fits(0.10, "two-stage", iterations=n) for n in (0, 1, 2, 4)}
-    found["maximum-likelihood (joint)"] = fits(0.10, "maximum-likelihood")
-    cells = [[label, f"{scores['clean']:.2f}", f"{scores['unseen']:.2f}"] for label, scores in found.items()]
+    by_label: dict[object, dict[str, float]] = {n: fits(0.10, "two-stage", iterations=n) for n in (0, 1, 2, 4)}
+    by_label["maximum-likelihood (joint)"] = fits(0.10, "maximum-likelihood")
+    cells = [[label, f"{scores['clean']:.2f}", f"{scores['unseen']:.2f}"] for label, scores in by_label.items()]
     return [
         *lines,
         *table(["iterations", "clean ramp", "unseen"], cells),

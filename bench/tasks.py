@@ -1,4 +1,4 @@
-"""What contenders are given: a record whose rows of `validate` they predict in free run, and what the error counts in.
+"""Tasks of the contenders: a record whose rows of `validate` they predict in free run, and the unit of the error.
 
 Muscles of the paper and of the emulator, whose equations are nobody's here. One sample a pulse, so that all see the
 same rows.
@@ -64,7 +64,7 @@ class Task:
 
     @property
     def fine(self) -> bool:
-        """Whether it has more than one sample a pulse."""
+        """True where it has more than one sample a pulse."""
         return self.rate_hz > 1.5 * self.record.pulse_rate_hz
 
     def error(self, predicted: np.ndarray) -> float:
@@ -86,30 +86,30 @@ def papers(rate_hz: float, noise_nm: float, seed: int) -> Task:
 
 def emulated(effect: str | None, seed: int) -> Task:
     """A muscle of the emulator with something hidden, or nothing."""
-    made = generate(effect, "middle", seed, rate_hz=RATE_HZ)
-    return Task(effect or "nothing hidden", as_record(made), scale=made["truth"]["noise"]["sd_nm"])
+    generated = generate(effect, "middle", seed, rate_hz=RATE_HZ)
+    return Task(effect or "nothing hidden", as_record(generated), scale=generated["truth"]["noise"]["sd_nm"])
 
 
-def rounded(made: dict[str, Any]) -> dict[str, Any]:
-    """One sample a pulse of a generated record."""
-    each = round((len(made["time_s"]) - 1) / float(made["time_s"][-1] - made["time_s"][0]) / RATE_HZ)
-    rows = {name: made[name][::each] for name in ("time_s", "pulse_width_us", "torque_nm", "segment")}
-    return made | rows | ({"bout": made["bout"][::each]} if "bout" in made else {})
+def rounded(generated: dict[str, Any]) -> dict[str, Any]:
+    """Return one sample a pulse of a generated record."""
+    each = round((len(generated["time_s"]) - 1) / float(generated["time_s"][-1] - generated["time_s"][0]) / RATE_HZ)
+    rows = {name: generated[name][::each] for name in ("time_s", "pulse_width_us", "torque_nm", "segment")}
+    return generated | rows | ({"bout": generated["bout"][::each]} if "bout" in generated else {})
 
 
 def of_physics(seed: int) -> Task:
     """A muscle of other physics, with white noise alone."""
-    made = rounded(record_of_physics("physics", seed, disturbed=()))
-    return Task(f"physics: {made['truth']['kind']}", as_record(made), scale=made["truth"]["noise_sd_nm"])
+    generated = rounded(record_of_physics("physics", seed, disturbed=()))
+    return Task(f"physics: {generated['truth']['kind']}", as_record(generated), scale=generated["truth"]["noise_sd_nm"])
 
 
 def of_bouts(seed: int) -> Task:
     """A record as arms give them: its last ramp, in errors of the mean of the other ramps."""
-    made = rounded(record_of_bouts(seed))
-    bouts = [np.flatnonzero(made["bout"] == made["bout"][-1] - back) for back in range(RAMPS)]
-    torque = np.array([made["torque_nm"][rows[: min(map(len, bouts))]] for rows in bouts])
+    generated = rounded(record_of_bouts(seed))
+    bouts = [np.flatnonzero(generated["bout"] == generated["bout"][-1] - back) for back in range(RAMPS)]
+    torque = np.array([generated["torque_nm"][rows[: min(map(len, bouts))]] for rows in bouts])
     off = float(np.sqrt(np.mean((torque[0] - torque[1:].mean(axis=0)) ** 2)))
-    return Task("as of an arm", as_record(made), unit="× repetition", scale=off)
+    return Task("as of an arm", as_record(generated), unit="× repetition", scale=off)
 
 
 def makers(seed: int) -> Iterator[tuple[str, Callable[[], Task]]]:

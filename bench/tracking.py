@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 
 from bench.adaptive import paper_test
-from bench.common import keep_lines, parser, table
+from bench.common import bench_parser, table, write_json_lines
 from bench.muscles.offline import simulate
 from examples import ilc_controller as ilc
 from stimrig import identify
@@ -92,12 +92,12 @@ class Person:
         clean = simulate(self.muscle, times, widths_us, CURRENT_MA, RATE_HZ, span_s, self.now_s)
         self.now_s += span_s
         noisy = clean + NOISE_NM * self.rng.standard_normal(clean.size)
-        held = np.repeat(widths_us, PER)
-        return Record.from_arrays(np.arange(clean.size) / RATE_HZ, held, noisy, np.repeat(names, PER))
+        held_us = np.repeat(widths_us, PER)
+        return Record.from_arrays(np.arange(clean.size) / RATE_HZ, held_us, noisy, np.repeat(names, PER))
 
 
 class Simulated:
-    """What `ilc.learn` asks of the service; it follows `model` from trial to trial."""
+    """Takes the place of the service for `ilc.learn`; it follows `model` from trial to trial."""
 
     def __init__(self, person: Person, model: Model) -> None:
         self.person, self.model, self.state = person, model, None
@@ -128,8 +128,8 @@ class Simulated:
         return document
 
 
-def one(seed: int, case: str) -> list[dict[str, Any]]:
-    """The sessions with and without tracking with this muscle."""
+def run_sessions(seed: int, case: str) -> list[dict[str, Any]]:
+    """Run the sessions with and without tracking on this muscle."""
     person = Person(seed, case)
     test = person.play(*paper_test(LARGEST_US, held_out=True))
     person.now_s += APPROVAL_S
@@ -154,20 +154,20 @@ def session(person: Person, model: Model, reference: ilc.Reference, tracked: boo
 
 
 def moves(served: list[dict[str, Any]]) -> list[list[float]]:
-    """How far each trial moved what is expected of the next, in half widths of the band before it; from the second on.
+    """Return the change of the expected quantities by each trial, in half widths of the band before it.
 
-    One row a trial: gain, threshold, time scale.
+    One row a trial, from the second on: gain, threshold, time scale.
     """
-    found = []
+    shifts = []
     for before, after in pairwise(served):
         if not before or not after:
             continue
-        found.append([
+        shifts.append([
             abs(after["coming"][name]["value"] - before["coming"][name]["value"])
             / max((before["coming"][name]["high"] - before["coming"][name]["low"]) / 2, 1e-12)
             for name in ilc.TRACKED
         ])  # fmt: skip
-    return found
+    return shifts
 
 
 def tables(rows: list[dict[str, Any]]) -> list[str]:
@@ -185,11 +185,11 @@ def tables(rows: list[dict[str, Any]]) -> list[str]:
             if not errors.size:
                 cells.append("")
                 continue
-            told = f"{np.median(errors):.2f} %"
+            cell = f"{np.median(errors):.2f} %"
             if np.isfinite(still).any():
-                half, most = np.nanquantile(errors / still, [0.5, 0.9])
-                told += f" (× {half:.2f}, {most:.2f})"
-            cells.append(told)
+                median, p90 = np.nanquantile(errors / still, [0.5, 0.9])
+                cell += f" (× {median:.2f}, {p90:.2f})"
+            cells.append(cell)
         lines.append([case, *cells])
     return table(["case", *(f"{name}, n = {muscles[name]}" for name in names)], lines)
 
@@ -198,19 +198,19 @@ def seconds_of(rows: list[dict[str, Any]]) -> list[str]:
     """Time that following a trial took."""
     lines = []
     for name in dict.fromkeys(row["who"] for row in rows if row["seconds"]):
-        taken = np.concatenate([row["seconds"] for row in rows if row["who"] == name])
-        half, most = 1e3 * np.quantile(taken, [0.5, 0.99])
-        lines.append(f"{name}: {half:.0f} ms in the middle, p99 {most:.0f} ms, n = {taken.size}")
+        durations_s = np.concatenate([row["seconds"] for row in rows if row["who"] == name])
+        median_ms, p99_ms = 1e3 * np.quantile(durations_s, [0.5, 0.99])
+        lines.append(f"{name}: {median_ms:.0f} ms in the middle, p99 {p99_ms:.0f} ms, n = {durations_s.size}")
     return lines
 
 
 def moved_lines(rows: list[dict[str, Any]]) -> list[str]:
-    """How often a trial moved what is served by more than its band."""
+    """Return for each case the share of trials that moved a served quantity by more than its band."""
     lines = []
     for case in dict.fromkeys(row["case"] for row in rows):
-        found = [row["moves"] for row in rows if row["case"] == case and row["who"] == TRACKED and row["moves"]]
-        if found:
-            moved = np.concatenate(found)
+        case_moves = [row["moves"] for row in rows if row["case"] == case and row["who"] == TRACKED and row["moves"]]
+        if case_moves:
+            moved = np.concatenate(case_moves)
             beyond = np.mean(np.any(moved > 1.0, axis=1))
             lines.append(
                 f"{case}: {100 * beyond:.1f} % of {len(moved)} trials moved beyond a band; largest, in bands: "
@@ -221,15 +221,15 @@ def moved_lines(rows: list[dict[str, Any]]) -> list[str]:
 
 def main() -> None:
     """Print the tables."""
-    made = parser(__doc__, "94000:94020")
-    made.add_argument("--cases", nargs="*", default=list(CASES))
-    options = made.parse_args()
+    parser = bench_parser(__doc__, "94000:94020")
+    parser.add_argument("--cases", nargs="*", default=list(CASES))
+    options = parser.parse_args()
     rows: list[dict[str, Any]] = []
     for seed in options.seeds:
         for case in options.cases:
-            rows += one(seed, case)
+            rows += run_sessions(seed, case)
         print(f"seed {seed}", file=sys.stderr, flush=True)
-        keep_lines(options.json, rows)
+        write_json_lines(options.json, rows)
     print(*tables(rows), "", *seconds_of(rows), "", *moved_lines(rows), sep="\n")
 
 

@@ -62,16 +62,16 @@ def record_of(folder: Path, validate_from: int = 15) -> tuple[Record, list[slice
         size = int(rest * SAMPLE_HZ)
         # The muscle is at rest before a train, as the force at its first sample says.
         quiet = start + rest - np.arange(size, 0, -1) / SAMPLE_HZ
-        own = start + rest + (time_s - begin)
+        train_s = start + rest + (time_s - begin)
         # The train ends one interval after its last pulse.
         width = np.where(time_s < end + interval, WIDTH_US, 0.0)
         name = "validate" if number >= validate_from else "train"
-        keep = own > quiet[-1] + 0.5 / SAMPLE_HZ
+        after_rest = train_s > quiet[-1] + 0.5 / SAMPLE_HZ
         parts.append((quiet, np.zeros(size), np.full(size, force[0]), ["rest"] * size))
-        parts.append((own[keep], width[keep], force[keep], [name] * int(keep.sum())))
-        slices.append(slice(done + size, done + size + int(keep.sum())))
-        done += size + int(keep.sum())
-        start = np.ceil((own[-1] + 0.002) / interval) * interval
+        parts.append((train_s[after_rest], width[after_rest], force[after_rest], [name] * int(after_rest.sum())))
+        slices.append(slice(done + size, done + size + int(after_rest.sum())))
+        done += size + int(after_rest.sum())
+        start = np.ceil((train_s[-1] + 0.002) / interval) * interval
     columns = [np.concatenate([part[i] for part in parts]) for i in range(3)]
     labels = np.concatenate([part[3] for part in parts])
     return Record.from_arrays(*columns, labels, pulse_rate_hz=1.0 / interval), slices

@@ -57,7 +57,7 @@ STEP = 0.8
 """Share of the error that is corrected at once where the prediction, not (f, G), is inverted."""
 TRACKED = ("gain", "threshold_shift_us", "time_scale")
 ROUND_S = 0.25
-"""A disturbance begins and ends less sharply than it is told."""
+"""A disturbance begins and ends less sharply than its reported times."""
 TRACKED_WITHIN_S = 5.0
 """After a trial the service follows it; that takes half a second."""
 LEAST_SHARE = 0.2
@@ -91,7 +91,7 @@ class Reference:
 
 
 class Plant:
-    """What MODEL.json says: f both ways as tables, G as the response to one held pulse, on the grid of pulses."""
+    """The model of MODEL.json: f both ways as tables, G as the response to one held pulse, on the grid of pulses."""
 
     def __init__(self, document: dict[str, Any], size: int) -> None:
         curve, self.document = document["recruitment"], document
@@ -103,13 +103,14 @@ class Plant:
         self.G = lower_triangle(self.response)
 
     def now(self) -> Plant:
-        """What was known after the last trial, where this one is what is expected of the next; forward only."""
+        """Return the plant of the last trial, where this one is expected of the next trial; forward only."""
         tracking = self.document.get("tracking")
         if not tracking or tracking["now"] is None:
             return self
         level = {name: (tracking["now"][name]["value"], tracking["coming"][name]["value"]) for name in TRACKED}
-        held = (1.0, 1.0)  # by what does not move with the muscle nothing is explained: it is learnt
-        (gain, of), (shift_us, from_us), (slow, than) = (level[n] if n in tracking["moved"] else held for n in TRACKED)
+        unchanged = (1.0, 1.0)  # a quantity that is not tracked explains nothing: its change is learnt
+        moved = [level[name] if name in tracking["moved"] else unchanged for name in TRACKED]
+        (gain, of), (shift_us, from_us), (slow, than) = moved
         plant, time = copy.copy(self), np.arange(self.response.size + 1.0)
         plant.level_nm = gain / of * self.level(self.width_us - (shift_us - from_us))
         step = np.interp((time[1:] - 0.5) * than / slow, np.r_[0.0, time[1:] - 0.5], np.r_[0.0, self.response.cumsum()])
@@ -120,10 +121,10 @@ class Plant:
     def undisturbed(self) -> np.ndarray:
         """1 where the last trial was the muscle's answer to its pulses alone, else 0; shape (N,)."""
         time_s = BEFORE_S + np.arange(self.response.size) / PULSE_RATE_HZ
-        kept = np.ones(time_s.size)
+        weight = np.ones(time_s.size)
         for begin_s, end_s in self.document.get("tracking", {}).get("disturbed_s") or ():
-            kept[(time_s > begin_s - ROUND_S) & (time_s < end_s + ROUND_S)] = 0.0
-        return kept
+            weight[(time_s > begin_s - ROUND_S) & (time_s < end_s + ROUND_S)] = 0.0
+        return weight
 
     def level(self, widths_us: np.ndarray) -> np.ndarray:
         """f, N·m."""
@@ -181,23 +182,24 @@ def phase_lead(plant: Plant) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     G = np.fft.rfft(plant.response, 16 * size)
     weight = 1 / (1 + (frequency_hz / REFERENCE_HZ) ** 4) ** 2
 
-    def left(gain: float, lead: int) -> tuple[float, float]:
+    def remaining_error(gain: float, lead: int) -> tuple[float, float]:
         factor = np.abs(1 - gain * G * np.exp(2j * np.pi * frequency_hz * lead / PULSE_RATE_HZ))
         outside = np.flatnonzero(factor >= 0.98)
         reach_hz = float(frequency_hz[outside[0]]) if outside.size else PULSE_RATE_HZ / 2
         learnt = np.where(frequency_hz < 0.7 * reach_hz, np.minimum(factor, 1.0) ** 8, 1.0)
         return float(np.sum(weight * learnt)), reach_hz
 
-    gain, lead = min(((g, n) for g in GAINS for n in range(60)), key=lambda choice: left(*choice)[0])
-    spread = 0.75 * PULSE_RATE_HZ / (2 * np.pi * max(left(gain, lead)[1], 0.2))  # a Gaussian, -3 dB where Q must end
+    gain, lead = min(((g, n) for g in GAINS for n in range(60)), key=lambda choice: remaining_error(*choice)[0])
+    reach_hz = max(remaining_error(gain, lead)[1], 0.2)
+    spread = 0.75 * PULSE_RATE_HZ / (2 * np.pi * reach_hz)  # a Gaussian, -3 dB where Q must end
     taps = np.exp(-0.5 * (np.arange(-80, 81) / max(spread, 0.5)) ** 2)
 
     def smooth(demand_nm: np.ndarray) -> np.ndarray:
         return np.convolve(np.pad(demand_nm, 80, mode="edge"), taps / taps.sum(), mode="valid")
 
     def law(demand_nm: np.ndarray, error_nm: np.ndarray) -> np.ndarray:
-        ahead = np.r_[error_nm[lead:], np.full(lead, error_nm[-1])] if lead else error_nm
-        return demand_nm + smooth(gain * ahead)
+        shifted_nm = np.r_[error_nm[lead:], np.full(lead, error_nm[-1])] if lead else error_nm
+        return demand_nm + smooth(gain * shifted_nm)
 
     return law
 
@@ -209,7 +211,7 @@ LAWS = {"norm-optimal": norm_optimal, "phase-lead": phase_lead}
 
 
 class Service:
-    """What a controller asks of the service for one participant."""
+    """The controller's access to the service for one participant."""
 
     def __init__(self, client: Client, participant: str) -> None:
         self.client, self.participant = client, participant
@@ -222,12 +224,12 @@ class Service:
         Raises
         ------
         HaltedError
-            The muscle is no longer what a person allowed: they are asked.
+            The muscle is no longer as a person approved it: a new test is needed.
         """
-        asked = {"tracked": True} if tracked else {}
-        self.known = self.client.approved_model(self.participant, self.known, **asked)
-        if ask := self.known.document.get("tracking", {}).get("ask"):
-            raise HaltedError(ask)
+        query = {"tracked": True} if tracked else {}
+        self.known = self.client.approved_model(self.participant, self.known, **query)
+        if reason := self.known.document.get("tracking", {}).get("ask"):
+            raise HaltedError(reason)
         return self.known.document
 
     def fetch_followed(self) -> dict[str, Any]:
@@ -251,7 +253,7 @@ class Service:
                 return measured(self.client.recording(test["recording_id"]), widths_us.size)
         raise HaltedError(f"the trial ended as {test['state']}: {test['reason']}")
 
-    def start(self, segments: list[dict[str, Any]], **asked: Any) -> str:
+    def start(self, segments: list[dict[str, Any]], **options: Any) -> str:
         """Start a trial as soon as the rig has rested; the id of its test. The service shows its error."""
         patience = time.monotonic() + 90
         rests = round(BEFORE_S * PULSE_RATE_HZ), round(AFTER_S * PULSE_RATE_HZ)
@@ -259,7 +261,7 @@ class Service:
         while True:
             try:
                 return self.client.start_test(
-                    self.participant, kind="sequence", segments=segments, reference_torque_nm=wanted_nm, **asked
+                    self.participant, kind="sequence", segments=segments, reference_torque_nm=wanted_nm, **options
                 )["id"]
             except (Conflict, Invalid) as error:
                 if error.code != "rest-needed" or time.monotonic() > patience:
@@ -267,7 +269,7 @@ class Service:
             time.sleep(0.3)  # the gate asks for a rest between tests
 
     def predict(self, model_id: str, widths_us: np.ndarray) -> np.ndarray:
-        """What the model says a trial would give, N·m in each pulse's period, shape (N,)."""
+        """Predict a trial's torque with the model, N·m in each pulse's period, shape (N,)."""
         return np.array(self.client.predict(model_id, widths_us.tolist()))
 
 
@@ -315,12 +317,12 @@ def follow(
     plant: Plant, demand_nm: np.ndarray, wanted_nm: np.ndarray, predict: Callable[[np.ndarray], np.ndarray]
 ) -> np.ndarray:
     """The demand whose predicted torque is what is wanted: the same law, played on the model with its effects."""
-    update, best, least = norm_optimal(plant), demand_nm, np.inf
+    update, best, lowest = norm_optimal(plant), demand_nm, np.inf
     for _ in range(PLAN_STEPS):
         error_nm = wanted_nm - predict(plant.widths(demand_nm))
-        left = float(np.mean(error_nm**2))
-        if left < least:
-            best, least = demand_nm, left
+        mean_square = float(np.mean(error_nm**2))
+        if mean_square < lowest:
+            best, lowest = demand_nm, mean_square
         demand_nm = np.clip(update(demand_nm, error_nm), 0.0, plant.largest_nm)
     return best
 
@@ -347,7 +349,7 @@ def learn(
     if tracked or not model["effects"]:
         update = LAWS[law](plant)
     service.wanted_nm = reference.torque_nm
-    share, left_nm = 1.0, np.zeros(demand.size)
+    share, disturbance_nm = 1.0, np.zeros(demand.size)
     for _ in range(trials):
         widths_us = plant.widths(demand)
         torque_nm, sent_us = service.play(widths_us)
@@ -365,9 +367,9 @@ def learn(
             played, plant = plant, Plant(service.fetch_followed(), demand.size)
             now, update = plant.now(), LAWS[law](plant)
             demand = demand + now.level(widths_us) - played.level(widths_us)
-            new_nm = torque_nm + not_sent_nm - now.G @ demand - left_nm
-            left_nm = left_nm + share * plant.undisturbed() * new_nm
-            demand = update(demand, reference.torque_nm - left_nm - plant.G @ demand)
+            new_nm = torque_nm + not_sent_nm - now.G @ demand - disturbance_nm
+            disturbance_nm = disturbance_nm + share * plant.undisturbed() * new_nm
+            demand = update(demand, reference.torque_nm - disturbance_nm - plant.G @ demand)
             demand = np.clip(demand, 0.0, plant.largest_nm)
             continue
         if update is not None:
@@ -385,16 +387,16 @@ def draw(path: str, reference: Reference, runs: dict[str, list[Trial]]) -> None:
     mpl.use("Agg")
     import matplotlib.pyplot as plt
 
-    figure, (left, right) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
+    figure, (error_axis, torque_axis) = plt.subplots(1, 2, figsize=(11, 4), layout="constrained")
     time_s = np.arange(reference.torque_nm.size) / PULSE_RATE_HZ
-    right.plot(time_s, reference.torque_nm, "k--", label="reference")
+    torque_axis.plot(time_s, reference.torque_nm, "k--", label="reference")
     for name, trials in runs.items():
-        left.semilogy(range(1, len(trials) + 1), [trial.error_percent for trial in trials], "o-", label=name)
-        right.plot(time_s, trials[-1].torque_nm, label=f"{name}, trial {len(trials)}")
-    left.axhline(5, color="grey", lw=0.8)
-    left.set(xlabel="trial", ylabel="tracking error (% of the reference's rms)")
-    right.set(xlabel="time (s)", ylabel="torque (N·m)")
-    left.legend(), right.legend()
+        error_axis.semilogy(range(1, len(trials) + 1), [trial.error_percent for trial in trials], "o-", label=name)
+        torque_axis.plot(time_s, trials[-1].torque_nm, label=f"{name}, trial {len(trials)}")
+    error_axis.axhline(5, color="grey", lw=0.8)
+    error_axis.set(xlabel="trial", ylabel="tracking error (% of the reference's rms)")
+    torque_axis.set(xlabel="time (s)", ylabel="torque (N·m)")
+    error_axis.legend(), torque_axis.legend()
     figure.savefig(path, metadata={"Date": None})
 
 

@@ -99,7 +99,7 @@ class MovingService(Service):
             raise HaltedError(f"the movement did not start: {error}") from None
 
     def foretell(self, model: dict[str, Any], widths_us: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
-        """What a model gives along these angles, N·m above rest, shape (N,); without g and h they do not matter."""
+        """Predict the torque along these angles, N·m above rest, shape (N,); a model without g and h ignores them."""
         along = angle_rad.tolist() if model.get("joint") else None
         return np.array(self.client.predict(model["model_id"], widths_us.tolist(), angle_rad=along))
 
@@ -127,11 +127,12 @@ def learn_moving(
         The movement as it is meant to be; later it is taken to be as it was, on average.
     """
     plant = Plant(model, reference.torque_nm.size)
-    demand, unexplained, meant, done = plan(plant, reference), np.zeros(reference.torque_nm.size), movement_rad, []
+    demand, unexplained = plan(plant, reference), np.zeros(reference.torque_nm.size)
+    expected_rad, done = movement_rad, []
     share = FIRST_SHARE
     for number in range(1, trials + 1):
         demand = follow(
-            plant, demand, reference.torque_nm - unexplained, partial(service.foretell, model, angle_rad=meant)
+            plant, demand, reference.torque_nm - unexplained, partial(service.foretell, model, angle_rad=expected_rad)
         )
         widths_us = plant.widths(demand)
         torque_nm, sent_us, angle_rad = service.play_moving(widths_us)
@@ -141,9 +142,9 @@ def learn_moving(
             share = max(LEAST_SHARE, share / 2) if percent > done[-1].error_percent else min(1.0, 1.5 * share)
         done.append(MovingTrial(widths_us, torque_nm, angle_rad, percent))
         print(f"  trial {number:2d}  {percent:6.2f} % of the reference's rms", file=sys.stderr)
-        left = torque_nm - service.foretell(model, sent_us, angle_rad) - unexplained
-        unexplained = unexplained + LEARNT * share * left
-        meant = np.mean([trial.angle_rad for trial in done], axis=0)
+        new_nm = torque_nm - service.foretell(model, sent_us, angle_rad) - unexplained
+        unexplained = unexplained + LEARNT * share * new_nm
+        expected_rad = np.mean([trial.angle_rad for trial in done], axis=0)
     return done
 
 

@@ -48,10 +48,10 @@ def follow(client: Any, test_id: str, outlets: dict[str, Any]) -> None:
             if zero_s == math.inf:
                 outlets["marks"].push_sample([f"start {test_id}"], pylsl.local_clock() - message["elapsed_s"])
             zero_s = min(zero_s, pylsl.local_clock() - message["elapsed_s"])  # the message with the least delay
-            for one in (*earlier, message):
-                for at_s, *torque_nm in zip(one["time_s"], one["torque_min_nm"], one["torque_max_nm"], strict=True):
+            for part in (*earlier, message):
+                for at_s, *torque_nm in zip(part["time_s"], part["torque_min_nm"], part["torque_max_nm"], strict=True):
                     outlets["torque"].push_sample(torque_nm, zero_s + at_s)
-                for at_s, width_us in zip(one["pulse_time_s"], one["pulse_width_us"], strict=True):
+                for at_s, width_us in zip(part["pulse_time_s"], part["pulse_width_us"], strict=True):
                     if width_us > 0:
                         outlets["pulses"].push_sample([width_us], zero_s + at_s)
             earlier = []

@@ -40,20 +40,20 @@ for name in ("--torque", "--pulses", "--segments"):
 parser.add_argument("--channel", type=int, default=0)
 parser.add_argument("--scale", type=float, default=1.0)
 parser.add_argument("--pulse-rate-hz", type=float, default=40.0)
-given = parser.parse_args()
+options = parser.parse_args()
 
-with NWBHDF5IO(given.nwb, "r") as file:
+with NWBHDF5IO(options.nwb, "r") as file:
     nwb = file.read()
-    torque, pulses = nwb.acquisition[given.torque], nwb.stimulus[given.pulses]
-    values = np.asarray(torque.data[:], float).reshape(len(torque.data), -1)[:, given.channel]
-    torque_nm = (values * torque.conversion + torque.offset) * given.scale
+    torque, pulses = nwb.acquisition[options.torque], nwb.stimulus[options.pulses]
+    values = np.asarray(torque.data[:], float).reshape(len(torque.data), -1)[:, options.channel]
+    torque_nm = (values * torque.conversion + torque.offset) * options.scale
     time_s = times_s(torque)
     width_us = np.asarray(pulses.data[:], float) * pulses.conversion * MICROSECONDS[pulses.unit]
-    held_us = width_in_force(time_s, times_s(pulses), width_us, given.pulse_rate_hz)
-    spans = (nwb.epochs if given.segments == "epochs" else nwb.intervals[given.segments]).to_dataframe()
+    held_us = width_in_force(time_s, times_s(pulses), width_us, options.pulse_rate_hz)
+    spans = (nwb.epochs if options.segments == "epochs" else nwb.intervals[options.segments]).to_dataframe()
     title = next(name for name in spans.columns if name not in ("start_time", "stop_time", "tags", "timeseries"))
 
-with Path(given.csv).open("w", newline="", encoding="utf-8") as out:
+with Path(options.csv).open("w", newline="", encoding="utf-8") as out:
     (rows := csv.writer(out)).writerow(["time_s", "pulse_width_us", "torque_nm", "segment"])
     for start_s, stop_s, name in zip(spans["start_time"], spans["stop_time"], spans[title], strict=True):
         inside = np.flatnonzero((time_s >= start_s - 1e-9) & (time_s < stop_s - 1e-9))

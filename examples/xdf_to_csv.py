@@ -36,19 +36,19 @@ parser.add_argument("--scale", type=float, default=1.0)
 parser.add_argument("--pulses", required=True)
 parser.add_argument("--pulse-rate-hz", type=float, default=40.0)
 parser.add_argument("--segments", required=True)
-given = parser.parse_args()
+options = parser.parse_args()
 
-streams = {stream["info"]["name"][0]: stream for stream in pyxdf.load_xdf(given.xdf, dejitter_timestamps=False)[0]}
-for name in (given.torque, given.pulses, given.segments):
+streams = {stream["info"]["name"][0]: stream for stream in pyxdf.load_xdf(options.xdf, dejitter_timestamps=False)[0]}
+for name in (options.torque, options.pulses, options.segments):
     if name not in streams:
-        parser.error(f"{given.xdf}: no stream is called {name}. It has {', '.join(streams)}.")
-torque, pulses, marks = (streams[name] for name in (given.torque, given.pulses, given.segments))
+        parser.error(f"{options.xdf}: no stream is called {name}. It has {', '.join(streams)}.")
+torque, pulses, marks = (streams[name] for name in (options.torque, options.pulses, options.segments))
 time_s = torque["time_stamps"]
-torque_nm = torque["time_series"][:, given.channel] * given.scale
-held_us = width_in_force(time_s, pulses["time_stamps"], pulses["time_series"][:, 0], given.pulse_rate_hz)
+torque_nm = torque["time_series"][:, options.channel] * options.scale
+held_us = width_in_force(time_s, pulses["time_stamps"], pulses["time_series"][:, 0], options.pulse_rate_hz)
 index = np.searchsorted(marks["time_stamps"], time_s + 1e-9, side="right") - 1
 
-with Path(given.csv).open("w", newline="", encoding="utf-8") as out:
+with Path(options.csv).open("w", newline="", encoding="utf-8") as out:
     rows = csv.writer(out)
     rows.writerow(["time_s", "pulse_width_us", "torque_nm", "segment"])
     for k in np.flatnonzero(index >= 0):

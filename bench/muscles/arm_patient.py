@@ -65,7 +65,7 @@ class ArmPatient:
 
     @property
     def inertia_kg_m2(self) -> float:
-        """What moves with the forearm."""
+        """Inertia of the forearm and of what moves with it."""
         return self.tissue.mechanics.inertia_kg_m2
 
     def recruitment_nm(self, width_us: Number) -> Floats:
@@ -88,7 +88,7 @@ class ArmPatient:
         return np.asarray(lfilter(np.ravel(system[0]), np.ravel(system[1]), self.recruitment_nm(width_us)))
 
     def remembered_nm(self, angle_rad: Floats, step_s: float) -> Floats:
-        """What the tissue's memory adds to `h_nm` along a movement, N·m."""
+        """Return the torque that the tissue's memory adds to `h_nm` along a movement, N·m."""
         passive = self.tissue.passive
         memory, out = passive.begin(float(angle_rad[0])), np.empty(angle_rad.size)
         for k, at_rad in enumerate(angle_rad.tolist()):
@@ -98,7 +98,7 @@ class ArmPatient:
 
     @cached_property
     def truth(self) -> dict[str, Any]:
-        """What was drawn, as plain values."""
+        """The drawn parameters, as plain values."""
         laws = {place: getattr(self.tissue, place) for place in LAWS}
         return {
             "seed": self.seed,
@@ -134,18 +134,19 @@ def _choice(rng: Generator, place: str, kinds: dict[str, tuple[float, dict[str, 
 
 def _torque_angle(rng: Generator) -> Any:
     fibre_rad, lengths, gamma = rng.uniform(0.8, 2.1), rng.uniform(0.3, 0.7), rng.uniform(0.25, 0.5)
-    arm_rad, least, sharpness = rng.uniform(1.3, 2.0), rng.uniform(0.2, 0.6), rng.uniform(0.8, 1.4)
+    arm_rad, arm_least, sharpness = rng.uniform(1.3, 2.0), rng.uniform(0.2, 0.6), rng.uniform(0.8, 1.4)
     quadratic = 0.5 / rng.uniform(55.0, 100.0) ** 2
     linear = 2.0 * quadratic * (90.0 - rng.uniform(60.0, 110.0))
     fibre = {"lengths_per_rad": lengths, "gamma": gamma}
-    both = {"arm_best_rad": arm_rad, "arm_least": least, "sharpness": sharpness, "length_best_rad": fibre_rad, **fibre}
+    arm = {"arm_best_rad": arm_rad, "arm_least": arm_least, "sharpness": sharpness}
+    both = {**arm, "length_best_rad": fibre_rad, **fibre}
     return _choice(
         rng,
         "torque_angle",
         {
             "arm_and_length": (0.35, both),
             "force_length": (0.25, {"best_rad": fibre_rad, **fibre}),
-            "moment_arm": (0.25, {"best_rad": arm_rad, "least": least, "sharpness": sharpness}),
+            "moment_arm": (0.25, {"best_rad": arm_rad, "least": arm_least, "sharpness": sharpness}),
             "parabola": (0.15, {"linear_per_deg": linear, "quadratic_per_deg2": quadratic}),
         },
     )

@@ -38,7 +38,7 @@ Moves = list[tuple[float, str, dict[str, Any]]]
 
 @dataclass(frozen=True)
 class AngleSensor:
-    """Of the joint's angle, read at `ANGLE_HZ`: white noise, then steps; and how much too late its times are."""
+    """Sensor of the joint's angle, read at `ANGLE_HZ`: white noise, then steps; its times are `delay_s` too late."""
 
     noise_deg: float = 0.02
     step_deg: float = 360.0 / 2**13
@@ -49,8 +49,8 @@ ENCODER = AngleSensor()
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A record that is wanted; `bench.muscles.arm_records.record` says what the fields mean."""
+class RecordRequest:
+    """Arguments of `bench.muscles.arm_records.record`, which documents the fields."""
 
     patient: ArmPatient
     rng: Generator
@@ -96,47 +96,47 @@ def _fine(parts: Parts) -> Floats:
     return np.repeat(np.concatenate([widths for _, widths in parts]), SIMULATION_HZ // PULSES_PER_S)
 
 
-def _held(asked: Asked, angle_rad: float, parts: Parts) -> ArmDesign:
+def _at_angle(request: RecordRequest, angle_rad: float, parts: Parts) -> ArmDesign:
     """At this angle, in a fixture that yields by the torque."""
-    patient, yields = asked.patient, float(asked.rng.uniform(0.0, LARGEST_COMPLIANCE_RAD_PER_NM))
+    patient, yields = request.patient, float(request.rng.uniform(0.0, LARGEST_COMPLIANCE_RAD_PER_NM))
     isometric_nm = patient.isometric_nm(_fine(parts), 1.0 / SIMULATION_HZ)
     return ArmDesign(parts, angle_rad + yields * patient.g(angle_rad, 0.0) * isometric_nm)
 
 
-def _isometric(asked: Asked) -> ArmDesign:
-    at_rad = asked.patient.reference_rad if asked.angle_rad is None else asked.angle_rad
-    design = make_design("full", asked.rng, asked.top_us, with_validate=False)
+def _isometric(request: RecordRequest) -> ArmDesign:
+    at_rad = request.patient.reference_rad if request.angle_rad is None else request.angle_rad
+    design = make_design("full", request.rng, request.top_us, with_validate=False)
     borders = np.flatnonzero(design.segment[1:] != design.segment[:-1]) + 1
     widths, names = np.split(design.width_us, borders), np.split(design.segment, borders)
-    return _held(asked, at_rad, [(str(name[0]), width) for name, width in zip(names, widths, strict=True)])
+    return _at_angle(request, at_rad, [(str(name[0]), width) for name, width in zip(names, widths, strict=True)])
 
 
-def _somewhere(asked: Asked) -> ArmDesign:
-    drawn_rad = float(asked.rng.uniform(*asked.patient.range_rad))
-    return _staircase_at(asked, drawn_rad if asked.angle_rad is None else asked.angle_rad)
+def _somewhere(request: RecordRequest) -> ArmDesign:
+    drawn_rad = float(request.rng.uniform(*request.patient.range_rad))
+    return _staircase_at(request, drawn_rad if request.angle_rad is None else request.angle_rad)
 
 
-def _staircase_at(asked: Asked, angle_rad: float) -> ArmDesign:
-    steps = np.round(staircase(asked.top_us, 5, 1.0))
-    return _held(asked, angle_rad, asked.parts or [_rest(1.0), ("staircase", steps), _rest(1.5)])
+def _staircase_at(request: RecordRequest, angle_rad: float) -> ArmDesign:
+    steps = np.round(staircase(request.top_us, 5, 1.0))
+    return _at_angle(request, angle_rad, request.parts or [_rest(1.0), ("staircase", steps), _rest(1.5)])
 
 
-def _passive(asked: Asked) -> ArmDesign:
-    seconds = asked.duration_s or 66.0
+def _passive(request: RecordRequest) -> ArmDesign:
+    seconds = request.duration_s or 66.0
     moves = [
-        (share * seconds, *_sweeps(asked, deg_s * float(asked.rng.uniform(0.85, 1.15))))
+        (share * seconds, *_sweeps(request, deg_s * float(request.rng.uniform(0.85, 1.15))))
         for share, deg_s in ((0.0, 8.0), (0.4, 20.0), (0.66, 45.0), (0.84, 80.0))
     ]
     parts = [("passive", np.zeros(round(seconds * PULSES_PER_S)))]
-    return ArmDesign(parts, _moved(asked, moves, parts))
+    return ArmDesign(parts, _moved(request, moves, parts))
 
 
-def _moving(asked: Asked) -> ArmDesign:
-    parts = asked.parts or _steady(asked.rng, asked.top_us, asked.duration_s or 60.0)
+def _moving(request: RecordRequest) -> ArmDesign:
+    parts = request.parts or _steady(request.rng, request.top_us, request.duration_s or 60.0)
     seconds = sum(widths.size for _, widths in parts) / PULSES_PER_S
-    speeds = asked.rng.permutation([15.0, 35.0, 60.0])
-    moves = [(third * seconds / 3.0, *_sweeps(asked, float(deg_s))) for third, deg_s in enumerate(speeds)]
-    return ArmDesign(parts, _moved(asked, moves, parts))
+    speeds = request.rng.permutation([15.0, 35.0, 60.0])
+    moves = [(third * seconds / 3.0, *_sweeps(request, float(deg_s))) for third, deg_s in enumerate(speeds)]
+    return ArmDesign(parts, _moved(request, moves, parts))
 
 
 def _steady(rng: Generator, top_us: float, seconds: float) -> Parts:
@@ -151,19 +151,19 @@ def _steady(rng: Generator, top_us: float, seconds: float) -> Parts:
     return [_rest(2.0), ("levels", np.concatenate(shares)), _rest(2.0)]
 
 
-def _unseen(asked: Asked) -> ArmDesign:
-    seconds, rng = asked.duration_s or 30.0, asked.rng
-    parts = [_rest(2.0), ("validate", np.round(levels(rng, asked.top_us, seconds - 4.0))), _rest(2.0)]
+def _unseen(request: RecordRequest) -> ArmDesign:
+    seconds, rng = request.duration_s or 30.0, request.rng
+    parts = [_rest(2.0), ("validate", np.round(levels(rng, request.top_us, seconds - 4.0))), _rest(2.0)]
     time_s = np.arange(_fine(parts).size) / SIMULATION_HZ
     hz, phase = rng.uniform(0.05, 0.6, 4), rng.uniform(0.0, 2.0 * math.pi, 4)
     waves = np.sin(2.0 * math.pi * hz * time_s[:, None] + phase) @ rng.uniform(0.3, 1.0, 4)
-    low, high = asked.patient.range_rad
+    low, high = request.patient.range_rad
     return ArmDesign(parts, low + (high - low) * (waves - waves.min()) / np.ptp(waves))
 
 
-def _reaching(asked: Asked) -> ArmDesign:
+def _reaching(request: RecordRequest) -> ArmDesign:
     """As `_unseen`, by movements of minimum jerk from one angle to another, with pauses."""
-    parts, (low, high), rng = _unseen(asked).parts, asked.patient.range_rad, asked.rng
+    parts, (low, high), rng = _unseen(request).parts, request.patient.range_rad, request.rng
     time_s = np.arange(_fine(parts).size) / SIMULATION_HZ
     begin_s, at, angle = 0.0, Motion(float(rng.uniform(low, high))), np.empty(time_s.size)
     while begin_s < time_s[-1]:
@@ -176,16 +176,16 @@ def _reaching(asked: Asked) -> ArmDesign:
     return ArmDesign(parts, angle)
 
 
-def _sweeps(asked: Asked, deg_s: float) -> tuple[str, dict[str, Any]]:
+def _sweeps(request: RecordRequest, deg_s: float) -> tuple[str, dict[str, Any]]:
     """Through the range of the day, a little inside its ends."""
-    low_deg, high_deg = np.degrees(asked.patient.range_rad)
-    return asked.mover, {"from_deg": float(low_deg) + 3.0, "to_deg": float(high_deg) - 3.0, "deg_s": deg_s}
+    low_deg, high_deg = np.degrees(request.patient.range_rad)
+    return request.mover, {"from_deg": float(low_deg) + 3.0, "to_deg": float(high_deg) - 3.0, "deg_s": deg_s}
 
 
-def _moved(asked: Asked, moves: Moves, parts: Parts) -> Floats:
+def _moved(request: RecordRequest, moves: Moves, parts: Parts) -> Floats:
     """Angles at the simulation's rate, by the emulator's movers one after another, from the middle of the range."""
-    motion, mover, coming = Motion(0.5 * sum(asked.patient.range_rad)), None, list(moves)
-    seeds = asked.rng.integers(1 << 31, size=len(moves)).tolist()
+    motion, mover, coming = Motion(0.5 * sum(request.patient.range_rad)), None, list(moves)
+    seeds = request.rng.integers(1 << 31, size=len(moves)).tolist()
     angle = np.empty(_fine(parts).size)
     for k in range(angle.size):
         time_s = k / SIMULATION_HZ
@@ -197,7 +197,7 @@ def _moved(asked: Asked, moves: Moves, parts: Parts) -> Floats:
     return angle
 
 
-KINDS: dict[str, Callable[[Asked], ArmDesign]] = {
+KINDS: dict[str, Callable[[RecordRequest], ArmDesign]] = {
     "isometric": _isometric,
     "held": _somewhere,
     "passive": _passive,
@@ -253,26 +253,26 @@ def record(
     rng = rng_of(seed, "arm record", str(patient.seed), kind)
     mover = str(rng.choice(["hand", "robot"]))
     sd_nm = float(rng.uniform(0.05, 0.1))
-    design = KINDS[kind](Asked(patient, rng, mover, angle_rad, duration_s, parts))
+    design = KINDS[kind](RecordRequest(patient, rng, mover, angle_rad, duration_s, parts))
     clean = _simulated(patient, design)
     every = SIMULATION_HZ // RATE_HZ
     rows = {name: column[::every] for name, column in clean.items()}
     time_s = np.arange(rows["torque_nm"].size) / RATE_HZ
     angle, velocity = _measured(rng, clean["angle_rad"], time_s, sensor)
-    held = (time_s * PULSES_PER_S + 1e-9).astype(int)
+    pulse_of_row = (time_s * PULSES_PER_S + 1e-9).astype(int)
     return {
         "time_s": time_s,
-        "pulse_width_us": design.width_us[held],
+        "pulse_width_us": design.width_us[pulse_of_row],
         "torque_nm": rows["torque_nm"] + rng.normal(0.0, sd_nm, time_s.size),
         "angle_rad": angle,
         "velocity_rad_s": velocity,
-        "segment": design.segment[held],
+        "segment": design.segment[pulse_of_row],
         "truth": {**rows, "noise_sd_nm": sd_nm, "mover": mover, "kind": kind, "patient": patient.truth},
     }
 
 
 def changed(
-    made: dict[str, Any],
+    original: dict[str, Any],
     *,
     scale: float = 1.0,
     offset_nm: float = 0.0,
@@ -286,12 +286,13 @@ def changed(
     the angle off by a calibration's error.
     """
     first = round(start_s * RATE_HZ)
-    columns = {name: column[first:].copy() for name, column in made.items() if isinstance(column, np.ndarray)}
+    columns = {name: column[first:].copy() for name, column in original.items() if isinstance(column, np.ndarray)}
     columns["time_s"] += time_shift_s - start_s
     columns["torque_nm"] = columns["torque_nm"] * scale + offset_nm
     columns["angle_rad"] += angle_error_rad
     truth = {
-        name: value[first:].copy() if isinstance(value, np.ndarray) else value for name, value in made["truth"].items()
+        name: value[first:].copy() if isinstance(value, np.ndarray) else value
+        for name, value in original["truth"].items()
     }
     return {**columns, "truth": truth}
 
@@ -314,7 +315,7 @@ def _simulated(patient: ArmPatient, design: ArmDesign) -> dict[str, Floats]:
 
 
 def _measured(rng: Generator, angle_rad: Floats, time_s: Floats, sensor: AngleSensor) -> tuple[Floats, Floats]:
-    """What sensor and rig make of the true angles, at the torque's times."""
+    """Return angle and velocity at the torque's times, as sensor and rig record them."""
     every = SIMULATION_HZ // ANGLE_HZ
     first = int(rng.integers(every))
     true_deg = np.degrees(angle_rad[first::every])

@@ -66,7 +66,7 @@ def record_of_bouts(seed: int) -> dict[str, Any]:
     clean_nm, muscle = _muscle_nm(seed, bouts, largest_us, rate_hz)
     working = np.repeat(bouts.width_us > 0.0, repeated)
     added_nm, sensor = _disturbed_nm(seed, working, muscle["spread_nm"], rate_hz)
-    reading_nm, sensor["read_hz"] = _held(rng_of(seed, "bouts", "converter"), clean_nm + added_nm, rate_hz)
+    reading_nm, sensor["read_hz"] = _sample_and_hold(rng_of(seed, "bouts", "converter"), clean_nm + added_nm, rate_hz)
     return {
         "time_s": np.arange(clean_nm.size) / rate_hz,
         "pulse_width_us": np.repeat(bouts.width_us, repeated),
@@ -100,7 +100,7 @@ def draw_bouts(rng: Generator, top_us: float) -> Bouts:
 
 
 def _muscle_nm(seed: int, bouts: Bouts, largest_us: int, rate_hz: int) -> tuple[Floats, dict[str, Any]]:
-    """The muscle's torque at every sample, N·m, and what was drawn."""
+    """Return the muscle's torque at every sample, N·m, and the drawn parameters."""
     rng, variation = rng_of(seed, "bouts", "muscle"), rng_of(seed, "bouts", "variation")
     last = int(bouts.bout[-1])
     gain = 1.0 + BOUT_VARIES * variation.standard_normal(last + 1)
@@ -121,8 +121,8 @@ def _muscle_nm(seed: int, bouts: Bouts, largest_us: int, rate_hz: int) -> tuple[
     spread_nm = float(np.exp(rng.uniform(*np.log(SPREAD_NM))))
     before = np.repeat(bouts.bout < last, rate_hz // PULSES_PER_S)  # so that a weaker last bout changes no other
     size_nm = spread_nm / float(np.std(torque[before])) * float(rng.choice([-1.0, 1.0]))
-    told = {"spread_nm": spread_nm, "size_nm": size_nm, "weaker": weaker, "tau_s": [quick_s, slow_s]}
-    return size_nm * torque, told | {"shares": [share, 1.0 - share], "recruitment": shapes}
+    parameters = {"spread_nm": spread_nm, "size_nm": size_nm, "weaker": weaker, "tau_s": [quick_s, slow_s]}
+    return size_nm * torque, parameters | {"shares": [share, 1.0 - share], "recruitment": shapes}
 
 
 def _two_lags(drive: Floats, tau_s: float, rate_hz: int) -> Floats:
@@ -135,7 +135,7 @@ def _two_lags(drive: Floats, tau_s: float, rate_hz: int) -> Floats:
 
 
 def _disturbed_nm(seed: int, working: np.ndarray, spread_nm: float, rate_hz: int) -> tuple[Floats, dict[str, Any]]:
-    """What the sensor adds at every sample, N·m: jumps that creep back, and the zero."""
+    """Return the sensor's error at every sample, N·m: jumps that creep back, and the zero; and the parameters."""
     count = working.size
     rng = rng_of(seed, "bouts", "noise")
     rng.standard_normal(count)  # drawn and left: the numbers below stay those of earlier figures
@@ -150,12 +150,12 @@ def _disturbed_nm(seed: int, working: np.ndarray, spread_nm: float, rate_hz: int
     # an arm settles over tenths of a second: a walk of its speed, not of white steps
     added = added + np.cumsum(lfilter([1.0 - math.exp(-3.0 / rate_hz)], [1.0, -math.exp(-3.0 / rate_hz)], steps))
     offset_nm = spread_nm * float(rng_of(seed, "bouts", "offset").normal(0.0, 2.0))
-    drawn = {"jumps_per_s": per_s, "creep_s": creep_s, "jump_nm": size_nm, "zero_nm_per_root_s": speed_nm}
-    return added + offset_nm, drawn | {"offset_nm": offset_nm}
+    parameters = {"jumps_per_s": per_s, "creep_s": creep_s, "jump_nm": size_nm, "zero_nm_per_root_s": speed_nm}
+    return added + offset_nm, parameters | {"offset_nm": offset_nm}
 
 
-def _held(rng: Generator, torque: Floats, rate_hz: int) -> tuple[Floats, float]:
-    """Each reading repeated until the next, and how often it is read, Hz: by a clock that is not even."""
+def _sample_and_hold(rng: Generator, torque: Floats, rate_hz: int) -> tuple[Floats, float]:
+    """Repeat each reading until the next, read by an uneven clock; return the readings and its mean rate, Hz."""
     read_hz = float(rng.uniform(*READ_HZ))
     gap = np.maximum(np.round(rate_hz / read_hz * rng.uniform(0.7, 1.3, torque.size // 4)), 1.0).astype(int)
     read = np.cumsum(gap)

@@ -101,8 +101,8 @@ def generate(
     sequence = scenario.design
     if again_after_s is not None:
         largest_us = float(scenario.base.largest_width_us)
-        again = make_design(design, rng_of(seed, "again"), largest_us, with_validate=with_validate)
-        sequence = sequence.then(again_after_s, again)
+        second_test = make_design(design, rng_of(seed, "again"), largest_us, with_validate=with_validate)
+        sequence = sequence.then(again_after_s, second_test)
     rng = rng_of(seed, "noise", *names, strength)
     rho = float(1.0 - np.exp(rng.uniform(np.log(0.01), np.log(0.5))))
 
@@ -166,12 +166,12 @@ def sampled(muscle: Staged, design: Design, rate_hz: float, noise_nm: Callable[[
     fine_noise = np.zeros(width.size)
     fine_noise[::every] = noise_nm(count)
     torque = simulate(muscle.base, muscle.stages(), design, step_s, fine_noise)[::every]
-    held = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), design.width_us.size - 1)
+    pulse_of_row = np.minimum(np.floor(np.arange(count) / rate_hz * 40 + 1e-9).astype(int), design.width_us.size - 1)
     columns: dict[str, Any] = {
         "time_s": np.arange(count) / rate_hz,
-        "pulse_width_us": design.width_us[held],
+        "pulse_width_us": design.width_us[pulse_of_row],
         "torque_nm": torque,
-        "segment": design.segment[held],
+        "segment": design.segment[pulse_of_row],
     }
     if design.movement is not None:
         columns |= {"angle_rad": angle[::every], "velocity_rad_s": velocity[::every]}

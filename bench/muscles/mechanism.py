@@ -1,4 +1,4 @@
-"""How a muscle of other physics is written: one kernel, its draws, and what a diagnosis may rightly say of it.
+"""Mechanism of a muscle of other physics: one kernel, its draws, and the right answers of a diagnosis.
 
 The kernel stands between the recruited torque (a share of the largest, pulse by pulse) and the torque.
 """
@@ -17,7 +17,7 @@ from stimrig.hardware_sim.hidden.kernels import Kernel, kernel
 ENTERS = ("drive", "rate of rise", "rate of fall", "output", "zero")
 """Where the plain structure, a static curve before linear dynamics, can be departed from."""
 DRIVEN_BY = ("width", "activation", "torque", "time since", "sum of the past", "angle")
-"""What a departure can depend on. Activation: the recruited share, or calcium; time since: the last pulse or train."""
+"""Inputs of a departure. Activation: the recruited share, or calcium; time since: the last pulse or train."""
 
 
 @dataclass(frozen=True)
@@ -40,15 +40,20 @@ class Mechanism:
 
         What ends in `_us_share` is drawn as a share of the way from 10 to 90 % recruitment, and given as a width in µs.
         """
-        drawn = {}
+        values = {}
         for name, (low, high) in self.draws.items():
             value = math.exp(rng.uniform(math.log(low), math.log(high))) if low > 0.0 else rng.uniform(low, high)
-            drawn[name] = float(value)
+            values[name] = float(value)
         low_us, high_us = base.rise_us()
         return {
             name: low_us + value * (high_us - low_us) if name.endswith("_us_share") else value
-            for name, value in drawn.items()
+            for name, value in values.items()
         }
+
+
+def by_name(*mechanisms: Mechanism) -> dict[str, Mechanism]:
+    """Return mechanisms by the names of their kernels' functions."""
+    return {each.kernel.function.__name__: each for each in mechanisms}
 
 
 def mechanism(

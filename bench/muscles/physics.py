@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from bench.muscles.mechanism import mechanism
+from bench.muscles.mechanism import by_name, mechanism
 from stimrig.hardware_sim.hidden.base import lag_after
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US, helper
 
@@ -71,10 +71,10 @@ def ding_fatigue(x, p, s, c):
 
     s[5]: what is lost. A' = -(A - A0)/τfat + αA F; likewise τ1 and Km.
     """
-    kept = p[2]
-    p[2] = kept * (1.0 + p[7] * s[5])
+    rested_km = p[2]
+    p[2] = rested_km * (1.0 + p[7] * s[5])
     bound = calcium_of(p, s, c)
-    p[2] = kept
+    p[2] = rested_km
     if c[PULSE] > 0.0:
         s[4] = x / c[LARGEST_NM]
     tau = p[3] * (1.0 + p[7] * s[5]) + p[4] * bound
@@ -347,9 +347,9 @@ def sarcomere_chain(x, p, s, c):
             shortened -= s[10 + k] / count
         force = max(shortened / p[4], 0.0)
         for k in range(count):
-            own = 1.0 + p[2] * (2.0 * k / (count - 1.0) - 1.0)
+            strength = 1.0 + p[2] * (2.0 * k / (count - 1.0) - 1.0)
             length = s[10 + k]
-            active = own * s[1] * max(1.0 - p[5] * length * length, 0.05)
+            active = strength * s[1] * max(1.0 - p[5] * length * length, 0.05)
             stretched = p[6] * length * abs(length)
             speed = (force - active - stretched) / (active + 0.15)
             s[10 + k] += c[STEP_S] / 6.0 * p[3] * min(max(speed, -1.0), 1.0)
@@ -389,8 +389,5 @@ def closed_space(x, p, s, c):
     return p[0] * c[LARGEST_NM] * max(s[1], 0.0)
 
 
-PHYSICS = {one.kernel.function.__name__: one for one in (ding, ding_fatigue, hill_series, two_populations)}
-FURTHER = {
-    one.kernel.function.__name__: one
-    for one in (huxley, unit_pool, slack_tendon, two_buffers, cooperative, sarcomere_chain, closed_space)
-}
+PHYSICS = by_name(ding, ding_fatigue, hill_series, two_populations)
+FURTHER = by_name(huxley, unit_pool, slack_tendon, two_buffers, cooperative, sarcomere_chain, closed_space)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from bench.muscles.mechanism import mechanism
+from bench.muscles.mechanism import by_name, mechanism
 from stimrig.hardware_sim.hidden.base import delayed, lag_after
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, PULSE, STEP_S, WIDTH_US, helper
 
@@ -103,14 +103,14 @@ def dry_cushion(x, p, s, c):
     """
     torque = two_lags(x / c[LARGEST_NM], p, s, c)
     step = 0.125 * c[STEP_S]
-    felt = 0.0
+    cell_force = 0.0
     for _ in range(8):
-        felt = p[3] * s[2] + (1.0 - p[3]) * (s[2] - s[3])
-        speed = (torque - felt - s[4]) / p[7]
+        cell_force = p[3] * s[2] + (1.0 - p[3]) * (s[2] - s[3])
+        speed = (torque - cell_force - s[4]) / p[7]
         s[2] += step * speed
         s[3] += step * (s[2] - s[3]) / p[4]
         s[4] += step * (p[5] * speed - abs(speed) * s[4]) / p[6]
-    return p[0] * c[LARGEST_NM] * felt
+    return p[0] * c[LARGEST_NM] * cell_force
 
 
 @mechanism(
@@ -131,12 +131,12 @@ def worn_reflex(x, p, s, c):
 
     s: place in a ring, two lags, wear; s[100:612]: the ring. The reflex is largest where half of the axons answer.
     """
-    own = min(max(x / c[LARGEST_NM], 0.0), 1.0)
+    recruited = min(max(x / c[LARGEST_NM], 0.0), 1.0)
     if c[PULSE] > 0.0:
         s[3] += p[4] * (1.0 - s[3])
     s[3] *= math.exp(-c[STEP_S] / p[5])
-    felt = delayed(s[2], p[7] / c[STEP_S], s, 100, 512)
-    drive = own + p[3] * own * (1.0 - own) * (1.0 - s[3]) * max(1.0 - p[6] * felt, 0.0)
+    sensed_tension = delayed(s[2], p[7] / c[STEP_S], s, 100, 512)
+    drive = recruited + p[3] * recruited * (1.0 - recruited) * (1.0 - s[3]) * max(1.0 - p[6] * sensed_tension, 0.0)
     before = s[1]
     s[1] = lag_after(drive, drive, before, p[1], c[STEP_S])
     s[2] = lag_after(before, s[1], s[2], p[2], c[STEP_S])
@@ -190,20 +190,17 @@ def swinging_splint(x, p, s, c):
     s: two lags, travel, its speed; s[10:18]: where each of 8 joints has slipped to.
     """
     torque = two_lags(x / c[LARGEST_NM], p, s, c)
-    omega, step, held = 2.0 * math.pi * p[3], 0.125 * c[STEP_S], 0.0
+    omega, step, splint_torque = 2.0 * math.pi * p[3], 0.125 * c[STEP_S], 0.0
     for _ in range(8):
-        held = p[4] * s[2] + (1.0 - p[4]) * max(s[2] - p[5], 0.0)
+        splint_torque = p[4] * s[2] + (1.0 - p[4]) * max(s[2] - p[5], 0.0)
         for k in range(8):
             reach = p[7] * (k + 1.0) / 8.0
             s[10 + k] = min(max(s[10 + k], s[2] - reach), s[2] + reach)
-            held += p[6] / 8.0 * (s[2] - s[10 + k]) / p[7]
-        held += 2.0 * p[8] / omega * s[3]
-        s[3] += step * omega * omega * (torque - held)
+            splint_torque += p[6] / 8.0 * (s[2] - s[10 + k]) / p[7]
+        splint_torque += 2.0 * p[8] / omega * s[3]
+        s[3] += step * omega * omega * (torque - splint_torque)
         s[2] += step * s[3]
-    return p[0] * c[LARGEST_NM] * held
+    return p[0] * c[LARGEST_NM] * splint_torque
 
 
-PLACES = {
-    one.kernel.function.__name__: one
-    for one in (central_plateau, moving_electrode, dry_cushion, worn_reflex, axon_pump, swinging_splint)
-}
+PLACES = by_name(central_plateau, moving_electrode, dry_cushion, worn_reflex, axon_pump, swinging_splint)

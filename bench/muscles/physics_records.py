@@ -19,12 +19,12 @@ from stimrig.hardware_sim.hidden.kernels import Floats
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
 DISTURBED = {"hum": "mains_hum", "slow zero": "baseline_drift", "breath": ""}
-"""What may lie over a record, and the library's name of it, where it has one."""
+"""Disturbances of a record, and the library's name of each, where it has one."""
 NOISE_SD_NM = 0.05
 RATE_HZ = 400.0
 UNSEEN_S = 22.0
-AGAIN = 1_000_000
-"""Added to the seed of what lies over a further record."""
+FURTHER_SEED_OFFSET = 1_000_000
+"""Added to the seed of the disturbances of a further record."""
 
 
 def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None = None) -> dict[str, Any]:
@@ -57,15 +57,15 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     muscle = draw_muscle(kinds, seed, rng)
     top_us = float(muscle.base.largest_width_us)
     design = make_design("full", rng, top_us)
-    made = sampled(muscle, design, RATE_HZ, np.zeros)
+    columns = sampled(muscle, design, RATE_HZ, np.zeros)
     chance = rng.random(2)
-    over = disturbed if disturbed is not None else _which(kinds, seed, chance)
-    made["torque_nm"] = made["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, made["torque_nm"].size)
-    for one in over:
-        made["torque_nm"] += disturbance_nm(one, seed, made["time_s"])
-    told = _truth(kinds, muscle) | {"seed": seed, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
-    told["true"] = sorted({*told["true"], *(DISTURBED[one] for one in over)} - {""})
-    return made | {"unseen": sampled(muscle, unseen_design(seed, top_us), RATE_HZ, np.zeros), "truth": told}
+    over = disturbed if disturbed is not None else _disturbances(kinds, seed, chance)
+    columns["torque_nm"] = columns["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, columns["torque_nm"].size)
+    for disturbance in over:
+        columns["torque_nm"] += disturbance_nm(disturbance, seed, columns["time_s"])
+    truth = _truth(kinds, muscle) | {"seed": seed, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
+    truth["true"] = sorted({*truth["true"], *(DISTURBED[disturbance] for disturbance in over)} - {""})
+    return columns | {"unseen": sampled(muscle, unseen_design(seed, top_us), RATE_HZ, np.zeros), "truth": truth}
 
 
 def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Floats) -> dict[str, Any]:
@@ -86,25 +86,26 @@ def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Float
         The columns of `record_of_physics`, with noise; its one segment is `further`.
     """
     design = Design(np.round(width_us), np.full(width_us.size, "further", "U12"))
-    made = sampled(draw_muscle(kinds, seed), design, RATE_HZ, np.zeros)
+    columns = sampled(draw_muscle(kinds, seed), design, RATE_HZ, np.zeros)
     rng = rng_of(seed, "physics", "further")
-    made["torque_nm"] = made["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, made["torque_nm"].size)
-    for one in over:
-        made["torque_nm"] += disturbance_nm(one, seed if one == "hum" else seed + AGAIN, made["time_s"])
-    return made
+    columns["torque_nm"] = columns["torque_nm"] + rng.normal(0.0, NOISE_SD_NM, columns["torque_nm"].size)
+    for disturbance in over:
+        disturbance_seed = seed if disturbance == "hum" else seed + FURTHER_SEED_OFFSET
+        columns["torque_nm"] += disturbance_nm(disturbance, disturbance_seed, columns["time_s"])
+    return columns
 
 
 def _truth(kinds: str, muscle: PhysicsMuscle) -> dict[str, Any]:
-    """What is right to say of the muscle alone."""
+    """Return the right answers about the muscle alone."""
     kind = SETS[kinds].get(muscle.kind)
     right = {key: sorted(getattr(kind, key)) if kind else [] for key in ("true", "enters", "driven_by")}
     return {"kind": muscle.kind, "numbers": muscle.numbers} | right
 
 
-def _which(kinds: str, seed: int, chance: Floats) -> tuple[str, ...]:
+def _disturbances(kinds: str, seed: int, chance: Floats) -> tuple[str, ...]:
     if kinds == "plain":
-        return (*((one,) for one in DISTURBED), tuple(DISTURBED))[seed % (len(DISTURBED) + 1)]
-    return tuple(one for one, drawn in zip(("hum", "slow zero"), chance, strict=True) if drawn < 1.0 / 3.0)
+        return (*((name,) for name in DISTURBED), tuple(DISTURBED))[seed % (len(DISTURBED) + 1)]
+    return tuple(name for name, number in zip(("hum", "slow zero"), chance, strict=True) if number < 1.0 / 3.0)
 
 
 def unseen_design(seed: int, top_us: float) -> Design:
@@ -118,7 +119,7 @@ def unseen_design(seed: int, top_us: float) -> Design:
 
 
 def disturbance_nm(kind: str, seed: int, time_s: Floats) -> Floats:
-    """What lies over a record, N·m.
+    """Return a disturbance of a record, N·m.
 
     `hum`: 50 or 60 Hz of 0.03 to 0.1 N·m, and its third harmonic. `slow zero`: a smooth random walk whose spread over
     the record is 0.1 to 0.3 N·m. `breath`: 0.2 to 0.35 Hz, slowly varying, of 0.05 to 0.15 N·m.

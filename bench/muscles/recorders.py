@@ -38,19 +38,19 @@ def _start(record: dict[str, Any], rng: Generator) -> int:
 def _gaps(record: dict[str, Any], rng: Generator) -> tuple[list[list[float]], np.ndarray]:
     """Two gaps outside `validate`, as begin and length in s, and the rows that remain."""
     time_s = record["time_s"]
-    kept = np.ones(time_s.size, bool)
+    remaining = np.ones(time_s.size, bool)
     held_out = record["segment"] == "validate"
-    found: list[list[float]] = []
+    gaps: list[list[float]] = []
     for _ in range(1000):
         length_s = float(rng.uniform(*GAP_S))
         begin_s = float(rng.uniform(time_s[0] + APART_S, time_s[-1] - APART_S - length_s))
         missing = (time_s >= begin_s) & (time_s < begin_s + length_s)
-        alone = all(abs(begin_s - other) > GAP_S[1] + APART_S for other, _ in found)
+        alone = all(abs(begin_s - other) > GAP_S[1] + APART_S for other, _ in gaps)
         if alone and not held_out[missing].any():
-            kept &= ~missing
-            found.append([begin_s, length_s])
-        if len(found) == 2:
-            return sorted(found), kept
+            remaining &= ~missing
+            gaps.append([begin_s, length_s])
+        if len(gaps) == 2:
+            return sorted(gaps), remaining
     raise ValueError("the record has no room for two gaps outside validate")
 
 
@@ -59,15 +59,15 @@ def _rows_of(record: dict[str, Any], rows: Any) -> dict[str, Any]:
     return {name: column[rows] for name, column in record.items()}
 
 
-def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
-    """The record `made` as another recorder gives it.
+def recorded(original: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
+    """Return the record as another recorder gives it.
 
     Joint angle and velocity lose the rows that torque loses and keep their values: only the load cell is turned round,
     shifted or scaled.
 
     Parameters
     ----------
-    made
+    original
         From `bench.muscles.hidden_records.generate`; it is not changed.
     kind
         `plain`: as it is. `offset`: a zero within ±50 N·m. `start`: it begins 0.5 to 3 s into the PRBS, within a
@@ -76,7 +76,7 @@ def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
         missing twice, outside `validate`. `real`: start, counts, an offset within ±12 N·m, and negative for odd
         seeds. Several with `+`.
     seed
-        Decides, together with what is hidden, every random number.
+        Decides every random number, together with the hidden effects.
 
     Returns
     -------
@@ -93,29 +93,29 @@ def recorded(made: dict[str, Any], kind: str, seed: int) -> dict[str, Any]:
     for name in kinds:
         if name not in KINDS:
             raise ValueError(f"recorder {name!r}: one of {', '.join(KINDS)}")
-    truth = made["truth"]
+    truth = original["truth"]
     rng = {name: rng_of(seed, "recorder", name, *truth["effects"], truth["strength"]) for name in KINDS}
     all_of_real = {"start", "counts", "offset", *(["negative"] if seed % 2 else [])} if "real" in kinds else set()
-    asked = {*kinds} | all_of_real
+    changes = {*kinds} | all_of_real
 
-    record = {name: column.copy() for name, column in made.items() if isinstance(column, np.ndarray)}
+    record = {name: column.copy() for name, column in original.items() if isinstance(column, np.ndarray)}
     recorder: dict[str, Any] = {"kind": kind, "scale": 1.0, "offset_nm": 0.0, "cut_s": 0.0, "gaps_s": []}
-    if "start" in asked:
+    if "start" in changes:
         first = _start(record, rng["start"])
         recorder["cut_s"] = float(record["time_s"][first] - record["time_s"][0])
         record = _rows_of(record, slice(first, None))
         record["time_s"] = record["time_s"] - record["time_s"][0]
-    if "gap" in asked:
-        recorder["gaps_s"], kept = _gaps(record, rng["gap"])
-        record = _rows_of(record, kept)
-    if "shifted" in asked:
+    if "gap" in changes:
+        recorder["gaps_s"], remaining = _gaps(record, rng["gap"])
+        record = _rows_of(record, remaining)
+    if "shifted" in changes:
         record["time_s"] = record["time_s"] + SHIFT_S
-    size = (10.0 if seed % 2 else 0.1) if "scaled" in asked else 1.0
-    recorder["scale"] = -size if "negative" in asked else size
-    if "offset" in asked:
+    size = (10.0 if seed % 2 else 0.1) if "scaled" in changes else 1.0
+    recorder["scale"] = -size if "negative" in changes else size
+    if "offset" in changes:
         largest = LARGEST_OFFSET_NM["offset" if "offset" in kinds else "real"]
         recorder["offset_nm"] = float(rng["offset"].uniform(-largest, largest))
     record["torque_nm"] = record["torque_nm"] * recorder["scale"] + recorder["offset_nm"]
-    if "counts" in asked:
+    if "counts" in changes:
         record["torque_nm"] = np.round(record["torque_nm"] / COUNT_NM) * COUNT_NM
     return {**record, "truth": truth, "recorder": recorder}

@@ -18,8 +18,8 @@ class Refused(Exception):
     """The service has understood and said no: nothing was begun."""
 
 
-def ask(path, body=None, **head):
-    """One request: the answer's text and its ETag."""
+def request(path, body=None, **head):
+    """Send a request; return the answer's text and its ETag."""
     data = None if body is None else json.dumps(body).encode()
     head |= {"Authorization": f"Bearer {KEY}", "Content-Type": "application/json"}
     try:
@@ -35,15 +35,15 @@ def ask(path, body=None, **head):
 def stop():
     """Press stop; say so where that does not get through."""
     try:
-        ask("/v1/stop", {})
+        request("/v1/stop", {})
     except BaseException:
         print("STOP WAS NOT CONFIRMED: use the emergency switch on the stimulator now", file=sys.stderr, flush=True)
         raise
 
 
 def must_look():
-    """Why a person has to look before the next trial; None: the muscle is still as it was approved."""
-    followed = json.loads(ask(f"/v1/participants/{CODE}/model?tracked=true")[0]).get("tracking") or {}
+    """Return why a person has to look before the next trial; None: the muscle is still as it was approved."""
+    followed = json.loads(request(f"/v1/participants/{CODE}/model?tracked=true")[0]).get("tracking") or {}
     return followed.get("ask")
 
 
@@ -53,7 +53,7 @@ def start(body):
     for _ in range(200):
         try:
             playing = True
-            return json.loads(ask("/v1/tests", body, **{"If-Match": etag})[0])
+            return json.loads(request("/v1/tests", body, **{"If-Match": etag})[0])
         except Refused as refused:
             playing = False
             if "rest-needed" not in str(refused):
@@ -71,11 +71,11 @@ def play(widths_us):
     test = start(body)
     while not test["done"]:
         time.sleep(0.3)
-        test = json.loads(ask("/v1/tests/" + test["id"])[0])
+        test = json.loads(request("/v1/tests/" + test["id"])[0])
     playing = False
     if test["state"] != "completed":
         raise SystemExit(test["reason"])
-    rows = list(csv.DictReader(ask(f"/v1/recordings/{test['recording_id']}/csv")[0].splitlines()))
+    rows = list(csv.DictReader(request(f"/v1/recordings/{test['recording_id']}/csv")[0].splitlines()))
     samples = [[] for _ in range(len(widths_us) + 1)]  # the last one is the rest before the trial
     for row in rows:
         period = math.floor((float(row["time_s"]) - 1.0) * rate_hz)
@@ -87,7 +87,7 @@ def play(widths_us):
 
 for number in (signal.SIGINT, signal.SIGTERM):  # a shell's background job begins with Ctrl-C ignored
     signal.signal(number, lambda *_: sys.exit(1))
-answer, etag = ask(f"/v1/participants/{CODE}/model")
+answer, etag = request(f"/v1/participants/{CODE}/model")
 model = json.loads(answer)
 rate_hz = model["pulse_rate_hz"]
 size = round(4 * rate_hz)
@@ -97,7 +97,7 @@ asked_nm = reference_nm
 try:
     for number in range(1, 7):
         body = {"reference_torque_nm": asked_nm}
-        plan = json.loads(ask(f"/v1/models/{model['model_id']}/widths", body)[0])
+        plan = json.loads(request(f"/v1/models/{model['model_id']}/widths", body)[0])
         torque_nm = play(plan["pulse_width_us"])
         error_nm = [want - got for want, got in zip(reference_nm, torque_nm, strict=True)]
         rms = math.sqrt(sum(e * e for e in error_nm) / sum(r * r for r in reference_nm))
