@@ -70,7 +70,7 @@ class AngleSensor:
         data = LAYOUT.pack(reading.angle_deg, self.counter & 0xFFFF, FAULT_BIT if reading.fault else 0, 0)
         frames = [Frame(CAN_ID, data, self.clock.time_us(time_s), time_s=time_s)]
         self.counter += 1
-        self.clock.taken()
+        self.clock.advance()
         for hook in self.frame_hooks:
             frames = [changed for frame in frames for changed in hook(frame)]
         for frame in frames:
@@ -78,7 +78,7 @@ class AngleSensor:
 
 
 def describe(settings: Settings) -> dict[str, Any]:
-    """What the ready line says of it: how it sends, and what a calibration would find."""
+    """Return its entry in the ready line: how it sends, and the result of a perfect calibration."""
     in_cell = settings.angle == "in-cell"
     return {
         "kind": "in_cell" if in_cell else "own",

@@ -104,7 +104,7 @@ class Devices:
         return self.timeline.next_s()
 
     def take_bytes(self) -> list[tuple[float, bytes]]:
-        """What the stimulator has written since the last call, each with the emulated time at which it did."""
+        """Return the stimulator's writes since the last call, each with its emulated time."""
         data, self._bytes = self._bytes, []
         return data
 

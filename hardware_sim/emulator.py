@@ -19,7 +19,7 @@ from stimrig.hardware_sim.tables import pick
 from stimrig.hardware_sim.timeline import WallClock
 
 TICK_S = 0.0025
-"""How often frames are delivered, in real time: four at a time at 1600 samples/s."""
+"""Period at which frames are delivered, in real time: four at a time at 1600 samples/s."""
 SHORTEST_TICK_S = 0.0005
 
 
@@ -45,7 +45,7 @@ class Emulator:
         self._control = Control(self._reactor, path, devices, self.clock, self.catch_up, self.state)
 
     def ready(self) -> dict[str, Any]:
-        """What the host needs to know: the line printed once the devices answer."""
+        """Return the facts that the host needs: the line printed once the devices answer."""
         settings, cell, limb = self.devices.settings, self.devices.load_cell.cell, self.devices.limb
         return {
             "stimulator": self.port.path,

@@ -38,7 +38,7 @@ def make_devices(
 
 
 LONGEST_NAME = 256
-"""Of a file; the system refuses to look for far longer ones."""
+"""Longest name of a file; the system refuses to look for far longer ones."""
 
 
 def _hidden_seed(patient: str) -> int | None:

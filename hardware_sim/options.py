@@ -38,7 +38,7 @@ def parse(arguments: Sequence[str] | None = None, prog: str = "stimrig emulate")
         description="The emulated rig: a stimulator on a serial line, a CAN load cell, and a muscle between "
         "them. Prints one JSON line once its devices answer, then runs until SIGTERM or Ctrl-C.",
     )
-    _who(parser.add_argument_group("the muscle"))
+    _patient(parser.add_argument_group("the muscle"))
     devices = parser.add_argument_group("the devices")
     _devices(devices)
     _add(devices, lambda name: name != "speed" and not name.startswith("angle"))
@@ -65,7 +65,7 @@ def _cell_kind(options: argparse.Namespace) -> str:
     return kind
 
 
-def _who(group: argparse._ArgumentGroup) -> None:
+def _patient(group: argparse._ArgumentGroup) -> None:
     exclusive = group.add_mutually_exclusive_group()
     exclusive.add_argument(
         "--patient",

@@ -1,4 +1,4 @@
-"""What the emulator has of the operating system: pseudo-terminals as serial ports, and waiting on several at once."""
+"""The emulator's access to the operating system: pseudo-terminals as serial ports, and waiting on several at once."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class PseudoTerminal:
         return self._master
 
     def read(self) -> bytes:
-        """What the client has written since the last call; empty if nothing."""
+        """Return the bytes that the client has written since the last call; empty if none."""
         self.forget_speed(settled=True)
         try:
             return os.read(self._master, 65536)
@@ -64,7 +64,7 @@ class PseudoTerminal:
             termios.tcsetattr(self._slave, termios.TCSANOW, settings)
 
     def unread_bytes(self) -> int:
-        """How many bytes the client has not read yet."""
+        """Count the bytes that the client has not read yet."""
         if not self.is_open:
             return 0
         (queued,) = struct.unpack("i", fcntl.ioctl(self._slave, termios.FIONREAD, bytes(4)))

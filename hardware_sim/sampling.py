@@ -1,4 +1,4 @@
-"""What sensors that sample by clocks of their own have in common: the clock, white noise, and whose turn it is."""
+"""Clock and white noise of sensors that sample by their own clocks, and the order in which they sample."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Noise:
             self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist()
         return self._block.pop()
 
-    def take(self, count: int) -> list[float]:
+    def draw(self, count: int) -> list[float]:
         """Noise of the next `count` samples, at least one."""
         while len(self._block) < count:
             self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist() + self._block
@@ -36,7 +36,7 @@ class Noise:
 
 
 class SampleClock:
-    """When a sensor takes its next sample, in emulated seconds, and what its own clock says then.
+    """Time of a sensor's next sample, in emulated seconds, and the sensor's own clock at that time.
 
     Samples come at exact multiples of the period, which is off by `ppm`. With `jitter_s` each is taken, and stamped,
     off that time by this standard deviation.
@@ -54,19 +54,19 @@ class SampleClock:
         """When the next sample is due."""
         return self._due_s
 
-    def taken(self) -> None:
-        """The sample that was due is taken."""
+    def advance(self) -> None:
+        """Go on to the next sample."""
         self.samples += 1
         largest_s = LARGEST_JITTER_PERIODS * self._period_s
         self._off_s = min(max(self._jitter.next(), -largest_s), largest_s) if self._jitter else 0.0
         self._due_s = self._anchor_s + (self.samples - self._anchor_sample) * self._period_s + self._off_s
 
-    def take(self, until_s: float) -> list[float]:
-        """Times of all samples due before `until_s`, which are taken."""
+    def advance_until(self, until_s: float) -> list[float]:
+        """Go on to the first sample from `until_s` on; return the times of those before it."""
         times_s = []
         while self._due_s < until_s:
             times_s.append(self._due_s)
-            self.taken()
+            self.advance()
         return times_s
 
     def set_rate_factor(self, factor: float) -> None:

@@ -22,9 +22,9 @@ def option(value: Any, span: tuple[float, float] | None = None, **arguments: Any
 
 @dataclass(frozen=True)
 class Settings:
-    """How the emulated rig is set up.
+    """Settings of the emulated rig.
 
-    What begins with `angle` is of the joint's sensor, which is there where the rig has an arm. The cell says which
+    Names that begin with `angle` are of the joint's sensor, which a rig with an arm has. The cell decides which
     `samples_per_frame` it takes.
     """
 

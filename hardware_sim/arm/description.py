@@ -38,7 +38,7 @@ KEYS = ("mode", "movement", "mechanics", *LAWS)
 
 @dataclass(frozen=True)
 class Arm:
-    """What moves it at first and how, and its tissue."""
+    """Description of an arm: its first mover with settings, and its tissue."""
 
     mode: str = "held"
     movement: Mapping[str, Any] = field(default_factory=dict)

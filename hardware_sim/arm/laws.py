@@ -52,7 +52,7 @@ class PassiveLaw:
         return memory
 
     def remembered_nm(self, memory: Number, angle_rad: Number) -> Number:  # noqa: ARG002
-        """What the memory adds to `torque_nm`, N·m."""
+        """Return the torque that the memory adds to `torque_nm`, N·m."""
         return 0.0
 
 

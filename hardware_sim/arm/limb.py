@@ -55,7 +55,7 @@ class Limb:
         self._advance(time_s)
         begin = Begin(self._time_s, self.motion, self._seed + SEEDS_APART * self._moves)
         mover = make_mover(mode, begin, settings)
-        if not (mover.holds or self._inertia_kg_m2 > 0.0):
+        if not (mover.holds_forearm or self._inertia_kg_m2 > 0.0):
             raise ArmError(f"mode '{mode}': a forearm without inertia (a hidden patient's) cannot be let go")
         self._mover, self._moves = mover, self._moves + 1
         self.mode = mode
@@ -68,7 +68,7 @@ class Limb:
     def torque_nm(self, time_s: float) -> float:
         """Advance to `time_s` and give the torque on the load cell, N·m, without the sensor's noise."""
         self._advance(time_s)
-        if not self._mover.holds:
+        if not self._mover.holds_forearm:
             return 0.0
         angle_rad, velocity_rad_s, acceleration_rad_s2 = self.motion
         return self._net_nm(angle_rad, velocity_rad_s) - self._inertia_kg_m2 * acceleration_rad_s2

@@ -1,4 +1,4 @@
-"""How the elbow moves: its motion, and the curves and the servo that movers are made of.
+"""Motion of the elbow, and the curves and the servo that movers are made of.
 
 Angle 0 is the straight arm, flexion is positive.
 """
@@ -12,7 +12,7 @@ from typing import NamedTuple
 from stimrig.hardware_sim.errors import ArmError
 
 SMALLEST_DEG, LARGEST_DEG = -10.0, 160.0
-"""What an elbow can be asked for; people reach -5 to 150 degrees."""
+"""Angles that a mover accepts; people reach -5 to 150 degrees."""
 SLOWEST_DEG_S, FASTEST_DEG_S = 0.1, 1000.0
 
 
@@ -97,7 +97,7 @@ class Quintic:
 
 
 def lasting_s(from_rad: float, to_rad: float, peak_rad_s: float) -> float:
-    """How long a minimum-jerk movement takes at this peak speed, s."""
+    """Return the duration of a minimum-jerk movement with this peak speed, s."""
     return max(SHORTEST_S, PEAK_OVER_MEAN * abs(to_rad - from_rad) / peak_rad_s)
 
 

@@ -1,4 +1,4 @@
-"""What holds or moves the forearm, by name, made with settings that the control line or a file gives."""
+"""Movers that hold or move the forearm, by name, made with settings of the control line or a file."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ STOPS_WITHIN_S = 0.3
 class Mover:
     """Holds the forearm, moves it, or lets it go.
 
-    Its constructor takes `Begin` and, by keyword, settings with defaults: what the control line and files give.
+    Its constructor takes `Begin` and, by keyword, settings with defaults, which the control line and files set.
     """
 
-    holds = True
-    """Whether somebody holds the forearm, so that the load cell between the two carries the torque."""
+    holds_forearm = True
+    """True where the forearm is held, so that the load cell in between carries the torque."""
 
     _at: Callable[[float], Motion]
 
@@ -55,7 +55,7 @@ class Mover:
 class Free(Mover):
     """Nobody holds the forearm: it moves by its muscle, its tissue and gravity. Fourth-order Runge-Kutta."""
 
-    holds = False
+    holds_forearm = False
 
     def __init__(self, begin: Begin) -> None:
         self._time_s, self._motion = begin.time_s, begin.motion
@@ -78,7 +78,7 @@ class Free(Mover):
         return self._motion
 
 
-class Held(Mover):
+class Fixture(Mover):
     """A fixture holds it still at `angle_deg` (where it is, if none is given).
 
     It is brought there smoothly with a peak speed of `deg_s`, as nobody jerks an arm.
@@ -310,7 +310,7 @@ class Waves(Mover):
 MOVERS: dict[str, Callable[..., Mover]] = {
     "free": Free,
     "hand": Hand,
-    "held": Held,
+    "held": Fixture,
     "robot": Robot,
     "script": Script,
     "waves": Waves,

@@ -47,7 +47,7 @@ class Mechanics:
         return -self.weight_nm * np.sin(angle_rad + math.radians(self.upper_arm_deg))
 
     def stops_nm(self, angle_rad: Number, velocity_rad_s: Number) -> Number:
-        """What the stops push with, flexion positive."""
+        """Return the torque of the stops, flexion positive."""
         over = np.maximum(angle_rad - math.radians(self.most_deg), 0.0)
         under = np.maximum(math.radians(self.least_deg) - angle_rad, 0.0)
         flexed = over * np.maximum(1.0 + self.stop_loss_s_per_rad * velocity_rad_s, 0.0)

@@ -99,12 +99,12 @@ def stuck() -> Callable[[float, float], float]:
     """A hook that holds the first reading."""
     first: list[float] = []
 
-    def hold(reading: float, _time_s: float) -> float:
+    def repeat_first(reading: float, _time_s: float) -> float:
         if not first:
             first.append(reading)
         return first[0]
 
-    return hold
+    return repeat_first
 
 
 def at_another_rate(clock: Any, percent: float) -> Undo:
@@ -120,7 +120,7 @@ def check_not_negative(fault_name: str, setting: str, value: float) -> None:
 
 
 class Faults:
-    """Which faults of one target are on, and what undoes them."""
+    """Faults of one target that are on, and the calls that undo them."""
 
     def __init__(self, target: Target) -> None:
         self._target = target

@@ -55,7 +55,7 @@ def line_stalled(target: Target, to_device: bool = True, to_host: bool = True) -
 
 @fault
 def frames_doubled(target: Target, probability: float = 1.0) -> Undo:
-    """What the host sends arrives twice, with this probability for each piece read."""
+    """Deliver bytes from the host twice, with this probability for each piece read."""
     return hooked(sometimes(target, probability, lambda data: data * 2), target.board.incoming)
 
 

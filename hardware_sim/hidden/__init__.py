@@ -17,7 +17,7 @@ __all__ = ["draw_patient", "make", "movement", "reveal"]
 
 NOISE_SD_NM = 0.04
 KINDS = {"one": 0.64, "nothing": 0.12, "two": 0.1, "outside": 0.14}
-"""What the seed of a patient hides, and its probability: effects of the library, or one that no library has."""
+"""Hidden effects that a patient's seed draws, with their probabilities: of the library, or outside it."""
 MOVING_KINDS = {"moving": 0.7, "nothing": 0.15, "one": 0.15}
 """The same of a patient whose joint moves: mostly an effect of the movement."""
 
@@ -54,12 +54,12 @@ def make(seed: int, moving: bool = False) -> HiddenMuscle:
 
 
 def movement(seed: int) -> dict[str, Any]:
-    """How the joint of the moving patient moves in the test that its effect was sized on: settings of `waves`."""
+    """Return the movement in the test that sized the moving patient's effect, as settings of `waves`."""
     hz, amplitude_rad, phase_rad = draw_patient(seed, True).design.movement or ((), (), ())
     deg = [math.degrees(size) for size in amplitude_rad]
     return {"hz": list(map(float, hz)), "deg": deg, "phase_rad": list(map(float, phase_rad))}
 
 
 def reveal(seed: int, moving: bool = False) -> dict[str, Any]:
-    """What `make(seed)` hides: `effects`, `formulation`, `strength`, `parameters`, `outside_library` and more."""
+    """Return the truth of a seed: `effects`, `formulation`, `strength`, `parameters`, `outside_library` and more."""
     return draw_patient(seed, moving).truth(NOISE_SD_NM) | {"seed": seed}

@@ -157,7 +157,7 @@ class Base:
         return stages
 
     def describe(self) -> dict[str, Any]:
-        """What `reveal` says of it."""
+        """Return its entry in `reveal`."""
         return {
             "recruitment": self.shape,
             "dynamics": self.dynamics,

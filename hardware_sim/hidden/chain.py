@@ -87,7 +87,7 @@ class Chain:
         self._c[LARGEST_NM] = largest_nm
         self._stages = (addresses, recruiting, parameters, self._s, self._c)
         self._steps = 0.0
-        self._one = np.zeros((5, 1))
+        self._column = np.zeros((5, 1))
 
     def run(self, x: Floats, pulse: Floats, angle_rad: Floats, velocity_rad_s: Floats) -> Floats:
         """Advance by as many steps as `x` has entries; the last stage's output after each step."""
@@ -104,7 +104,7 @@ class Chain:
 
         `lingering` is added to what `x` recruits.
         """
-        column = self._one
+        column = self._column
         column[0, 0], column[1, 0], column[2, 0], column[3, 0] = x, pulse, *joint
         if at_step is not None:
             self._steps = at_step
@@ -115,7 +115,7 @@ class Chain:
 
     @property
     def recruited(self) -> float:
-        """What the width of the last step recruited."""
+        """The torque recruited by the last step's width."""
         return float(self._c[RECRUITED])
 
     def save(self) -> tuple[Floats, Floats, float]:

@@ -25,7 +25,7 @@ class Design:
 
     @property
     def held_out(self) -> np.ndarray:
-        """Which rows must not be fitted."""
+        """Mask of the rows that must not be fitted."""
         return self.segment == "validate"
 
     @property

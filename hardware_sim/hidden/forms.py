@@ -24,7 +24,7 @@ from stimrig.hardware_sim.hidden.kernels import Kernel, Stage
 
 Draw = Any
 Counted = Literal["held out", "training", "larger", "all", "added"]
-"""Which error of a fit without an effect counts as its strength: that in the held-out rows; in the training rows, where
+"""Error of a fit without an effect that counts as its strength: that in the held-out rows; in the training rows, where
 it happens only there; the larger of both, where it may not show in the held-out rows; that of all rows, where it cannot
 be predicted; or the rms of the torque added at the full rate, where it aliases at the pulse rate."""
 

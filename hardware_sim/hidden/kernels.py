@@ -1,4 +1,4 @@
-"""How a stage of a hidden muscle is written: a small compiled function with its parameters and its state.
+"""Stages of hidden muscles: small compiled functions, each with its parameters and its state.
 
 Every kernel takes `(x, p, s, c)`: its input signal, its parameters, its state and the context that all stages share.
 It returns its output signal. Kernels are C functions called by address, so that any set of them runs in one compiled

@@ -20,7 +20,7 @@ _Saved = tuple[Floats, Floats, float]
 
 
 class Staged(Protocol):
-    """What is made of stages: a scenario, or another muscle."""
+    """Muscle made of stages: a scenario, or another one."""
 
     @property
     def base(self) -> Base:

@@ -299,7 +299,7 @@ SLOW_CONVERTER = OUTSIDERS["slow_converter"] = Effect()
 
 @SLOW_CONVERTER.form("each reading is held", "sample and hold")
 @draws("converter", 1.2, "held_s")
-def _held(x, p, s, c):
+def _sample_and_hold(x, p, s, c):
     """p: how long a reading is held, s. s: reading, time of the next."""
     if p[0] <= 0.0:
         return x

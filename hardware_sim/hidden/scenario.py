@@ -46,7 +46,7 @@ class Scenario:
         return combine(self.base, [(effect.formulation, effect.magnitude) for effect in self.hidden])
 
     def truth(self, noise_sd_nm: float) -> dict[str, Any]:
-        """What is hidden, as plain values."""
+        """Return the hidden effects and their parameters as plain values."""
         return {
             "effects": [effect.effect for effect in self.hidden],
             "formulation": [effect.formulation.name for effect in self.hidden],

@@ -1,5 +1,5 @@
-"""How much a hidden effect shows: the residual of the best Hammerstein model without effects, on a noise-free record;
-and the magnitude at which an effect shows as asked.
+"""Strength of a hidden effect: the residual of the best Hammerstein model without effects, on a noise-free record;
+and the magnitude that gives a wanted strength.
 
 A cubic spline with many knots, then a second-order system, fitted by variable projection (Golub and Pereyra 1973) at
 the pulse rate. Half of the knots lie where the base really rises, which the identification cannot know. Held-out rows

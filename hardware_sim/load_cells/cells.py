@@ -34,7 +34,7 @@ class Cell:
         self.rig_keys = self.layouts[samples_per_frame]
         self.has_counter, self.has_sync = (self.rig_keys.get(key) != "" for key in ("counter", "sync"))
         self.running = True
-        """Whether it is sending."""
+        """True while it sends."""
 
     def encode(self, samples: Sequence[Sample]) -> Frame:
         """The frame of `samples_per_frame` samples."""
@@ -95,7 +95,7 @@ class CanOpen(Cell):
     """
 
     NMT_ID, NODE = 0x000, 1
-    START, LEAVE = 0x01, (0x02, 0x80, 0x81, 0x82)
+    START, STOP_COMMANDS = 0x01, (0x02, 0x80, 0x81, 0x82)
 
     name, can_id, layouts = "canopen", 0x180 + NODE, {1: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]}}
 
@@ -104,7 +104,7 @@ class CanOpen(Cell):
         self.running = False
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
-        """Of one sample."""
+        """Pack one sample."""
         sample = samples[0]
         return TORQUE.pack(sample.torque_nm, sample.counter & 0xFFFF, int(sample.sync), 0)
 
@@ -113,7 +113,7 @@ class CanOpen(Cell):
         if can_id == self.NMT_ID and len(data) == 2 and data[1] in (0, self.NODE):
             if data[0] == self.START:
                 self.running = True
-            elif data[0] in self.LEAVE:
+            elif data[0] in self.STOP_COMMANDS:
                 self.running = False
 
 
@@ -131,7 +131,7 @@ class WithAngle(Cell):
     name, can_id, layouts = "with_angle", 0x181, {1: {"dbc": "torque_with_angle"}}
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
-        """Of one sample; an angle that is no number is the lowest count."""
+        """Pack one sample; an angle that is no number is the lowest count."""
         sample = samples[0]
         status = (SYNC_BIT if sample.sync else 0) | (ANGLE_FAULT_BIT if sample.angle and sample.angle.fault else 0)
         angle_deg = sample.angle.angle_deg if sample.angle else math.nan

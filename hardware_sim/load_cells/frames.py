@@ -9,7 +9,7 @@ LARGEST_STANDARD_ID = 0x7FF
 
 
 class AngleReading(NamedTuple):
-    """What a sensor of the joint's angle says: degrees from its own zero in its own direction, and its fault bit."""
+    """Reading of a sensor of the joint's angle: degrees from its own zero in its own direction, and its fault bit."""
 
     angle_deg: float
     fault: bool
@@ -49,7 +49,7 @@ FrameHandler = Callable[[int, bytes], None]
 
 
 class TransportProtocol(Protocol):
-    """What connects the CAN bus to the host."""
+    """Connection of the CAN bus to the host."""
 
     can: dict[str, Any]
     """Arguments of `can.Bus`."""

@@ -46,7 +46,7 @@ class LoadCell:
         self._read_angle = read_angle
         self._one_by_one = self._converted_nm is not None or read_angle is not None
         self._sync = False
-        self._held: list[Sample] = []
+        self._unsent: list[Sample] = []
         self._frames: list[Frame] = []
 
     def raise_sync(self) -> None:
@@ -58,13 +58,13 @@ class LoadCell:
         if self._one_by_one or self.torque_hooks or self.frame_hooks:
             while self.clock.next_s() < until_s:
                 self.sample()
-        elif times_s := self.clock.take(until_s):
+        elif times_s := self.clock.advance_until(until_s):
             self._read(times_s)
 
     def restart(self) -> None:
         """Power lost and back, with electronics as they are from power-on: what has not been taken is lost."""
         self.cell, self.counter, self._sync = _make_cell(self._settings), 0, False
-        self._held.clear()
+        self._unsent.clear()
         self._frames.clear()
 
     def take_frames(self) -> list[Frame]:
@@ -79,14 +79,14 @@ class LoadCell:
     def sample(self) -> None:
         """Take the next sample."""
         time_s = self.clock.next_s()
-        self.clock.taken()
+        self.clock.advance()
         self._read([time_s])
 
     def _read(self, times_s: list[float]) -> None:
         """Samples at these times; one alone where a hook, a converter or an angle wants its turn."""
         torques_nm = list(map(self._muscle.torque_nm, times_s))
         self.torque_nm = torques_nm[-1]
-        noise_nm = self._noise.take(len(times_s))
+        noise_nm = self._noise.draw(len(times_s))
         offset_nm = self._settings.torque_offset_nm
         readings_nm = [nm + offset_nm + more for nm, more in zip(torques_nm, noise_nm, strict=True)]
         if self._converted_nm is not None:
@@ -103,9 +103,9 @@ class LoadCell:
     def _send(self, samples: Iterable[Sample]) -> None:
         """Frames of these samples; a cell that does not run throws them away."""
         if not self.cell.running:
-            self._held.clear()
+            self._unsent.clear()
             return
-        frames, waiting, full = [], self._held, self.cell.samples_per_frame
+        frames, waiting, full = [], self._unsent, self.cell.samples_per_frame
         for sample in samples:
             waiting.append(sample)
             if len(waiting) >= full:

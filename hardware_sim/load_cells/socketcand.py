@@ -90,13 +90,13 @@ class Socketcand:
                 self._answer(client, b"< ok >")
                 client.raw_from_s = time.monotonic() + QUIET_S
             case ["send", can_id, length, *data] if client.opened:
-                self._take(client, can_id, length, data)
+                self._receive_frame(client, can_id, length, data)
             case ["echo"]:
                 self._answer(client, b"< echo >")
             case _:
                 self._answer(client, b"< error unknown command >")
 
-    def _take(self, client: _Client, can_id: str, length: str, data: list[str]) -> None:
+    def _receive_frame(self, client: _Client, can_id: str, length: str, data: list[str]) -> None:
         try:
             payload = bytes(int(byte, 16) for byte in data)
             if len(payload) != int(length, 16):
@@ -137,7 +137,7 @@ class _Client:
         self.raw_from_s: float | None = None
 
     def listens(self, now_s: float) -> bool:
-        """Whether frames may be sent to it."""
+        """Return whether frames may be sent to it."""
         return self.raw_from_s is not None and now_s >= self.raw_from_s
 
 

@@ -63,7 +63,7 @@ class Parameters:
 
 
 class Store:
-    """What fills with use and empties at rest; `share` after the usual session, negative for the opposite effect."""
+    """Fills with use and empties at rest; `share` after the usual session, negative for the opposite effect."""
 
     def __init__(self, share: float, recovery_s: float) -> None:
         self._sign = math.copysign(1.0, share)
@@ -139,7 +139,7 @@ class ChangingMuscle(HeldPulses):
         return 1.0 + self._slowing.value
 
     def shift_us(self, time_s: float) -> float:
-        """How far the threshold has moved, µs."""
+        """Return the threshold's shift, µs."""
         since_s = max(time_s - self._first_pulse_s, 0.0)
         return -self.parameters.drift_us * math.expm1(-since_s / self.parameters.drift_settling_s)
 
@@ -174,7 +174,7 @@ class ChangingMuscle(HeldPulses):
             added_nm += p.effort_nm * _bump((since_s - p.effort_begins_s) / p.effort_lasts_s)
         return added_nm
 
-    def _kept(self) -> tuple[float, ...]:
+    def _state(self) -> tuple[float, ...]:
         stores = self._fatigue.level, self._potentiation.level, self._slowing.level
         return (self._y, self._dy, *stores)
 

@@ -1,4 +1,4 @@
-"""What every emulated muscle is, and what those with second-order dynamics have in common."""
+"""Protocol of emulated muscles, and the base of those with second-order dynamics."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class HeldPulses:
     the time since is integrated again with the hold extended to it. Readings taken in between are off by w dt² / (2
     T²): 1e-5 N·m for a pulse 1 ms late.
 
-    A patient overrides `drive_nm`; one with further states `_kept`, `_return_to` and `_step_to`.
+    A patient overrides `drive_nm`; one with further states `_state`, `_return_to` and `_step_to`.
     """
 
     def __init__(self, natural_period_s: float, damping_ratio: float, pulse_period_s: float, late_periods: float):
@@ -70,7 +70,7 @@ class HeldPulses:
         self._sigma = self._damping_ratio / natural_period_s
         self._discriminant = (1.0 - self._damping_ratio**2) * self._omega2
 
-    def _kept(self) -> Any:
+    def _state(self) -> Any:
         """The state, for `_return_to`."""
         return self._y, self._dy
 
@@ -83,7 +83,7 @@ class HeldPulses:
                 self._step_to(time_s, self._held_nm)
                 return
             self._step_to(self._hold_end_s, self._held_nm)
-            self._at_hold_end = self._kept()
+            self._at_hold_end = self._state()
         self._step_to(time_s, 0.0)
 
     def _step_to(self, time_s: float, input_nm: float) -> None:

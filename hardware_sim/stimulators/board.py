@@ -116,7 +116,7 @@ class Board:
 
 
 class Firmware(ABC):
-    """What every stimulator's firmware offers, by the commands that it takes."""
+    """Base of the stimulators' firmwares: commands in, packets out."""
 
     device: ClassVar[str]
     wire: ClassVar[type[ScienceMode]]
@@ -125,7 +125,7 @@ class Firmware(ABC):
         self._board = board
         self._wire: Any = self.wire()
         self.commands: Counter[int] = Counter()
-        """How often each came."""
+        """Count of each command received."""
 
     @abstractmethod
     def received(self, data: bytes) -> None:

@@ -38,7 +38,7 @@ def parse_points(data: bytes, count: int) -> list[Point] | None:
 
 
 def within_limits(points: Sequence[Point]) -> bool:
-    """Whether the device accepts this shape: currents within ±130 mA and some duration."""
+    """Return whether the device accepts this shape: currents within ±130 mA and some duration."""
     currents_fit = all(-LARGEST_CURRENT_MA <= current <= LARGEST_CURRENT_MA for _, current in points)
     return currents_fit and sum(width for width, _ in points) > 0
 
@@ -67,7 +67,7 @@ class MidLevel:
 
     @property
     def running(self) -> bool:
-        """Whether any channel is pulsing."""
+        """True while any channel pulses."""
         return bool(self._channels)
 
     def start(self, stop_on_error: bool) -> None:
@@ -214,7 +214,7 @@ class P24(Firmware):
 
     @property
     def high_voltage_on(self) -> bool:
-        """Whether the source that drives the pulses is on."""
+        """True while the source that drives the pulses is on."""
         return self._level != NO_LEVEL and self._source != HIGH_VOLTAGE_OFF and self._board.high_voltage_works
 
     def received(self, data: bytes) -> None:

@@ -120,7 +120,7 @@ class ChannelList:
 
     @property
     def one_shot_runs(self) -> bool:
-        """Whether the group of an earlier Start still runs."""
+        """True while the group of an earlier Start still runs."""
         return self.setup.period_s == 0 and self._board.timeline.now_s < self._one_shot_ends_s
 
     def set_up(self, setup: Setup) -> None:
@@ -249,7 +249,7 @@ class RehaStim2(Firmware):
     def _offer_connection(self) -> None:
         if self._board.unread() == 0:  # on hardware a closed port drops it; here it would wait for the next client
             self._offered.add(self._number)
-            self._say(INIT, bytes((PROTOCOL_VERSION,)))
+            self._send_event(INIT, bytes((PROTOCOL_VERSION,)))
         self._offer = self._board.timeline.after(INIT_PERIOD_S, self._offer_connection)
 
     def _alive(self) -> None:
@@ -267,7 +267,7 @@ class RehaStim2(Firmware):
     def _ack(self, packet: Packet, result: int, data: bytes = b"") -> None:
         self._send(packet.number, packet.command + 1, bytes((result & 0xFF,)) + data)
 
-    def _say(self, command: int, data: bytes) -> None:
+    def _send_event(self, command: int, data: bytes) -> None:
         """Send a packet that answers no command, with the device's own packet number."""
         self._send(self._number, command, data)
         self._number = (self._number + 1) & 0xFF
@@ -276,7 +276,7 @@ class RehaStim2(Firmware):
         """Stop, go back to start mode and report the error."""
         self._channels.stop()
         self._mode = START_MODE
-        self._say(STIMULATION_ERROR, bytes((error & 0xFF,)))
+        self._send_event(STIMULATION_ERROR, bytes((error & 0xFF,)))
 
     def _init_channel_list(self, packet: Packet) -> None:
         wanted = parse_init(packet.data)

@@ -50,7 +50,7 @@ def frame(header: bytes, body: bytes) -> bytes:
 
 
 class ScienceMode(ABC):
-    """What both versions share: byte stuffing, and finding frames in a stream of bytes.
+    """Base of both versions of the protocol: byte stuffing, and finding frames in a stream of bytes.
 
     Bytes in, packets out; bytes that form no frame are skipped and counted in `corrupt_frames`.
 
