@@ -81,14 +81,14 @@ class Notifier:
 log = logging.getLogger("rig")
 
 SWITCH_INTERVAL_S = 0.0005
-"""How long a thread may hold the interpreter while the sender waits; Python's default is 5 ms."""
+"""Longest time that a thread keeps the interpreter while the sender waits; Python's default is 5 ms."""
 PROCESS_PRIORITY = 10
 LOCK_ALL = 1 | 2 | 4
-"""Of mlockall: what is there, what will be, each page once it is touched."""
+"""Flags of mlockall: present pages, future pages, each page once it is touched."""
 HUNG_S = 5.0
 """Real seconds after which the rig's thread counts as hung."""
 BEAT_PERIOD_S = 0.5
-"""How often the process checks its parent and its own threads, s (see WatchdogSec in deploy/)."""
+"""Period at which the process checks its parent and its own threads, s (see WatchdogSec in deploy/)."""
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -166,7 +166,7 @@ async def _serve(config: configuration.RigConfig, parent: int | None) -> None:
 
 
 async def _trouble(rig: Rig, submit: Submit) -> str | None:
-    """What `Rig.trouble` finds, or that the rig's own thread does not answer. Then the watchdog is not fed."""
+    """Return `Rig.trouble`, or that the rig's own thread does not answer. Then the watchdog is not fed."""
 
     async def check() -> str | None:
         return rig.trouble()

@@ -23,14 +23,14 @@ MAX_POINTS = 400
 MISFIT_WINDOWS = 8
 COARSE_MISFIT_S = 0.005
 RATE_TOLERANCE = 0.035
-"""How far a device's rate may be from the rig file's before it ends a test."""
+"""Largest deviation of a device's rate from the rig file's; a larger one ends the test."""
 BELIEVED_RATES = 0.25, 4.0
 """No two clocks differ by more. A rate outside means that a backlog was read at once: the rate is unknown."""
 
 
 @dataclass(frozen=True, slots=True)
 class Alignment:
-    """How the times were obtained."""
+    """Method by which the times were obtained."""
 
     method: Method  # of a load cell: sync or regression; of an angle sensor: see `stimrig.rig.align_angle`
     error_ms: float
@@ -222,7 +222,7 @@ def paired(edge_s: Array, written_s: Array, envelope: Line) -> tuple[Array, Arra
 
 
 def _in_step(edge_s: Array, written_s: Array) -> bool:
-    """Whether there are as many edges as pulses, at the same intervals: then they belong together in this order.
+    """Return whether there are as many edges as pulses, at the same intervals: then they match in this order.
 
     A stall of the host bends the envelope, and the nearest pulse may then be the wrong one.
     """

@@ -166,7 +166,7 @@ def _attributes(method: Method, error_ms: float, host_s: Array, time_s: Array, r
 
 
 def _match_frames(samples: NDArray[Any], torque: Reference) -> tuple[NDArray[np.bool_], Array] | None:
-    """Which samples came in the frame of a torque sample, and its time; None: fewer than two did.
+    """Find the samples that came in the frame of a torque sample, and its time; None: fewer than two did.
 
     Both were read at once, so they have the same time of arrival. A frame with several torques was sent with the last.
     """
@@ -290,7 +290,7 @@ def read_angles(
 
 
 def _believable(samples: NDArray[Any]) -> NDArray[np.bool_]:
-    """Which samples are the angle of a joint: others would spoil a test that did not need the sensor."""
+    """Mask the samples that can be the angle of a joint: others would spoil a test that did not need the sensor."""
     return (np.abs(samples["angle_rad"]) <= LARGEST_RAD) & np.isin(samples["fault"], TRUSTED)
 
 

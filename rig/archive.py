@@ -62,7 +62,7 @@ ANGLE_COLUMNS: tuple[tuple[str, str, str], ...] = (
 """The same, after the others, of a rig with an angle sensor: all of them, or none."""
 
 MOST_BYTES = 10**9
-"""Of a recording's values; three hours at 1600 Hz have as many. A damaged file that declares more is not read."""
+"""Most bytes of a recording's values: three hours at 1600 Hz. A damaged file that declares more is not read."""
 
 
 def layout(columns: Collection[str]) -> tuple[tuple[str, str, str], ...]:

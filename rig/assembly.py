@@ -159,7 +159,7 @@ def _header_of_blocks(contents: JournalContents, notes: list[str]) -> dict[str, 
 
 
 def _start(contents: JournalContents, header: dict[str, Any], rate_hz: float) -> tuple[bool, float, float]:
-    """Whether the test began; start of the test's clock on the rig's clock, s; the same time as UTC."""
+    """Return whether the test began, and the start of its clock: on the rig's clock, s, and as UTC."""
     started = contents.first_json(Kind.START)
     if started is not None:
         return True, float(started["t0_s"]), float(started["unix_s"])
@@ -185,7 +185,7 @@ def _last_time(contents: JournalContents) -> float:
 
 
 class _Pulses:
-    """What became of each planned pulse."""
+    """Outcome of each planned pulse."""
 
     def __init__(self, planned: NDArray[Any], current_ma: float, t0_s: float) -> None:
         n = len(planned)

@@ -110,7 +110,7 @@ FAULTS = {
                        "take every electrode off the person, and put the dummy load on"),
     "sync": ("the sync line does not rise with the pulse", 'wire it to the cell, or write sync = "" in the rig file'),
 }  # fmt: skip
-"""What may be wrong, with its remedy."""
+"""Possible faults, each with its remedy."""
 ENDINGS = {
     "end of stimulation is not confirmed": "stop", "electrode error": "open_circuit",
     "emergency switch": "open_circuit", "not acknowledged": "unanswered", "N·m is outside": "torque_follows",

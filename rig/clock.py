@@ -12,7 +12,7 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """What the rig asks of a clock."""
+    """Clock of the rig."""
 
     @property
     def speed(self) -> float:

@@ -48,7 +48,7 @@ class LatchChangedError(RigError, code="latch-changed", title="The rig was stopp
 
 
 class WithdrawnError(RigError, code="withdrawn", title="The test was withdrawn"):
-    """What the test was allowed on is no longer so: it does not begin."""
+    """The conditions under which the test was allowed have changed: it does not begin."""
 
 
 class UncertainError(RigError, code="uncertain", title="The rig died in a test and waits for a person"):

@@ -41,8 +41,8 @@ class OnItsWay:
 
 @dataclass(frozen=True, slots=True)
 class Done:
-    """What became of a pulse: its index, the width that was sent (0: none was), when it was written
-    and acknowledged (rig clock, s; NaN: not)."""
+    """Outcome of a pulse: its index, the width that was sent (0: none), the times when it was written and acknowledged
+    (rig clock, s; NaN: not)."""
 
     index: int
     pulse_width_us: float
@@ -76,7 +76,7 @@ class Gate:
         self._on_fault = on_fault
         self._journal: Journal | None = None
         self.is_open = False
-        """Whether a test may send pulses now."""
+        """True while a test may send pulses."""
         self._table: dict[str, Limit] = {}
         self.on_its_way: OnItsWay | None = None
         self._recent: deque[tuple[float, float]] = deque()
@@ -156,7 +156,7 @@ class Gate:
         return self._send(journal, index, verdict, now_s, due_s, latest_s)
 
     async def changed(self) -> str | None:
-        """What the device says that it did not say when it was armed; None: it is as it was. Raises DeviceError."""
+        """Return a change of the device's reports since it was armed; None: it is unchanged. Raises DeviceError."""
         try:
             _, state = await self._stimulator.state()
         except DeviceError:  # its answer may have come while the computer stood still again
@@ -234,7 +234,7 @@ class Gate:
         return status
 
     def _note(self, index: int, status: PulseStatus) -> None:
-        """Of a pulse that was not sent."""
+        """Record the outcome of a pulse that was not sent."""
         self.done.append(Done(index, 0.0, math.nan, math.nan, status))
 
     def _too_close(self, now_s: float) -> str:

@@ -49,7 +49,7 @@ APART_BYTES = 8192
 
 
 class Kind(IntEnum):
-    """What a block holds."""
+    """Content of a block."""
 
     HEADER = 1
     PLAN = 2
@@ -157,12 +157,12 @@ class JournalContents:
 
     @property
     def damaged(self) -> bool:
-        """Whether something cannot be read, or is missing."""
+        """True where something cannot be read, or is missing."""
         return self.damaged_bytes > 0 or self.blocks_missing > 0
 
     @property
     def ended(self) -> bool:
-        """Whether the test's end was written: nothing is missing at the end."""
+        """True where the test's end was written: nothing is missing at the end."""
         return any(kind == Kind.END for kind, _ in self.blocks)
 
     def first_json(self, kind: Kind) -> dict[str, Any] | None:
@@ -179,7 +179,7 @@ def read(path: Path) -> JournalContents:
 
 
 def parse(path: Path, data: bytes) -> JournalContents:
-    """What a journal's bytes say, complete or partial: only damaged blocks are lost.
+    """Parse a journal's bytes, complete or partial: only damaged blocks are lost.
 
     Raises RecordingError: not a journal.
     """

@@ -22,7 +22,7 @@ STOP_S = 8.5
 
 
 def in_front(fd: int) -> bool:
-    """Whether `fd` is a terminal and this process is in its foreground."""
+    """Return whether `fd` is a terminal and this process is in its foreground."""
     try:
         return os.isatty(fd) and os.tcgetpgrp(fd) == os.getpgrp()
     except OSError:

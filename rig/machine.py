@@ -1,4 +1,4 @@
-"""What the rig needs of the machine on which it runs, as small Protocols: the only doors to anything that blocks.
+"""The machine on which the rig runs, as small Protocols: every call that blocks goes through them.
 
 `stimrig.rig.adapters` has the real ones. A simulator gives others, on a virtual clock. No adapter decides anything.
 """
@@ -51,7 +51,7 @@ class Frame(NamedTuple):
 
 
 class Listener(NamedTuple):
-    """Who wants the frames of one identifier."""
+    """Receiver of the frames of one identifier."""
 
     frame_id: int
     is_extended: bool  # whether the identifier has 29 bits: the one of 11 bits that has the same number is another one
@@ -67,7 +67,7 @@ class Bus(Protocol):
     """A CAN adapter that is open."""
 
     place: str
-    """How messages call it."""
+    """Its name in messages."""
 
     def listen(self, listener: Listener) -> None:
         """Hand frames to it from now on."""
@@ -96,7 +96,7 @@ class Log(Protocol):
         ...
 
     def sync(self) -> None:
-        """What was written survives a power failure; blocks. Raises OSError."""
+        """Sync to the disk, so that written data survives a power failure; blocks. Raises OSError."""
         ...
 
     def close(self) -> None:
@@ -120,7 +120,7 @@ class Disk(Protocol):
         ...
 
     def is_written(self, path: Path) -> bool:
-        """Whether a process, be it another rig's, has it open as `create` gave it."""
+        """Return whether a process, of this rig or another, has it open as `create` gave it."""
         ...
 
     def read(self, path: Path) -> bytes:
@@ -154,7 +154,7 @@ class Machine(Protocol):
     tasks: Tasks
     disk: Disk
     boot_id: str
-    """Of this boot of the machine; empty if the system has none."""
+    """Identifier of this boot of the machine; empty if the system has none."""
 
     def port(self, path: str, **arguments: Any) -> Port:
         """The stimulator's serial port, not yet opened; arguments of `serial.Serial`."""

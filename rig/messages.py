@@ -92,7 +92,7 @@ class Profile(Message):
 
 
 class AnglePlan(Message):
-    """What a test asks of the joint's angle; refused on a rig without an angle sensor.
+    """Conditions of a test on the joint's angle; refused on a rig without an angle sensor.
 
     Only a test that has it is stopped by the angle: outside its range, away from its target, without a movement, or
     where the sensor gives no reliable angle.
@@ -124,7 +124,7 @@ class AdaptivePlan(Message):
 
 
 class Labels(BaseModel):
-    """What a test is known by: asked for, sent to the rig, sealed into the recording, shown, and chosen by in cohorts.
+    """Labels of a test: requested, sent to the rig, sealed into the recording, shown, and used to select in cohorts.
 
     A new one is a field here with the default None, and a title under which pages and the command line take it and show
     it; CONTRIBUTING says what follows by itself.
@@ -335,7 +335,7 @@ class ProtocolInfo(Message):
 
 
 class Sequences(Message):
-    """What this rig can play."""
+    """Sequences that this rig can play."""
 
     sequences: list[SequenceInfo]
     protocols: list[ProtocolInfo] = Field(default_factory=list, description="whole tests; the first is the default")
@@ -351,7 +351,7 @@ class Preview(Message):
 
 
 class StopEvidence(Message):
-    """Whether a stop took effect: what the device answered, and what the torque did."""
+    """Evidence whether a stop took effect: the device's answer, and the torque after it."""
 
     confirmed: bool
     detail: str
@@ -378,7 +378,7 @@ class LaidSegment(Message):
 
 
 class Extended(Message):
-    """What is laid of an adaptive test, and what its bounds leave."""
+    """Scheduled part of an adaptive test, and the remainder of its bounds."""
 
     test_id: str
     laid: int = Field(description="pulses that are laid, those of width 0 included, without rest for a late client")
@@ -395,7 +395,7 @@ class StateEvent(Message):
 
 
 class PulseOutcomes(Message):
-    """What became of the pulses since the last live event, as it became known: not the plan, but what was sent.
+    """Outcomes of the pulses since the last live event, in the order of becoming known: as sent, not as planned.
 
     Times are on the test's clock, s; None: it was not written, or not acknowledged. A recording has the same columns.
     """

@@ -47,7 +47,7 @@ class Phase:
 
     @property
     def busy(self) -> bool:
-        """Whether a test is in progress: its devices and files are in use."""
+        """True while a test is in progress: its devices and files are in use."""
         return self.state in BUSY
 
     def connected(self, before: RigState | None = None, reason: str = "") -> Phase:

@@ -115,7 +115,7 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
 
 
 def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:
-    """What a kind of test needs of the angle, and whether its angles fit each other."""
+    """Check that the kind of test has the angles it needs, and that they fit each other."""
     if plan.angle is None:
         if plan.kind in (PASSIVE, HELD, MOVING):
             raise PlanError(f"plan.angle: a {plan.kind} test needs it; give at least its range_rad")

@@ -86,7 +86,7 @@ class EnoughRequest(Message):
 
 
 class WithdrawRequest(Message):
-    """What a test was allowed on is no longer so: it plays no pulse, and nothing latches. Reply: `Withdrawn`.
+    """Withdraw a test whose conditions have changed: it plays no pulse, and nothing latches. Reply: `Withdrawn`.
 
     It waits for nothing, and holds for a test that the rig has not heard of yet: its start is refused (`withdrawn`).
     """

@@ -1,4 +1,4 @@
-"""What is laid out to be played. It grows while it plays, if the test is adaptive; only an end takes laid pulses away.
+"""Queue of segments to play. In an adaptive test it grows while it plays; only the test's end removes queued pulses.
 
 The sender asks for one pulse after the other. Shortly before it reaches the end of what is laid, the fixed plan's next
 segment is laid, unless a client has laid others by then. A plan may have patience with a client that is late: then a
@@ -169,7 +169,7 @@ class Score:
         self._shut = True
 
     def progress(self, torque_time_nms: float) -> Extended:
-        """What is laid, and what the bounds leave of an adaptive test."""
+        """Return the scheduled part of an adaptive test, and the remainder of its bounds."""
         assert self.adaptive is not None
         queue, rate_hz = self.queue, self.plan.pulse_rate_hz
         charge_uc = float(np.sum(queue.pulse_width_us)) * self.plan.profile.current_ma * 1e-3

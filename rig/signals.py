@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 
 class PulseStatus(IntEnum):
-    """What became of a planned pulse; the values of `/pulses/status` in a recording."""
+    """Outcome of a planned pulse; the values of `/pulses/status` in a recording."""
 
     ACKNOWLEDGED = 0
     REST = 1

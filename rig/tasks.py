@@ -35,7 +35,7 @@ class Signal:
         self._set = False
         self._waiting: dict[Task[Any], int] = {}
         self.awaited = False
-        """Whether anybody ever waited for it."""
+        """True once a task has waited for it."""
 
     def is_set(self) -> bool:
         return self._set

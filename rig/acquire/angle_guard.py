@@ -1,4 +1,4 @@
-"""What a test asks of the joint's angle while it runs, and what it hears of a sensor that it does not need.
+"""Checks of the joint's angle while a test runs, and notes about a sensor that the test does not need.
 
 It detects an angle that a test may not have: outside its range, away from its target, still, or not to be believed. A
 sensor that slipped by less than the limit on a jump cannot be detected here, nor one that is stuck in a held test.
@@ -51,7 +51,7 @@ class AngleGuard:
         self._wanted, self._is_held = plan.angle, plan.kind == HELD
         self._range, self._jump_rad = table["angle_rad"], table["angle_jump_rad"].hi
         self.needed = plan.angle is not None
-        """Whether a fault of the angle ends the test."""
+        """True where a fault of the angle ends the test."""
         self._journal: Journal | None = None
         self._noted = False
         self._rate_hz = 1.0 if receiver is None else receiver.nominal_rate_hz
@@ -70,11 +70,11 @@ class AngleGuard:
         return None if self._receiver is None else self._receiver.release()
 
     def fresh(self) -> bool:
-        """Whether the test may begin: the newest angle is of now, or none is needed."""
+        """Return whether the test may begin: the newest angle is current, or none is needed."""
         return not self.needed or self._stale() is None
 
     def begin(self) -> None:
-        """What waited in buffers has been read."""
+        """Begin to measure the rate; call it once the buffers have been read."""
         self._rate.begin()
 
     def started(self) -> None:
@@ -82,15 +82,15 @@ class AngleGuard:
         self._moving = True
 
     def fault(self, stood_s: float = 0.0) -> str | None:
-        """What must end the test; asked before each pulse, rests included. None: nothing. `stood_s`: see `Health`."""
+        """Return the fault that must end the test, or None; called before each pulse. `stood_s`: see `Health`."""
         return self._ending(self._stale(stood_s))
 
     def fault_at_end(self) -> str | None:
-        """What only the whole test shows, and must make it a fault."""
+        """Return the fault that only the whole test shows, or None."""
         return self._ending(self._rate.fault_at_end())
 
     def _ending(self, fault: str | None) -> str | None:
-        """What was found, if this test needs the sensor; else it is noted."""
+        """Return the fault if this test needs the sensor; else note it and return None."""
         if fault is not None and not self.needed:
             self._note(fault)
         return fault if self.needed else None
@@ -114,7 +114,7 @@ class AngleGuard:
                 self._journal.append_json(Kind.EVENT, event)
 
     def _wrong(self, samples: NDArray[Any]) -> str | None:
-        """What is wrong with this block; None: nothing."""
+        """Return the fault of this block in words, or None."""
         angle_rad, now_s = samples["angle_rad"], float(samples["host_time_s"][-1])
         fault = (
             _unreliable(samples)

@@ -47,11 +47,11 @@ class AngleReceiver(Stream):
         self.angle_rad: float | None = None
         self.velocity_rad_s: float | None = None
         self.late_s = 0.0
-        """How much later the newest sample came than the promptest one, by its number, rig seconds."""
+        """Delay of the newest sample against the promptest one, by its number, rig seconds."""
         self._prompt: tuple[float, float] | None = None
         self._behind = 0
         self._restarted = False
-        """Whether the next sample is the first one since it was opened."""
+        """True where the next sample is the first one since it was opened."""
         self._slope = LiveSlope(sensor.sample_rate_hz)
         self._recent: deque[NDArray[Any]] = deque()
 
@@ -62,7 +62,7 @@ class AngleReceiver(Stream):
         self._recent = deque(self._scaled(samples) for samples in self._recent)
 
     def data_age_s(self, now_s: float) -> float:
-        """How old the newest angle is: since its arrival, and what it came late."""
+        """Return the age of the newest angle: the time since its arrival, and its delay."""
         return self.age_s(now_s) + self.late_s
 
     def recent(self, duration_s: float) -> NDArray[Any]:

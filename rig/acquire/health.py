@@ -103,7 +103,7 @@ class Health:
         return self._receiver.suspicion(self._watch.stuck_torque_s, self._watch.unmoved_torque_s)
 
     def fault(self, stood_s: float = 0.0) -> str | None:
-        """What is wrong, in words; None: all checks pass.
+        """Return the first fault in words; None: all checks pass.
 
         `stood_s`: real seconds for which this computer has just stood still: what came meanwhile could not be taken, so
         a silence counts without them.

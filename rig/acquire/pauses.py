@@ -45,7 +45,7 @@ class Pauses:
         self.all: list[Pause] = []
 
     async def fault(self, due_s: float, t0_s: float, first: bool = False) -> str | None:
-        """What must end the test before the pulse that is due; None: nothing, or it is being ended.
+        """Return the fault that must end the test before the due pulse; None: no fault, or the test is ending.
 
         After a standstill it returns once all is whole again.
 

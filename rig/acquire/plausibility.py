@@ -50,7 +50,7 @@ class RateCheck:
         self._restarted = True
 
     def fault(self, count: int, number: int, now_s: float) -> str | None:
-        """What is wrong with the rate; None: nothing.
+        """Return the fault of the rate in words, or None.
 
         `count`, `number`: of samples in this block; of its last sample, -1 if the device counts none. `now_s`: when the
         block arrived.
@@ -70,7 +70,7 @@ class RateCheck:
         return self._message(rate_hz)
 
     def fault_at_end(self) -> str | None:
-        """Whether the rate over the whole test differs from the rig file's; None: no, or there were too few samples.
+        """Compare the rate over the whole test with the rig file's; None: they agree, or there were too few samples.
 
         `fault` cannot measure the rate in a test shorter than its window, or between frequent long standstills.
         The tolerance allows for the error that the longest standstill can cause.
@@ -127,8 +127,7 @@ class RateCheck:
 
 FASTEST_NM_S = 1000.0
 RAIL_VISITS = 2
-"""How often the torque must reach an extreme value before it counts as saturation: a failing cell reaches its last
-value once."""
+"""Visits of an extreme value before it counts as saturation: a failing cell reaches its last value once."""
 RAIL_LEAST_NM = 0.5
 """Smallest distance of a saturation value from the test's first torque. At rest a coarse converter gives two or three
 values and returns to the smallest again and again; a cell that fails there is not saturated."""
@@ -165,7 +164,7 @@ class PlausibilityCheck:
         self._same_since_s: float | None = None
 
     def fault(self, samples: NDArray[Any]) -> str | None:
-        """What is wrong with this block; None: nothing."""
+        """Return the fault of this block in words, or None."""
         torque_nm, now_s = samples["torque_nm"], float(samples["host_time_s"][-1])
         fault = self._jumped(torque_nm, now_s) or self._stuck(torque_nm, now_s)
         fault = fault or self.rate.fault(len(samples), int(samples["counter"][-1]), now_s)
@@ -212,7 +211,7 @@ class _Rail:
         self._sign, self._end_nm, self._visits = sign, -np.inf, 0
 
     def contains(self, torque_nm: NDArray[np.float64], before_nm: float) -> bool:
-        """Whether the last of these samples may be saturated."""
+        """Return whether the last of these samples may be saturated."""
         signed_nm = self._sign * np.concatenate(((before_nm,), torque_nm))
         most_nm = float(signed_nm.max())
         if most_nm > self._end_nm:

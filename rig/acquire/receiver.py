@@ -42,9 +42,9 @@ class TorqueTime:
 
 
 class Stillness:
-    """Whether a value that stands exactly still is odd for this cell: a bridge without its plug gives a constant.
+    """Judges whether an exactly constant value is odd for this cell: a bridge without its plug gives a constant.
 
-    A coarse cell of a limb at rest stands still, too. It did so before, so nothing is odd about it.
+    A coarse cell of a limb at rest is constant, too. It was so before, so it is not odd.
     """
 
     def __init__(self) -> None:
@@ -52,11 +52,11 @@ class Stillness:
         """When it began to stand, rig time; None: it changes."""
         self.ever_changed = False
         self._changed: deque[bool] = deque(maxlen=200)
-        """Of the newest blocks; of each standstill only the beginning."""
+        """Changes of the newest blocks; of each standstill only the beginning."""
 
     @property
     def restless(self) -> bool:
-        """Whether most blocks before this standstill brought a change."""
+        """True where most blocks before this standstill brought a change."""
         return 2 * sum(self._changed) > len(self._changed)
 
     def add(self, changes: bool, now_s: float, brief_s: float) -> None:
@@ -119,7 +119,7 @@ class Receiver(Stream):
         return float(np.median(values)) if values else None
 
     def changes_lately(self) -> int:
-        """How often the torque changed from block to block during the last one or two seconds."""
+        """Count the torque's changes from block to block during the last one or two seconds."""
         means_nm = [torque for _, torque in tuple(self.recent)]
         return int(np.sum(np.abs(np.diff(means_nm)) > 1e-9))  # means of equal samples differ by rounding
 

@@ -86,7 +86,7 @@ class RunResult:
     reason: str
     evidence: StopEvidence
     summary: dict[str, Any]
-    """Of `FinishedEvent`, as far as it is known without the recording."""
+    """Summary of `FinishedEvent`, as far as it is known without the recording."""
     rise_nm: float | None
     last_pulse_s: float | None
     last_sample_unix_s: float | None
@@ -129,7 +129,7 @@ class TestRun:
         """Called when the device has been stopped and the torque watched."""
         self.t0_s: float | None = None
         self.told_pulses = 0
-        """How many of `Gate.done` live events have told; who makes these events counts here, in a thread of its own."""
+        """Count of entries of `Gate.done` that live events have published; written by the thread that makes them."""
         self.pauses: Pauses | None = None
         """From its arming on."""
         self._table = table
@@ -191,7 +191,7 @@ class TestRun:
 
     @property
     def begun(self) -> bool:
-        """Whether a pulse was sent."""
+        """True once a pulse was sent."""
         return self.t0_s is not None and self.sent > 0
 
     @property
@@ -201,7 +201,7 @@ class TestRun:
 
     @property
     def ended_by(self) -> str:
-        """What ended it: stopped, fault, withdrawn, or why nothing more was laid."""
+        """Cause of its end: stopped, fault, withdrawn, or the reason why no more pulses were scheduled."""
         return self.halt.cause or self.score.ended_by
 
     def elapsed_s(self) -> float:
@@ -363,7 +363,7 @@ CLIMB = 10
 
 
 class Rise:
-    """How wide the next pulse may be: after pulses that were left out the width climbs back within the limit.
+    """Limit on the next pulse's width: after omitted pulses the width climbs back within the largest step.
 
     `most_us`: the largest step from one pulse to the next, µs.
     """
@@ -381,7 +381,7 @@ class Rise:
         return width_us if jumps and not self._climb else min(width_us, self._felt_us + self._most_us)
 
     def add(self, status: PulseStatus, asked_us: float, width_us: float) -> None:
-        """What became of a pulse. One that the device would make too short counts as none."""
+        """Record the outcome of a pulse. One that the device would make too short counts as none."""
         self._missed = self._missed + 1 if status is PulseStatus.DROPPED else 0
         if self._missed >= self._most_missed:
             self.begin_anew()

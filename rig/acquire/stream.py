@@ -1,4 +1,4 @@
-"""What the receivers of torque and angle share: one each, from connect to disconnect.
+"""Base of the receivers of torque and angle: one each, from connect to disconnect.
 
 A stream unwraps the device's counter, finds lost, repeated and disordered samples, measures the rate, and notices
 silence and samples that come late.
@@ -36,7 +36,7 @@ SETTLING_S = 0.1
 SETTLE_S = 3.0
 """Real seconds to wait until a backlog in buffers has been read, and no errors come."""
 LOOK_AT = "look at its plug and supply, and at the CAN adapter"
-"""What a person does about a sensor from which nothing comes."""
+"""Remedy for a sensor from which nothing comes."""
 BACKLOG_RATE = 1.6
 BEHIND_S = 0.1
 """Real seconds by which the newest sample may be later than the promptest one of the last `PROMPT_S` real seconds. A
@@ -135,7 +135,7 @@ class Stream:
 
     @property
     def living(self) -> bool:
-        """Whether it still looks at whether samples come."""
+        """True while it checks that samples come."""
         return self._watch is not None and not self._watch.done.is_set()
 
     async def close(self) -> None:
@@ -149,7 +149,7 @@ class Stream:
         return np.inf if last_s is None else now_s - last_s
 
     def settled(self) -> bool:
-        """Whether what arrives is of now: at the device's own rate, not faster, and not behind.
+        """Return whether samples are current: they arrive at the device's own rate, not faster, and not behind.
 
         If samples arrive faster, old ones from a buffer are being read: after a pause of host or adapter.
         """
@@ -161,7 +161,7 @@ class Stream:
         return rate_hz <= BACKLOG_RATE * self.nominal_rate_hz and self.behind_s() <= BEHIND_S * self._clock.speed
 
     def behind_s(self) -> float:
-        """How much later the newest sample came than the promptest one of the last seconds, rig seconds; at least 0.
+        """Return the newest sample's delay against the promptest one of the last seconds, rig seconds; at least 0.
 
         Its number says when it was due. A device may be slower than its nominal rate by `RATE_TOLERANCE`.
         """
@@ -253,7 +253,7 @@ class Stream:
         return samples
 
     def _in_order(self, samples: NDArray[Any]) -> NDArray[Any]:
-        """Of a device that counts nothing: without those that its adapter's stamps show to be repeated or late."""
+        """Drop repeated and late samples of a device that counts nothing, by its adapter's stamps."""
         stamp_s = samples["stamp_s"]
         if not np.isfinite(stamp_s).all():
             return samples

@@ -92,7 +92,7 @@ class CanBus:
         self._listening: tuple[_Gathering, ...] = ()
         self._stamped = arguments.get("interface") in STAMPING
         self._tells_length = arguments.get("interface") != "socketcand"
-        """Whether a frame's length of identifier is sure; some gateways write all identifiers with eight digits."""
+        """True where a frame's identifier length is certain; some gateways write all identifiers with eight digits."""
         # python-can warns about every frame that is split between two packets, which is normal
         logging.getLogger("can").setLevel(logging.CRITICAL)
         self.can = self._opened()
@@ -186,7 +186,7 @@ class CanBus:
                     gathering.add(frame)
 
     def _count(self, damaged: int = 0, errors: int = 0) -> None:
-        """What belongs to no identifier is told to who opened the bus."""
+        """Report counts that belong to no identifier to the listener that opened the bus."""
         for gathering in self._listening[:1]:
             gathering.damaged += damaged
             gathering.errors += errors
@@ -262,7 +262,7 @@ def _size_buffer(bus: can.BusABC) -> None:
 
 
 def place_of(arguments: dict[str, Any]) -> str:
-    """How messages call an adapter."""
+    """Return the name of an adapter in messages."""
     where = arguments.get("channel", "")
     if "host" in arguments:
         where = f"{where}@{arguments['host']}:{arguments.get('port')}"

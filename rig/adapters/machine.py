@@ -121,13 +121,13 @@ def undisturbed() -> Iterator[None]:
 HOLD_S = 0.00025
 """Real seconds: the last part of a wait for a deadline, in which nothing else runs; a sleep ends later than asked."""
 MOST_OF_IT = 0.5
-"""Of a standstill: what explains so much of it is told as its cause."""
+"""Share of a standstill that a cause must explain to be reported."""
 PAGES = 200
 """Pages read back from the disk: less delay nobody."""
 
 
 class Strain:
-    """What kept this thread from running, as far as Linux counts it."""
+    """Causes that kept this thread from running, as far as Linux counts them."""
 
     def __init__(self) -> None:
         self._before = self._counted()

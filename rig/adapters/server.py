@@ -195,7 +195,7 @@ class Server:
 
 
 async def _is_listening(path: Path) -> bool:
-    """Whether a process is listening on that socket."""
+    """Return whether a process is listening on that socket."""
     try:
         _, writer = await asyncio.open_unix_connection(path)
     except OSError:

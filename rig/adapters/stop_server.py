@@ -25,7 +25,8 @@ from stimrig.rig.requests import StopRequest
 GRACE_S = 2.0
 """So long after it came, or after its last request, a connection is closed for no other, unless too many come."""
 MOST_AT_ONCE = 600
-"""Of a kind: beyond it a new one closes the oldest. More than a socket's backlog, so that was read by then."""
+"""Most connections of a kind: a further one closes the oldest. The number exceeds a socket's backlog, so that the
+oldest was read by then."""
 
 
 class Connections:

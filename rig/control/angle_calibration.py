@@ -37,12 +37,12 @@ STILL_RAD = 0.01
 PART_S = 0.05
 """Real seconds of which one mean counts for stillness: noise is no movement."""
 LEAST_SHARE = 0.7
-"""Of the samples due in that time that must have come."""
+"""Share of the samples due in that time that must have come."""
 APART_RAD = 0.5
 FIRST_LASTS_S = 600.0
 """Real seconds for which a first pose waits for its second: later the sensor may sit elsewhere."""
 SCALES = 0.7, 1.4
-"""How far the scale of two poses may be from the rig file's: beyond it a number was mistyped or the sensor slips."""
+"""Bounds of the scale of two poses over the rig file's: beyond them a number was mistyped or the sensor slips."""
 SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
 """Settings that tell one sensor from another."""
 NO_SENSOR = "{}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)"
@@ -92,7 +92,7 @@ class AngleCalibrating:
         )
 
     def described(self, rig_file: AngleScale) -> dict[str, Any]:
-        """What holds now, for journals and recordings: the calibration, else what the rig file says."""
+        """Return the valid scale, for journals and recordings: the calibration, else the rig file's."""
         if self.calibration is not None:
             return self.calibration.model_dump(mode="json")
         return {"poses": [], **asdict(rig_file), "by": "rig file", "set_at_utc": ""}
@@ -168,7 +168,7 @@ def _check_poses(calibration: AngleCalibration) -> AngleCalibration:
 
 
 def still_raw(receiver: AngleReceiver, speed: float) -> float:
-    """What the sensor gave during the last moment, in its unit.
+    """Return the sensor's mean during the last moment, in its unit.
 
     Raises DeviceError: too little came. RefusedError: the joint moved, or the sensor reports a fault.
     """
@@ -231,7 +231,7 @@ class Joint:
         )
 
     def described(self) -> dict[str, Any] | None:
-        """What a journal's header says of the sensor; None: there is none."""
+        """Return the entry of the sensor in a journal's header; None: there is no sensor."""
         if self._pair.angle is None:
             return None
         sensor = self._pair.angle.sensor

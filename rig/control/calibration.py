@@ -35,7 +35,7 @@ STEPS: tuple[Direction, ...] = ("up", "fine", "repeat", "down")
 REST_S = 0.25
 """Rest before and after each train, s: shows the torque at rest, and its fall."""
 CLOCK_SLIP_S = 300.0
-"""How far in the future a profile may have been set, s: the clocks of two computers differ."""
+"""Largest lead of a profile's time over this clock, s: the clocks of two computers differ."""
 MAX_VALID_S = 25 * 3600.0
 """A day, and the hour that is added when summer time ends."""
 OWNER = "calibration request"
@@ -96,7 +96,7 @@ class Calibration:
         self._width_us = 0.0
         self._left_us: set[float] = set()
         self._whole = True
-        """Whether the last train was felt as it was planned."""
+        """True where the last train was played as planned."""
         self._marks_us: dict[Threshold, float] = {}
         self._trains: list[CalibrationTrain] = []
         self._charge_uc = 0.0

@@ -1,4 +1,4 @@
-"""How far a step of a guided calibration goes: large steps far from a mark, fine steps near it. Pure.
+"""Size of a step of a guided calibration: large steps far from a mark, fine steps near it. Pure.
 
 The rule in words: a step up is large until the place where the next answer is expected, and fine from there on. Where
 nobody knows the participant, a large step is the widest `calibration_step_us`. Where an earlier calibration is known,

@@ -1,4 +1,4 @@
-"""What is new since the last live event: torque and angle samples as they came, and what became of the pulses."""
+"""News since the last live event: torque and angle samples as they came, and the outcomes of the pulses."""
 
 from __future__ import annotations
 

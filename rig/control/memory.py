@@ -1,4 +1,4 @@
-"""What the rig must remember when its process ends: its latch, its last pulse, and a calibration's result.
+"""Memory of the rig beyond its process: its latch, its last pulse, and a calibration's result.
 
 Each is a small file of JSON in the data folder, synced to the disk before what it describes is told.
 """
@@ -26,7 +26,7 @@ rest_log = logging.getLogger("rig.rest")
 
 
 class SmallFile:
-    """What is asked for first is written first. `place` begins the words of an error."""
+    """Writes in the order of requests. `place` begins the words of an error."""
 
     def __init__(self, path: Path, place: str, machine: Machine) -> None:
         self.path, self._place = path, place
@@ -186,7 +186,7 @@ class Result:
 
     @property
     def waiting(self) -> Calibrated | None:
-        """What nobody has stored yet; None also once its day has ended: then it is no profile any more."""
+        """Result that is not yet stored by the service; None also after its day, when it is no profile any more."""
         profile = self._stored and self._stored.result.profile
         if not profile or not profile.expires_at_utc:
             return None

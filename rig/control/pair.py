@@ -123,7 +123,7 @@ class Pair:
         return safe and await self.torque_comes()
 
     async def torque_comes(self) -> bool:
-        """Whether a new sample arrives within a short time from now."""
+        """Wait a short time for a new sample; return whether one came."""
         receiver = self.receiver
         if receiver is None:
             return False

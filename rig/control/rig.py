@@ -112,7 +112,7 @@ class Rig:
         )
 
     def trouble(self) -> str | None:
-        """Which task or request of this process hangs or has died; None: none. For the process's watchdog."""
+        """Return the task or request of this process that hangs or has died, or None. For the process's watchdog."""
         phase, receiver = self.state.phase, self.pair.receiver
         if (trouble := self.state.trouble() or self.player.trouble()) is not None:
             return trouble
@@ -332,7 +332,7 @@ _DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
     "calibrate-stored": lambda rig, request: rig.calibrations.stored(request.calibration_id),
     "angle_pose": Rig.angle_pose,
 }
-"""What has no answer of its own, and all others, are answered by the status."""
+"""Handlers of requests. A request without a handler, or whose handler returns None, is answered by the status."""
 
 
 def read_request(line: bytes) -> Any:

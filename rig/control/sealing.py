@@ -179,7 +179,7 @@ def _pauses(recording: Recording) -> list[dict[str, Any]]:
 
 
 def notes(recording: Recording) -> list[str]:
-    """What happened and leaves nothing in doubt: that the computer stood still, for how long, and why, if known."""
+    """Return notes that put nothing in doubt: pauses of the computer, with their length and, if known, their cause."""
     pauses = _pauses(recording)
     if not pauses:
         return []

@@ -1,4 +1,4 @@
-"""Which state the rig is in and why, who may change it, and what the next process has to know of it."""
+"""State of the rig with its reason, the rules for changing it, and the part that the next process needs."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ class State:
         self.calibration: Calibration | None = None
         """The one that is open: a stop, a fault or a lost device closes it."""
         self.closing = False
-        """Whether the rig shuts down: from now on nothing begins."""
+        """True once the rig shuts down: from then on nothing begins."""
         self._tasks, self._clock, self._publish = tasks, tasks.clock, publish
         self._turn = Turn(tasks)
         self._turn_since_s: float | None = None
         self._instance, self._stops = instance, 0
-        """How often it was stopped, a fault was reported, or why it is stopped became another reason."""
+        """Count of stops, of reported faults, and of changes of the reason for a stop."""
         self._published = ""
         """The latch that was told last."""
         self._latching: Task[None] | None = None
@@ -49,7 +49,7 @@ class State:
 
     @property
     def latch(self) -> str:
-        """What a person must have seen who re-arms: another one after each stop, and in each process."""
+        """Version of the latch that a person who re-arms must have seen: new after each stop, and in each process."""
         return f"{self._instance}-{self._stops}"
 
     @contextlib.asynccontextmanager

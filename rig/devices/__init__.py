@@ -116,9 +116,9 @@ class AngleSensor(Sensor, Protocol):
     scale: AngleScale
     """From its own value to the joint's angle, by the rig file. A calibration by two poses replaces it."""
     of_the_cell: bool
-    """Whether its samples come in the load cell's own frames, counted by the cell's counter."""
+    """True where its samples come in the load cell's own frames, counted by the cell's counter."""
     on_the_cells_bus: bool
-    """Whether its frames come over the load cell's adapter: then one clock stamps both."""
+    """True where its frames come over the load cell's adapter: then one clock stamps both."""
 
 
 @cache

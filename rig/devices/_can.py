@@ -1,4 +1,4 @@
-"""What drivers of sensors on a CAN bus share: samples are decoded by a DBC file, so a new one needs a description."""
+"""Base of drivers of CAN sensors: samples are decoded by a DBC file, so a new sensor needs only a description."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def _choose(kind: str, name: str, known: Sequence[str], place: str) -> str:
 
 
 def _measured(value: float | NamedSignalValue) -> float:
-    """Of a signal; a word is no number."""
+    """Return a signal's value; NaN where the description has a word for it."""
     return math.nan if isinstance(value, NamedSignalValue) else float(value)
 
 
 def _raw(value: float | NamedSignalValue) -> float:
-    """Of a counter or a status word, also where the description has a word for it."""
+    """Return a counter's or a status word's value, also where the description has a word for it."""
     return value.value if isinstance(value, NamedSignalValue) else value
 
 

@@ -1,4 +1,4 @@
-"""What drivers of stimulators on a serial line share: the frames of ScienceMode 2 and 4, and commands with their acks.
+"""Base of drivers of stimulators on a serial line: frames of ScienceMode 2 and 4, and commands with their acks.
 
 An ack has its command's number, and the command + 1.
 """
@@ -61,7 +61,7 @@ def unstuff(stuffed: bytes) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class Framing:
-    """What differs between the protocols: start byte, header, stuffed body and stop byte they have in common.
+    """Differences between the protocols, which share start byte, header, stuffed body and stop byte.
 
     Each header byte stands behind an escape, xor 55. A frame's end is found by its length, since a header byte may
     itself look like `F0` or `0F`. After damage the reader continues at the next `F0 81`.
@@ -322,7 +322,7 @@ class PacketLine:
 
 
 class LineSettings(DeviceSettings):
-    """What the settings of every driver on a serial line have."""
+    """Settings of every driver on a serial line."""
 
     port: str
     channel: int

@@ -54,7 +54,7 @@ RESULTS = {
 """Result of an ack -> words."""
 
 ERRORS = {-1: "emergency switch pressed", -2: "electrode error", -3: "stimulation module error"}
-"""What a StimulationError says -> words."""
+"""Words for the codes of StimulationError."""
 
 START_MODE = 0
 MODES = {0: "start mode, pulses on command only", 1: "channel list initialised", 2: "channel list running"}

@@ -95,7 +95,7 @@ def build(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float) -> N
 
 
 def jumps(sequence_id: str, settings: dict[str, Any]) -> bool:
-    """Whether the width may rise to any allowed level within one pulse."""
+    """Return whether the width may rise to any allowed level within one pulse."""
     checked = settings_of(sequence_id, settings)
     return bool(getattr(find(sequence_id), "JUMPS", False) or getattr(checked, "jumps", False))
 
