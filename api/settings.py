@@ -1,4 +1,4 @@
-"""What can be set, by environment (prefix ``STIMRIG_``) or by the command line."""
+"""Settings, by environment (prefix ``STIMRIG_``) or by the command line."""
 
 from __future__ import annotations
 

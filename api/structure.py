@@ -1,4 +1,4 @@
-"""Which structure is meant: what a model holds, in words; and the words of the test that decides on it.
+"""Words for a model's structure, and for the test that decides on it.
 
 A structure is a model's method, order and set of effects; here it is named by its effects, each `id` or `id:form`. None
 of them: the plain structure, f(u) and then G of second order.

@@ -29,7 +29,7 @@ TOOLBAR_PX = 42
 GAP_PX = 30
 TORQUE, RESIDUAL, WIDTH = "%{y:.2f} N·m", "%{y:+.3f} N·m", "%{y:.0f} µs"
 ERROR, SHARE, FACTOR = "%{y:.3f} N·m", "%{y:.3f}", "%{y:.2f}"
-"""How a value is written under the pointer."""
+"""Format of a value in the tooltip."""
 Figure = dict[str, Any]
 
 

@@ -11,12 +11,12 @@ from typing import Any
 CLEAR_LINE = "\r\x1b[K"
 
 
-def say(*lines: object) -> None:
+def print_lines(*lines: object) -> None:
     """Print lines for people."""
     print(*lines, sep="\n", flush=True)
 
 
-def say_aside(words: str) -> None:
+def print_aside(words: str) -> None:
     """Print on standard error, on a line of its own: standard output is the result's."""
     print(f"{CLEAR_LINE}{words}" if sys.stderr.isatty() else words, file=sys.stderr, flush=True)
 
@@ -28,7 +28,7 @@ def report(document: Mapping[str, Any], as_json: bool, *lines: object, files: It
 
         print(json.dumps(json_value(document), ensure_ascii=False, allow_nan=False))
     else:
-        say(*lines, *(f"written to {path}" for path in files if path is not None))
+        print_lines(*lines, *(f"written to {path}" for path in files if path is not None))
 
 
 def listed(document: Mapping[str, Any]) -> list[str]:

@@ -28,7 +28,7 @@ from stimrig.api.cohort.task import Task
 from stimrig.api.whole_file import whole_path
 
 TO_DISK_S = 10.0
-"""What a run loses at most where the machine goes down."""
+"""Longest time of results that a run loses where the machine goes down, s."""
 GROUP_ROWS = 5000
 COPY = "copy"
 """Status of a row whose content has a newer row: of another address."""

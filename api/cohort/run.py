@@ -33,7 +33,7 @@ IN_FLIGHT = 24
 """Records for each thread of a worker: none waits for its next, and the list is never in memory as a whole."""
 DONE_BEFORE = "done before"
 RETRIES = 2
-"""Of a record that a worker could not begin; what a record itself does is a row, and needs none."""
+"""Retries of a record that a worker could not begin; a record that fails by itself is a row and is not retried."""
 
 
 def run_cohort(

@@ -1,4 +1,4 @@
-"""What a worker of Dask does with a record: fetch it, and have a process with limits compute it.
+"""Work of a Dask worker on a record: fetch it, and have a process with limits compute it.
 
 A record that hangs that process, fills its memory or crashes it costs its own row.
 """
@@ -33,7 +33,7 @@ LIBRARIES = (
 
 @dataclass(frozen=True)
 class Bounds:
-    """What one record may take."""
+    """Limits of one record."""
 
     limit_s: float = 600.0
     memory_bytes: int = 10**9  # beyond the libraries

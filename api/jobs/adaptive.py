@@ -20,7 +20,7 @@ from stimrig.identify.json_text import json_value
 from stimrig.identify.records.live import SAMPLE, Segments, live_record
 
 NEW_PERSON_SHARE = 1 / 3
-"""Of the torque that stops a test: the guess of a new person's torque at the largest width."""
+"""Expected torque of a new person at the largest width, as a share of the torque that stops a test."""
 DIGITS = 4
 
 

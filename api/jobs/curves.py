@@ -1,4 +1,4 @@
-"""What pages draw of a recording, rounded: curves beside a model's, a comparison, a sealed recording as it was made."""
+"""Rounded curves of a recording for pages: beside a model's, in a comparison, or of the sealed recording alone."""
 
 from __future__ import annotations
 

@@ -62,7 +62,7 @@ class Process:
 
     @property
     def ready(self) -> bool:
-        """Whether it can do another call."""
+        """True while it can do another call."""
         usable = self._executor is not None and not self._killed and self._calls < self.most_calls
         return usable and self._context.process.is_alive()
 
@@ -105,7 +105,7 @@ class Process:
 
 
 class _Child:
-    """What the process itself was given."""
+    """Arguments of the process itself."""
 
     progress: Connection
 

@@ -122,7 +122,7 @@ STILL_USABLE = {
     "unexplained": " Some error is left that is not explained.",
     "missing": " An effect is possibly missing.",
 }
-"""What is said of a usable model by the kind of its diagnosis, where that names no likely effect."""
+"""Remark on a usable model by the kind of its diagnosis, where that names no likely effect."""
 
 
 def findings(document: dict[str, Any]) -> list[Finding]:

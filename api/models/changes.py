@@ -1,6 +1,6 @@
-"""What differs between two models of a muscle by more than its uncertainty, in figures and in words; what is in doubt.
+"""Differences between two models of a muscle beyond their uncertainty, in figures and in words, with their doubts.
 
-The standard deviations of both models say what the noise of the two records does. On emulated muscles that had not
+The standard deviations of both models measure the effect of the two records' noise. On emulated muscles that had not
 changed they are right for most figures and too small for some (a curve's bend between two knots, an effect that no
 model holds). So a floor is added to them; docs/results/trend.md says how it was measured.
 """
@@ -47,7 +47,7 @@ class State:
     """Its effects, each `id:form`."""
     current_ma: float | None = None
     notes: dict[str, str] = field(default_factory=dict)
-    """What was noted on each of the conditions."""
+    """Notes on each of the conditions."""
 
 
 def structure_of(effects: Collection[str], figures: dict[str, Figure]) -> tuple[str, ...]:

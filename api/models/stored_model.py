@@ -97,7 +97,7 @@ def mark_without_evidence(document: dict[str, Any], effects: Sequence[str]) -> N
 
 
 class Followed(NamedTuple):
-    """How much of the torque a model explains, %; None where it is not defined."""
+    """Share of the torque that a model explains, %; None where it is not defined."""
 
     percent: float | None
     ceiling_percent: float | None  # what the sensor noise allows on the same pulses

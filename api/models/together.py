@@ -17,8 +17,8 @@ from stimrig.api.store import audit, uploads
 from stimrig.api.store.tables import Model, Recording, Test
 
 JOINT_EFFECTS = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
-"""What the torque does with angle and velocity, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):
-fitted where nothing else is asked for."""
+"""Effects of angle and velocity on the torque, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):
+the default of a fit."""
 MAX_RECORDINGS = 20
 ANGLE = "angle_rad"
 

@@ -40,7 +40,7 @@ class Trial:
 
     @property
     def limits(self) -> Limits:
-        """How far the model may be tracked."""
+        """Limits of tracking the model."""
         return Limits(**(self.approval.tracking or {}))
 
 

@@ -29,7 +29,7 @@ CHANGES = {
     "threshold_shift_us": ("threshold", "lower", "higher"),
     "time_scale": ("muscle", "faster", "slower"),
 }
-"""What a quantity describes, and the words for less and for more of it."""
+"""Subject of each quantity, and the words for less and for more of it."""
 NEW_TEST = "A new test is needed; the shortest is the adaptive test, which stops by itself."
 
 Bounds = dict[str, tuple[float, float]]
@@ -38,7 +38,7 @@ Percent = Annotated[FiniteFloat, Field(ge=0.0, le=60.0)]
 
 
 class Limits(BaseModel):
-    """How far a tracked model may move from the approved one, either way, 0 to 60 %; 0: this stays as approved."""
+    """Limits on a tracked model's distance from the approved one, either way, 0 to 60 %; 0: this stays as approved."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True)
 

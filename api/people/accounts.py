@@ -29,7 +29,7 @@ from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import PageSession, Token, User
 
 CONFIRMED_S = 120.0
-"""How long a password given once more is good for one approval."""
+"""Time for which a re-entered password is valid for one approval, s."""
 MOST_PLACES = 20
 """Number of places remembered for a user."""
 

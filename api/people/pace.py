@@ -21,7 +21,7 @@ MOST_KEYS = 10_000
 SWEEP_S = 1.0
 FREE_TRIES, FREE_FOR_A_NAME, MOST_PROVEN = 5, 20, 1000
 Key = tuple[Hashable, ...]
-"""What a try counts for; the first part is its kind: `pair`, `known pair`, `name`, `place`, `session` or `token`."""
+"""Key of counted attempts; the first part is its kind: `pair`, `known pair`, `name`, `place`, `session` or `token`."""
 
 
 @dataclass

@@ -16,10 +16,10 @@ SETTINGS = {
 
 
 class Scope(StrEnum):
-    """What a token may be used for.
+    """Permission of a token.
 
-    ``rearm`` is in no role and no controller's key: after a stop a person looks first. Who signed in with a password
-    and may run tests holds it for the session; a program holds it only if it was asked for by name.
+    ``rearm`` is in no role and no controller's key: after a stop a person looks first. A person who signed in with a
+    password and may run tests has it for the session; a program has it only where it was requested by name.
     """
 
     READ_LIVE = "read-live"

@@ -1,1 +1,1 @@
-"""What can be done with the service: one function for each action, typed input, one transaction, typed refusals."""
+"""Actions of the service: one function for each, with typed input, one transaction and typed refusals."""

@@ -23,7 +23,7 @@ class Change:
 
 @dataclass(frozen=True)
 class Decision:
-    """Who decides, on which versions, and the token that confirms it; `on_page`: a person signed in decides."""
+    """Decider, versions and confirmation token of a decision; `on_page`: a person signed in decides."""
 
     by: str
     tags: Tags

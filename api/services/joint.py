@@ -27,7 +27,7 @@ NOTHING_OPEN: dict[str, Any] = {
 
 
 class PoseIn(Body):
-    """What a goniometer shows while the joint is held still."""
+    """Reading of a goniometer while the joint is held still."""
 
     angle_rad: FiniteFloat = Field(description="elbow: 0 is straight, flexion is positive, rad")
     first: StrictBool = Field(False, description="begin anew with this one: a first pose that waits is forgotten")

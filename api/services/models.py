@@ -1,4 +1,4 @@
-"""What a model foretells of a trial: the torque of given pulse widths, and the pulse widths for a reference torque."""
+"""Predictions of a model for a trial: the torque of given pulse widths, and the widths for a reference torque."""
 
 from __future__ import annotations
 

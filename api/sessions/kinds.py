@@ -137,7 +137,7 @@ class Watched(Kind):
     watching, alone = "watching", "alone"
     """States of a test that is watched, and of one that is left to its plan."""
     left_alone = ""
-    """What it means that it is left to its plan."""
+    """Consequence of leaving it to its plan, in words."""
 
     def __init__(self, clock: Clock, rig: RigClient, versions: Versions, send: Send) -> None:
         super().__init__(rig)

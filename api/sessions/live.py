@@ -17,7 +17,7 @@ ANGLE_OLD_S = 0.5
 """An older angle is not shown as that of now."""
 SERIES = ("time_s", "torque_min_nm", "torque_max_nm", "pulse_time_s", "pulse_width_us")
 ANGLES = ("angle_time_s", "angle_rad", "velocity_rad_s")
-"""Of a rig with an angle sensor: one of each for each frame."""
+"""Series of a rig with an angle sensor: one value of each for each frame."""
 
 
 class LiveOut(LiveState):

@@ -30,7 +30,7 @@ LOOK_AGAIN_S = 0.25
 
 @dataclass(frozen=True)
 class Requester:
-    """Who asks for a test, and what they decided it on."""
+    """Requester of a test, and the versions that they decided it on."""
 
     name: str
     token: str = ""

@@ -55,7 +55,7 @@ class Previews:
         text = json.dumps([secrets.token_hex(16), plan, answer], sort_keys=True)
         plan_hash = hashlib.sha256(text.encode()).hexdigest()
         self._previews[plan_hash] = Preview(body, planned, answer, dict(row.profile), site_of(row), self._now_s())
-        of_one = [old for old, kept in self._previews.items() if kept.body.participant == body.participant]
+        of_one = [old for old, preview in self._previews.items() if preview.body.participant == body.participant]
         for old in of_one[:-CAPACITY_OF_ONE] or list(self._previews)[:-CAPACITY]:
             del self._previews[old]
         return plan_hash
@@ -66,7 +66,7 @@ class Previews:
         if preview is None or preview.body.participant != participant:
             why = "Newer previews took its place, or the service was restarted since."
         elif preview.test_id is None:
-            ages_s = [now - made for now, made in zip(self._now_s(), preview.made_s, strict=True)]
+            ages_s = [now - made_s for now, made_s in zip(self._now_s(), preview.made_s, strict=True)]
             if not all(0 <= age_s <= VALID_S for age_s in ages_s):
                 why = f"It is valid for {VALID_S / 60:.0f} minutes; what it shows may have changed."
         if preview is None or why:

@@ -15,8 +15,8 @@ Profile = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Named:
-    """How people call a limit, in a sentence and beside its field, its unit, the rig's name of its bound, and the least
-    and the most that any rig takes.
+    """Names of a limit, in a sentence and beside its field, its unit, the rig's name of its bound, and the smallest and
+    largest value that any rig takes.
 
     Below the least there is no limit but a slip: the finest step in which a stimulator tells currents and widths apart,
     and a torque that every muscle at rest has.

@@ -1,4 +1,4 @@
-"""What clients send to ask for a test, a calibration, a stop, or other limits; each field is checked."""
+"""Request bodies for tests, calibrations, stops and limits; each field is checked."""
 
 from __future__ import annotations
 
@@ -82,16 +82,16 @@ class Body(BaseModel):
     model_config = ConfigDict(extra="forbid", strict=True)
 
 
-KEPT: Any = None
+UNCHANGED: Any = None
 """Default of a limit that keeps its value where it is left out; null is refused as no number."""
 
 
 class ProfileIn(Body):
     """Some of a participant's limits; one that is left out keeps its value. First ones are all set, or none."""
 
-    current_ma: CurrentMa = KEPT
-    max_pulse_width_us: WidthUs = KEPT
-    max_torque_nm: TorqueNm = KEPT
+    current_ma: CurrentMa = UNCHANGED
+    max_pulse_width_us: WidthUs = UNCHANGED
+    max_torque_nm: TorqueNm = UNCHANGED
     angle_range_rad: RangeRad | None = Field(default=None, description="null: the participant has none any more")
 
     def sent(self) -> dict[str, Any]:
@@ -121,14 +121,14 @@ Percent = Annotated[FiniteFloat, Field(ge=LEAST_PERCENT, le=MOST_PERCENT)]
 
 
 class TargetIn(Body):
-    """What a test that stops itself must reach: half-widths of the 95 % bands of whole curves, %."""
+    """Target of a test that stops itself: half-widths of the 95 % bands of whole curves, %."""
 
     curve_percent: Percent = Field(default=2.0, description="of the recruitment curve, % of its plateau")
     step_percent: Percent = Field(default=2.0, description="of the response to a unit step, %")
 
 
 class AngleIn(Body):
-    """What a test of a joint that moves asks of its angle, beside the participant's range."""
+    """Conditions on the angle in a test of a joint that moves, beside the participant's range."""
 
     target_rad: AngleRad | None = Field(
         default=None, description="kind `held`: the angle to hold; null: the next one that is open"
@@ -228,7 +228,7 @@ class TestIn(Labels, Body):
 
 
 class CalibrationIn(Body):
-    """How a guided calibration goes: one current, small steps, short trains."""
+    """Settings of a guided calibration: one current, small steps, short trains."""
 
     current_ma: CurrentMa | None = Field(None, description="of every pulse, mA; None: the participant's own")
     step_us: Annotated[FiniteFloat, Field(ge=1, le=25, description="how much wider a (fine) step up is, µs")] = 10.0
@@ -253,7 +253,7 @@ class StepIn(Body):
 
 
 class MarkIn(Body):
-    """What the participant feels, or the muscle does, at the last train's width."""
+    """Threshold that the last train's width reached, by the participant's feeling or the muscle's response."""
 
     threshold: Literal["sensory", "motor", "comfort"]
 
@@ -305,7 +305,7 @@ class ParticipantIn(MuscleIn):
 
 
 class RanByIn(Body):
-    """Who ran a test at the rig."""
+    """Person who ran a test at the rig."""
 
     ran_by: PersonName | None = Field(None, description="null: who asked for it")
 
@@ -349,18 +349,18 @@ def limits_of(body: TestIn, participant_profile: Mapping[str, Any] | None) -> di
 
     Raises ApiError: 422: the participant has no limits; a limit is wider than the participant's, which and by how much.
     """
-    own, asked = participant_profile or {}, body.profile.sent() if body.profile else {}
-    if lacking := [name for name in LIMITS if own.get(name) is None]:
+    limits, requested = participant_profile or {}, body.profile.sent() if body.profile else {}
+    if lacking := [name for name in LIMITS if limits.get(name) is None]:
         fix = "Set all of them: PUT /v1/participants/{code}/profile."
         detail = f"{body.participant} has no {', '.join(lacking)}. {fix}"
         raise ApiError(422, "no-limits", "The participant has no limits", detail)
     wider = {
-        name: f"{asked[name]:g} {limit.unit} is above the participant's {own[name]:g} {limit.unit} by "
-        f"{asked[name] - own[name]:g}"
+        name: f"{requested[name]:g} {limit.unit} is above the participant's {limits[name]:g} {limit.unit} by "
+        f"{requested[name] - limits[name]:g}"
         for name, limit in LIMITS.items()
-        if name in asked and not (asked[name] <= own[name])  # NaN counts as wider
+        if name in requested and not (requested[name] <= limits[name])  # NaN counts as wider
     }
-    range_rad, own_rad = profiles.range_of(asked), profiles.range_of(own)
+    range_rad, own_rad = profiles.range_of(requested), profiles.range_of(limits)
     if range_rad is not None and own_rad is None:
         wider[RANGE] = f"{profiles.range_words(range_rad)} narrows nothing: {body.participant} has no range"
     elif range_rad is not None and not profiles.range_within(range_rad, own_rad):
@@ -371,6 +371,6 @@ def limits_of(body: TestIn, participant_profile: Mapping[str, Any] | None) -> di
         narrow = "A test may narrow them; to widen them, calibrate anew or set the participant's."
         detail = f"{'; '.join(error['detail'] for error in errors)}. {narrow}"
         raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail, errors=errors)
-    kept = {name: asked[name] for name in ("current_ma", RANGE) if asked.get(name) is not None}
-    narrowed = {name: asked.get(name) for name in ("max_pulse_width_us", "max_torque_nm")}
-    return {"profile": Profile(**{**own, **kept}), **narrowed}
+    overrides = {name: requested[name] for name in ("current_ma", RANGE) if requested.get(name) is not None}
+    narrowed = {name: requested.get(name) for name in ("max_pulse_width_us", "max_torque_nm")}
+    return {"profile": Profile(**{**limits, **overrides}), **narrowed}

@@ -171,7 +171,7 @@ class RigClient:
         if self.connected:
             log.warning("the rig's socket closed")
             self.connected = False
-            self._tell(False)
+            self._notify(False)
 
     async def _listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         subscription = requests.SubscribeRequest(id=next(self._numbers))
@@ -192,21 +192,21 @@ class RigClient:
             with contextlib.suppress(ApiError):  # the age of the state shows it
                 status = await self.fresh_status()
                 if status.state != before:  # a change without an event
-                    self._tell(messages.StateEvent(status=status))
-                self._tell(status)
+                    self._notify(messages.StateEvent(status=status))
+                self._notify(status)
 
     def _receive(self, message: dict[str, Any], subscription_id: int) -> None:
         if "event" in message:
             event = _events.validate_python(message)
             if isinstance(event, messages.StateEvent):
                 self.status = event.status
-            self._tell(event)
+            self._notify(event)
             return
         reply = messages.Reply.model_validate(message)
         if reply.id == subscription_id and reply.ok:
             self.status = messages.Status.model_validate(reply.body)
             self.connected = True
-            self._tell(True)
+            self._notify(True)
         request, future = self._waiting.get(reply.id, (None, None))
         self._take_state(request, reply)
         if future is not None and not future.done():
@@ -218,7 +218,7 @@ class RigClient:
             with contextlib.suppress(ValidationError):  # `ask_for` reports it
                 self.status = messages.Status.model_validate(reply.body)
 
-    def _tell(self, news: News) -> None:
+    def _notify(self, news: News) -> None:
         for listener in list(self.listeners):
             try:
                 listener(news)

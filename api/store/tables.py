@@ -60,13 +60,13 @@ class Test(Table):
     requested_utc: Mapped[str] = mapped_column(index=True)
     finished_utc: Mapped[str | None]
     ran_by: Mapped[str | None]
-    """Who ran it at the rig, if that was somebody else than `requested_by`."""
+    """The person who ran it at the rig, if not `requested_by`."""
     version: Mapped[int] = mapped_column(BigInteger, default=0)
     __mapper_args__ = {"version_id_col": version, "version_id_generator": False}  # noqa: RUF012
 
 
 class Note(Table):
-    """What a person noted about a session, or at a time in a test; struck, but never deleted."""
+    """A person's note on a session, or on a time in a test; struck, but never deleted."""
 
     __tablename__ = "notes"
     id: Mapped[str] = mapped_column(primary_key=True)
@@ -90,11 +90,11 @@ class Recording(Table):
     path: Mapped[str]
     file_sha256: Mapped[str]
     samples_sha256: Mapped[str | None]
-    """Of the measured samples, the same in each format (`record_files.samples_sha256`); empty: they cannot be read."""
+    """Hash of the measured samples, same in each format (`record_files.samples_sha256`); empty: they cannot be read."""
     origin: Mapped[str] = mapped_column(default="rig")
     created_utc: Mapped[str]
     warnings: Mapped[list[str] | None]
-    """What is in doubt about an upload; a test's doubts stand in its summary."""
+    """Doubts about an upload; those about a test are in its summary."""
     site: Mapped[list[str | None] | None]
     """Side, muscle and placement that were stimulated; None: from before they were kept."""
 
@@ -111,7 +111,7 @@ class Model(Table):
     carried_from_id: Mapped[str | None]
     """The model of an earlier session whose structure this one was fitted with."""
     carried: Mapped[dict[str, Any] | None]
-    """What the new record said of that structure."""
+    """Assessment of that structure on the new record."""
     method: Mapped[str]
     effects: Mapped[list[str]] = mapped_column(default=list)
     fit: Mapped[dict[str, Any]] = mapped_column(default=dict)
@@ -136,7 +136,7 @@ class Approval(Table):
     site: Mapped[list[Any] | None]
     """The participant's site then: at another one it does not hold."""
     tracking: Mapped[dict[str, float] | None]
-    """How far the model may be tracked, in percent (`api.models.tracking.Limits`); None: nobody has allowed it."""
+    """Limits of tracking the model, in percent (`api.models.tracking.Limits`); None: tracking is not allowed."""
 
 
 class Tracked(Table):
@@ -149,7 +149,7 @@ class Tracked(Table):
     model_id: Mapped[str] = mapped_column(ForeignKey("models.id"))
     recording_id: Mapped[str | None]
     number: Mapped[int]
-    """Of the approval's trials, from 1."""
+    """Number among the approval's trials, from 1."""
     outcome: Mapped[str]
     """As `stimrig.identify.tracking.Outcome`, or `not-followed`."""
     reason: Mapped[str] = mapped_column(default="")
@@ -168,7 +168,7 @@ class Tracked(Table):
 
 
 class Analysis(Table):
-    """What a worker found about a model: comparison, diagnosis. Kept, since a model never changes."""
+    """A worker's result about a model: comparison, diagnosis. It is stored, since a model never changes."""
 
     __tablename__ = "analyses"
     model_id: Mapped[str] = mapped_column(ForeignKey("models.id"), primary_key=True)
@@ -192,7 +192,7 @@ class Token(Table):
     participant: Mapped[str | None]
     """The only one that a controller's key opens; None: a token that is bound to nobody."""
     plan: Mapped[dict[str, Any] | None]
-    """What trials a controller's key may play."""
+    """Plan of the trials that a controller's key may play."""
     made_by: Mapped[str | None]
     """Hash of the token of whoever made a controller's key; it falls with that one."""
 
@@ -238,7 +238,7 @@ class Secret(Table):
 
 
 class AuditEntry(Table):
-    """Who did what, when, to what; each entry holds the hash of the one before."""
+    """One action with its actor, time and subject; each entry has the hash of the one before."""
 
     __tablename__ = "audit"
     seq: Mapped[int] = mapped_column(primary_key=True, autoincrement=False)

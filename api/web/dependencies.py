@@ -1,4 +1,4 @@
-"""What routes and pages are given: the service's context, who asks, and the versions that decisions are made on."""
+"""Dependencies of routes and pages: the service's context, the requester, and the versions of decisions."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ async def _decision(principal: Tester, tags: ParticipantVersion, confirm: Confir
 
 
 ParticipantDecision = Annotated[Decision, Depends(_decision)]
-"""Of who may test; one who is signed in is asked before what deserves a second look (409, `confirm`)."""
+"""Decision of someone who may test; a person signed in must confirm where a second look is needed (409, `confirm`)."""
 
 
 async def _version(context: Ctx, model_id: str) -> Model:

@@ -121,8 +121,8 @@ OPEN = (
     "WS /v1/tests/(?P<test>[^/]+)/live",
     "GET /v1/recordings/(?P<recording>[^/]+)(?:/csv)?",
 )
-"""What a controller's key opens of its participant: of the models the approved one and what was tracked from it under
-the approval that holds, of recordings those of tests."""
+"""Routes that a controller's key opens for its participant: of the models the approved one and those tracked from it
+under the valid approval, of the recordings those of tests."""
 
 
 def refuse_outside(registry: Versions, principal: Principal, method: str, path: str) -> None:

@@ -1,4 +1,4 @@
-"""What stands around every route: bounds and strict JSON for what comes in, headers for what goes out."""
+"""Middleware of every route: bounds and strict JSON for requests, headers for responses."""
 
 from __future__ import annotations
 

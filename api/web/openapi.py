@@ -48,7 +48,7 @@ def problem(description: str) -> dict[str, Any]:
 TOO_MANY = problem("too many wrong tries, or too much at once") | {
     "headers": {"Retry-After": {"description": "s to wait", "required": True, "schema": {"type": "integer"}}}
 }
-"""Of every operation that asks who comes: a guess is held to a pace, whatever it was to open."""
+"""Response of every operation that checks a token: failed attempts are limited, whatever they were to open."""
 CHANGED = problem("changed since: `changes` says who, when, from what to what") | {"headers": {"ETag": ETAG}}
 NO_VERSION = problem("`If-Match` is missing, or cannot be read")
 

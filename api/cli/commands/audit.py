@@ -12,7 +12,7 @@ import typer
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.files import write
 from stimrig.api.cli.options import Json, set_options
-from stimrig.api.cli.terminal import report, say
+from stimrig.api.cli.terminal import print_lines, report
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, audit
 from stimrig.api.store.tables import AuditEntry
@@ -58,7 +58,7 @@ def export(
     """Write the trail, one entry a line; `verify --file` checks it without the database."""
     entries = stored(settings_of(data))
     write(output, "".join(json.dumps(entry.as_dict(), sort_keys=True) + "\n" for entry in entries))
-    say(f"{len(entries)} entries written to {output}; head {head_of(entries)}")
+    print_lines(f"{len(entries)} entries written to {output}; head {head_of(entries)}")
 
 
 def head_of(entries: list[AuditEntry]) -> str:

@@ -17,7 +17,7 @@ from stimrig.api.cli.errors import CommandError
 from stimrig.api.cli.options import Emulate, Json, set_options
 from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.supervisor import Services
-from stimrig.api.cli.terminal import report, say_aside
+from stimrig.api.cli.terminal import print_aside, report
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
 
@@ -35,11 +35,11 @@ def demo(
     began = time.monotonic()
     folder = data or Path("var") / "demo" / datetime.now().strftime("%Y%m%d-%H%M%S")
     settings, token = Settings(**set_options(data_dir=folder, port=0) | {"rig_file": None}), secrets.token_urlsafe(32)
-    say_aside("starting the emulated rig, the rig process and the service")
+    print_aside("starting the emulated rig, the rig process and the service")
     with Services(settings, emulate.split(), token) as services, Client(services.url, token) as client:
-        say_aside(f"service at {services.url}; participant {PARTICIPANT}; the test runs in real time")
+        print_aside(f"service at {services.url}; participant {PARTICIPANT}; the test runs in real time")
         test = run_test(client, PARTICIPANT, services.watch)
-        say_aside("approving the model; fetching it as the controller (ETag, then 304)")
+        print_aside("approving the model; fetching it as the controller (ETag, then 304)")
         model = approve_and_fetch(client, test["model_id"])
         page = comparison_html(model, client.curves(test["model_id"]).to_dict(), test["id"], test)
     (recording,) = (folder / "recordings").glob(f"*{test['id']}*.h5")

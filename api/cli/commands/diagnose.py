@@ -11,7 +11,7 @@ from stimrig.api.structure import in_words
 
 
 def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap = None, as_json: Json = False) -> None:
-    """What is missing in a model's structure, most probable first; or nothing; or structure that no effect explains.
+    """Name the effects missing in a model's structure, most probable first; or none; or structure that none explains.
 
     Takes 5 to 30 s, longer where structure is left or with several recordings. DATA decides: a model given with --model
     lends its structure, not its numbers.

@@ -24,7 +24,7 @@ def explain(
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
-    """How far a model goes, step by step: where it fails, what is missing, how the error falls with it, what is left.
+    """Explain a model's error step by step: where it fails, the missing effects, the error with them, and what is left.
 
     Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o no model is kept.
     """

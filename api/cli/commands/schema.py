@@ -9,7 +9,7 @@ import typer
 
 from stimrig.api import schemas
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.terminal import say
+from stimrig.api.cli.terminal import print_lines
 
 
 def schema(
@@ -19,9 +19,9 @@ def schema(
 ) -> None:
     """Print a JSON Schema; its `$id` ends in its version."""
     if name is None:
-        say(*[schemas.load(known)["$id"] for known in schemas.NAMES])
+        print_lines(*[schemas.load(known)["$id"] for known in schemas.NAMES])
         return
     try:
-        say(json.dumps(schemas.load(name), indent=2, ensure_ascii=False))
+        print_lines(json.dumps(schemas.load(name), indent=2, ensure_ascii=False))
     except KeyError:
         raise InputError(f"{name}: no such schema. Give one of {', '.join(schemas.NAMES)}.") from None

@@ -14,7 +14,7 @@ from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.options import DataDir, RigFile, set_options
 from stimrig.api.cli.stop_key import StopKey, at_rig
 from stimrig.api.cli.supervisor import Services
-from stimrig.api.cli.terminal import say
+from stimrig.api.cli.terminal import print_lines
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.sessions.rig_client import RigClient
@@ -43,17 +43,19 @@ def serve(
         rig_status(attached)
     services = Services(settings, emulate.split(), attach=attached)
     with contextlib.suppress(KeyboardInterrupt), services:
-        say(*welcome(services, rig_status(services.socket)))
+        print_lines(*welcome(services, rig_status(services.socket)))
         try:
-            with StopKey(at_rig(services.socket), say) as key:
+            with StopKey(at_rig(services.socket), print_lines) as key:
                 if key.watched:
-                    say("any key stops a running test; Ctrl-C ends the service" + ("" if attached else " and the rig"))
+                    print_lines(
+                        "any key stops a running test; Ctrl-C ends the service" + ("" if attached else " and the rig")
+                    )
                 while True:
                     time.sleep(0.2)
                     for event in services.watch():
-                        say(event)
+                        print_lines(event)
         except KeyboardInterrupt:
-            say("stopping" + ("; the rig goes on by itself" if attached else ""))
+            print_lines("stopping" + ("; the rig goes on by itself" if attached else ""))
 
 
 def rig_status(socket: Path) -> Status:

@@ -22,7 +22,7 @@ from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, names, set_
 from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
 from stimrig.api.cli.supervisor import Services
-from stimrig.api.cli.terminal import CLEAR_LINE, report, say_aside
+from stimrig.api.cli.terminal import CLEAR_LINE, print_aside, report
 from stimrig.api.client.errors import ServiceError, Unreachable
 from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
@@ -31,7 +31,7 @@ from stimrig.api.web.responses.rig import TestOut
 from stimrig.rig.messages import LABEL_TITLES, Labels
 
 Events = Callable[[], list[str]]
-"""What has happened to the processes of the service since the last call."""
+"""Returns the events of the service's processes since the last call."""
 
 
 def test(
@@ -156,8 +156,8 @@ def service(
             settings, token = Settings(**set_options(rig_file=rig, data_dir=data, port=0)), secrets.token_urlsafe(32)
             services = stack.enter_context(Services(settings, emulate.split(), token))
             url, events, stop = services.url, services.watch, at_rig(services.socket, over.is_set)
-        if stack.enter_context(StopKey(stop, say_aside)).watched:
-            say_aside("any key stops the test")
+        if stack.enter_context(StopKey(stop, print_aside)).watched:
+            print_aside("any key stops the test")
         yield stack.enter_context(Client(url, token)), events
 
 
@@ -177,7 +177,7 @@ def play(
     document = run_test(client, participant, events, over, **request)
     best = document["model_id"]
     if (document.get("adaptive") or {}).get("problem"):
-        say_aside("  the structure leaves an error: adding what explains it")
+        print_aside("  the structure leaves an error: adding what explains it")
         with contextlib.suppress(ServiceError), progress_bar() as progress:  # the plain model is there all the same
             best = client.improve(best, progress)["id"]
     return {"test": document, "model": client.model_file(best), "recording": client.recording(document["recording_id"])}

@@ -1,1 +1,1 @@
-"""What clients get, typed for the OpenAPI document. Tests check the answers against it; the service itself does not."""
+"""Responses, typed for the OpenAPI document. Tests check the answers against it; the service itself does not."""

@@ -1,4 +1,4 @@
-"""What all answers share."""
+"""Base of all responses, and the parts that several share."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Holder(Document):
 
 
 class EntryOut(Document):
-    """Who did what."""
+    """Entry of the audit trail."""
 
     at_utc: str
     who: str = Field(description="empty: the rig itself")
@@ -87,7 +87,7 @@ class ChangeOut(Document):
 
 
 class ReachOut(Document):
-    """What was said of an adaptive test's target before the first pulse."""
+    """Assessment of an adaptive test's target before the first pulse."""
 
     reachable: bool
     curve_percent: float | None = Field(description="half-width of the curve's band at the end, %; null: none at all")
@@ -99,7 +99,7 @@ class ReachOut(Document):
 
 
 class ConfirmRow(Document):
-    """What changes, from what to what."""
+    """Change of one value, from the old to the new one."""
 
     what: str
     now: str

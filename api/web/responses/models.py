@@ -80,7 +80,7 @@ class ExperimentOut(Document):
 
 
 class DiagnosisOut(Document):
-    """What is missing in a model's structure: the schema `diagnosis`, and the next experiment."""
+    """Effects missing in a model's structure: the schema `diagnosis`, and the next experiment."""
 
     experiment: ExperimentOut | None = None
 
@@ -130,7 +130,7 @@ class CurvesOut(Document):
 
 
 class PredictionOut(Document):
-    """What a model says a list of pulse widths would give."""
+    """Torque that a model predicts for a list of pulse widths."""
 
     model_id: str
     pulse_rate_hz: float
@@ -160,7 +160,7 @@ class TrendFigureOut(ParameterOut):
 
 
 class TrendNoteOut(Document):
-    """What a person noted on the session."""
+    """A person's note on the session."""
 
     at_utc: str
     kind: str
@@ -206,7 +206,7 @@ class DifferenceOut(Document):
 
 
 class ChangesOut(Document):
-    """What changed from one session to another."""
+    """Changes from one session to another."""
 
     since_utc: str = Field(description="the earlier session")
     since_model_id: str
@@ -236,7 +236,7 @@ Levels = Annotated[
 
 
 class StepOut(Document):
-    """What a trial said of the muscle."""
+    """Change of the muscle as estimated from one trial."""
 
     at_utc: str = Field(description="when it was followed")
     now: Levels | None = Field(description="in this trial")
@@ -250,7 +250,7 @@ class StepOut(Document):
 
 
 class TrackedOut(StepOut):
-    """What a model that is asked for with `tracked` was moved by; missing in one that nothing has moved yet."""
+    """Changes that a model requested with `tracked` was moved by; missing where no trial has moved it yet."""
 
     approved_model_id: str
     trial: int = Field(description="the trial that it was tracked to; 0: none")
@@ -283,7 +283,7 @@ class TrialOut(StepOut):
 
 
 class TrackingOut(Document):
-    """What was tracked since the approval that holds."""
+    """Changes tracked since the valid approval."""
 
     participant: str
     approved_model_id: str

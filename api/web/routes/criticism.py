@@ -39,7 +39,7 @@ async def curves(context: Ctx, _principal: ModelReader, row: Version) -> dict[st
 
 @router.get("/models/{model_id}/diagnosis", response_model=DiagnosisOut, responses=LATER)
 async def diagnosis(context: Ctx, _principal: ModelReader, row: Version, wait: Wait = True) -> Any:
-    """What is missing, ranked; or that nothing is; or that what is left has no name in the library."""
+    """Rank the missing effects; or report that none is missing, or that the library has none for what is left."""
     if wait or await asyncio.to_thread(context.analyses.known_diagnosis, row) is not None:
         return await context.analyses.diagnosis(row)
     return later(jobs.begin_diagnosis(context, row))

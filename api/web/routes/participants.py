@@ -19,7 +19,7 @@ from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
 
 
 class ArchivedIn(Body):
-    """Whether a participant is in the archive."""
+    """Archive state of a participant."""
 
     archived: bool
 
