@@ -33,6 +33,7 @@ class Job:
     # of a job that a person asked for, and that REST lists
     id: str = ""
     subject: str = ""
+    request: Any = None
     part: Job | None = None
     """The job in a worker process that this one awaits now."""
     state: str = "queued"  # queued, running, completed, failed or cancelled

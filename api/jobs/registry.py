@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 from collections.abc import Awaitable, Callable
+from typing import Any
 
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.jobs.job import Job
@@ -26,15 +27,16 @@ class Jobs:
         self._tasks = Tasks(log)
         self.close = self._tasks.close
 
-    def start(self, kind: str, subject: str, work: Callable[[Job], Awaitable[str]]) -> Job:
-        """Start work that returns the address of its result, or return the same job that runs already.
+    def start(self, kind: str, subject: str, work: Callable[[Job], Awaitable[str]], request: Any = None) -> Job:
+        """Start work that returns the address of its result, or return the job that runs already on the same request.
 
-        `subject`: the model's id, or the participant's code. The work calls `job.follow` with what it submits.
+        `subject`: the model's id, or the participant's code. `request`: what is asked for, and by whom, where that
+        makes it another job. The work calls `job.follow` with what it submits.
         """
         for job in self.all.values():
-            if (job.kind, job.subject, job.state) == (kind, subject, "running"):
+            if (job.kind, job.subject, job.request, job.state) == (kind, subject, request, "running"):
                 return job
-        job = Job(kind, id=f"J{next(self._numbers)}", subject=subject)
+        job = Job(kind, id=f"J{next(self._numbers)}", subject=subject, request=request)
         job.start()
         self.all[job.id] = job
         for old in [known.id for known in self.all.values() if known.state != "running"][:-MOST_FINISHED]:

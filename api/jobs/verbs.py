@@ -1,6 +1,6 @@
 """Verbs of the worker processes: paths and plain objects in, plain objects out.
 
-Imported by the worker and the command line only; the web process never loads numpy, and never fits.
+Imported by the worker and the command line only: the web process never fits, and loads neither scipy nor numba.
 """
 
 from __future__ import annotations

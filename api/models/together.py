@@ -17,8 +17,8 @@ from stimrig.api.store import audit, uploads
 from stimrig.api.store.tables import Model, Recording, Test
 
 JOINT_EFFECTS = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
-"""Effects of angle and velocity on the torque, as `identify.fitting.MOVING_JOINT` (the web process loads no numpy):
-the default of a fit."""
+"""Effects of angle and velocity that are fitted where nothing else is asked for, as `identify.fitting.MOVING_JOINT`,
+which the web process does not load."""
 MAX_RECORDINGS = 20
 ANGLE = "angle_rad"
 

@@ -27,7 +27,7 @@ def begin_adding(context: Context, model: Model, body: EffectsIn, by: str) -> Jo
         )
         return f"/v1/models/{new.id}"
 
-    return context.jobs.start("add-effects", model.id, work)
+    return context.jobs.start("add-effects", model.id, work, (body.model_dump(), by))
 
 
 def begin_improving(context: Context, model: Model, by: str) -> Job:

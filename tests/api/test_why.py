@@ -81,6 +81,16 @@ def test_job_reports_progress_and_can_be_cancelled(client: httpx.Client, service
     assert client.get("/v1/jobs/J999").status_code == 404
 
 
+def test_a_job_is_shared_by_equal_requests_alone(client: httpx.Client, service: Service, participant: str) -> None:
+    model = run_test(client, participant)["model_id"]
+    make_slow(service)
+    urls = [
+        client.post(f"/v1/models/{model}/effects?wait=false", json={"effects": [effect]}).headers["location"]
+        for effect in ("fatigue", "fatigue", "tremor")
+    ]
+    assert urls[0] == urls[1] != urls[2]
+
+
 def test_pages_of_jobs_lead_to_the_result_or_say_why_there_is_none(
     client: httpx.Client, pages: httpx.Client, model: str
 ) -> None:

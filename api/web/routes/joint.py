@@ -61,7 +61,7 @@ async def fit_together(
         async def work(job: Job) -> str:
             return f"/v1/models/{(await together.fit(*arguments, job.follow)).id}"
 
-        return later(context.jobs.start(FIT_TOGETHER, code, work))
+        return later(context.jobs.start(FIT_TOGETHER, code, work, (body.model_dump(), principal.name)))
     model = await together.fit(*arguments)
     response.headers["Location"] = f"/v1/models/{model.id}"
     return await asyncio.to_thread(context.versions.document, model)
