@@ -1,4 +1,4 @@
-"""What the model of a record lacks: the search for effects, the verdict on it, and the result in words."""
+"""Diagnosis of a model: the search for effects it lacks, the verdict, and the result in words."""
 
 from __future__ import annotations
 

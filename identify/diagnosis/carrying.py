@@ -103,7 +103,7 @@ class Reason:
 
 @dataclass(frozen=True)
 class Judged:
-    """What a record says of one carried effect: None if it cannot tell. `gain` is None if it was not compared."""
+    """Verdict on one carried effect; `needed` is None if the record cannot tell, `gain` if it was not compared."""
 
     effect: Effect
     needed: bool | None
@@ -176,7 +176,7 @@ def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], report: Progress
 
 
 def _judged(effect: Effect, fitted: Fitted, detected: bool) -> tuple[Judged, Fitted]:
-    """What the record says of an effect of a model, and the model without it."""
+    """Judge one effect of a model; return the verdict and the model without the effect."""
     if detected:
         return Judged(effect, True, Reason("in-samples", "The samples show it directly, before any fit.")), fitted
     without = without_effect(fitted, effect.id)
@@ -215,7 +215,7 @@ def _nothing(judged: list[Judged]) -> Reason:
 
 
 def _verdict(plain: Fitted, last: Fitted, raw: Raw) -> tuple[bool, Reason]:
-    """Whether the carried structure as a whole is better than the plain one, and why."""
+    """Compare the carried structure as a whole with the plain one: True if it is better, with the reason."""
     carried_effects = effect_names(last)
     # The log evidence says little of an effect that the samples show.
     in_samples = any(effect in carried_effects for effect, _, _ in detected_effects(raw))

@@ -63,7 +63,7 @@ class Chain:
         return list(pairwise(self.models[-len(self.added) - 1 :]))
 
     def better(self, than: LeftOut) -> Difference:
-        """How much better its last model predicts left-out blocks."""
+        """Compare the left-out error of its last model with another one."""
         return difference(than, self.left_out[-1])
 
 
@@ -105,7 +105,7 @@ def _accepted_effects(search: EffectSearch) -> list[str]:
 
 
 def _doubted(verdict: Verdict, structure_left: bool) -> bool:
-    """Whether free effects are tried beside named ones."""
+    """Return True if free effects are to be tried beside named ones."""
     error = verdict.held_out_error
     return structure_left or (error is not None and error.ratio > thresholds.NAMED_BUT)
 
@@ -172,7 +172,7 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
 
 
 def _likeliest(chains: Sequence[Chain]) -> Chain:
-    """Of the chains that left-out blocks cannot tell from the first the one with fewest names, then the likeliest.
+    """Pick among the chains that left-out blocks cannot separate from the first: fewest names, then likeliest.
 
     Likelihoods are compared where the noise is of one kind.
     """
@@ -228,7 +228,7 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
 
 
 def _applicable(effect: Effect, base: Fitted) -> bool:
-    """Whether a free effect can stand beside those of a model: free lags take the place of every other speed law.
+    """Return True if a free effect fits beside those of a model: free lags replace every other speed law.
 
     A zero that drifts is tried, too: a zero that follows from the work must gain more.
     """

@@ -103,7 +103,7 @@ def explain(record: Record, progress: Progress | None = None, model: Model | Non
 def diagnose_and_improve(
     record: Record, progress: Progress | None = None, model: Model | None = None
 ) -> tuple[Diagnosis, Improvement]:
-    """What `diagnose` and `improve` give, with one search. Parameters and errors are those of `improve`.
+    """Return the results of `diagnose` and `improve` from one search. Parameters and errors are those of `improve`.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str
 
 
 def _rising(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    """What is said where the error on held-out pulses rises and does not speak against the effect."""
+    """Return a sentence if the held-out error rises, but not enough to refuse the effect."""
     rises = before["held_out_by"] == HELD_OUT and after["held_out_rms_nm"] > RISE * before["held_out_rms_nm"]
     return ["On held-out pulses the error rises, but not by more than its standard error."] if rises else []
 

@@ -20,7 +20,7 @@ MEDIAN = 0.6745
 
 @dataclass(frozen=True)
 class ResidualStructure:
-    """What the residual of one model shows; all but log-likelihoods in N·m."""
+    """Residual of one model at work and at rest; all but log-likelihoods in N·m."""
 
     white_nm: float  # standard deviation that white noise of the samples alone gives an interval's mean
     busy_nm: float  # residual while the muscle works
@@ -146,7 +146,7 @@ def held_out_error(
 
 
 def vetoed(before: Fitted, after: Fitted) -> str | None:
-    """What held-out pulses say against an effect, in words; None where they do not.
+    """Return the objection of held-out pulses to an effect, in words; None if there is none.
 
     They speak against it where the error rises, and by more than its standard error over pieces of the rows. They
     never speak for one.

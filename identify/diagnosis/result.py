@@ -129,8 +129,11 @@ def _deciding(search: EffectSearch, verdict: Verdict, diagnosis: dict[str, Any])
 
 
 def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
-    """Whether a further test is planned for what is left; not of a joint that moves, which has tests of its own, and
-    not where the curve is a guess or the muscle hardly answers: the dose would be one, too."""
+    """Return True if a further test is planned for the structure that is left.
+
+    None is planned for a moving joint, which has tests of its own, nor where the curve is a guess or the muscle hardly
+    answers: the dose would be a guess, too.
+    """
     if verdict.kind != "unexplained_structure":
         return False
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)
@@ -138,13 +141,13 @@ def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
 
 
 def _is_noise(search: EffectSearch) -> bool:
-    """Whether what the examined model leaves over passes for noise, as the model's own check says."""
+    """Return True if the residual of the examined model passes the model's own check for noise."""
     model = finish("maximum-likelihood", search.base, statistics=steps(search)[0].statistics)
     return bool(model.quality["gates"]["residual"]["passed"])
 
 
 def _free(search: EffectSearch, effect: str, covariance: np.ndarray) -> dict[str, Any]:
-    """What a free effect does, and what left-out blocks say of it."""
+    """Describe a free effect: its form, parameters and curves, and its left-out error."""
     number = search.added.index(effect)
     fitted = search.last.written
     index = [name for name, _ in fitted.effects].index(effect)

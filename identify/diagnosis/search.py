@@ -52,12 +52,12 @@ Progress = Callable[[float, str], None]
 
 
 def silent(_share: float, _text: str) -> None:
-    """A `Progress` that tells nobody."""
+    """A `Progress` that reports nothing."""
 
 
 @dataclass
 class EffectSearch:
-    """What was tried on a record, and with what result. Round i starts from chain[i]."""
+    """Record of a search: candidates tried and models chosen. Round i starts from chain[i]."""
 
     record: Record
     raw: Raw  # what the samples show before any fit
@@ -196,9 +196,9 @@ def required_errors(search: EffectSearch, candidate: Candidate) -> float:
 
 
 def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iterable[str]) -> bool:
-    """Whether an effect may only repair the form of one that is there.
+    """Return True if an effect may only repair the form of an effect already in the model.
 
-    They resemble, both change the dynamics, or that one is free: it describes a cause that nobody knows.
+    This is so if the two resemble each other, both change the dynamics, or the present one is free (cause unknown).
     """
     return any(
         find_effect(name).shape
@@ -278,7 +278,7 @@ def _by_gain(candidate: Candidate) -> tuple[float, str]:
 
 
 def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
-    """Whether an effect can be tried: no earlier step looks for it, it is not there, the record has its columns.
+    """Return True if an effect can be tried: no earlier step covers it, it is not present, the record has its columns.
 
     Only the likelihood asks for one that comes and goes by no law: not where jumps of held readings decide the
     likelihood, and for a narrow band of noise not where the noise is held white.
@@ -352,16 +352,16 @@ def _margin(search: EffectSearch, number: int) -> float:
 
 
 def _exhausted(search: EffectSearch) -> bool:
-    """Whether no further effect can gain enough: the residual is nearly as small and as white as noise can be."""
+    """Return True if no further effect can gain enough: the residual is nearly as small and white as noise can be."""
     structure, last = search.residuals[-1], search.last
     if last.noise.ar1 > thresholds.SLOWEST_AR1 and structure.slow_nm > structure.white_nm:
-        return False  # such slow noise may be a drift: the rests cannot tell how small the residual could be
+        return False  # such slow noise may be a drift: the rests do not show how small the residual could be
     near = thresholds.NEAR_IDEAL if last.noise.is_white else thresholds.NEXT_MARGIN
     return structure.ideal - last.log_likelihood < near and structure.ratio < thresholds.NEXT_MARGIN
 
 
 def prior(effect: Effect) -> float:
-    """What is added to a gain of log evidence: the effect's prior odds, and the cost of a narrow band."""
+    """Term added to a gain of log evidence: the effect's prior odds, less the cost of a narrow band."""
     return effect.prior - (BAND_COST if effect.band else 0.0)
 
 

@@ -88,7 +88,7 @@ QUIET = 0.025
 CLOSE = 0.8
 """An effect that resembles the best one is named beside it from this share of its gain."""
 RIVAL = 0.04
-"""Probability from which an effect is named as one that this record cannot tell from the best."""
+"""Probability from which an effect is named as one that this record cannot separate from the best."""
 FORM_ERROR = 0.01
 """Error, as a share of the largest torque, that a curve of few knots may leave on held-out pulses with no effect."""
 FORM_ERROR_WITH_EFFECTS = 0.003

@@ -25,7 +25,7 @@ class Verdict:
     explained: float  # share of the explainable log-likelihood that the effects explain
     structure: float  # log-likelihood by which the residuals at work and at rest still differ
     probability: float  # of the verdict as a whole
-    held_out_error: HeldOutError | None = None  # of the last model; None if held-out pulses tell nothing
+    held_out_error: HeldOutError | None = None  # of the last model; None if held-out pulses cannot be judged
     notes: list[str] = field(default_factory=list)  # reasons, for people
     objections: dict[str, str] = field(default_factory=dict)  # by effect: what held-out pulses say against it
 
@@ -53,7 +53,7 @@ def _nothing(candidates: list[Candidate]) -> float:
 
 
 def _no_effort(search: EffectSearch, explained: float, structure: bool) -> bool:
-    """Whether what looks like efforts is more likely caused by the stimulation."""
+    """Return True if apparent efforts are more likely caused by the stimulation."""
     if explained < thresholds.LEAST_EXPLAINED_BY_EFFORTS and structure:
         return True
     effort = search.added[0]
@@ -67,7 +67,7 @@ def _no_effort(search: EffectSearch, explained: float, structure: bool) -> bool:
 
 
 def _only_at_work(search: EffectSearch, number: int) -> bool:
-    """Whether a sporadic added torque does not appear at rest."""
+    """Return True if a sporadic added torque does not appear at rest."""
     effect, holder = search.added[number], search.chain[number + 1]
     form = dict(holder.effects).get(effect)
     if form is None or form.stage != "additive" or not find_effect(effect).sporadic:
@@ -76,7 +76,7 @@ def _only_at_work(search: EffectSearch, number: int) -> bool:
 
 
 def _everywhere(search: EffectSearch) -> bool:
-    """Whether what looks like efforts lasts for much of the test: efforts are rare."""
+    """Return True if apparent efforts last for much of the test: true efforts are rare."""
     effort = search.added[0]
     holder = search.chain[1]
     widths = [value for name, value in holder.parameters_of(effort).items() if name.startswith(("width_", "decay_"))]
@@ -91,7 +91,7 @@ def _efforts(parameters: dict[str, float]) -> int:
 
 
 def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
-    """Whether the error on held-out pulses shows that structure is left."""
+    """Return True if the error on held-out pulses shows that structure is left."""
     if after.ratio < thresholds.HELD_OUT_RATIO:
         return False
     return before is None or after.excess_nm > thresholds.HELD_OUT_SHARE * before.excess_nm

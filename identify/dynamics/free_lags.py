@@ -19,7 +19,7 @@ PARTS = 3
 EDGE = 0.02
 """Share of the largest torque over which rising turns into falling."""
 LEAST_PRESENT = 0.05
-"""A pulse that is there for a smaller share of an interval tells no width."""
+"""A pulse that acts for a smaller share of an interval gives no width."""
 LOW = 0.25
 """Share of the largest torque that is added to a level before its logarithm is taken."""
 STEEPEST = 3.0
@@ -27,7 +27,7 @@ STEEPEST = 3.0
 
 
 class FreeLaw(IntEnum):
-    """What is free: each is a column of the kernel's table, and is neutral at 0. Levels are shares of y_max."""
+    """Columns of the kernel's table of free laws; each is neutral at 0. Levels are shares of y_max."""
 
     FIRST_DIRECTION = 0  # log rate of the first lag while rising, less that while falling
     FIRST_RISING = 1  # power of the level (a + 1/4) of the first lag's rate, while rising

@@ -158,7 +158,7 @@ class Grid:
 
     @cached_property
     def _shifts(self) -> tuple[np.ndarray, ...] | None:
-        """How late pulses change the drive: rows with their shares of the intervals before and after; moved pulses."""
+        """Shifts of the drive by late pulses: rows, their shares of the intervals before and after, moved pulses."""
         if self.late_s is None or not np.any(self.late_s):
             return None
         part = self.late_s / self.step_s
@@ -227,7 +227,7 @@ class Grid:
 
     @cached_property
     def _evenly_sampled(self) -> bool:
-        """Whether all intervals are sampled at the same places."""
+        """True if all intervals are sampled at the same places."""
         each = int(self.count[0])
         if not each or np.any(self.count != each):
             return False
@@ -247,7 +247,7 @@ class Grid:
         return places, place
 
     def curve(self, core: Core) -> Core | None:
-        """How to read the curve between states: exactly (`core`), or as a cubic (None) if both lags are long.
+        """Choose how the curve between states is read: exactly (`core`), or as a cubic (None) if both lags are long.
 
         For a numerical derivative use the same choice for all points; otherwise the result has a jump.
         """
@@ -370,7 +370,7 @@ def _applied(
 
 
 def _moved(record: Record, middle: np.ndarray, gap: slice) -> bool:
-    """Whether the torque differs before and after a gap: then stimulation was cut out between two rests."""
+    """Return True if the torque differs before and after a gap: then stimulation was cut out between two rests."""
     before, after = middle[max(gap.start - 2, 0)], middle[min(gap.stop, middle.size - 1)]
     near = max(round(record.sample_rate_hz / record.pulse_rate_hz), 1)
     levels = [float(np.mean(record.torque_nm[at : at + near])) for at in (before, after)]

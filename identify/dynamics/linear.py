@@ -100,7 +100,7 @@ class Discrete:
 
     @property
     def stable(self) -> bool:
-        """Whether every pole is inside the unit circle."""
+        """True if every pole is inside the unit circle."""
         return bool(np.all(np.abs(self.poles) < 1.0 - 1e-9))
 
     @property

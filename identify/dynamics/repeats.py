@@ -14,7 +14,7 @@ SAME_US = 1.0 + 1e-6
 LARGEST_DIFFERENCE = 0.05
 """Mean difference of the widths of two repeats, as a share of the largest, at most."""
 APART = 10
-"""Of the same two parts shifted by fewer intervals only the best alignment counts."""
+"""Alignments of the same two parts that differ by fewer intervals compete: only the best one counts."""
 MOST_ROWS = 12_000
 """Only so many of the last intervals are looked at (5 min): time grows with the square."""
 MOST_RUNS = 20_000

@@ -18,7 +18,7 @@ PARTS, LEVEL_PARTS = 3, 5
 
 
 class Lag(IntEnum):
-    """What a speed law multiplies: T, and so both lags, or one of them."""
+    """Target of a speed law: T, and so both lags, or one of them."""
 
     BOTH = 0
     SLOW = 1
@@ -26,7 +26,7 @@ class Lag(IntEnum):
 
 
 class SpeedLaw(IntEnum):
-    """What the speed depends on: each law is a column of the kernel's table, and is neutral at 0.
+    """Dependences of the speed: each law is a column of the kernel's table, and is neutral at 0.
 
     y is the torque, w the drive, a the state between the two lags, all as shares of y_max.
     """

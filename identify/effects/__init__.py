@@ -100,7 +100,7 @@ def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
 
 
 def depend_on_joint(names: Iterable[str]) -> bool:
-    """Whether one of some effects depends on the angle or the velocity of the joint.
+    """Return True if one of the effects depends on the angle or the velocity of the joint.
 
     Parameters
     ----------
@@ -111,7 +111,7 @@ def depend_on_joint(names: Iterable[str]) -> bool:
 
 
 def any_free(names: Iterable[str]) -> bool:
-    """Whether one of some effects is free: it describes and names no cause.
+    """Return True if one of the effects is free: it describes the error and names no cause.
 
     Parameters
     ----------

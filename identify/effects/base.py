@@ -1,4 +1,4 @@
-"""What an effect is: one or more published forms, each a pure function of arrays, with its parameters."""
+"""Classes of an effect: one or more published forms, each a pure function of arrays, with its parameters."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STAGES = ("pulse_width", "gain", "speed", "lags", "branch", "delay", "filter", "
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
 JOINT_COLUMNS = frozenset({"angle_rad", "velocity_rad_s"})
-"""What an effect may need beside pulses and torque."""
+"""Columns that an effect may need beside pulses and torque."""
 LEAST_RANGE_RAD = 0.1
 """A smaller range of angles counts as this one: of a joint that is held, noise is no shape."""
 
@@ -41,8 +41,8 @@ class Parameter:
     scale: str = "linear"
     """The scale on which it is varied and on which its prior is symmetric: "linear" or "log"."""
     relative: str = ""
-    """What bounds, start and neutral are multiples of. "torque", "width", "span": the record's largest torque, largest
-    pulse width or length; "level", the largest torque, counted from the sensor's zero."""
+    """Unit of bounds, start and neutral: "torque", "width", "span" are the record's largest torque, largest pulse width
+    and length; "level" is the largest torque, counted from the sensor's zero."""
     about: str = ""  # one line for people
 
     def on(self, scene: Scene) -> Parameter:
@@ -61,7 +61,7 @@ class Parameter:
         )
 
     def to_dict(self) -> dict[str, Any]:
-        """As the library tells it."""
+        """Return the entry of the library."""
         return {
             "name": self.name,
             "unit": self.unit,
@@ -75,7 +75,7 @@ class Parameter:
 
 @dataclass(frozen=True)
 class Scene:
-    """What a form can use of the record, at the times at which it is evaluated."""
+    """Data of the record that a form can use, at the times at which it is evaluated."""
 
     time_s: np.ndarray  # shape (K,); times since the record's start, s
     pulse_width_us: np.ndarray  # shape (K,); pulse width applied, µs
@@ -126,7 +126,7 @@ class Scene:
 
     @property
     def angle(self) -> np.ndarray:
-        """Of the joint, rad, shape (K,); only of a record that has it."""
+        """Angle of the joint, rad, shape (K,); only for a record that has it."""
         assert self.angle_rad is not None
         return self.angle_rad
 
@@ -192,7 +192,7 @@ class Form:
     apply: Apply | None = None
     """See above. At the neutral values it must return x itself, bit for bit."""
     batched: bool = False
-    """Whether `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row."""
+    """True if `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row."""
     law: Mapping[str, tuple[Lag, SpeedLaw] | FreeLaw] = field(default_factory=dict)
     """For "speed": the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on that
     scale; for "lags" the `FreeLaw`. `apply` is then not called."""
@@ -201,14 +201,14 @@ class Form:
     """`propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
     there are none. `previous` holds the parameters of the form before it in a chain."""
     grows: bool = False
-    """Whether the form is the next in a chain. It is tried only while the forms before it gain."""
+    """True if the form is the next in a chain. It is tried only while the forms before it gain."""
     accept: Callable[[dict[str, float], Scene], bool] | None = None
     """`accept(parameters, scene)`: whether the result of a fit is plausible."""
     restarts: tuple[dict[str, float], ...] = ()
     """Further starts that also set `base.time_constant_s` and `base.damping`, of the linear dynamics, by which the
     model without the effect may have imitated it."""
     fixed: bool = False
-    """Whether its parameters are found in the samples before the fit, and the torque is corrected for it then."""
+    """True if its parameters are estimated from the samples before the fit, and the torque is corrected for it then."""
     scales: bool = False
     """For "output" only: whether it multiplies the torque by what does not depend on it; x may then be 1."""
     fine: bool = False
@@ -219,7 +219,7 @@ class Form:
     `state(x, p, scene)`, called as a batched `apply` is, returns it after the last interval, shape (M,)."""
 
     def to_dict(self, source: str) -> dict[str, Any]:
-        """As the library tells it; `source` is that of the effect."""
+        """Return the entry of the library; `source` is that of the effect."""
         return {
             "name": self.name,
             "stage": self.stage,
@@ -252,7 +252,7 @@ class Form:
 
 @dataclass(frozen=True)
 class Shape:
-    """What a free effect is found to do."""
+    """Fitted behaviour of a free effect, as a sentence and curves."""
 
     enters: str  # "drive", "rate of rise", "rate of fall", "output" or "zero"
     driven_by: str  # "width", "activation", "torque", "time since" or "sum of the past"
@@ -278,28 +278,28 @@ class Effect:
     source: str = ""  # where the physics is described
     needs: tuple[str, ...] = ()  # columns that the record must have; otherwise the effect is not tried
     predictable: bool = True
-    """Whether it can be foreseen on another record, as what follows from the pulses can. Hum, a zero that moves,
-    efforts and tremor cannot: their mean over the fitted rows stays as a zero, their size widens the band."""
+    """True if it can be predicted on another record because it follows from the pulses. Hum, a moving zero, efforts and
+    tremor cannot: their mean over the fitted rows stays as a zero, their size widens the band."""
     sporadic: bool = False
-    """Whether it comes and goes by no law, as efforts and tremor do. It can repair any error, so the evidence asks for
-    more of it; its mean does not stay either."""
+    """True if it comes and goes by no law, as efforts and tremor do. It can repair any error, so more evidence is
+    required for it; its mean does not stay either."""
     raw: bool = False  # whether it is detected in the samples, before the means over pulse intervals are taken
     band: bool = False
-    """Whether it is a narrow band of noise: found in the residual's spectrum, part of the noise beside other
+    """True if it is a narrow band of noise: detected in the residual's spectrum, part of the noise beside other
     effects."""
     detect: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
     """`detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. Such an
     effect is added before any fit. `raw` is what `stimrig.identify.estimation.samples.inspect` gives."""
     prior: float = 0.0  # logarithm of its prior odds, relative to other effects
     muscle: bool = True
-    """Whether it is of the muscle. Else it is of one record, its sensor or its person's mood: that its parameters
-    differ between two sessions says nothing of the muscle."""
+    """True if it is a property of the muscle. Otherwise it belongs to one record, its sensor or the person's mood:
+    differences of its parameters between sessions say nothing about the muscle."""
     main: dict[str, str] = field(default_factory=dict)
     """The parameters that stand for it in the trend, first choice first, and their names for people, without units; the
     form's first one where none of them is its own."""
     shape: Callable[[Form, Mapping[str, float]], Shape] | None = None
-    """Of a free effect only: `shape(form, values)` is what a fit found, as a picture with its sentence. A free effect
-    describes what no other explains. It is tried last, and its name claims no physics."""
+    """For a free effect only: `shape(form, values)` returns the fitted curves and a sentence. A free effect describes
+    an error that no other effect explains. It is tried last, and its name claims no physics."""
 
     @property
     def stage(self) -> str:
@@ -308,7 +308,7 @@ class Effect:
 
     @property
     def moves_with_joint(self) -> bool:
-        """Whether it depends on the angle or the velocity of the joint."""
+        """True if it depends on the angle or the velocity of the joint."""
         return not JOINT_COLUMNS.isdisjoint(self.needs)
 
     @property
@@ -326,7 +326,7 @@ class Effect:
         raise KeyError(name)
 
     def to_dict(self) -> dict[str, Any]:
-        """As the library tells it; without forms of a great many parameters."""
+        """Return the entry of the library, without forms of a great many parameters."""
         first = self.forms[0]
         return {
             "id": self.id,
@@ -453,6 +453,6 @@ def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> s
 
 
 def _alone(form: Form) -> set[int]:
-    """What one form of free lags alone can set: all but the rates, whose logarithms add up."""
+    """Columns of free lags that only one form may set: all but the rates, whose logarithms add up."""
     columns = [*form.law.values(), *form.held] if form.stage == "lags" else []
     return {column for column in columns if isinstance(column, FreeLaw) and column > FreeLaw.COUPLING}

@@ -12,7 +12,7 @@ from stimrig.identify.effects.base import Effect, Form, Parameter, Shape
 TIME_S = np.linspace(0.0, 0.5, 101)
 STOPS_S = 0.25
 SLOWS = 0.3
-"""Log of the change of speed from which the gate is told as one of speed, not of the drive: a third."""
+"""Log of the change of speed above which the gate is described as one of speed, not of the drive: a third."""
 
 
 def _shape(_form: Form, values: Mapping[str, float]) -> Shape:

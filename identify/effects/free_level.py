@@ -14,7 +14,7 @@ LEVEL = np.linspace(0.0, 1.0, 41)
 
 
 def _bent(level: np.ndarray, p: Values) -> np.ndarray:
-    """What is added to a level; 0 at none and at the full torque."""
+    """Torque added to a level; 0 at zero and at full torque."""
     return level * (1.0 - level) * (p["bend"] + p["skew"] * (1.0 - 2.0 * level))
 
 

@@ -1,4 +1,4 @@
-"""A user's own effect from its file: loaded and tried at once, so that a mistake is told with its file and line."""
+"""A user's own effect from its file: loaded and tried at once, so that an error names its file and line."""
 
 from __future__ import annotations
 
@@ -154,7 +154,7 @@ def _check_form(form: Form, place: str, path: Path | None) -> None:
 
 
 def _check_laws(form: Form, names: list[str], where: str) -> None:
-    """Of "lags" each parameter sets what is free there; of "speed" what it likes."""
+    """Check `law` and `held`: with "lags" each parameter must have a `FreeLaw`; with "speed" a law is optional."""
     for what in ("law", "held"):
         mapping = getattr(form, what)
         if not isinstance(mapping, dict):
@@ -177,7 +177,7 @@ def _check_laws(form: Form, names: list[str], where: str) -> None:
 
 
 def _check_free(form: Form, where: str) -> None:
-    """What the kernel can take: each law set once, and numbers in its range over the whole of the bounds."""
+    """Check that each law is set once and that its bounds lie in the range that the kernel accepts."""
     ranges: dict[Any, tuple[float, float]] = {
         law: (float(value), float(value)) for law, value in form.held.items() if _is_number(value)
     }
@@ -201,9 +201,9 @@ def _check_free(form: Form, where: str) -> None:
 
 
 POSITIVE = {FreeLaw.FILL_S: 0.0, FreeLaw.EMPTY_S: 0.0, FreeLaw.GATE_S: 0.0, FreeLaw.BEND: -1.0}
-"""Where the kernel divides by it, or by one more than it."""
+"""Lower bounds of laws by which, or by one more than which, the kernel divides."""
 OF_STATE = FreeLaw.GAIN, FreeLaw.RATE, FreeLaw.ZERO, FreeLaw.BY_PULSES, FreeLaw.BY_DRIVE
-"""What the slow state does, and what fills it."""
+"""Actions of the slow state, and the signals that fill it."""
 MOST_STARTS = 32
 """Each is a fit."""
 

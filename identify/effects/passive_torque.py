@@ -10,7 +10,7 @@ from numba import njit
 from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form, weighted
 
 SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
-"""Of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
+"""Sizes of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
 
 
 def _part(name: str, unit: str, reach: float, about: str, start: tuple[float, ...] = (0.0,)) -> Parameter:
@@ -89,7 +89,7 @@ def surface(_: None, p: Values, scene: Scene) -> np.ndarray:
 def relaxed(
     value: np.ndarray, time_s: np.ndarray, begins: np.ndarray, relaxation_s: np.ndarray
 ) -> np.ndarray:  # pragma: no cover
-    """What follows a value by a first-order lag, exact for a value that goes straight from point to point; (M, K).
+    """First-order lag of a value, exact for a value that is linear between points; shape (M, K).
 
     `value` and `time_s`, (K,), are what is followed, and when; it has already arrived where a recording `begins`, (K,).
     """

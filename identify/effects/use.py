@@ -1,4 +1,4 @@
-"""What free effects of use share: a slow state that fills with work, its picture, and words for sizes."""
+"""Shared parts of the free effects of use: a slow state that fills with work, its curve, and words for sizes."""
 
 from __future__ import annotations
 

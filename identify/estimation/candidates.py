@@ -1,4 +1,4 @@
-"""Which rows count, and which noise: candidates like structures, between which left-out blocks choose.
+"""Choice of the fitted rows and of the noise model of the plain fit, by the error on left-out blocks.
 
 Likelihood with slow noise is efficient where the structure is right. Where it is wrong, the slow noise takes up what
 the structure leaves, and the dynamics follow increments alone. White noise asks for the free run itself; and rows of
@@ -23,7 +23,7 @@ Fit = Callable[[np.ndarray, bool], Fitted]
 """A fit of the plain structure to some rows, with noise that is held white or not."""
 
 BETTER = 1.0
-"""Standard errors by which a candidate must predict left-out blocks better: where they cannot tell, the usual stays."""
+"""Standard errors by which a candidate must predict left-out blocks better: otherwise the usual one stays."""
 SLOW, SLOW_SHARE = 0.9, 0.05
 """Correlation of neighbours, and share of the variance, from which slow noise of free effects or a moving joint is
 distrusted."""
@@ -75,7 +75,7 @@ def trusted(base: Fitted) -> Fitted:
 
 
 def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
-    """What was chosen and why, in words; nothing where the noise is usual and all rows were fitted."""
+    """Describe the choice and its reason; empty where the noise is usual and all rows were fitted."""
     fitted_rows, sentences = fitted.problem.setup.fitted, []
     if fitted_rows.sum() < rows.sum():
         count, all_rows = int(fitted_rows.sum()), int(rows.sum())
@@ -125,7 +125,7 @@ def alike_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
 
 
 def _smooth(grid: Grid, bout_rows: np.ndarray) -> bool | None:
-    """Whether the width of a bout moves smoothly, as in a ramp, not in jumps; None of a bout too short to tell."""
+    """Return True if the width moves smoothly, as in a ramp, False if in jumps; None for a bout too short to tell."""
     widths_us = grid.pulse_width_us[bout_rows]
     steps_us = np.abs(np.diff(widths_us[np.flatnonzero(widths_us)]))
     if steps_us.size * grid.step_s < LONG_S:

@@ -73,7 +73,7 @@ class CurvePosterior:
         return np.r_[np.exp(self._log_steps(mode.z, mode.kind)), mode.z[3 + self.n :]]
 
     def _beyond(self, x: np.ndarray) -> tuple[float, float]:
-        """How far the log of the plateau is from what is expected, in standard deviations, and the plateau, N·m."""
+        """Distance of the log of the plateau from its prior mean, in standard deviations, and the plateau, N·m."""
         mean, sd = self.prior.plateau
         total = float(np.sum(x[: self.n]))
         return (float(np.log(total)) - mean) / sd, total

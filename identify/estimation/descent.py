@@ -13,7 +13,7 @@ Trial = Callable[[float], Point | None]
 
 @dataclass(frozen=True)
 class Damping:
-    """How a search is damped."""
+    """Damping rule of a search."""
 
     first: float  # at the first step
     less: float  # a step that helped divides it by this
@@ -26,14 +26,14 @@ class Damping:
 
 @dataclass(frozen=True)
 class Search(Generic[Point]):
-    """What is searched."""
+    """Functions and damping that define a search."""
 
     damping: Damping  # of its steps
     trials: Callable[[Point, int, float], Trial[Point] | None]
     """From a point, the number of the step and the damping to the trial steps there; None where the search ends."""
     gain: Callable[[Point, Point], float | None]  # what a trial gains over the point before; None where it is worse
     settled: Callable[[float, int], bool] = lambda _gained, _step: False
-    """Whether the search ends after a step that gained so much; with the step's number. By default it never does."""
+    """True if the search ends after a step, from its gain and its number. By default it never does."""
 
 
 def descend(search: Search[Point], at: Point, max_steps: int) -> tuple[Point, int]:

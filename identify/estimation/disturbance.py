@@ -69,7 +69,7 @@ def unsure(short: Short, with_disturbance: Fitted) -> Short:
 
 
 def _waves(time_s: np.ndarray, step_s: float, mains_hz: float | None) -> np.ndarray:
-    """What a disturbance is made of, each wave as large as it may be, as a share of the largest torque; (W, K)."""
+    """Waves that make up a disturbance, each at its largest size, as a share of the largest torque; shape (W, K)."""
     span_s = time_s[-1] - time_s[0] + step_s
     place = (time_s - time_s[0] + 0.5 * step_s) / span_s
     number = np.arange(1, int(2.0 * QUICKEST_HZ * span_s) + 1)[:, None]

@@ -1,4 +1,4 @@
-"""What is known of a person from earlier sessions: the last approved model, widened by how much people change.
+"""Prior from earlier sessions of a person: the last approved model, widened by the usual change between sessions.
 
 Between two sessions the electrodes move and the muscle is another day's: gain, threshold, width of the rise and speed
 change. By how much is learnt from a person's own models (`learn_change`).
@@ -44,7 +44,7 @@ USUAL_WEIGHT = 3.0
 
 
 def learn_change(models: Sequence[Model]) -> Change:
-    """How much a person changes between sessions, from their own approved models, oldest first.
+    """Estimate how much a person changes between sessions, from their own approved models, oldest first.
 
     Each standard deviation is that of the differences between successive models, with the usual change as a prior that
     counts like three differences. With fewer than two models it is the usual change.

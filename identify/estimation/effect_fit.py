@@ -44,7 +44,7 @@ class Candidate:
 
     @property
     def refusal(self) -> str | None:
-        """What left-out blocks say and what was required, in words; None of a candidate that they do not refuse."""
+        """Left-out error and the required one, in words; None if left-out blocks do not refuse the candidate."""
         if self.refused is None:
             return None
         needed = "It must not rise."

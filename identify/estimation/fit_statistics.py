@@ -33,7 +33,7 @@ def best_fit_percent(measured_nm: np.ndarray, predicted_nm: np.ndarray, noise_sd
 
 
 def is_constant(measured_nm: np.ndarray, noise_sd_nm: float = 0.0) -> bool:
-    """Whether the torque is constant: then its fit in per cent is not defined."""
+    """Return True if the torque is constant: then its fit in per cent is not defined."""
     if not measured_nm.size:
         return True
     largest = float(np.max(np.abs(measured_nm)))

@@ -65,18 +65,18 @@ class Fitted:
 
     @cached_property
     def excess_kurtosis(self) -> float:
-        """Of the innovations: 0 where they are normal; large where a few jumps hold most of the squares."""
+        """Excess kurtosis of the innovations: 0 if they are normal; large if a few jumps hold most of the squares."""
         white = self.problem.setup.whitened(self.residual_nm[None, :], self.noise)[0]
         return float(np.mean(white**4) / max(np.mean(white**2) ** 2, 1e-300) - 3.0)
 
     @property
     def heavy_tails(self) -> bool:
-        """Whether a few jumps hold most of the innovations' squares."""
+        """True if a few jumps hold most of the innovations' squares."""
         return self.excess_kurtosis > HEAVY_TAILS
 
     @property
     def distrusted(self) -> bool:
-        """Whether its likelihood is no evidence."""
+        """True if its likelihood cannot be used as evidence."""
         return self.noise.at_bound or self.heavy_tails
 
     @property
@@ -122,7 +122,7 @@ class Fitted:
 
 
 def knows_joint(fitted: Fitted) -> bool:
-    """Whether an effect of the model depends on the joint."""
+    """Return True if an effect of the model depends on the joint."""
     return depend_on_joint(name for name, _ in fitted.effects)
 
 

@@ -58,7 +58,7 @@ def _step(fitted: Fitted) -> tuple[float, np.ndarray]:
 
 
 def sensor_of(fitted: Fitted) -> dict[str, float]:
-    """What the angle's sensor is like, for MODEL.json; empty where no effect of the model depends on the joint.
+    """Describe the angle's sensor for MODEL.json; empty where no effect of the model depends on the joint.
 
     `noise_rad`: what smoothing took off the angle, root mean square; `step_rad`: its steps, 0 where none are seen;
     `delay_s`; `cost_nm`: standard deviation of the torque owing to what error is left.

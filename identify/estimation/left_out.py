@@ -25,30 +25,30 @@ APART_S = 1.0
 PIECES, LEAST_S = 10, 2.0
 """A block has about this part of the rows at most, unless that is less than so many seconds."""
 MOST_BOUTS = 2 * PIECES
-"""Of more bouts neighbours are joined: each block is a fit."""
+"""Neighbours are joined if there are more bouts: each block is a fit."""
 START_S = 0.3
-"""Rows after a start that stay in the fit: they alone tell the state that the record begins with."""
+"""Rows after a start that stay in the fit: only they show the state in which the record begins."""
 NEAR = 0.02
 """A width farther than this (share of the largest) from every width of the fit lies on a guessed part of the curve."""
 LEAST_ROWS = 20
 """A block with fewer rows to judge by is not counted."""
 SHORTER = (1.0, 0.5)
 TRUSTED = 0.25
-"""A step, or its half, is trusted where it gains this share of what it promised; else a search of so many steps is
-made."""
+"""A step, or its half, is trusted where it gains this share of the predicted gain; else the search makes STEPS
+steps."""
 STEPS = 4
 RIDGE = 1e-9
-"""Share added to the curvature of each parameter, for those that only the left-out block tells of."""
+"""Share added to the curvature of each parameter, for parameters that only the left-out block determines."""
 ZERO_SD = 2.0
-"""Standard deviations of the zero at rest within which the mean error of a block may be its zero."""
+"""Number of standard deviations of the zero at rest within which the mean error of a block may be its zero."""
 LEAST_WEIGHT = 0.01
 """Weight of a block in which both models err no more than white noise."""
 LEAST_BLOCKS = 1.5
-"""Number of telling blocks below which nothing is concluded."""
+"""Number of effective blocks below which nothing is concluded."""
 MOVED_RAD = 0.05
 """A joint that moves by more at rest is not held."""
 SLACK = 0.05
-"""Log posterior that a step may fall short of its promise by."""
+"""Log posterior by which a step may gain less than predicted."""
 FLOOR_SHARE = 0.0015
 """Share of the largest torque below which an error does not matter."""
 
@@ -96,7 +96,7 @@ def near_widths(grid: Grid, rows: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class LeftOut:
-    """What a model predicts on left-out blocks."""
+    """Errors of a model's predictions on left-out blocks."""
 
     error_nm: np.ndarray
     """Shape (K,); measured minus predicted where the block of the interval was left out, N·m; NaN where nothing can be
@@ -203,21 +203,21 @@ def _refitted(fitted: Fitted, remaining: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Difference:
-    """How much better one model predicts left-out blocks than another."""
+    """Difference between two models in the error on left-out blocks."""
 
     gain: float
     """Mean over rows of the logarithm of the ratio of their blocks' errors; above 0: the second model is better."""
     sd: float  # its standard error over blocks
-    blocks: float  # number of blocks that tell something
+    blocks: float  # effective number of blocks
 
     @property
     def errors(self) -> float:
-        """The gain in standard errors; 0 where hardly more than one block tells anything."""
+        """The gain in standard errors; 0 where there is hardly more than one effective block."""
         return self.gain / max(self.sd, 1e-9) if self.blocks > LEAST_BLOCKS else 0.0
 
     @property
     def words(self) -> str:
-        """What the error on left-out parts says of an effect."""
+        """Change of the error on left-out parts, as a sentence."""
         change, errors = 100.0 * abs(1.0 - np.exp(-self.gain)), abs(self.errors)
         # not "rises by 0 %: it must not rise"
         percent = f"{change:.0f}" if change >= 0.5 else f"{change:.2f}" if change >= 0.01 else "less than 0.01"
@@ -235,7 +235,7 @@ def difference(before: LeftOut, after: LeftOut) -> Difference:
     """Compare two models of one record, block by block of the second.
 
     Each row weighs as the share of its block's larger error that is not white noise: a block in which both err by no
-    more tells nothing.
+    more has hardly any weight.
     """
     pairs, noise = [], before.floor_nm**2
     for number in np.unique(after.block[after.block >= 0]):

@@ -55,7 +55,7 @@ WIDEST_SHARE = 0.9
 
 
 def still_rows(grid: Grid, rows: np.ndarray) -> np.ndarray:
-    """Of some rows, those in which the joint is held at the angle with most stimulation, shape (K,).
+    """Select the rows in which the joint is held at the angle with most stimulation, shape (K,).
 
     Where the joint never moved, where there is no angle, or where too little was stimulated at any one angle: all.
     """
@@ -77,7 +77,7 @@ def still_rows(grid: Grid, rows: np.ndarray) -> np.ndarray:
 
 
 def moves(grid: Grid, rows: np.ndarray) -> bool:
-    """Whether the joint is at more than one angle in some rows."""
+    """Return True if the joint is at more than one angle in the given rows."""
     return grid.angle_rad is not None and bool(np.ptp(grid.angle_rad[rows]) > 2 * ONE_ANGLE_RAD)
 
 
@@ -159,7 +159,7 @@ def designed(first: Solution, count: int | None = None) -> tuple[Projection, Sec
 
 
 def _is_quiet(first: Solution) -> bool:
-    """Whether the noise is so small that few knots would show, and is what limits the fit: not jumps, as of an arm."""
+    """Return True if the noise is so small that few knots would show, and no jumps (as of an arm) limit the fit."""
     noise_nm = first.projection.grid.noise_sd_nm
     if not 0.0 < noise_nm < QUIET * first.projection.range_nm:
         return False
@@ -335,7 +335,7 @@ def renewed_curve(base: Fitted) -> Fitted:
     """The model with the knots and the smoothness of its curve chosen with all rows, where the evidence rises by that.
 
     The plain structure is fitted where the joint is held still (`still_rows`), since elsewhere it lacks g and h; its
-    curve is as smooth as those rows alone ask for. Once g and h are there, the other rows tell of f, too. The model is
+    curve is as smooth as those rows alone ask for. Once g and h are there, the other rows show f, too. The model is
     returned as it is if its curve was chosen with all rows already (also where the joint was nowhere still for long
     enough), if no effect of it depends on the joint, or if its curve is no smoothed spline.
     """

@@ -87,7 +87,7 @@ class Projection:
 
     @cached_property
     def range_nm(self) -> float:
-        """Of the torque, N·m."""
+        """Range of the torque, N·m."""
         return max(float(np.ptp(self.target[self.rows])), 1e-9)
 
     @property
@@ -328,7 +328,7 @@ def descend_from(start: Solution, max_steps: int, tolerance: float) -> Solution:
 
 
 class _Bend:
-    """What the information lacks of the cost's second derivatives, learnt from how the gradient changes (SR1).
+    """Correction of the information to the cost's second derivatives, learnt from changes of the gradient (SR1).
 
     Where the residual is large, steps by the information alone overshoot, time after time, and the search would end
     wherever its patience does (Dennis, Gay & Welsch 1981).
@@ -375,7 +375,7 @@ def _difference(before: SecondOrder, after: SecondOrder) -> np.ndarray:
 
 
 def _at_bound(projection: Projection, linear: SecondOrder, gradient: np.ndarray) -> np.ndarray:
-    """Which searched parameters are at a bound and would leave it."""
+    """Flag the searched parameters that are at a bound and would leave it."""
     values = np.array([linear.time_constant_s, linear.damping, linear.delay_s])[: gradient.size]
     bounds = np.array([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS, projection.grid.delay_bounds_s])[: gradient.size]
     lower, upper = bounds[:, 0], bounds[:, 1]

@@ -158,7 +158,7 @@ def _stable(model: Model) -> dict[str, Any]:
 
 
 def _tame(model: Model) -> bool:
-    """Whether held widths keep the torque in bounds: rates that switch can pump energy, though each alone damps."""
+    """Return True if held widths keep the torque bounded: switching rates can pump energy, though each alone damps."""
     rng, joint = np.random.default_rng(0), Surfaces.of(model.effects)
     widths_us = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
     curve_nm = float(np.ptp(model.recruitment(np.linspace(0.0, model.recruitment.basis.largest_us, 101))))
@@ -170,7 +170,7 @@ def _tame(model: Model) -> bool:
 
 
 def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
-    """Whether stimulation changes the torque by more than the noise."""
+    """Check that stimulation changes the torque by more than the noise."""
     table = model.recruitment(np.linspace(0.0, float(np.max(grid.pulse_width_us)), 101))
     spread = float(np.ptp(table))
     measured_nm = float(np.ptp(grid.torque_nm[rows]))
@@ -228,7 +228,7 @@ def _held_out(model: Model) -> dict[str, Any]:
 
 
 def _gap(model: Model) -> dict[str, Any]:
-    """Whether the fit on held-out pulses is near what the noise allows there.
+    """Check that the fit on held-out pulses is near the one that the noise allows there.
 
     If the torque is constant there, their error above the noise is taken as a share of the fitted torque's spread.
     """
@@ -272,7 +272,7 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
 
 
 def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
-    """Whether the joint moved in a test that a model of a joint at rest does not follow."""
+    """Check that the joint did not move in a test whose model is one of a joint at rest."""
     if grid.angle_rad is None or moving:
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
@@ -282,7 +282,7 @@ def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray, moving: bool) -> 
 
 
 def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
-    """Whether the joint moved in the tests of a model of a joint that moves."""
+    """Check that the joint moved enough in the tests of a model of a joint that moves."""
     if grid.angle_rad is None or not moving:
         return _gate(True, "care", "")
     moved_rad = float(
@@ -295,7 +295,7 @@ def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:
-    """Whether the sensor clips: many samples in a row at exactly the largest (or smallest) torque."""
+    """Check for clipping of the sensor: many samples in a row at exactly the largest (or smallest) torque."""
     torque = grid.record.torque_nm
     span = float(np.ptp(torque))
     if not span > 0:

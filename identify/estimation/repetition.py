@@ -20,9 +20,9 @@ from stimrig.identify.yardstick import floor_nm
 
 EXACT, ESTIMATE = "exact repeats", "estimate"
 LEAST_S = 1.0
-"""Less time, in which the same input came again or in which the muscle rests, tells nothing."""
+"""Shortest time with repeated input, or at rest, that is evaluated."""
 LEAST_SHARE = 0.75
-"""If less than this share of the variance repeats, what differs may hide any error: no share of it is told."""
+"""If less than this share of the variance repeats, what differs may hide any error: no share is reported."""
 UNKNOWN: dict[str, Any] = dict.fromkeys(
     ("found_by", "repeats", "seconds", "rms_nm", "model_rms_nm", "explained_percent", "held_out_rms_nm",
      "held_out_model_rms_nm")
@@ -30,7 +30,7 @@ UNKNOWN: dict[str, Any] = dict.fromkeys(
 
 
 def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, Any]:
-    """What repeats in a record, and how much of that a model explains.
+    """Measure what repeats in a record, and how much of that a model explains.
 
     All values are of means over pulse intervals. With torque y of an interval of a group of n with the same input, the
     between-repeat variance is s² = Σ (y - mean of its group)² / Σ (n - 1), the sums over all intervals and groups. A

@@ -31,7 +31,7 @@ MOST_HARMONICS = 8
 
 @dataclass(frozen=True)
 class Raw:
-    """What the samples of a record show."""
+    """Noise, hum and clipping in the samples of a record."""
 
     torque_nm: np.ndarray  # torque without mains hum, N·m, shape (N,)
     noise_sd_nm: float  # white noise of a sample, N·m

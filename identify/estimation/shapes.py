@@ -1,4 +1,4 @@
-"""What free effects of a fit do, as pictures: curves with bands, and one sentence."""
+"""Curves of the free effects of a fit, with bands, and one sentence for each."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PERCENTILES = 2.5, 97.5
 
 
 def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] | None:
-    """What one effect of a fit does; None of an effect that is not free.
+    """Compute the curves of one effect of a fit; None for an effect that is not free.
 
     `index`: of the effect in `fitted.problem.chosen`. `matrix`: covariance of all parameters in their units. Returns
     `enters`, `driven_by`, `words`, `driver`, `at`, `effect`, and `lines`: by name `value`, `lower` and `upper` (95 % of

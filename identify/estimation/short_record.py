@@ -23,7 +23,7 @@ from stimrig.identify.recruitment.near_shape import FINE_KNOTS, KNOTS, LOGISTIC_
 
 @dataclass(frozen=True)
 class Short:
-    """What a short record shows."""
+    """Result of the fit to a short record."""
 
     grid: Grid  # the record on the grid of pulses
     rows: np.ndarray  # intervals that were fitted, bool, shape (K,)
@@ -197,12 +197,12 @@ class _Search:
         return new_person(basis, rise, self.scale_nm)
 
     def _on(self, basis: SplineBasis) -> bool:
-        """Whether the fit before this one has as many knots up to the same width."""
+        """Return True if the fit before this one has as many knots up to the same width."""
         near = self.near
         return near is not None and near.largest_us == self.largest_us and near.basis.size == basis.size
 
     def _knots_suit(self, middle: float, rise: float) -> bool:
-        """Whether the knots of the fit before this one still suit the curve."""
+        """Return True if the knots of the fit before this one still suit the curve."""
         assert self.near is not None
         moved = abs(middle - self.near.three[1])
         return 0.75 < rise / self.near.rise_us < 1.33 and moved < 0.25 * self.near.rise_us

@@ -56,7 +56,7 @@ def covariance_of(fitted: Fitted) -> np.ndarray:
 
 
 def _beyond(gradients: np.ndarray, information: np.ndarray) -> np.ndarray:
-    """How much more the gradients of blocks, shape (P, B), vary than the information says, shape (P, P).
+    """Excess covariance of the gradients of blocks, shape (P, B), over the information, shape (P, P).
 
     A few blocks say little of many directions. So their covariance is drawn towards a multiple of the information, as
     far as it varies itself from block to block (Ledoit and Wolf 2004).
@@ -81,7 +81,7 @@ def _block_gradients(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _held_back(fitted: Fitted) -> np.ndarray:
-    """How far the penalty may hold the curve back: its coefficients' change without most of it, shape (P,).
+    """Largest change of the curve's coefficients when most of the penalty is removed, shape (P,).
 
     To first order, and as far as it is more than the noise gives a curve that is as smooth as the penalty says. Below
     the smallest width played no further than a rising curve can be from zero.
@@ -121,7 +121,7 @@ def _below_played(fitted: Fitted, change: np.ndarray) -> np.ndarray:
 
 
 def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
-    """What the structure leaves of left-out blocks beyond noise and the parameters' uncertainty, N·m, rms.
+    """Error on left-out blocks beyond noise and the parameters' uncertainty, N·m, rms.
 
     `matrix` is the parameters' covariance. A part that chance alone may leave is taken off, so that it is zero where
     the structure is right. No error counts for more than the torque's own range: far from linear, one step of a refit
@@ -140,7 +140,7 @@ def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:
     """Variance of the noise of an interval's mean, (N·m)², and its standard error.
 
     Where noise was taken for slow, what the structure leaves is in it; then it is that about a straight line in each
-    rest. Without rests the two cannot be told apart, and only the noise of the samples counts.
+    rest. Without rests the two cannot be separated, and only the noise of the samples counts.
     """
     setup, noise = fitted.problem.setup, fitted.noise
     grid, rows = setup.grid, setup.fitted

@@ -85,7 +85,7 @@ class Surfaces:
 
     @property
     def inertia_nm_s2_per_rad(self) -> float:
-        """What the cell feels of an acceleration, N·m per rad/s², with the record's sign."""
+        """Torque at the load cell per acceleration, N·m per rad/s², with the record's sign."""
         return self._sign * sum(joint_effect.values.get(INERTIA, 0.0) for joint_effect in self.acting)
 
     @cached_property
@@ -170,7 +170,7 @@ def joint_tables(
     velocity_rad_s: np.ndarray,
     at_work: np.ndarray,
 ) -> dict[str, Any]:
-    """What MODEL.json has under `joint`: g and h on a grid, with 95 % bands, and how long each cell was seen.
+    """Make the tables under `joint` in MODEL.json: g and h on a grid, 95 % bands, and intervals in each cell.
 
     `names`, `matrix`: of the model's parameters and their covariance. `angle_rad`, `velocity_rad_s`: of each fitted
     pulse interval. `at_work`: those in which the muscle was stimulated: only they show g.

@@ -26,7 +26,7 @@ LARGEST_RATE_CHANGE = 0.25
 GROWN, LEAST_USUAL_NM = 1e6, 1.0
 """A prediction beyond so many times the usual torque, recruited or at rest, is no torque."""
 MOVES_RAD = 0.1
-"""What most readings of an earlier trial lie apart at least: less tells the sensor's noise, not how the joint moves."""
+"""Smallest range of the angle in an earlier trial: a smaller one shows the sensor's noise, not the movement."""
 
 
 class Muscle(Protocol):
@@ -96,7 +96,7 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
 
 
 def _tells_movement(angle_rad: np.ndarray) -> bool:
-    """Whether most readings are there, and nine tenths of them lie far enough apart to tell a movement."""
+    """Return True if most readings are present and nine tenths of them span a movement."""
     known = angle_rad[np.isfinite(angle_rad)]
     return known.size > 0.5 * angle_rad.size and float(np.ptp(np.percentile(known, (5.0, 95.0)))) > MOVES_RAD
 
@@ -139,8 +139,9 @@ def _predict_samples(model: Muscle, record: Record, problem: Problem, theta: np.
 
 
 def unpredictable_torque(model: Muscle) -> dict[str, tuple[float, float]]:
-    """What cannot be foreseen on another record, by effect: its mean in the fitted rows of its own, which stays as a
-    zero, and its root mean square there (a zero may also be where it began), N·m.
+    """Return the torque of each effect that cannot be predicted on another record: mean and root mean square, N·m.
+
+    Both are taken over the fitted rows of the model's own record. The mean stays as a zero.
     """
     entries = {e["id"]: e.get("unforeseen", {}) for e in model.effects if not find_effect(e["id"]).predictable}
     return {
@@ -287,7 +288,7 @@ def refuse_rate(model: Muscle, record: Record) -> None:
 
 
 def same_data(model: Muscle, record: Record) -> bool:
-    """Whether the record is the one that the model was fitted on."""
+    """Return True if the record is the one that the model was fitted on."""
     return bool(model.data.get("fingerprint")) and model.data["fingerprint"] == fingerprint(record)
 
 

@@ -323,7 +323,7 @@ class _StagePass:
         return torque, rate
 
     def free_laws(self, lags: list[tuple[Chosen, np.ndarray]], rows: int) -> np.ndarray:
-        """What all forms of the stage "lags" say together, shape (M, len(FreeLaw))."""
+        """Sum of the laws of all forms of the stage "lags", shape (M, len(FreeLaw))."""
         laws = np.zeros((rows, len(FreeLaw)))
         for chosen, values in lags:
             for column, value in chosen.form.held.items():
@@ -390,7 +390,7 @@ class _StagePass:
         return mean
 
     def curves(self) -> list[Core | None]:
-        """How the curve of each row is read: exactly, from its T and ζ; or all as cubics, where both lags are long."""
+        """Reading of each row's curve: exactly, from its T and ζ; or all as cubics, if both lags are long."""
         cores: list[Core] = [(time_constant_s, damping) for time_constant_s, damping in self.grown(self.cores).tolist()]
         return [*cores] if self.setup.grid.curve(cores[0]) else [None] * len(cores)
 

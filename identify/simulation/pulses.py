@@ -1,4 +1,4 @@
-"""What a list of pulses gives: free run from rest, for whoever plans a trial."""
+"""Free-run torque of a list of pulses, from rest, for planning a trial."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ SAMPLES_A_PULSE = 8
 
 @dataclass(frozen=True)
 class Motion:
-    """How the joint moves during a trial."""
+    """Movement of the joint during a trial."""
 
     angle_rad: np.ndarray  # mean in each pulse's period, rad, shape (K,)
     velocity_rad_s: np.ndarray  # the same, rad/s
 
     @classmethod
     def of(cls, angle_rad: np.ndarray, pulse_rate_hz: float) -> Motion:
-        """From the angles alone, as the sensor told or would tell them, late if it is late: smoothed both ways."""
+        """From the angles alone, as the sensor gives them (late if it is late), smoothed in both directions."""
         angle = np.asarray(angle_rad, float)
         motion = JointMotion.of(np.arange(angle.size) / pulse_rate_hz, angle)
         return cls(motion.angle_rad, motion.velocity_rad_s)

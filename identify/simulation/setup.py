@@ -1,4 +1,4 @@
-"""What all candidates of a record share: grid, scenes, one recruitment spline with its penalty, bounds of the delay."""
+"""Set-up shared by all candidates of a record: grid, scenes, recruitment spline with its penalty, delay bounds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class Setup:
     """Zero of each part as its rests show it, as the target is given, and its sd; None where they say nothing."""
     states: Mapping[str, float] = field(default_factory=dict)
     """By effect id, where its slow state begins; 0 (rested) where there is none."""
-    angle_late_s: float = 0.0  # by how much later than it was the sensor tells the angle, s
+    angle_late_s: float = 0.0  # delay of the sensor of the angle, s
     motion: JointMotion | None = None  # in place of the record's own
 
     @cached_property
