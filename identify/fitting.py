@@ -73,8 +73,8 @@ def fit(
     wanted = [effects] if isinstance(effects, str) else list(effects or ())
     twice = {name for name in wanted if wanted.count(name) > 1}
     if twice or not all(isinstance(name, str) for name in wanted):
-        given = ", ".join(map(str, sorted(twice, key=str) or wanted))
-        raise BadRequest(f"not a list of different effects: {given}", place="effects", fix="Name each effect once.")
+        listed = ", ".join(map(str, sorted(twice, key=str) or wanted))
+        raise BadRequest(f"not a list of different effects: {listed}", place="effects", fix="Name each effect once.")
     try:
         with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
             against = [method] if chosen is not MAXIMUM_LIKELIHOOD else sorted(set(options) & NO_EFFECTS_WITH)
@@ -88,17 +88,17 @@ def fit(
             if not wanted:
                 return chosen.fit(grid, names, **options)
             rows = fitted_rows(grid, names)
-            tell = progress or (lambda _share, _text: None)
+            report = progress or (lambda _share, _text: None)
             if AUTO in wanted:
-                return _fit_auto(grid, raw, wanted, rows, options, tell)
-            return _fit_effects(grid, raw, wanted, rows, options, tell)
+                return _fit_auto(grid, raw, wanted, rows, options, report)
+            return _fit_effects(grid, raw, wanted, rows, options, report)
     except np.linalg.LinAlgError as error:
         fix = "Check that torque follows the pulses."
         raise NotIdentifiable(f"{method} finds no solution on this record ({error})", fix=fix) from error
     except (TypeError, ValueError) as error:
         if options:
-            given = ", ".join(f"{key}={value}" for key, value in options.items())
-            raise BadRequest(f"invalid option ({error})", place=given, fix="See the options of the method.") from error
+            listed = ", ".join(f"{key}={value}" for key, value in options.items())
+            raise BadRequest(f"invalid option ({error})", place=listed, fix="See the options of the method.") from error
         raise
 
 
@@ -111,9 +111,9 @@ def _fit_auto(
         fix = f"Give {AUTO}, or a list of effects."
         raise BadRequest(f"{AUTO} chooses the effects itself, but {others} is given as well", place="effects", fix=fix)
     if options:
-        given = ", ".join(sorted(options))
+        listed = ", ".join(sorted(options))
         fix = "Leave out the options."
-        raise BadRequest(f"{AUTO} takes no options, but {given} is given", place="effects", fix=fix)
+        raise BadRequest(f"{AUTO} takes no options, but {listed} is given", place="effects", fix=fix)
     from stimrig.identify.diagnosis.free import searched  # here: a fit without a search needs them not
     from stimrig.identify.diagnosis.search import helpful
 
@@ -132,10 +132,10 @@ def _fit_effects(
     base, reasons = start(grid, rows, options)
     steps = count(1)
 
-    def tell(effect: str) -> None:
+    def report(effect: str) -> None:
         progress(min(next(steps), len(wanted)) / (len(wanted) + 2), f"fitting {find_effect(effect).name.lower()}")
 
-    base = add_effects(base, wanted, raw, tell)
+    base = add_effects(base, wanted, raw, report)
     if "knots" not in options and (renewed := renewed_curve(base)) is not base:
         base, size = renewed, renewed.problem.setup.basis.size
         reasons[0] = f"spline of {size} coefficients, chosen again with the rows in which the joint moves"

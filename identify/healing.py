@@ -1,4 +1,4 @@
-"""Where a model fails, and what a later one leaves there; from comparisons as they are kept."""
+"""Worst places of a model, and the error of a later model there, from stored comparisons."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from collections.abc import Mapping
 from typing import Any
 
 HEALED = 1.3
-"""Error at a place over the noise up to which nothing is left to be seen there."""
+"""Largest ratio of error to noise at a place that counts as healed."""
 
 
 def stands_out(comparison: Mapping[str, Any]) -> bool:
-    """Whether more is left of held-out pulses (of all where none are) than noise leaves; else its places are noise's.
+    """Return true if the error on held-out pulses (all, without such) exceeds the noise; else the places are noise.
 
     `comparison`: the keys of `compare --json`.
     """
@@ -20,7 +20,7 @@ def stands_out(comparison: Mapping[str, Any]) -> bool:
 
 
 def looks_like_noise(comparison: Mapping[str, Any]) -> bool:
-    """Whether nothing stands out and no correlation of the residual does."""
+    """Return true if neither the error nor a correlation of the residual stands out."""
     tests = (comparison.get("tests") or {}).get("tests") or []
     return not stands_out(comparison) and all(test["passed"] for test in tests)
 
@@ -35,14 +35,14 @@ def healed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[d
     noise_nm = max(before["noise_sd_nm"], after["noise_sd_nm"])
     rows = []
     for place in before.get("where") or []:
-        errors = [_rms_within(found["series"], place["start_s"], place["end_s"]) for found in (before, after)]
+        errors = [_rms_within(comparison["series"], place["start_s"], place["end_s"]) for comparison in (before, after)]
         healed = errors[1] <= HEALED * noise_nm
         rows.append({**place, "before_nm": errors[0], "after_nm": errors[1], "noise_nm": noise_nm, "healed": healed})
     return rows
 
 
 def place_words(place: Mapping[str, Any]) -> str:
-    """What became of the error at a place."""
+    """Describe the change of the error at a place."""
     before, after, noise = (f"{place[name]:.3g}" for name in ("before_nm", "after_nm", "noise_nm"))
     if before == after:
         return f"the error there is {after} N·m, as before; the noise is {noise} N·m."
@@ -55,5 +55,5 @@ def place_words(place: Mapping[str, Any]) -> str:
 
 def _rms_within(series: Mapping[str, Any], start_s: float, end_s: float) -> float:
     pairs = zip(series["time_s"], series["residual_nm"], strict=True)
-    found = [value for time_s, value in pairs if start_s <= time_s <= end_s and value is not None]
-    return math.sqrt(sum(value * value for value in found) / len(found)) if found else 0.0
+    errors_nm = [value for time_s, value in pairs if start_s <= time_s <= end_s and value is not None]
+    return math.sqrt(sum(value * value for value in errors_nm) / len(errors_nm)) if errors_nm else 0.0

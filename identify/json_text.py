@@ -69,12 +69,12 @@ def _check_depth(text: str, deepest: int) -> None:
 
 
 def _single(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    unique = dict(pairs)
+    if len(unique) < len(pairs):
         names = [name for name, _ in pairs]
         twice = next(name for name, count in Counter(names).items() if count > 1)
         raise BadJson(f"the key {twice[:60]!r} is there twice")
-    return found
+    return unique
 
 
 def _refused(name: str) -> Any:

@@ -36,7 +36,7 @@ def _version() -> str:
 
 
 def made_by() -> dict[str, Any]:
-    """What a model of today is made by."""
+    """Name and version of this software."""
     return {"name": "stimrig", "version": _version()}
 
 
@@ -66,7 +66,7 @@ class Covariance:
 
 @dataclass(frozen=True, repr=False)
 class Model(Summarised):
-    """A Hammerstein model, with or without effects. What the dicts hold is as in MODEL.json (`docs/`)."""
+    """A Hammerstein model, with or without effects. The dicts are those of MODEL.json (`docs/`)."""
 
     method: str  # id of the method that estimated it
     recruitment: Curve  # f(u), N·m
@@ -105,11 +105,11 @@ class Model(Summarised):
 
         An `sd` is None if the model has no covariance.
         """
-        found = landmarks(self.recruitment, self.curve_covariance)
+        figures = landmarks(self.recruitment, self.curve_covariance)
         if isinstance(self.linear, SecondOrder):
             for name, unit in (("time_constant_s", "s"), ("damping", "1"), ("delay_s", "s")):
-                found[name] = {"value": getattr(self.linear, name), "sd": self._sd(name), "unit": unit}
-        return found
+                figures[name] = {"value": getattr(self.linear, name), "sd": self._sd(name), "unit": unit}
+        return figures
 
     @property
     def curve_covariance(self) -> np.ndarray | None:
@@ -195,8 +195,8 @@ class Model(Summarised):
             with np.errstate(all="ignore"):
                 table = model.recruitment.table()[1]
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
-            said = " ".join(f"{type(error).__name__} {error}".split())[:100]
-            raise BadModel(f"the parts do not match ({said})", fix=model_schema.FIX) from error
+            cause = " ".join(f"{type(error).__name__} {error}".split())[:100]
+            raise BadModel(f"the parts do not match ({cause})", fix=model_schema.FIX) from error
         if not np.isfinite(table).all():
             raise BadModel("the curve is not finite", place="recruitment.basis", fix=model_schema.FIX)
         for index, entry in enumerate(model.effects):
@@ -320,8 +320,8 @@ def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
             lower, upper = 1e-6 if p.scale == "log" else -model_schema.PLAUSIBLE, model_schema.PLAUSIBLE
         slack = 1e-6 * (upper - lower) if np.isfinite(upper - lower) else 0.0
         wanted[p.name] = {"type": "number", "minimum": lower - slack, "maximum": upper + slack}
-    given = {name: model_schema.parameter_value(value) for name, value in entry["parameters"].items()}
-    model_schema.check(given, {"type": "object", "properties": wanted, "x-needed": list(wanted)}, place)
+    values = {name: model_schema.parameter_value(value) for name, value in entry["parameters"].items()}
+    model_schema.check(values, {"type": "object", "properties": wanted, "x-needed": list(wanted)}, place)
 
 
 def _covariance(data: dict[str, Any] | None) -> Covariance | None:
@@ -334,13 +334,13 @@ def _covariance(data: dict[str, Any] | None) -> Covariance | None:
     return Covariance(names, values, matrix)
 
 
-def _parameters(values: dict[str, Any], most: int = 4) -> str:
+def _parameters(values: dict[str, Any], max_shown: int = 4) -> str:
     parts = []
-    for name, entry in list(values.items())[:most]:
+    for name, entry in list(values.items())[:max_shown]:
         entry = entry if isinstance(entry, dict) else {"value": entry}
         value = estimate(entry.get("value"), entry.get("sd"), str(entry.get("unit") or "1"))
         parts.append(f"{name} {value} {entry.get('direction') or ''}".rstrip())
-    more = len(values) - most
+    more = len(values) - max_shown
     return ", ".join([*parts, *([f"{more} more parameters"] if more > 0 else [])])
 
 

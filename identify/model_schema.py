@@ -1,4 +1,4 @@
-"""What a MODEL.json may contain: model.schema.json, the published JSON Schema, read by the few rules that it uses.
+"""Checks of a MODEL.json against model.schema.json, the published JSON Schema, by the few rules that it uses.
 
 It is checked before anything is computed from it. Keys that the schema does not know are not checked, since a later
 version may write more. Keys that it requires may be missing, except those of `x-needed`.
@@ -19,9 +19,9 @@ SCHEMA: dict[str, Any] = json.loads(FILE.read_text("utf-8"))
 STATE: dict[str, Any] = SCHEMA["properties"]["effects"]["items"]["properties"]["state"]
 FIX = "Fit the record again."
 LONGEST = 10_000
-"""Of a list or a text, where the schema says nothing."""
+"""Largest length of a list or a text without a limit in the schema."""
 LARGEST = 1e300
-"""Of a number, where the schema says nothing."""
+"""Largest number without a limit in the schema."""
 PLAUSIBLE = 1e6
 """Larger than any torque, N·m, or time, s, in a record."""
 NUMBERS = {"type": "object", "additionalProperties": {"type": "number"}}
@@ -49,7 +49,7 @@ def check(value: Any, schema: dict[str, Any], place: str) -> None:
     kind = next(fitting, kinds[0] if kinds else "")
     known = schema.get("enum", [schema["const"]] if "const" in schema else None)
     if known is not None and kind not in also and (isinstance(value, bool | list | dict) or value not in known):
-        listed = " or ".join("null" if one is None else str(one) for one in known)
+        listed = " or ".join("null" if choice is None else str(choice) for choice in known)
         raise BadModel(f"{_short(value)} is not {listed}", place=place, fix=FIX)
     if kind in CHECKS:
         CHECKS[kind](value, schema, place)
@@ -84,10 +84,10 @@ def _boolean(value: Any, _schema: dict[str, Any], place: str) -> None:
 
 
 def _array(value: Any, schema: dict[str, Any], place: str) -> None:
-    least, most = schema.get("minItems", 0), schema.get("maxItems", LONGEST)
-    if not isinstance(value, list) or not (least <= len(value) <= most):
+    min_items, max_items = schema.get("minItems", 0), schema.get("maxItems", LONGEST)
+    if not isinstance(value, list) or not (min_items <= len(value) <= max_items):
         what = f"a list of {len(value)}" if isinstance(value, list) else _short(value)
-        raise BadModel(f"{what}, not a list of {least} to {most}", place=place, fix=FIX)
+        raise BadModel(f"{what}, not a list of {min_items} to {max_items}", place=place, fix=FIX)
     items = schema["items"]
     lo, hi = items.get("minimum", -LARGEST), items.get("maximum", LARGEST)
     sound = items.get("type") == "number" and all(type(item) in (int, float) and lo <= item <= hi for item in value)
@@ -108,10 +108,10 @@ def _object(value: Any, schema: dict[str, Any], place: str) -> None:
         if name not in value:
             raise BadModel("the key is missing", place=prefix + name, fix=FIX)
     if "if" in schema:
-        _object(value, schema["then" if _holds(value, schema["if"]) else "else"], place)
+        _object(value, schema["then" if _matches(value, schema["if"]) else "else"], place)
 
 
-def _holds(value: Any, schema: dict[str, Any]) -> bool:
+def _matches(value: Any, schema: dict[str, Any]) -> bool:
     try:
         _object(value, schema, "")
     except BadModel:
@@ -129,17 +129,17 @@ CHECKS = {
 
 
 def _short(value: Any) -> str:
-    shown = repr(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
-    return shown if len(shown) <= 40 else f"{shown[:40]}…"
+    text = repr(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
+    return text if len(text) <= 40 else f"{text[:40]}…"
 
 
 def _effect(effect: dict[str, Any], place: str) -> None:
-    """Of a free effect every parameter has its sd, and every line of the picture a value at each place."""
-    given = effect["parameters"]
-    check({name: parameter_value(value) for name, value in given.items()}, NUMBERS, f"{place}.parameters")
+    """Check an effect; a free one has an sd for each parameter, and a value of each line at each place."""
+    parameters = effect["parameters"]
+    check({name: parameter_value(value) for name, value in parameters.items()}, NUMBERS, f"{place}.parameters")
     if "shape" not in effect:
         return
-    check(given, WITH_SD, f"{place}.parameters")
+    check(parameters, WITH_SD, f"{place}.parameters")
     count = len(effect["shape"]["at"])
     as_many = {"type": "array", "items": {"type": "number"}, "minItems": count, "maxItems": count}
     for name, line in effect["shape"]["lines"].items():

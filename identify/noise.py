@@ -28,58 +28,64 @@ class NoiseLevel:
     """Share of the variance that is slow. Above 1: all of it is slow, and smoothed by the mean over an interval."""
     sd_nm: float  # total standard deviation of an interval's mean, N·m
     turn: float = 0.0  # of a narrow band: angle per step, rad
-    keep: float = 0.0  # of it: decay factor per step
+    decay: float = 0.0  # of it: decay factor per step
     band: float = 0.0  # of it: share of the variance; 0: no band
     slowest: float = 0.02  # smallest angle, rad
     fastest: float = 2.6  # largest angle, rad
-    held: bool = False
-    """Whether it is white whatever the residual looks like: all of a wrong structure's error counts then."""
+    white_only: bool = False
+    """White whatever the residual looks like, so that all error of a wrong structure counts."""
 
     @property
     def at_bound(self) -> bool:
-        """Whether it is as slow as noise may be: a slower thing is a drift, and levels cost the likelihood nothing."""
+        """Return true for the slowest noise: anything slower is a drift, and levels cost the likelihood nothing."""
         return min(self.share, 1.0) > 0.05 and self.ar1 >= 1.0 - 1.01 * SHORTEST
 
     @property
     def is_white(self) -> bool:
-        """Whether hardly any of it is correlated from one interval to the next."""
+        """Return true if hardly any of it is correlated from one interval to the next."""
         return self.band <= 0.0 and min(self.share, 1.0) * self.ar1 < 0.05
 
 
-WHITE = NoiseLevel(0.0, 0.0, 1.0, held=True)
-"""The noise that is held white, of whatever size."""
+WHITE = NoiseLevel(0.0, 0.0, 1.0, white_only=True)
+"""White noise of any size."""
 
 
 def profile(
     residual: np.ndarray, stretches: Stretches, near: NoiseLevel, wide: bool = True
 ) -> tuple[NoiseLevel, float]:
     """The most likely noise of the same kind as `near`, and its log-likelihood; searched over a `wide` range or not."""
-    if near.held:
-        own = np.concatenate([residual[start:stop] for start, stop in zip(*stretches, strict=True)])
-        sd = max(float(np.sqrt(np.mean(own**2))), 1e-9)
-        return replace(near, sd_nm=sd), -0.5 * own.size * (np.log(2 * np.pi * sd * sd) + 1.0)
+    if near.white_only:
+        fitted = np.concatenate([residual[start:stop] for start, stop in zip(*stretches, strict=True)])
+        sd = max(float(np.sqrt(np.mean(fitted**2))), 1e-9)
+        return replace(near, sd_nm=sd), -0.5 * fitted.size * (np.log(2 * np.pi * sd * sd) + 1.0)
     if near.band <= 0.0:
         ar1, share, sd, log_likelihood = profile_noise(residual, *stretches, near.ar1, near.share, wide)
         return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood
-    slow, fading = np.log(1.0 - min(near.ar1, 1.0 - SHORTEST)), np.log(1.0 - min(near.keep, 0.9999))
+    slow, fading = np.log(1.0 - min(near.ar1, 1.0 - SHORTEST)), np.log(1.0 - min(near.decay, 0.9999))
     share = min(near.share / max(1.0 - near.band, 1e-9), 1.0)
     x = np.array([slow, share, near.turn, fading, near.band])
     return _search(residual, stretches, x, 0.15, 0.03, (near.slowest, near.fastest))
 
 
 def _search(
-    residual: np.ndarray, stretches: Stretches, x: np.ndarray, wide: float, least: float, turns: tuple[float, float]
+    residual: np.ndarray,
+    stretches: Stretches,
+    x: np.ndarray,
+    wide: float,
+    smallest_step: float,
+    turns: tuple[float, float],
 ) -> tuple[NoiseLevel, float]:
     lower = np.array([np.log(SHORTEST), 0.0, turns[0], np.log(0.0008), 0.001])
     upper = np.array([0.0, 1.0, turns[1], np.log(0.12), 0.999])
     step = wide * np.array([1.5, 0.4, 0.12, 1.5, 0.4])
-    x, sd, log_likelihood = _profile_band(residual, *stretches, np.clip(x, lower, upper), lower, upper, step, least)
+    x = np.clip(x, lower, upper)
+    x, sd, log_likelihood = _profile_band(residual, *stretches, x, lower, upper, step, smallest_step)
     noise = NoiseLevel(
         ar1=float(1.0 - np.exp(x[0])),
         share=float(x[1] * (1.0 - x[4])),
         sd_nm=max(float(sd), 1e-9),
         turn=float(x[2]),
-        keep=float(1.0 - np.exp(x[3])),
+        decay=float(1.0 - np.exp(x[3])),
         band=float(x[4]),
         slowest=turns[0],
         fastest=turns[1],
@@ -90,12 +96,12 @@ def _search(
 def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tuple[NoiseLevel, float]:
     """The most likely noise with a narrow band between 2.8 and 14.5 Hz, and its log-likelihood."""
     turns = (2 * np.pi * LOWEST_HZ * step_s, 2 * np.pi * min(HIGHEST_HZ, 0.42 / step_s) * step_s)
-    found = []
+    candidates = []
     for frequency_hz in _peaks(residual, stretches, step_s):
         for width_hz in (0.1, 0.7):
             x = np.array([np.log(0.3), 0.5, 2 * np.pi * frequency_hz * step_s, np.log(np.pi * width_hz * step_s), 0.5])
-            found.append(_search(residual, stretches, x, 1.0, 0.05, turns))
-    return max(found, key=lambda one: one[1])
+            candidates.append(_search(residual, stretches, x, 1.0, 0.05, turns))
+    return max(candidates, key=lambda candidate: candidate[1])
 
 
 def _peaks(residual: np.ndarray, stretches: Stretches, step_s: float) -> list[float]:
@@ -120,7 +126,7 @@ def whitened(rows: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> np.nd
     """Rows on the grid, shape (M, K), whitened to unit variance; the fitted intervals in order, shape (M, F)."""
     if noise.band <= 0.0:
         return _whiten_rows(rows, *stretches, noise.ar1, noise.share) / noise.sd_nm
-    white, _ = _whiten_band(rows, *stretches, noise.ar1, noise.share, noise.turn, noise.keep, noise.band)
+    white, _ = _whiten_band(rows, *stretches, noise.ar1, noise.share, noise.turn, noise.decay, noise.band)
     return white / noise.sd_nm
 
 
@@ -128,7 +134,7 @@ def band_part(residual: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> 
     """The narrow band's part of a residual; zero in intervals that were not fitted."""
     if noise.band <= 0.0:
         return np.zeros(residual.size)
-    return _smooth_band(residual, *stretches, noise.ar1, noise.share, noise.turn, noise.keep, noise.band)
+    return _smooth_band(residual, *stretches, noise.ar1, noise.share, noise.turn, noise.decay, noise.band)
 
 
 # ---- kernels: white plus slow, then with a band -------------------------------------------------------------------
@@ -243,7 +249,7 @@ def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
 
 
 STEPS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
-"""In what directions of log(1 - ar1) and share a pattern search looks."""
+"""Directions of the pattern search in log(1 - ar1) and share."""
 
 
 @njit(cache=True, nogil=True)
@@ -280,16 +286,16 @@ def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _system(ar1, slow, turn, keep, band):  # pragma: no cover
+def _system(ar1, slow, turn, decay, band):  # pragma: no cover
     """Transition of (slow, cos, sin) over a step, the stationary covariance, and what each step adds to it."""
-    c, s = keep * np.cos(turn), keep * np.sin(turn)
+    c, s = decay * np.cos(turn), decay * np.sin(turn)
     f = np.array(((ar1, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
-    fresh = band * (1 - keep * keep)
+    fresh = band * (1 - decay * decay)
     return f, np.diag(np.array((slow, band, band))), np.array((slow * (1 - ar1 * ar1), fresh, fresh))
 
 
 @njit(cache=True, nogil=True)
-def _ahead(f, p, gain, h, q):  # pragma: no cover
+def _predict(f, p, gain, h, q):  # pragma: no cover
     """Covariance a step later, after a measurement, whose covariance with the state is h; p is used up."""
     fresh = np.zeros((3, 3))
     for i in range(3):
@@ -307,9 +313,9 @@ def _ahead(f, p, gain, h, q):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
+def _gains(length, ar1, slow, turn, decay, band):  # pragma: no cover
     """Kalman gains of (slow, cos, sin) and innovation variances for a stretch of `length` from the stationary state."""
-    f, p, q = _system(ar1, slow, turn, keep, band)
+    f, p, q = _system(ar1, slow, turn, decay, band)
     white = max(1.0 - slow - band, 1e-9)
     gains, variances, h = np.empty((length, 3)), np.empty(length), np.empty(3)
     for k in range(length):
@@ -318,7 +324,7 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
         variances[k] = h[0] + h[1] + white
         for i in range(3):
             gains[k, i] = h[i] / variances[k]
-        p = _ahead(f, p, gains[k], h, q)
+        p = _predict(f, p, gains[k], h, q)
         if k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11:  # settled
             gains[k + 1 :], variances[k + 1 :] = gains[k], variances[k]
             break
@@ -326,10 +332,10 @@ def _gains(length, ar1, slow, turn, keep, band):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
-    """As `_whiten_rows`, with an oscillator: `turn` is its angle per step, `keep` its decay, `band` its share."""
-    gains, variances = _gains(np.max(stop - start), ar1, slow, turn, keep, band)
-    c, s = keep * np.cos(turn), keep * np.sin(turn)
+def _whiten_band(rows, start, stop, ar1, slow, turn, decay, band):  # pragma: no cover
+    """As `_whiten_rows`, with an oscillator: `turn`, its angle per step, `decay` per step, and `band`, its share."""
+    gains, variances = _gains(np.max(stop - start), ar1, slow, turn, decay, band)
+    c, s = decay * np.cos(turn), decay * np.sin(turn)
     white = np.empty((rows.shape[0], np.sum(stop - start)))
     logdet = 0.0
     for i in range(start.size):
@@ -354,7 +360,7 @@ def _whiten_band(rows, start, stop, ar1, slow, turn, keep, band):  # pragma: no 
 def _band_cost(row, start, stop, x):  # pragma: no cover
     """Minus the profiled log-likelihood, up to a constant, the variance, and the count.
 
-    At x = (log(1 - ar1), slow share of the rest, turn, log(1 - keep), band).
+    At x = (log(1 - ar1), slow share of the rest, turn, log(1 - decay), band).
     """
     slow = x[1] * (1.0 - x[4])
     white, logdet = _whiten_band(row, start, stop, 1.0 - np.exp(x[0]), slow, x[2], 1.0 - np.exp(x[3]), x[4])
@@ -367,12 +373,12 @@ def _band_cost(row, start, stop, x):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no cover
+def _profile_band(row, start, stop, x, lower, upper, step, smallest_step):  # pragma: no cover
     """Coordinate search from x, halving its steps to `least`; returns x, sd and log-likelihood."""
     rows = row.reshape(1, row.size)
     best, variance, total = _band_cost(rows, start, stop, x)
     scale = 1.0
-    while scale > least:
+    while scale > smallest_step:
         moved = False
         for i in range(x.size):
             for sign in (1.0, -1.0):
@@ -391,27 +397,27 @@ def _profile_band(row, start, stop, x, lower, upper, step, least):  # pragma: no
 
 
 @njit(cache=True, nogil=True)
-def _smooth_band(row, start, stop, ar1, slow, turn, keep, band):  # pragma: no cover
+def _smooth_band(row, start, stop, ar1, slow, turn, decay, band):  # pragma: no cover
     """The oscillator's part of a residual, given all of it (fixed-interval smoother); zero outside the stretches."""
     out = np.zeros(row.size)
     for i in range(start.size):
-        f, p, q = _system(ar1, slow, turn, keep, band)
+        f, p, q = _system(ar1, slow, turn, decay, band)
         c, s = f[1, 1], f[2, 1]
         length = stop[i] - start[i]
-        gains, variances = _gains(length, ar1, slow, turn, keep, band)
+        gains, variances = _gains(length, ar1, slow, turn, decay, band)
         errors, waves, covariances = np.empty(length), np.empty(length), np.empty((length, 3, 3))
         x, u, v = 0.0, 0.0, 0.0
         for k in range(length):
             errors[k], waves[k], covariances[k] = row[start[i] + k] - x - u, u, p
             x, u, v = x + gains[k, 0] * errors[k], u + gains[k, 1] * errors[k], v + gains[k, 2] * errors[k]
             x, u, v = ar1 * x, c * u - s * v, s * u + c * v
-            p = _ahead(f, p, gains[k], p[0] + p[1], q)
+            p = _predict(f, p, gains[k], p[0] + p[1], q)
         # Backward pass on the adjoint r: x_hat = x + P r, with P h = gain * variance; only the oscillator is wanted.
         r = np.zeros(3)
         for k in range(length - 1, -1, -1):
             r[0], r[1], r[2] = ar1 * r[0], c * r[1] + s * r[2], c * r[2] - s * r[1]
             h = errors[k] / variances[k] - (gains[k, 0] * r[0] + gains[k, 1] * r[1] + gains[k, 2] * r[2])
             r[0], r[1] = r[0] + h, r[1] + h
-            own = covariances[k, 1]
-            out[start[i] + k] = waves[k] + own[0] * r[0] + own[1] * r[1] + own[2] * r[2]
+            cov = covariances[k, 1]
+            out[start[i] + k] = waves[k] + cov[0] * r[0] + cov[1] * r[1] + cov[2] * r[2]
     return out

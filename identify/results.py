@@ -89,19 +89,19 @@ class Comparison(Result):
         if not looks_like_noise(vars(self)):
             rows += _listed("worst place", [row["text"] for row in self.where[:FEW]])
             rows += [(f"by {kind}", _shares(self.by[kind])) for kind in ("segment", "direction") if self.by.get(kind)]
-        reached, most = quantity(self.fit_percent, "%"), quantity(self.ceiling_percent, "%")
-        return Sheet(f"Comparison: fit {reached} where the noise allows {most}", tuple(rows))
+        fit, ceiling = quantity(self.fit_percent, "%"), quantity(self.ceiling_percent, "%")
+        return Sheet(f"Comparison: fit {fit} where the noise allows {ceiling}", tuple(rows))
 
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Diagnosis(Result):
-    """What the model of a record lacks."""
+    """Diagnosis of the effects that the model of a record lacks."""
 
     noise_sd_nm: float  # white measurement noise of a sample
     slow_noise: Row  # `sd_nm`, and `ar1`, the correlation of neighbouring pulse intervals
     base: Row
     """The model of the examined structure: `fit_percent`, `rms_nm`, `ceiling_percent`, the same with `held_out_`, and
-    `held_out_by`, which says how the held-out values were found."""
+    `held_out_by`, the source of the held-out values."""
     verdict: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
     probability: float  # of the verdict, 0 to 1
     missing: tuple[Row, ...]
@@ -149,16 +149,16 @@ class Diagnosis(Result):
         rows += [(str(row["effect"]), str(row["words"])) for row in self.free]
         if self.missing or self.free:
             rows.append(("with all", both_words(self.with_all)))
-        told = [row for row in self.missing if row["confused_with"]]
-        rows += [("next test", row["next_experiment"]) for row in told[:1]]
+        confused = [row for row in self.missing if row["confused_with"]]
+        rows += [("next test", row["next_experiment"]) for row in confused[:1]]
         rows += [("next test", str(self.deciding_experiment["text"]))] if self.deciding_experiment else []
-        said = self.conclusion
+        conclusion = self.conclusion
         # If nothing is missing, the places of the largest noise do not matter.
-        places = () if said.kind == "nothing" else self.where[:FEW]
+        places = () if conclusion.kind == "nothing" else self.where[:FEW]
         rows += _listed("error in", [row["text"] for row in places])
-        rows += [("note", text) for text in self.notes] + [("", said.words), ("next", said.advice)]
+        rows += [("note", text) for text in self.notes] + [("", conclusion.words), ("next", conclusion.advice)]
         named = ", ".join(str(row["effect"]) for row in self.missing)
-        title = f"{said.title}: {named}" if named else said.title
+        title = f"{conclusion.title}: {named}" if named else conclusion.title
         return Sheet(f"Diagnosis: {title}{certainty(vars(self))}", tuple(rows))
 
 
@@ -176,7 +176,7 @@ class Improvement(Result):
 
     def _sheet(self) -> Sheet:
         rows = [
-            (str(step["added"] or _held(model)), both_words({**model.fit, **step}))
+            (str(step["added"] or _effect_ids(model)), both_words({**model.fit, **step}))
             for step, model in zip(self.steps, self.models, strict=True)
         ]
         rows += [
@@ -257,13 +257,13 @@ class Carried(Result):
         return self.models[-1 if self.offered == "carried" else 0]
 
     def finding(self) -> dict[str, Any]:
-        """What was found, as `to_dict()`, without the models."""
-        found = self.to_dict()
-        del found["models"]
-        return found
+        """Return `to_dict()` without the models."""
+        result = self.to_dict()
+        del result["models"]
+        return result
 
     def _sheet(self) -> Sheet:
-        rows = [("offered", f"{_held(self.model)}. {self.reason}")]
+        rows = [("offered", f"{_effect_ids(self.model)}. {self.reason}")]
         words = {True: "still needed", False: "no longer needed", None: "left out, undecided"}
         rows += [(str(row["effect"]), f"{words[row['needed']]}. {row['reason']}") for row in self.effects]
         names = ("plain", "carried")
@@ -276,7 +276,7 @@ def _listed(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
     return list(zip([label, *[""] * len(texts)], texts, strict=False))
 
 
-def _held(model: Model) -> str:
+def _effect_ids(model: Model) -> str:
     return ", ".join(str(effect["id"]) for effect in model.effects) or "no effects"
 
 

@@ -1,4 +1,4 @@
-"""How results are shown: as one line, as a summary of about ten lines, and as a table in notebooks."""
+"""Display of results: one line, a summary of about ten lines, and a table in notebooks."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from numbers import Real
 from typing import Any
 
-from stimrig.identify.conclusion import LIKELY, SURE, conclude
+from stimrig.identify.conclusion import PROBABLE, VERY_PROBABLE, conclude
 from stimrig.identify.errors import BadRequest
 
 Plotter = Callable[[Any, Any], Any]
@@ -106,8 +106,8 @@ class Summarised:
 
 def one_line(text: str) -> str:
     """A text without line breaks and unprintable characters, shortened if it is very long."""
-    seen = "".join(sign if sign.isprintable() else " " for sign in str(text))
-    words = " ".join(seen.split())
+    printable = "".join(sign if sign.isprintable() else " " for sign in str(text))
+    words = " ".join(printable.split())
     return words if len(words) <= LONGEST else f"{words[: LONGEST - 1]}…"
 
 
@@ -134,10 +134,11 @@ def estimate(value: Any, sd: Any, unit: str) -> str:
 
 
 def fit_words(figures: Mapping[str, Any], prefix: str = "") -> str:
-    """How well a model fits: fit, the best fit that the noise allows, and error."""
+    """Fit of a model, the best fit that the noise allows, and the error."""
     allowed = figures.get(f"{prefix}ceiling_percent")
-    most = "" if allowed is None else f" (the noise allows {quantity(allowed, '%')})"
-    return f"fit {quantity(figures.get(f'{prefix}fit_percent'), '%')}{most}, error {torque(figures, f'{prefix}rms_nm')}"
+    ceiling = "" if allowed is None else f" (the noise allows {quantity(allowed, '%')})"
+    fit, error = quantity(figures.get(f"{prefix}fit_percent"), "%"), torque(figures, f"{prefix}rms_nm")
+    return f"fit {fit}{ceiling}, error {error}"
 
 
 def both_words(figures: Mapping[str, Any]) -> str:
@@ -151,9 +152,9 @@ def held_out_label(figures: Mapping[str, Any]) -> str:
     return "cross-validated" if figures.get("held_out_by") == "cross-validation" else "held out"
 
 
-def sure(value: float) -> str:
+def probability_words(value: float) -> str:
     """A probability in words."""
-    return "very probably" if value > SURE else "probably" if value > LIKELY else "possibly"
+    return "very probably" if value > VERY_PROBABLE else "probably" if value > PROBABLE else "possibly"
 
 
 def torque(figures: Mapping[str, Any], key: str) -> str:
@@ -161,11 +162,11 @@ def torque(figures: Mapping[str, Any], key: str) -> str:
     return quantity(figures.get(key), "N·m")
 
 
-def certainty(found: Mapping[str, Any]) -> str:
+def certainty(diagnosis: Mapping[str, Any]) -> str:
     """The probability of a verdict, behind its title; empty where none is sure or each effect has its own."""
-    if conclude(found).kind == "unsure" or len(found.get("missing") or []) > 1:
+    if conclude(diagnosis).kind == "unsure" or len(diagnosis.get("missing") or []) > 1:
         return ""
-    return f" (probability {probability(found['probability'])})"
+    return f" (probability {probability(diagnosis['probability'])})"
 
 
 def probability(value: float) -> str:

@@ -12,36 +12,34 @@ TOO_LARGE = "Beside the torque that is too much to tell a share that the model e
 
 
 def repetition_sentences(figures: Mapping[str, Any]) -> list[str]:
-    """What repetition says cannot be better, and how much of what repeats the model explains; `figures`: fit
-    statistics.
-    """
-    return [*_repeating(figures.get("repetition")), *_unforeseen(figures.get("unforeseen_nm"))]
+    """Describe the irreducible error and the share that the model explains; `figures`: fit statistics."""
+    return [*_repeating(figures.get("repetition")), *_unpredictable_sentence(figures.get("unforeseen_nm"))]
 
 
-def _unforeseen(left_nm: float | None) -> list[str]:
-    """What the model explains of its own record and leaves out where it predicts."""
+def _unpredictable_sentence(left_nm: float | None) -> list[str]:
+    """Describe the part that a model explains in its own record and cannot predict."""
     if not left_nm:
         return []
     causes = "hum, slow zero, tremor, efforts"
     return [f"On held-out pulses {left_nm:.3g} N·m cannot be foreseen ({causes}): it is left out."]
 
 
-def _repeating(found: Mapping[str, Any] | None) -> list[str]:
-    if not found:
+def _repeating(repetition: Mapping[str, Any] | None) -> list[str]:
+    if not repetition:
         return []
-    needed = ("rms_nm",) if found["found_by"] == "estimate" else ("found_by", "rms_nm", "repeats")
-    if None in map(found.get, needed):
-        return ["Nothing repeats, and the record rests too little: what no model can foresee is not known."]
-    share, between = _share(found["explained_percent"]), f"{found['rms_nm']:.3g}"
-    if found["found_by"] == "estimate":
+    needed = ("rms_nm",) if repetition["found_by"] == "estimate" else ("found_by", "rms_nm", "repeats")
+    if None in map(repetition.get, needed):
+        return ["Too few repeats and rests to estimate the irreducible error."]
+    share, between = _share(repetition["explained_percent"]), f"{repetition['rms_nm']:.3g}"
+    if repetition["found_by"] == "estimate":
         at_rest = f"Nothing repeats exactly. At rest the mean torque of a pulse interval scatters by {between} N·m"
-        if floor_nm(found) is None:
+        if floor_nm(repetition) is None:
             return [f"{at_rest}; in such means the model's error is smaller."]
         lines = [f"{at_rest}: so much at least no model can foresee."]
         return [*lines, TOO_LARGE if share is None else f"The model explains {share} of all other variance."]
-    lines = [f"Between {found['repeats']:.3g} repeats of the same pulses the torque differs by {between} N·m."]
+    lines = [f"Between {repetition['repeats']:.3g} repeats of the same pulses the torque differs by {between} N·m."]
     lines.append(TOO_LARGE if share is None else f"The model explains {share} of the variance that repeats.")
-    errors = [found["held_out_rms_nm"], found["held_out_model_rms_nm"]]
+    errors = [repetition["held_out_rms_nm"], repetition["held_out_model_rms_nm"]]
     if None not in errors:
         plain, model = (f"{error:.3g}" for error in errors)
         lines.append(f"Held out, the mean of the other repeats errs by {plain} N·m, the model by {model} N·m.")
@@ -53,10 +51,10 @@ def held_out_pulses(figures: Mapping[str, Any]) -> str:
     return "parts left out in turn" if figures.get("held_out_by") == "cross-validation" else "held-out pulses"
 
 
-def floor_nm(found: Mapping[str, Any]) -> float | None:
-    """What no model can foresee, N·m; None where the model errs by less: the torque at rest then changes as it says."""
-    scatter_nm = found.get("rms_nm")
-    if found.get("found_by") == "estimate" and scatter_nm and (found.get("model_rms_nm") or math.inf) < scatter_nm:
+def floor_nm(repetition: Mapping[str, Any]) -> float | None:
+    """Irreducible error, N·m; None where the model errs by less, as it then explains the torque at rest."""
+    scatter_nm, model_nm = repetition.get("rms_nm"), repetition.get("model_rms_nm") or math.inf
+    if repetition.get("found_by") == "estimate" and scatter_nm and model_nm < scatter_nm:
         return None
     return scatter_nm
 

@@ -38,11 +38,11 @@ def adaptive_outlook(
 
     `playable_s`: for all segments, without the rest at the end; `models`: approved ones, oldest first.
     """
-    from stimrig.identify.experiments.adaptive import Asked, decide, reach
+    from stimrig.identify.experiments.adaptive import AdaptiveGoal, decide, reach
     from stimrig.identify.experiments.knowledge import Target
 
     progress(0.1, "playing the test on a simulated muscle")
-    limits = Asked(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models))
+    limits = AdaptiveGoal(Target(**target), playable_s, max_torque_time_nm_s, largest_us, pulse_rate_hz, known(models))
     opening = decide(None, (), limits)
     widths = [width for segment in opening.segments for width in segment.settings["pulse_width_us"]]
     outlook = reach(limits, NEW_PERSON_SHARE * max_torque_nm)
@@ -130,7 +130,7 @@ class Running:
         the samples; `laid_us`, `segments`: widths of all pulses that are laid, and their segments; `torque_time_nm_s`,
         `measured_s`: what was measured, and until when.
         """
-        from stimrig.identify.experiments.adaptive import Asked, decide
+        from stimrig.identify.experiments.adaptive import AdaptiveGoal, decide
 
         self.samples += samples
         for name, column in outcomes.items():
@@ -142,7 +142,7 @@ class Running:
         committed_nm_s = self._expected_nm_s(laid_us[round(measured_s * rate_hz) :])
         left_s = max(0.0, self.playable_s - len(laid_us) / rate_hz)
         left_nm_s = max(0.0, self.max_torque_time_nm_s - torque_time_nm_s - committed_nm_s)
-        limits = Asked(self.target, left_s, left_nm_s, self.largest_us, rate_hz, self.earlier)
+        limits = AdaptiveGoal(self.target, left_s, left_nm_s, self.largest_us, rate_hz, self.earlier)
         decision = decide(record, played_us, limits, self.decision)
         self.decision = decision if decision.short is not None else self.decision
         document = decision.to_dict()

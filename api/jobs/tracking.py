@@ -51,7 +51,7 @@ def track(
         model, rates = second_order(model_json), learn_rates(earlier)
         before = begin(model, rates) if state is None else State.from_dict(state)
         for _ in range(min(missed, MOST_MISSED)):
-            before = before.ahead(rates)
+            before = before.predicted(rates)
         for path in between if slow_forms(model) else ():
             with contextlib.suppress(identify.IdentifyError, OSError):  # one that cannot be read is left out
                 before = passed(model, before, dated(Path(path)))

@@ -18,7 +18,7 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Model, Recording
-from stimrig.identify.conclusion import asked_for
+from stimrig.identify.conclusion import effects_to_add
 
 log = logging.getLogger("stimrig.analyses")
 OnCall = Callable[[Job], None]
@@ -93,7 +93,7 @@ class Analyses:
                 place, kind = self._criticised(parent)
                 diagnosis = self.known(place.id, kind)
                 begun_with = [] if kind == DIAGNOSIS else place.effects
-                if diagnosis and asked_for(diagnosis) > set(model.effects) - set(begun_with):
+                if diagnosis and effects_to_add(diagnosis) > set(model.effects) - set(begun_with):
                     return place, kind
         return model, OWN_DIAGNOSIS
 

@@ -9,9 +9,9 @@ from typing import Any
 from stimrig.api.clinical_words import segment_words
 from stimrig.api.effect_words import effect_words, effects_words, parameter_words, without_unit
 from stimrig.api.structure import worded
-from stimrig.identify.conclusion import asked_for, conclude, in_order, is_likely
+from stimrig.identify.conclusion import conclude, effects_to_add, in_order, is_likely
 from stimrig.identify.healing import stands_out
-from stimrig.identify.summary import probability, sure
+from stimrig.identify.summary import probability, probability_words
 
 SPLITS = {
     "segment": "By part of the test",
@@ -40,7 +40,7 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
     `diagnosis`: as the verb `diagnosis` of the workers gives it; `comparison`: `identify.compare` of the same model.
     """
     library, missing, free = diagnosis.get("library") or {}, in_order(diagnosis), diagnosis.get("free") or []
-    wanted, conclusion, compared = asked_for(diagnosis), conclude(diagnosis), comparison or {}
+    wanted, conclusion, compared = effects_to_add(diagnosis), conclude(diagnosis), comparison or {}
     to_add = [entry for entry in [*missing, *free] if entry["effect"] in wanted]
     noise = conclusion.kind == "nothing" and not (comparison and stands_out(comparison))
     where = [] if noise else compared.get("where") or diagnosis.get("where") or []
@@ -141,7 +141,7 @@ def card(entry: Mapping[str, Any], library: Mapping[str, Any], base: Mapping[str
         "id": entry["effect"],
         "name": name,
         "heading": f"The missing effect: {name}",
-        "sure_words": "" if chance is None else f"{sure(chance)} missing · {probability(chance)}",
+        "sure_words": "" if chance is None else f"{probability_words(chance)} missing · {probability(chance)}",
         "notes": [words for words in notes if words],
         "source": known.get("source"),
         "rivals": [name[:1].lower() + name[1:] for name in (name_of(rival, library) for rival in rivals)],

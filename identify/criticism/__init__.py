@@ -28,11 +28,11 @@ from stimrig.identify.yardstick import repetition_sentences
 
 POINTS = 2400
 """Largest number of points of a plotted series."""
-TOLD_S = 5e-3
+REPORTED_LATE_S = 5e-3
 """Pulses at least this late are reported: a fifth of an interval, more than the jitter of a healthy computer."""
 SHORTEST_S = 3.0
-"""Less than so much beside `validate` tells no noise: the record is then compared as a whole."""
-LEAST = LAGS + 1
+"""With less than this beside `validate` the noise cannot be estimated: the record is compared as a whole."""
+LEAST_INTERVALS = LAGS + 1
 """Fewer known intervals are not enough for any result: the residual is correlated over so many."""
 
 
@@ -56,14 +56,14 @@ def compare(model: Model, record: Record) -> Comparison:
     Raises
     ------
     BadRecord
-        Fewer than `LEAST` pulse intervals are known.
+        Fewer than `LEAST_INTERVALS` pulse intervals are known.
     """
-    if np.sum(~record.held_out) < SHORTEST_S * record.sample_rate_hz:  # too few other rows to tell the noise from
+    if np.sum(~record.held_out) < SHORTEST_S * record.sample_rate_hz:  # too few other rows to estimate the noise
         record = replace(record, segment_names=("all rows",) * len(record.segment_names))
     grid = make_grid(record)
-    if np.sum(~grid.doubted & (grid.count > 0)) < LEAST:
+    if np.sum(~grid.doubted & (grid.count > 0)) < LEAST_INTERVALS:
         fix = "Give a longer record, with known pulses."
-        raise BadRecord(f"fewer than {LEAST} pulse intervals are known", place="time_s", fix=fix)
+        raise BadRecord(f"fewer than {LEAST_INTERVALS} pulse intervals are known", place="time_s", fix=fix)
     predicted = np.asarray(model.predict(record))
     raw = inspect(record)
     residual = record.torque_nm - predicted
@@ -71,19 +71,19 @@ def compare(model: Model, record: Record) -> Comparison:
     tests = correlation_tests(grid, residual)
     counted = grid.counted
     places = worst_places(record, residual, noise, rows=counted)
-    held = record.held_out & counted
+    held_out_rows = record.held_out & counted
     whole = _figures(record, predicted, noise, counted)
-    held_out = _figures(record, predicted, noise, held) if held.any() else None
+    held_out = _figures(record, predicted, noise, held_out_rows) if held_out_rows.any() else None
     left_out = _left_out(grid)
-    said = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
+    remarks = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
     clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
-    own = model.fit.get("repetition") if same_data(model, record) else None  # by errors of left-out rows
-    again = own or repetition(clean, block_means(grid, residual), grid.fitted)
+    fitted_repetition = model.fit.get("repetition") if same_data(model, record) else None  # by errors of left-out rows
+    repeats = fitted_repetition or repetition(clean, block_means(grid, residual), grid.fitted)
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
         noise_sd_nm=noise,
-        repetition=again,
+        repetition=repeats,
         fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
         by=_error_shares(record, residual, noise, counted),
@@ -93,17 +93,17 @@ def compare(model: Model, record: Record) -> Comparison:
         series=_series(model, record, predicted, noise),
         plain=(
             *_plain(whole, held_out, noise, tests, places),
-            *repetition_sentences({"repetition": again}),
-            *said,
+            *repetition_sentences({"repetition": repeats}),
+            *remarks,
             *outside,
         ),
     )
 
 
 def _figures(record: Record, predicted: np.ndarray, noise: float, rows: np.ndarray) -> dict[str, Any]:
-    found = figures(record.torque_nm[rows], predicted[rows], noise)
-    excess = float(np.sqrt(max(found["rms_nm"] ** 2 - noise**2, 0.0)))
-    return found | {"excess_rms_nm": excess, "samples": int(rows.sum())}
+    statistics = figures(record.torque_nm[rows], predicted[rows], noise)
+    excess = float(np.sqrt(max(statistics["rms_nm"] ** 2 - noise**2, 0.0)))
+    return statistics | {"excess_rms_nm": excess, "samples": int(rows.sum())}
 
 
 def _series(model: Model, record: Record, predicted: np.ndarray, noise: float) -> dict[str, Any]:
@@ -159,17 +159,17 @@ def _plain(
 def _left_out(grid: Grid) -> str:
     """One sentence: how much is left out, since it is not known which pulses acted there; empty if nothing was."""
     late = np.zeros(grid.size) if grid.late_s is None else np.where(grid.pulse_width_us > 0, grid.late_s, 0.0)
-    pulses = int(np.sum(np.abs(late) >= TOLD_S)) + _lost(grid)
+    pulses = int(np.sum(np.abs(late) >= REPORTED_LATE_S)) + _lost(grid)
     seconds = float(np.sum(grid.doubted[grid.count > 0])) * grid.step_s
     if not pulses and not seconds:
         return ""
     how = "felt 5 ms late or more, or lost"
-    told = f"1 pulse was {how}" if pulses == 1 else f"{pulses} pulses were {how}"
+    affected = f"1 pulse was {how}" if pulses == 1 else f"{pulses} pulses were {how}"
     if not seconds:
-        return f"{told}; the time of each is known, so nothing is left out."
+        return f"{affected}; the time of each is known, so nothing is left out."
     if not pulses:
         return f"{seconds:.1f} s are left out: the stimulation there is not known."
-    return f"{told}; {seconds:.1f} s are left out, where the time of the pulses is not known."
+    return f"{affected}; {seconds:.1f} s are left out, where the time of the pulses is not known."
 
 
 def _lost(grid: Grid) -> int:
@@ -192,7 +192,7 @@ Groups = list[tuple[str, np.ndarray]]
 def _error_shares(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
 ) -> dict[str, list[dict[str, Any]]]:
-    """What `Comparison.by` holds, of the samples that count."""
+    """Tables of `Comparison.by`, of the samples that count."""
     sign = direction_of(record)
     kinds: dict[str, Groups] = {
         "segment": [(name, record.segment == i) for i, name in enumerate(record.segment_names)],
@@ -206,11 +206,11 @@ def _error_shares(
 
 def _levels(width_us: np.ndarray) -> Groups:
     """Zero, then equal ranges up to the largest width."""
-    found = [("0 µs", width_us <= 0)]
+    groups = [("0 µs", width_us <= 0)]
     for low, high in pairwise(np.linspace(0.0, float(width_us.max()), LEVELS + 1)):
         rows = (width_us > max(low, 0.0)) & (width_us <= high) if high > 0 else np.zeros(width_us.size, bool)
-        found.append((f"{low:.0f}-{high:.0f} µs", rows))
-    return found
+        groups.append((f"{low:.0f}-{high:.0f} µs", rows))
+    return groups
 
 
 def _spans(time_s: np.ndarray) -> Groups:
@@ -231,9 +231,10 @@ def _table(groups: Groups, residual_nm: np.ndarray, noise_sd_nm: float, counted:
 
 def _with_shares(table: list[dict[str, Any]], excess: list[float]) -> list[dict[str, Any]]:
     """The rows with the share of each in the error above the noise."""
-    above = [max(own, 0.0) for own in excess]
+    above = [max(value, 0.0) for value in excess]
     total = sum(above)
-    return [row | {"share_of_excess": own / total if total > 0 else 0.0} for row, own in zip(table, above, strict=True)]
+    shares = [value / total if total > 0 else 0.0 for value in above]
+    return [row | {"share_of_excess": share} for row, share in zip(table, shares, strict=True)]
 
 
 def _frequency_rows(
@@ -266,7 +267,7 @@ def _frequency_rows(
 # ---- the worst places ----
 
 STRETCH_S = 0.5
-MOST = 5
+MAX_PLACES = 5
 """Largest number of places."""
 
 
@@ -312,17 +313,17 @@ def worst_places(
     rising, pieces = direction_of(record), []
     for run in np.split(np.arange(record.time_s.size), np.flatnonzero(np.diff(record.segment)) + 1):
         for part in np.split(run, range(length, run.size, length)):
-            take = part[rows[part]]
-            if take.size >= 2:
-                excess = float(np.sum(residual_nm[take] ** 2) - take.size * noise_sd_nm**2)
-                pieces.append([int(part[0]), int(part[-1]) + 1, excess, int(np.sign(np.sum(rising[take])))])
+            counted_rows = part[rows[part]]
+            if counted_rows.size >= 2:
+                excess = float(np.sum(residual_nm[counted_rows] ** 2) - counted_rows.size * noise_sd_nm**2)
+                pieces.append([int(part[0]), int(part[-1]) + 1, excess, int(np.sign(np.sum(rising[counted_rows])))])
     excess_total = sum(max(piece[2], 0.0) for piece in pieces)
     if excess_total <= 0.0:
         return []
     merged = sorted(_merge(pieces, record), key=lambda piece: -piece[2])
     return [
         _place(record, residual_nm, rows, piece, excess_total)
-        for piece in merged[:MOST]
+        for piece in merged[:MAX_PLACES]
         if piece[2] > 0.02 * excess_total
     ]
 

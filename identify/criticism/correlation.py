@@ -1,4 +1,4 @@
-"""Whether the residual is noise: its correlation with itself, u, u² and y, with bands of a known false-alarm rate.
+"""Tests for noise in the residual: its correlation with itself, u, u² and y, with bands of a known false-alarm rate.
 
 With a band of 1.96/√N at each lag, a false alarm at any lag is far more frequent than 5 %. Here the band of a function
 is the 95 % quantile of its largest value over all lags, found by simulating noise for this record: its length, gaps and

@@ -176,11 +176,11 @@ def _likeliest(chains: Sequence[Chain]) -> Chain:
 
     Likelihoods are compared where the noise is of one kind.
     """
-    noise_is_fixed = chains[0].models[-1].noise.held
+    noise_is_fixed = chains[0].models[-1].noise.white_only
     near = [
         chain
         for chain in chains
-        if chain.models[-1].noise.held == noise_is_fixed
+        if chain.models[-1].noise.white_only == noise_is_fixed
         and chains[0].better(chain.left_out[-1]).errors < thresholds.BETTER
     ]
     return min(near, key=lambda chain: (len(chain.names), -chain.models[-1].log_evidence))

@@ -21,7 +21,7 @@ from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.uncertainty import covariance_of
 from stimrig.identify.experiments import NOTHING, Experiment, plan, plan_further
 from stimrig.identify.results import Diagnosis
-from stimrig.identify.summary import probability, sure
+from stimrig.identify.summary import probability, probability_words
 
 MOST_PARAMETERS = 24
 """The wave of a tremor has hundreds."""
@@ -220,7 +220,7 @@ def _plain(search: EffectSearch, diagnosis: dict[str, Any], named: dict[str, Any
     ]
     for entry in missing:
         chance = entry["probability"]
-        text = f"{entry['name']} is {sure(chance)} missing ({probability(chance)}). {entry['plain']}"
+        text = f"{entry['name']} is {probability_words(chance)} missing ({probability(chance)}). {entry['plain']}"
         if entry["part"]:
             text += f" In the paper's Fig. 2 it stands in {PARTS[entry['part']]}."
         if entry["confused_with"]:

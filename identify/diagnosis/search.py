@@ -212,7 +212,7 @@ def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iter
 
 def released(fitted: Fitted) -> Fitted:
     """The model with its noise no longer held white, where its likelihood can then be trusted."""
-    if not fitted.noise.held:
+    if not fitted.noise.white_only:
         return fitted
     free = solve(fitted.problem, fitted.theta, NoiseLevel(0.5, 0.5, fitted.noise.sd_nm))
     return fitted if free.distrusted else free
@@ -286,7 +286,7 @@ def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     grid = base.problem.setup.grid
     record, jumps = grid.record, base.heavy_tails and grid.readings is not None
     applicable = not effect.raw and not effect.shape and effect.id not in present
-    applicable = applicable and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
+    applicable = applicable and not (effect.sporadic and jumps) and not (effect.band and base.noise.white_only)
     applicable = applicable and not replaced_by(base.effects, effect.forms)
     return applicable and all(record.knows(need) for need in effect.needs)
 

@@ -142,7 +142,7 @@ class Earlier:
         plateau = float(self.mean[0]), 2.0 * float(np.hypot(sd[0], model_sd[0]))
         precision = np.diag(1.0 / (sd**2 + model_sd**2))
         prior = NearShape(basis, self.shape, self.mean, precision, plateau, rise, EARLIER_DEVIATIONS)
-        return replace(prior, doubt=self._step_covariance(prior))
+        return replace(prior, shape_covariance=self._step_covariance(prior))
 
     def _step_covariance(self, prior: NearShape) -> np.ndarray | None:
         """Covariance of the logs of the steps, from that of the last curve's coefficients.

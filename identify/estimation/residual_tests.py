@@ -126,7 +126,7 @@ def _log_spectrum(noise: NoiseLevel) -> np.ndarray:
     white = max(1.0 - noise.share - noise.band, 1e-9)
     power = white + noise.share * _pole(angle, noise.ar1)
     if noise.band > 0.0:
-        band = _pole(angle - noise.turn, noise.keep) + _pole(angle + noise.turn, noise.keep)
+        band = _pole(angle - noise.turn, noise.decay) + _pole(angle + noise.turn, noise.decay)
         power = power + 0.5 * noise.band * band
     return np.log(power)
 

@@ -111,8 +111,8 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
     widths_us = np.linspace(0.0, fitted.problem.setup.basis.largest_us, 201)
     torque_nm = fitted.problem.setup.basis.design(widths_us) @ fitted.physical[fitted.problem.coefficients]
     threshold_us = float(widths_us[np.argmax(np.abs(torque_nm) >= 0.1 * np.abs(torque_nm).max())])
-    rows = [(one, one.pulse_widths(rate_hz)) for one in held_levels(largest_us, threshold_us, rate_hz)]
-    others = [one.pulse_widths(rate_hz) for one in held_levels(largest_us, threshold_us, rate_hz, REFERENCE)]
+    rows = [(design, design.pulse_widths(rate_hz)) for design in held_levels(largest_us, threshold_us, rate_hz)]
+    others = [design.pulse_widths(rate_hz) for design in held_levels(largest_us, threshold_us, rate_hz, REFERENCE)]
     reference = _simulate(fitted, _blank(record, np.concatenate(others)), True)[1]
     before = _expected_nm(fitted, reference, np.zeros((fitted.theta.size, 1)))
     after = [_expected_nm(fitted, reference, _whitened_slopes(fitted, _blank(record, width))) for _, width in rows]
@@ -135,8 +135,8 @@ def _whitened_slopes(fitted: Fitted, record: Record) -> np.ndarray:
 def _expected_nm(fitted: Fitted, reference: np.ndarray | None, white: np.ndarray) -> float:
     """Standard error of the model on a reference, N·m, once it has also seen a test of such whitened slopes."""
     assert reference is not None
-    found = np.linalg.lstsq(fitted.hessian + white @ white.T, reference, rcond=None)[0]
-    return float(np.sqrt(max(np.mean(np.sum(reference * found, axis=0)), 0.0)))
+    solution = np.linalg.lstsq(fitted.hessian + white @ white.T, reference, rcond=None)[0]
+    return float(np.sqrt(max(np.mean(np.sum(reference * solution, axis=0)), 0.0)))
 
 
 def _text(design: Design, duration_s: float, gain: float, names: tuple[str, ...]) -> str:
@@ -163,15 +163,15 @@ def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[st
         By effect id, or `NOTHING`.
     """
     simulated = _blank(record, width_us)
-    return float(min(separation(fits[one], fits[other], simulated) for one, other in permutations(fits, 2)))
+    return float(min(separation(fits[truth], fits[rival], simulated) for truth, rival in permutations(fits, 2)))
 
 
 def _blank(record: Record, width: np.ndarray) -> Record:
-    held, rate_hz = np.repeat(width, PER_PULSE), record.pulse_rate_hz
-    time_s, zeros = np.arange(held.size) / (PER_PULSE * rate_hz), np.zeros(held.size)
+    width_us, rate_hz = np.repeat(width, PER_PULSE), record.pulse_rate_hz
+    time_s, zeros = np.arange(width_us.size) / (PER_PULSE * rate_hz), np.zeros(width_us.size)
     angle = None if record.angle_rad is None else zeros + float(record.angle_rad[0])
     still = None if record.velocity_rad_s is None else zeros
-    return Record.from_arrays(time_s, held, zeros, angle_rad=angle, velocity_rad_s=still, pulse_rate_hz=rate_hz)
+    return Record.from_arrays(time_s, width_us, zeros, angle_rad=angle, velocity_rad_s=still, pulse_rate_hz=rate_hz)
 
 
 def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
@@ -203,8 +203,8 @@ def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.nda
     """Interval means of a fitted candidate on another record, without sporadic effects."""
     grid = make_grid(record)
     setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
-    kept = [(effect, form) for effect, form in fitted.effects if not find_effect(effect).sporadic]
-    problem = Problem(setup, kept)
+    lasting = [(effect, form) for effect, form in fitted.effects if not find_effect(effect).sporadic]
+    problem = Problem(setup, lasting)
     # Parameters are copied by name: the new test has one part, starts at rest, and has no sporadic effects.
     known = {name: place for place, name in enumerate(fitted.problem.names)}
     place = np.array([known[name] for name in problem.names])

@@ -1,11 +1,11 @@
-"""A test that stops itself: after each piece, the next one, or the word that enough is known.
+"""Adaptive test: after each piece, `decide` returns the next one, or ends the test.
 
 `decide` has no state and no clock: it takes what was measured and played so far. A worker calls it after each piece;
 when its answer is late, the rig plays the next piece of a fixed plan, and the worker is asked again with the longer
 record.
 
-What such a test can reach is said before the first pulse (`reach`): it is played in a simulation, on the last model of
-a known person, or on two usual muscles for a new one. The worse of the two counts.
+`reach` predicts the result before the first pulse: it simulates the test on the last model of a known person, or on two
+typical muscles for a new one, of which the worse counts.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Kind = Literal["next", "enough", "misfit", "spent"]
 REST_S, RISE_S, TOP_S, FALL_S = 0.5, 1.0, 0.3, 0.5
 """The opening: rest, a ramp to the largest width, a while there, silence."""
 LEAST_S = 1.9
-"""A record that is shorter tells nothing: the opening is played."""
+"""With a shorter record the opening is played."""
 ALARM = 1e-3
 """P-value of a residual test below which the structure fits badly; each test is asked about ten times in one test."""
 CONFIRMED_S = 1.0
@@ -45,7 +45,7 @@ fails, and each is asked about again and again."""
 EXCESS = 1.5
 """A residual larger than this many times the samples' noise is none of noise."""
 ROUNDS = 3
-"""How often a disturbance is looked for and taken off, each time beside a better fit of the muscle."""
+"""Rounds of finding and removing a disturbance, each beside a better fit of the muscle."""
 SETTLED_S = 4.0
 """No structure is judged before this, and so nothing is known well enough."""
 SECOND_COST = 2.0
@@ -57,7 +57,7 @@ SHARES = (0.03, 0.15, 0.35, 0.6, 0.85, 0.97)
 
 @dataclass(frozen=True)
 class Decision:
-    """What to play next, or that the test ends.
+    """The next segments to play, or the end of the test.
 
     Kinds are `next`: play `segments`. `enough`: both curves are known within the target. `misfit`: the structure fits
     badly; play the rest of the fixed test, so that the diagnosis gets its record. `spent`: no piece is left within the
@@ -84,8 +84,8 @@ class Decision:
 
 
 @dataclass(frozen=True)
-class Asked:
-    """What a test is to find out, what it may spend on that, and whom it is about.
+class AdaptiveGoal:
+    """Target and limits of a test, and earlier knowledge of the person.
 
     Raises BadRequest: a number that is none.
     """
@@ -105,22 +105,22 @@ class Asked:
 
 
 def decide(
-    record: Record | None, played_us: np.ndarray | Sequence[float], asked: Asked, before: Decision | None = None
+    record: Record | None, played_us: np.ndarray | Sequence[float], goal: AdaptiveGoal, before: Decision | None = None
 ) -> Decision:
     """The next piece of an adaptive test, or its end.
 
     `record`: what was measured so far, from the test's first pulse; None before the first. `played_us`: widths of all
-    pulses that were played or are committed, which may reach beyond the record's end. `asked`: what the test is to find
-    out, with what is left of its limits. `before`: the decision before this one; the search then starts from its fit.
+    pulses that were played or are committed, which may reach beyond the record's end. `goal`: the target, with
+    what is left of the limits. `before`: the decision before this one; the search then starts from its fit.
 
     Raises BadRecord: the record holds what no measurement gives.
     """
     if record is None or record.time_s[-1] - record.time_s[0] < LEAST_S:
-        return _opening(asked)
+        return _opening(goal)
     try:
         grid, raw = prepare(record)
         with np.errstate(all="ignore"):
-            short, wrong = _fitted(grid, raw, asked.earlier, before.short if before else None)
+            short, wrong = _fitted(grid, raw, goal.earlier, before.short if before else None)
     except (np.linalg.LinAlgError, IdentifyError) as error:
         return Decision("misfit", words=f"No model can be fitted ({error}). The rest of the fixed test is played.")
     known, played = knowledge(short), np.asarray(played_us, float)
@@ -130,20 +130,20 @@ def decide(
         if long_s - since_s >= CONFIRMED_S or not _finite(short):
             words = f"{wrong} The rest of the fixed test is played."
             return Decision("misfit", words=words, knowledge=known, short=short)
-        return replace(_next(short, known, played, asked), doubted_s=since_s)
-    if known.reaches(asked.target) and _settled(short):
+        return replace(_next(short, known, played, goal), doubted_s=since_s)
+    if known.reaches(goal.target) and _settled(short):
         return Decision("enough", words=f"Enough is known. {_state(known)}", knowledge=known, short=short)
-    return _next(short, known, played, asked)
+    return _next(short, known, played, goal)
 
 
-def _opening(asked: Asked) -> Decision:
-    rate = asked.pulse_rate_hz
+def _opening(goal: AdaptiveGoal) -> Decision:
+    rate = goal.pulse_rate_hz
     before, up, top, after = (round(seconds * rate) for seconds in (REST_S, RISE_S, TOP_S, FALL_S))
-    rise = asked.largest_us * np.arange(1, up + 1) / up
-    widths = np.r_[np.zeros(before), rise, np.full(top, asked.largest_us), np.zeros(after)]
-    earlier = asked.earlier
+    rise = goal.largest_us * np.arange(1, up + 1) / up
+    widths = np.r_[np.zeros(before), rise, np.full(top, goal.largest_us), np.zeros(after)]
+    earlier = goal.earlier
     dose = 0.0 if earlier is None else float(np.sum(np.abs(earlier.model.recruitment(widths))) / rate)
-    if widths.size / rate > asked.left_s or dose > asked.left_nm_s:
+    if widths.size / rate > goal.left_s or dose > goal.left_nm_s:
         return Decision("spent", words="The torque-time or the time that is left does not allow a first piece.")
     return Decision("next", (Piece("opening", widths).segment(1),), "A first look at the whole range.", None, dose)
 
@@ -159,11 +159,11 @@ def _fitted(grid: Grid, raw: Raw, last: Earlier | None, before: Short | None) ->
         wrong = _misfit(short)
     mains_hz = None if raw.hum is None else raw.hum["frequency_hz"]
     for _ in range(ROUNDS if wrong and _finite(short) else 0):
-        beside, added_nm = disturbed(short, short.grid.mean_noise_nm(short.rows), mains_hz)
+        disturbed_fit, added_nm = disturbed(short, short.grid.mean_noise_nm(short.rows), mains_hz)
         grid = replace(grid, torque_nm=grid.torque_nm - added_nm)
         short = fit_short(grid, grid.fitted, last=last, before=short, fine=True)
-        if _left(beside, short.grid.mean_noise_nm(short.rows)) is None:
-            return unsure(short, beside), None
+        if _unexplained(disturbed_fit, short.grid.mean_noise_nm(short.rows)) is None:
+            return unsure(short, disturbed_fit), None
     return short, wrong
 
 
@@ -177,31 +177,31 @@ def _misfit(short: Short) -> str | None:
         return "The estimate is not finite."
     if not _settled(short):
         return None
-    return _left(averaged(short, mean_of_draws=False), short.grid.mean_noise_nm(short.rows))
+    return _unexplained(averaged(short, mean_of_draws=False), short.grid.mean_noise_nm(short.rows))
 
 
-def _left(fitted: Fitted, white_nm: float) -> str | None:
+def _unexplained(fitted: Fitted, white_nm: float) -> str | None:
     """Why what a fit leaves is more than noise; None if it is not."""
-    own, white = fitted.rms_nm, white_nm
-    if own > EXCESS * white:
-        return f"The structure leaves {own:.2g} N·m where the noise is {white:.2g} N·m."
+    residual_nm, noise_nm = fitted.rms_nm, white_nm
+    if residual_nm > EXCESS * noise_nm:
+        return f"The structure leaves {residual_nm:.2g} N·m where the noise is {noise_nm:.2g} N·m."
     failed = [name for name, test in residual_tests(fitted).items() if test["p_value"] < ALARM]
     return f"The residual is not noise ({' and '.join(failed)})." if failed else None
 
 
 def _settled(short: Short) -> bool:
-    """Whether the record is long enough to judge the structure by."""
+    """Return true if the record is long enough to judge the structure by."""
     return short.grid.size * short.grid.step_s >= SETTLED_S
 
 
-def _next(short: Short, known: Knowledge, played: np.ndarray, asked: Asked) -> Decision:
+def _next(short: Short, known: Knowledge, played: np.ndarray, goal: AdaptiveGoal) -> Decision:
     rate = 1.0 / short.grid.step_s
-    foresight = Foresight.of(short, played, asked.target)
-    levels = _levels(short, known, asked.largest_us)
+    foresight = Foresight.of(short, played, goal.target)
+    levels = _levels(short, known, goal.largest_us)
     candidates = pieces(levels, rate)
     after, dose = foresight.after(candidates)
     seconds = np.array([piece.pulse_width_us.size for piece in candidates]) / rate
-    allowed = (dose <= asked.left_nm_s) & (seconds <= asked.left_s + 1e-9)
+    allowed = (dose <= goal.left_nm_s) & (seconds <= goal.left_s + 1e-9)
     if not allowed.any():
         return Decision(
             "spent", words=f"The torque-time or the time is used up. {_state(known)}", knowledge=known, short=short
@@ -246,7 +246,7 @@ USUAL = (SecondOrder(0.35, 0.9), ((1.0, 0.40, 0.05),)), (SecondOrder(0.45, 0.8),
 
 @dataclass(frozen=True)
 class Reach:
-    """What a test will probably reach."""
+    """Predicted result of an adaptive test."""
 
     reachable: bool  # whether the target is
     curve_percent: float  # largest half-width of this band at the end, %
@@ -257,14 +257,14 @@ class Reach:
 
     @property
     def cost(self) -> tuple[float, float]:
-        """What is worse the larger it is: torque-time and time, or the bands that are left, %."""
+        """Sort key, larger is worse: torque-time and time, or the remaining bands, %."""
         if self.reachable:
             return self.torque_time_nm_s, self.seconds
         return max(self.curve_percent, self.step_percent), self.torque_time_nm_s
 
 
-def reach(asked: Asked, plateau_nm: float) -> Reach:
-    """What an adaptive test can reach.
+def reach(goal: AdaptiveGoal, plateau_nm: float) -> Reach:
+    """Predict the result of an adaptive test by simulation.
 
     `plateau_nm`: torque at the largest width, N·m, from the calibration, or a guess. A known person's last model is
     used instead.
@@ -275,10 +275,10 @@ def reach(asked: Asked, plateau_nm: float) -> Reach:
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0.0 < value < float("inf"):
         fix = "Give a number above 0, in N·m."
         raise BadRequest(f"{value!r} is no positive number", place="plateau_nm", fix=fix)
-    earlier = asked.earlier
+    earlier = goal.earlier
     if earlier is not None:
-        return _play(earlier.linear, lambda u: np.abs(earlier.model.recruitment(u)), asked)
-    return worse([_play(linear, _curve(groups, asked.largest_us, plateau_nm), asked) for linear, groups in USUAL])
+        return _play(earlier.linear, lambda u: np.abs(earlier.model.recruitment(u)), goal)
+    return worse([_play(linear, _curve(groups, goal.largest_us, plateau_nm), goal) for linear, groups in USUAL])
 
 
 def worse(tests: Sequence[Reach]) -> Reach:
@@ -297,17 +297,17 @@ def _curve(groups: Groups, largest_us: float, plateau_nm: float) -> Curve:
     return lambda width_us: plateau_nm * (recruited(np.asarray(width_us, float) / largest_us) - recruited(0.0))
 
 
-def _play(linear: SecondOrder, curve: Curve, asked: Asked) -> Reach:
-    rate, target = asked.pulse_rate_hz, asked.target
+def _play(linear: SecondOrder, curve: Curve, goal: AdaptiveGoal) -> Reach:
+    rate, target = goal.pulse_rate_hz, goal.target
     widths, record, decision, dose = np.zeros(0), None, None, 0.0
     while True:
-        left_s, left_nm_s = max(asked.left_s - widths.size / rate, 0.0), max(asked.left_nm_s - dose, 0.0)
-        decision = decide(record, widths, replace(asked, left_s=left_s, left_nm_s=left_nm_s), decision)
+        left_s, left_nm_s = max(goal.left_s - widths.size / rate, 0.0), max(goal.left_nm_s - dose, 0.0)
+        decision = decide(record, widths, replace(goal, left_s=left_s, left_nm_s=left_nm_s), decision)
         if decision.kind != "next":
             return _reached(decision, target, widths.size / rate, dose)
         widths = np.r_[widths, *(segment.settings["pulse_width_us"] for segment in decision.segments)]
         dose = float(np.sum(curve(widths))) / rate
-        if record is None and dose > asked.left_nm_s:
+        if record is None and dose > goal.left_nm_s:
             return _reached(Decision("spent"), target, 0.0, 0.0)
         drive = np.repeat(curve(widths), SAMPLES)
         torque = boundary_states(*linear.core, 1.0 / (rate * SAMPLES), drive)[0][:-1]

@@ -138,7 +138,7 @@ def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, se
     In one design they are even between the threshold and the largest width, in the other half of them lie near the
     threshold, where a slow ramp spends little time and a PRBS none.
     """
-    found = []
+    sequences = []
     for words, near in (
         ("Random levels, each held for a moment", 0.0),
         ("Random levels, many near the threshold", 0.5),
@@ -153,17 +153,17 @@ def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, se
             if rested_s > OFTEN_S:
                 levels.append((0.0, 1.0))
                 rested_s = 0.0
-        found.append((words, levels))
+        sequences.append((words, levels))
     return [
         Design(
             words,
             (
                 _pause(),
-                Segment("levels", "widths", {"pulse_width_us": _held(own, pulse_rate_hz), "jumps": True}),
+                Segment("levels", "widths", {"pulse_width_us": _pulse_widths(levels, pulse_rate_hz), "jumps": True}),
                 _pause(),
             ),
         )
-        for words, own in found
+        for words, levels in sequences
     ]
 
 
@@ -171,7 +171,7 @@ def _pause() -> Segment:
     return Segment("rest", "rest", {"duration_s": 2.0})
 
 
-def _held(levels: list[tuple[float, float]], rate_hz: float) -> list[float]:
+def _pulse_widths(levels: list[tuple[float, float]], rate_hz: float) -> list[float]:
     """Widths of pulses, rounded down as the rig takes them."""
     return [float(np.floor(10.0 * us) / 10.0) for us, seconds in levels for _ in range(round(seconds * rate_hz))]
 
@@ -200,13 +200,13 @@ class Piece:
 def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:
     """All pieces between some levels, 0 among them."""
     levels = np.unique(np.round(np.floor(10.0 * levels_us) / 10.0, 1))
-    one, half, two = (max(round(s * pulse_rate_hz), 2) for s in (PIECE_S, HALF_S, LONG_S))
+    full, half, long = (max(round(s * pulse_rate_hz), 2) for s in (PIECE_S, HALF_S, LONG_S))
     chip = max(round(CHIP_S * pulse_rate_hz), 1)
-    found = [Piece("hold", np.full(one, level)) for level in levels]
+    candidates = [Piece("hold", np.full(full, level)) for level in levels]
     for first, second in permutations(levels, 2):
-        found.append(Piece("step", np.repeat([first, second], half)))
-        ramps = [first + (second - first) * np.arange(1, size + 1) / size for size in (one, two)]
-        found += [Piece("ramp", ramp) for ramp in ramps]
+        candidates.append(Piece("step", np.repeat([first, second], half)))
+        ramps = [first + (second - first) * np.arange(1, size + 1) / size for size in (full, long)]
+        candidates += [Piece("ramp", ramp) for ramp in ramps]
         if first > second:
-            found.append(Piece("prbs", np.repeat(np.where(CHIPS, first, second), chip)))
-    return found
+            candidates.append(Piece("prbs", np.repeat(np.where(CHIPS, first, second), chip)))
+    return candidates

@@ -1,4 +1,4 @@
-"""What is known of a muscle, and what pieces of a test would teach.
+"""Uncertainty of a muscle's curves, and its expected fall by each candidate piece of a test.
 
 Bands of both curves contain the whole true curve in 95 % of tests. For what pieces would teach, the draws' principal
 directions are few: the response to a piece is computed for the mean and for each direction, and the directions'
@@ -20,7 +20,7 @@ from stimrig.identify.experiments.designs import Piece
 
 POINTS = 61
 LONGEST_S = 12.0
-"""Of a step response, that is looked at."""
+"""Longest part of a step response that is judged, s."""
 LEVEL = 0.95
 EVEN = 0.9
 """The band is at least about this share of its largest width everywhere: where a curve has a sudden bend, the draws
@@ -79,7 +79,7 @@ class Knowledge:
     plateau_nm: float  # f at the largest width, positive
 
     def reaches(self, target: Target) -> bool:
-        """Whether both curves are known so well."""
+        """Return true if both bands are within the target."""
         return self.curve.percent <= target.curve_percent and self.step.percent <= target.step_percent
 
     def to_dict(self) -> dict:
@@ -153,8 +153,8 @@ class Foresight:
         right *= np.sign(
             np.take_along_axis(right, np.abs(right).argmax(axis=1)[:, None], 1)
         )  # the same on any computer
-        kept = min(DIRECTIONS, int(np.sum(size > 1e-9 * size[0])))
-        moved = mean + (size[:kept, None] / np.sqrt(len(draws))) * right[:kept] * scale
+        directions = min(DIRECTIONS, int(np.sum(size > 1e-9 * size[0])))
+        moved = mean + (size[:directions, None] / np.sqrt(len(draws))) * right[:directions] * scale
         rows = np.vstack([mean, moved])
         cores = np.c_[np.exp(rows[:, -3:-1]), rows[:, -1]]
         curves = rows[:, :-3]
@@ -190,8 +190,8 @@ class Foresight:
         curves = np.ascontiguousarray(self.coefficients_nm @ self.short.basis.design(levels).T)
         information = _information(curves, index, places, self.cores, self.states, step_s)
         size = len(self.cores) - 1
-        left = np.linalg.inv(np.eye(size) + information / self.noise_nm**2)
-        variance = np.einsum("bi,cij,bj->cb", self.targets, left, self.targets, optimize=True)
+        covariance = np.linalg.inv(np.eye(size) + information / self.noise_nm**2)
+        variance = np.einsum("bi,cij,bj->cb", self.targets, covariance, self.targets, optimize=True)
         dose = np.add.reduceat(curves[0][index], places[:-1]) * step_s
         return _norm(np.maximum(variance, 0.0)), dose
 
@@ -214,7 +214,7 @@ def _information(curves, index, places, cores, states, step_s):  # pragma: no co
     for c in range(count):
         y, v = states[:, 0].copy(), states[:, 1].copy()
         for k in range(places[c], places[c + 1]):
-            seen = 0.0
+            reference = 0.0
             for m in range(size + 1):
                 w, before = curves[m, index[k]], y[m]
                 y[m] = w + even[m, 0] * (before - w) + even[m, 1] * v[m]
@@ -222,9 +222,9 @@ def _information(curves, index, places, cores, states, step_s):  # pragma: no co
                 # The mean over the interval, read a delay earlier.
                 mean = 0.5 * (before + y[m]) - cores[m, 2] * v[m]
                 if m == 0:
-                    seen = mean
+                    reference = mean
                 else:
-                    slope[m - 1] = mean - seen
+                    slope[m - 1] = mean - reference
             for i in range(size):
                 for j in range(i + 1):
                     out[c, i, j] += slope[i] * slope[j]

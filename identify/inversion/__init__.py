@@ -1,4 +1,4 @@
-"""From a torque that a controller wants to the pulse widths that follow it best; where it cannot be had, and why."""
+"""Inversion: pulse widths whose torque follows a reference best, and where the reference cannot be reached."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class Inversion(Result):
 
     def _sheet(self) -> Sheet:
         fit = f"fit {quantity(self.fit_percent, '%')} where it can be reached"
-        missed = [one.row() for one in self.unreachable[:8]]
+        missed = [stretch.row() for stretch in self.unreachable[:8]]
         rows = [("widths", f"up to {quantity(self.pulse_width_us.max(), 'µs')}"), *missed]
         return Sheet(f"Pulse widths for a torque: {self.pulse_width_us.size} pulses, {fit}", tuple(rows))
 
@@ -84,7 +84,7 @@ class Inversion(Result):
                 **({} if reference.angle_rad is None else {"angle_rad": reference.angle_rad.round(6)}),
                 "pulse_width_us": self.pulse_width_us,
                 "predicted_torque_nm": self.predicted_nm.round(6),
-                "unreachable": [one.to_dict() for one in self.unreachable],
+                "unreachable": [stretch.to_dict() for stretch in self.unreachable],
                 "fit_percent": self.fit_percent,
                 "whole_fit_percent": self.whole_fit_percent,
                 "tolerance_nm": self.tolerance_nm,
@@ -135,18 +135,18 @@ def invert(
     wanted, motion = plant.sign * reference.torque_nm, reference.motion
     gain, passive_nm = _joint(model, reference, plant.sign)
     needed = (wanted - passive_nm) / gain  # what the muscle has to give at the model's own angle
-    demand, best, least = np.zeros(wanted.size), None, np.inf
+    demand, best, least_rms_nm = np.zeros(wanted.size), None, np.inf
     target, idle = needed, 0
     for _ in range(TURNS):
         demand = best_demand(plant.a, plant.b, target, plant.largest_nm, plant.rises(demand))
         widths = plant.widths(demand)
         got = plant.sign * above_rest(model, widths, reference.pulse_rate_hz, motion)
         error = wanted - got
-        left = float(np.sqrt(np.mean(error**2)))
-        idle = idle + 1 if left > GAIN * least else 0
-        if left < least:
-            best, least = (demand, widths, got), left
-        if idle > 1 or left < ENOUGH * plant.largest_nm or (not model.effects and rise_us is None):
+        rms_nm = float(np.sqrt(np.mean(error**2)))
+        idle = idle + 1 if rms_nm > GAIN * least_rms_nm else 0
+        if rms_nm < least_rms_nm:
+            best, least_rms_nm = (demand, widths, got), rms_nm
+        if idle > 1 or rms_nm < ENOUGH * plant.largest_nm or (not model.effects and rise_us is None):
             break
         target = plant.linear(demand) + STEP * error / gain
     assert best is not None
@@ -207,7 +207,7 @@ def _stretches(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float) 
         for index, reason in enumerate(REASONS)
         for run in runs(_joined(reasons == index))
     ]
-    return tuple(sorted(stretches, key=lambda one: one.begin_s))
+    return tuple(sorted(stretches, key=lambda stretch: stretch.begin_s))
 
 
 def _best_fit(wanted: np.ndarray, got: np.ndarray) -> float | None:

@@ -72,7 +72,7 @@ class _Programme:
         self.limit = np.stack([limit for *_, limit in sides])
 
     def constrained(self, v: np.ndarray) -> np.ndarray:
-        """What the limits bound, shape (sides, K)."""
+        """Values that the limits bound, shape (sides, K)."""
         return np.stack([sign * T(v) for T, sign, _ in self.sides])
 
     def back(self, y: np.ndarray) -> np.ndarray:
@@ -96,8 +96,8 @@ class _Programme:
             at = gradient, outside, slack, dual, np.asarray(cholesky_banded(self.P + np.sum(grams, axis=0), lower=True))
             _, ds, dz = self._step(*at, slack * dual)
             length = min(_longest(slack, ds), _longest(dual, dz))
-            ahead = float(np.mean((slack + length * ds) * (dual + length * dz)))
-            dv, ds, dz = self._step(*at, slack * dual + ds * dz - gap * (ahead / gap) ** 3)
+            affine_gap = float(np.mean((slack + length * ds) * (dual + length * dz)))
+            dv, ds, dz = self._step(*at, slack * dual + ds * dz - gap * (affine_gap / gap) ** 3)
             length = 0.99 * min(_longest(slack, ds), _longest(dual, dz))
             v, slack, dual = v + length * dv, slack + length * ds, dual + length * dz
         return v

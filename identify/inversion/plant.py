@@ -47,7 +47,7 @@ class Plant:
         cls, model: Model, reference: Reference, largest_us: float | None, rise_us: float | None, whole: bool,
         shortest_us: float = 0.0,
     ) -> Plant:  # fmt: skip
-        """Of a model, for a reference. Raises BadModel and BadRequest as `invert`."""
+        """Make the plant of a model for a reference. Raises BadModel and BadRequest as `invert`."""
         rate_hz = reference.pulse_rate_hz
         if not isinstance(model.linear, SecondOrder):
             fix = "Fit with maximum-likelihood."
@@ -126,8 +126,8 @@ class Plant:
         most_owed, widest_us = OWED * self.largest_nm, float(self.width_us[-1])
         widths, owed, last = np.zeros(wanted.size), 0.0, 0.0
         for k, demand in enumerate(wanted):
-            asked = float(np.interp(demand + owed, self.inverse_nm, self.inverse_us)) if demand > 0.0 else 0.0
-            width = min(max(asked, least_us[k]), widest_us)
+            exact_us = float(np.interp(demand + owed, self.inverse_nm, self.inverse_us)) if demand > 0.0 else 0.0
+            width = min(max(exact_us, least_us[k]), widest_us)
             if self.rise_us is not None:
                 width = min(width, last + self.rise_us)
             if self.whole:
@@ -138,15 +138,15 @@ class Plant:
 
     def _lead_in(self, widths_us: np.ndarray) -> np.ndarray:
         """Widths without torque that let a rise begin in time, µs, shape (K,)."""
-        least = np.zeros(widths_us.size)
+        lead_in_us = np.zeros(widths_us.size)
         if self.rise_us is None:
-            return least
+            return lead_in_us
         coming = 0.0
         for k in range(widths_us.size - 1, -1, -1):
-            least[k] = min(max(coming - self.rise_us, 0.0), self._ready_us)
-            least[k] = max(least[k], self.shortest_us) if least[k] > 0.0 else 0.0
-            coming = max(widths_us[k], least[k])
-        return np.floor(least) if self.whole else least
+            lead_in_us[k] = min(max(coming - self.rise_us, 0.0), self._ready_us)
+            lead_in_us[k] = max(lead_in_us[k], self.shortest_us) if lead_in_us[k] > 0.0 else 0.0
+            coming = max(widths_us[k], lead_in_us[k])
+        return np.floor(lead_in_us) if self.whole else lead_in_us
 
 
 def _curve(model: Model, largest_us: float | None, whole: bool) -> tuple[float, np.ndarray, np.ndarray]:
@@ -173,9 +173,9 @@ def _later(model: Model, rate_hz: float, widest_us: float) -> float:
     plain = model.with_(effects=())
     half_s = []
     surfaces = Surfaces.of(model.effects)
-    held = None if surfaces is None else Motion.still(surfaces.reference_rad, size)
-    for one in (model, plain):
-        step = np.abs(above_rest(one, np.full(size, widest_us), rate_hz, held))
+    at_reference = None if surfaces is None else Motion.still(surfaces.reference_rad, size)
+    for variant in (model, plain):
+        step = np.abs(above_rest(variant, np.full(size, widest_us), rate_hz, at_reference))
         peak = int(np.argmax(step))
         half_s.append(
             float(np.interp(step[peak] / 2, np.maximum.accumulate(step[: peak + 1]), np.arange(peak + 1))) / rate_hz

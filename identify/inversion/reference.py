@@ -17,7 +17,7 @@ from stimrig.identify.simulation.pulses import Motion
 
 LONGEST_S = 300.0
 MOST_SAMPLES = 60_000
-"""Of a reference: the longest one at 200 a second."""
+"""Samples of the longest reference, at 200 a second."""
 LARGEST_NM = 1000.0
 LARGEST_RAD = 7.0
 """A little more than a whole turn."""
@@ -43,7 +43,7 @@ class Reference:
 
     @property
     def motion(self) -> Motion | None:
-        """How the joint moves; None where nothing says so."""
+        """Motion of the joint; None where the reference has no angle."""
         return None if self.angle_rad is None else Motion.of(self.angle_rad, self.pulse_rate_hz)
 
     @classmethod
@@ -83,7 +83,7 @@ class Reference:
         _refuse_larger(torque, LARGEST_NM, "N·m", name, f"At most {LARGEST_NM:g} N·m; is it in mN·m?")
         angle = None
         if angle_rad is not None:
-            angle = _beside(angle_rad, "angle_rad", "angle", torque.size, name)
+            angle = _matching_column(angle_rad, "angle_rad", "angle", torque.size, name)
             _refuse_larger(angle, LARGEST_RAD, "rad", "angle_rad", f"At most {LARGEST_RAD:g}; is it in degrees?")
         if time_s is not None:
             times_s = _times(time_s, torque.size, name)
@@ -112,7 +112,7 @@ def _column(values: object, name: str) -> np.ndarray:
     return column
 
 
-def _beside(values: object, place: str, what: str, size: int, name: str) -> np.ndarray:
+def _matching_column(values: object, place: str, what: str, size: int, name: str) -> np.ndarray:
     """A column with one value for each torque."""
     column = _column(values, place)
     if column.size != size:
@@ -132,7 +132,7 @@ def _too_long(seconds: float, place: str) -> BadRequest:
 
 
 def _times(values: object, size: int, name: str) -> np.ndarray:
-    time_s = _beside(values, "time_s", "time", size, name)
+    time_s = _matching_column(values, "time_s", "time", size, name)
     if size < 2:
         raise BadRequest("one time only", place="time_s", fix="Give two or more, or leave the times out.")
     step_s = np.diff(time_s)
@@ -152,9 +152,10 @@ def _on_pulses(time_s: np.ndarray, torque_nm: np.ndarray, pulse_rate_hz: float) 
     edges = time_s[0] + np.arange(size + 1) / pulse_rate_hz
     area = np.r_[0.0, np.cumsum(np.diff(time_s) * (torque_nm[1:] + torque_nm[:-1]) / 2)]
     at = np.clip(np.searchsorted(time_s, edges, side="right") - 1, 0, time_s.size - 2)
-    past = np.clip(edges, time_s[0], time_s[-1]) - time_s[at]
+    offset_s = np.clip(edges, time_s[0], time_s[-1]) - time_s[at]
     slope = (torque_nm[at + 1] - torque_nm[at]) / (time_s[at + 1] - time_s[at])
-    whole = area[at] + past * (torque_nm[at] + slope * past / 2) + np.maximum(edges - time_s[-1], 0.0) * torque_nm[-1]
+    whole = area[at] + offset_s * (torque_nm[at] + slope * offset_s / 2)
+    whole += np.maximum(edges - time_s[-1], 0.0) * torque_nm[-1]
     return np.diff(whole) * pulse_rate_hz
 
 

@@ -22,7 +22,7 @@ class Curve:
         """Torque at steady state for pulse widths of any shape, N·m, or a derivative by the pulse width, N·m/µs."""
         return self.basis.design(np.asarray(pulse_width_us, float), derivative) @ self.coefficients_nm
 
-    def table(self, tolerance: float = 2e-4, most: int = 2001) -> tuple[np.ndarray, np.ndarray]:
+    def table(self, tolerance: float = 2e-4, max_points: int = 2001) -> tuple[np.ndarray, np.ndarray]:
         """Pulse widths, µs, and torques, N·m, dense enough for linear interpolation.
 
         The spacing is halved until the error at the midpoints is below `tolerance` times the curve's range.
@@ -40,7 +40,7 @@ class Curve:
             torque = self(u)
             middle = (u[1:] + u[:-1]) / 2
             worst = np.max(np.abs(self(middle) - (torque[1:] + torque[:-1]) / 2))
-            if worst <= tolerance * max(float(np.ptp(torque)), 1e-12) or 2 * size > most:
+            if worst <= tolerance * max(float(np.ptp(torque)), 1e-12) or 2 * size > max_points:
                 return u, torque
             size = 2 * size - 1
 
@@ -217,10 +217,10 @@ def fit_shape(
     costs = [float(np.sum(residual(np.array([s, m / top])) ** 2)) for s, m in scan]
     best = scan[int(np.argmin(costs))]
     bounds = ([np.log(0.5 / top), 0.0], [np.log(2000.0 / top), 1.2])
-    found = least_squares(
+    solution = least_squares(
         residual, [best[0], best[1] / top], bounds=bounds, x_scale=[0.3, 0.05], xtol=1e-12, ftol=1e-14, gtol=1e-14
     )
-    return basis_at(found.x[0], found.x[1] * top, largest_us)
+    return basis_at(solution.x[0], solution.x[1] * top, largest_us)
 
 
 def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:

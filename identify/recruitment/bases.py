@@ -77,16 +77,16 @@ def bsplines(padded: np.ndarray, degree: int, at: np.ndarray, derivative: int = 
     size = padded.size - degree - 1
     span = np.clip(np.searchsorted(padded, at, side="right") - 1, degree, size - 1)
     near = padded[span + np.arange(1 - degree, degree + 1)[:, None]]
-    ahead, behind = near[degree:] - at, at - near[:degree]
+    above, below = near[degree:] - at, at - near[:degree]
     local = np.zeros((degree + 1, at.size))
     local[0] = 1.0
     for order in range(1, degree + 1):
         carried = 0.0
         for j in range(order):
-            left = degree + j - order
-            share = local[j] / (near[degree + j] - near[left])
-            local[j] = carried + ahead[j] * share
-            carried = behind[left] * share
+            lower_knot = degree + j - order
+            share = local[j] / (near[degree + j] - near[lower_knot])
+            local[j] = carried + above[j] * share
+            carried = below[lower_knot] * share
         local[order] = carried
     values = np.zeros((at.size, size))
     values[np.arange(at.size), span - degree + np.arange(degree + 1)[:, None]] = local

@@ -66,7 +66,7 @@ class NearShape:
     """Mean and standard deviation of the log of the plateau, N·m: the sum of all steps, with their deviations."""
     rise_us: float  # rise from 10 to 90 %, µs: the scale of the deviation
     deviations: tuple[Deviation, ...] = DEVIATIONS  # kinds of the log density's deviation that are averaged over
-    doubt: np.ndarray | None = None
+    shape_covariance: np.ndarray | None = None
     """Covariance of the logs of the steps of the shape itself, where the shape is an estimate; shape (n, n)."""
 
     @cached_property
@@ -98,15 +98,17 @@ class NearShape:
         away = np.abs(at[:, None] - at[None, :]) / self.rise_us
         scaled = np.sqrt(3.0) * away / SMOOTH_LENGTH
         smooth, rough = (1.0 + scaled) * np.exp(-scaled), np.exp(-away / ROUGH_LENGTH)
-        found = []
+        roots = []
         for kind in self.deviations:
             covariance = kind.smooth_share * smooth + (1.0 - kind.smooth_share) * rough
             covariance = kind.sd**2 * (covariance + 1e-9 * np.eye(at.size))
-            found.append(np.linalg.cholesky(covariance if self.doubt is None else covariance + self.doubt))
-        return tuple(found)
+            if self.shape_covariance is not None:
+                covariance = covariance + self.shape_covariance
+            roots.append(np.linalg.cholesky(covariance))
+        return tuple(roots)
 
     def blurred(self, steps: np.ndarray) -> np.ndarray:
-        """How large a step may be, judging by itself and by the density of its neighbours, shape (n,).
+        """Largest plausible steps, by each step itself and by the density of its neighbours, shape (n,).
 
         Beside a jump of the density a step is small, but where exactly the jump is is not known: the small steps there
         may be as large as their neighbours.

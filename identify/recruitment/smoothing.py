@@ -73,8 +73,8 @@ def spline_roughness(
     if pilot is None:
         ease = (gaps / gaps.mean()) ** 3
     else:
-        own = pilot[0].knots_us
-        centre = (own[1:] + own[:-1]) / 2
+        pilot_knots_us = pilot[0].knots_us
+        centre = (pilot_knots_us[1:] + pilot_knots_us[:-1]) / 2
         energy = (pilot[0].design(centre, derivative=3) @ pilot[1]) ** 2
         energy = np.convolve(np.pad(energy, 2, mode="edge"), [0.1, 0.2, 0.4, 0.2, 0.1], mode="valid")
         ease = 1.0 / (np.interp(middle, centre, energy) / max(float(energy.max()), 1e-300) + STRAIGHTEST)
@@ -97,7 +97,7 @@ LOWEST, HIGHEST = 1e-9, 1e9
 """Bounds of the weight, relative to the balance of data and penalty."""
 
 TILT = 1e-3
-"""Of two weights between which the data do not decide, the smaller: log likelihood × 2 by which e times more loses."""
+"""Penalty on an e-fold weight, in twice the log likelihood: where the data do not decide, the smaller weight wins."""
 
 
 @dataclass(frozen=True)
@@ -134,8 +134,8 @@ def choose_weight(
     # This dimension is computed from the penalty, not from the data, which do not cover all shapes.
     straight = straight_lines(roughness) if null is None else null
     freedom_left = max(rows - free - straight, 1)
-    weight, left = _weighed(gram, moment, energy, freedom_left, roughness, straight)
-    return Choice(weight, left / freedom_left)
+    weight, squares = _weighed(gram, moment, energy, freedom_left, roughness, straight)
+    return Choice(weight, squares / freedom_left)
 
 
 def _weighed(

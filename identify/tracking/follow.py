@@ -1,4 +1,4 @@
-"""One trial followed: what was expected, what it said, what is expected next, and what a person should know of it.
+"""Tracking over one trial: prediction, fit of the trial, updated estimate, and the outcome for people.
 
 The approved model stands as it is now: its effects' slow states, its curve with gain and shift, its time scale. A slow
 state x (fatigue, potentiation) goes from 0 (rested) to 1. The pulses fill it by the effect's own law, with the gain and
@@ -27,16 +27,16 @@ from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.simulation.predict import refuse_rate
 from stimrig.identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, Values, updated
-from stimrig.identify.tracking.trial import Seen, curve_covariance, look, placed
+from stimrig.identify.tracking.trial import TrialFit, curve_covariance, fit_trial, placed
 
 UNEXPLAINED = 4.0
 """An error so many times what the approved model left is not one of gain, threshold or speed."""
 GONE = 0.25
 """Where less of the expected torque came, something came loose: no muscle changes so much from trial to trial."""
 ENOUGH = 0.05
-"""Of the model's largest torque: so much the expected one must vary for that to be told."""
+"""Least range of the expected torque, as a share of the model's largest, from which that can be decided."""
 LITTLE = np.array([0.05, 5.0, 0.08])
-"""A trial that would tell none of the levels to within such a standard deviation tells little."""
+"""A trial that determines no level to within such a standard deviation teaches little."""
 
 USUAL_REST_S = 15.0
 """Rest after the first trial, as it is expected: in the one before it the model was approved."""
@@ -51,11 +51,11 @@ Bounds = Mapping[str, Sequence[float]]
 
 
 class Outcome(StrEnum):
-    """What became of a trial."""
+    """Outcome of a trial."""
 
     FOLLOWED = "followed"
     LITTLE = "little"
-    """It tells little: too short, too weak, or too uneven."""
+    """It determines no level well: too short, too weak, or too uneven."""
     ODD = "odd"
     """It is far from what was expected, or something else happened in it. It moves little or nothing."""
     NO_TORQUE = "no-torque"
@@ -72,11 +72,11 @@ class Step:
     `coming`, after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that was the first.
     """
 
-    outcome: Outcome  # what became of it
-    seen: Seen  # what the trial said by itself
-    before: State  # what was expected of it
-    after: State  # what is known after it
-    coming: State  # what is expected of the next trial: of this the controller is told
+    outcome: Outcome
+    fit: TrialFit  # of this trial alone
+    before: State  # prediction before it
+    after: State  # estimate after it
+    coming: State  # prediction for the next trial, for the controller
     distance: float | None  # squared, of what was seen from what was expected, in sd; None if it moved nothing
     effects: dict[str, dict[str, float]] = field(default_factory=dict)  # their states
 
@@ -84,8 +84,8 @@ class Step:
     def disturbed_s(self) -> list[list[float]]:
         """Stretches from which nothing should be learnt, s since the record's begin: all of a trial that is odd."""
         if self.outcome in (Outcome.ODD, Outcome.NO_TORQUE, Outcome.CONTRADICTS):
-            return [[0.0, self.seen.duration_s]]
-        return [list(stretch) for stretch in self.seen.disturbed]
+            return [[0.0, self.fit.duration_s]]
+        return [list(stretch) for stretch in self.fit.disturbed]
 
     def to_dict(self) -> dict[str, Any]:
         """As JSON: the levels of this trial and of the next with their bands, and what people may ask."""
@@ -94,10 +94,10 @@ class Step:
             "trial": self.after.trials,
             "now": levels_of(self.after),
             "coming": levels_of(self.coming),
-            "error_nm": self.seen.error_nm,
-            "expected_error_nm": self.seen.expected_nm,
-            "error_before_nm": self.seen.before_nm,
-            "torque_nm": self.seen.torque_nm,
+            "error_nm": self.fit.error_nm,
+            "expected_error_nm": self.fit.expected_nm,
+            "error_before_nm": self.fit.before_nm,
+            "torque_nm": self.fit.torque_nm,
             "disturbed_s": self.disturbed_s,
             "distance": self.distance,
             "effects": self.effects,
@@ -119,7 +119,7 @@ def levels_of(state: State) -> dict[str, dict[str, float]]:
 
 
 def begin(model: Model, rates: Rates = USUAL) -> State:
-    """What is expected of the first trial after an approval.
+    """Predict the first trial after an approval.
 
     Parameters
     ----------
@@ -162,25 +162,25 @@ def follow(
     before = begin(model, rates) if state is None else state
     rest_s = rest_before(before, record, rest_s)
     begun = rested(model, before.effects, rest_s)
-    seen = look(set_states(model, begun), before, record)
-    if seen.came < GONE and seen.wanted_nm > ENOUGH * float(np.ptp(model.recruitment.table()[1])):
+    fit = fit_trial(set_states(model, begun), before, record)
+    if fit.slope < GONE and fit.wanted_nm > ENOUGH * float(np.ptp(model.recruitment.table()[1])):
         after, distance, outcome = replace(before, trials=before.trials + 1), None, Outcome.NO_TORQUE
-    elif not (seen.misfit <= UNEXPLAINED):
+    elif not (fit.misfit <= UNEXPLAINED):
         after, distance = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1), None
         outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
     else:
-        after, distance = updated(before, seen.vector, seen.information)
-        outcome = Outcome.ODD if after.odd is not None else _describe(seen)
+        after, distance = updated(before, fit.vector, fit.information)
+        outcome = Outcome.ODD if after.odd is not None else _describe(fit)
     after = passed(model, replace(after, effects=begun), record, 0.0)
     next_s = rest_s if before.trials or rest_s is None else min(rest_s, USUAL_REST_S)
     coming = rested(model, after.effects, next_s)
     effects = {effect: {"now": now, "coming": coming[effect]} for effect, now in after.effects.items()}
-    return Step(outcome, seen, before, after, after.ahead(rates), distance, effects)
+    return Step(outcome, fit, before, after, after.predicted(rates), distance, effects)
 
 
-def _describe(seen: Seen) -> Outcome:
-    own = seen.information[:LEVELS, :LEVELS] + np.diag(1e-3 / LITTLE**2)
-    little = np.all(np.sqrt(np.diag(np.linalg.inv(own))) > LITTLE)
+def _describe(fit: TrialFit) -> Outcome:
+    information = fit.information[:LEVELS, :LEVELS] + np.diag(1e-3 / LITTLE**2)
+    little = np.all(np.sqrt(np.diag(np.linalg.inv(information))) > LITTLE)
     return Outcome.LITTLE if little else Outcome.FOLLOWED
 
 
@@ -192,11 +192,11 @@ def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Mo
     model : Model
         The approved one.
     step : Step
-        What the last trial said.
+        The last trial.
     bounds : mapping of str to (float, float), optional
         Least and most of each quantity that may move; the others stay as approved. All three are followed
-        nevertheless: one that was held would be taken for a change of the others. By default all move freely.
-        Whether the expected values themselves are inside, the caller has to look.
+        nevertheless: a fixed one would be taken for a change of the others. By default all move freely.
+        The caller checks that the expected values themselves are inside.
     """
     coming, effects = step.coming, {effect: states["coming"] for effect, states in step.effects.items()}
     if bounds is None:
@@ -220,13 +220,13 @@ def slow_forms(model: Model) -> dict[str, tuple[Form, dict[str, Any]]]:
     model : Model
         The model.
     """
-    found = {}
+    forms = {}
     for entry in model.effects:
         known = known_form(entry)
         if known and known[1].state is not None:
             values = {name: np.full((1, 1), parameter_value(value)) for name, value in entry["parameters"].items()}
-            found[entry["id"]] = known[1], values
-    return found
+            forms[entry["id"]] = known[1], values
+    return forms
 
 
 def set_states(model: Model, states: Mapping[str, float]) -> Model:
@@ -247,15 +247,15 @@ def rest_before(state: State, record: Record, rest_s: float | None = None) -> fl
 
 def rested(model: Model, states: Mapping[str, float], rest_s: float | None) -> dict[str, float]:
     """States after a rest; a rest of unknown length is taken for one after which all have recovered."""
-    found = {}
+    states_after = {}
     for effect, (form, values) in slow_forms(model).items() if states else ():
         if rest_s is None:
-            found[effect] = 0.0
+            states_after[effect] = 0.0
             continue
         assert form.state is not None
         scene = Scene(np.zeros(1), np.zeros(1), 0.0, 1.0, 1.0, pauses_s=np.array([rest_s]), states=states)
-        found[effect] = float(form.state(np.zeros((1, 1)), values, scene)[0])
-    return found
+        states_after[effect] = float(form.state(np.zeros((1, 1)), values, scene)[0])
+    return states_after
 
 
 def passed(model: Model, state: State, record: Record, rest_s: float | None = None) -> State:
@@ -279,7 +279,7 @@ def passed(model: Model, state: State, record: Record, rest_s: float | None = No
     if not slow_forms(model):
         return state
     begun = rested(model, state.effects, rest_before(state, record, rest_s))
-    problem, theta = placed(set_states(model, begun), state.mean[state.seen], make_grid(record))
+    problem, theta = placed(set_states(model, begun), state.mean[state.observed], make_grid(record))
     return replace(state, effects=problem.states(theta), ended_s=_end_s(record))
 
 
@@ -298,8 +298,8 @@ def moved_curve(curve: Curve, values: Values) -> Curve:
     if values.threshold_shift_us == 0.0:
         return replace(curve, coefficients_nm=values.gain * curve.coefficients_nm)
     largest = curve.basis.largest_us
-    own = np.asarray(getattr(curve.basis, "knots_us", np.zeros(0))) + values.threshold_shift_us
-    basis = SplineBasis(_apart(np.r_[own, np.linspace(0.0, largest, EVEN)], largest))
+    shifted_us = np.asarray(getattr(curve.basis, "knots_us", np.zeros(0))) + values.threshold_shift_us
+    basis = SplineBasis(_apart(np.r_[shifted_us, np.linspace(0.0, largest, EVEN)], largest))
     # Between every two knots the same number of places, so that a steep rise counts as much as a long plateau.
     share = np.arange(PER_KNOT) / PER_KNOT
     u = np.r_[(basis.knots_us[:-1, None] + share * np.diff(basis.knots_us)[:, None]).ravel(), largest]
@@ -310,15 +310,15 @@ def moved_curve(curve: Curve, values: Values) -> Curve:
 def _apart(knots_us: np.ndarray, largest_us: float) -> np.ndarray:
     """The knots within 0 and the largest width, both included, without those too close to one before them."""
     inner = np.sort(knots_us[(knots_us > CLOSEST_US) & (knots_us < largest_us - CLOSEST_US)])
-    kept = [0.0]
+    spaced = [0.0]
     for knot in inner.tolist():
-        if knot - kept[-1] >= CLOSEST_US:
-            kept.append(knot)
-    return np.array([*kept, largest_us])
+        if knot - spaced[-1] >= CLOSEST_US:
+            spaced.append(knot)
+    return np.array([*spaced, largest_us])
 
 
 def largest_change(model: Model, curve_nm: np.ndarray) -> float:
-    """How far `curve_nm` moves the curve anywhere, as a share of its largest torque."""
+    """Largest change of the curve by `curve_nm`, as a share of its largest torque."""
     change = replace(model.recruitment, coefficients_nm=curve_nm).table()[1]
     return float(np.max(np.abs(change)) / max(np.ptp(model.recruitment.table()[1]), 1e-9))
 
@@ -346,7 +346,7 @@ def moved_model(
         raise BadModel("only second-order dynamics are tracked", fix="Fit with maximum-likelihood.")
     linear = replace(model.linear, time_constant_s=model.linear.time_constant_s * values.time_scale)
     sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
-    own = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
-    # What was known of the approved model's own parameters holds for none of the moved ones.
+    curve = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
+    # Covariance and bands of the approved parameters do not hold for the moved ones.
     begun = set_states(model, effects or {})
-    return begun.with_(recruitment=moved_curve(own, values), linear=linear, covariance=None, bands={})
+    return begun.with_(recruitment=moved_curve(curve, values), linear=linear, covariance=None, bands={})

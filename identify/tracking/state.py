@@ -1,4 +1,4 @@
-"""What is tracked from trial to trial, how it changes, and one step of the Kalman filter.
+"""The quantities that are tracked from trial to trial, how they change, and one step of the Kalman filter.
 
 Three levels, relative to the approved model: the log of the gain, the shift of the threshold (µs) and the log of the
 time scale. Each has a trend: a level changes by its trend and by a step without memory, and the trend turns slowly.
@@ -31,7 +31,7 @@ MOST_BY_ODD = 1.9
 
 @dataclass(frozen=True)
 class Rates:
-    """How fast a person changes, in the units of the levels (log gain, µs, log time scale); arrays of shape (3,)."""
+    """Rates of a person's change, in the units of the levels (log gain, µs, log time scale); arrays of shape (3,)."""
 
     start: np.ndarray  # standard deviation of the first trial's levels: what the approved model does not know
     step: np.ndarray  # standard deviation of a change from one trial to the next that has no trend
@@ -71,10 +71,10 @@ class Values:
 
 @dataclass(frozen=True)
 class State:
-    """What is known of the levels, their trends and the curve.
+    """Estimate of the levels, their trends and the curve.
 
-    `mean`, shape (6 + n,), holds three levels, three trends, and what is to be added to the n coefficients of the
-    approved curve, N·m.
+    `mean`, shape (6 + n,), holds three levels, three trends, and corrections of the n coefficients of the approved
+    curve, N·m.
     """
 
     mean: np.ndarray  # of levels and trends
@@ -101,16 +101,16 @@ class State:
 
     @property
     def curve_nm(self) -> np.ndarray:
-        """What is to be added to the coefficients of the approved curve, N·m, shape (n,)."""
+        """Corrections of the coefficients of the approved curve, N·m, shape (n,)."""
         return self.mean[CURVE:]
 
     @property
-    def seen(self) -> np.ndarray:
-        """Places of what a trial sees of: levels and curve, not the trends."""
+    def observed(self) -> np.ndarray:
+        """Indices of the elements of `mean` that a trial observes: levels and curve, not the trends."""
         return np.r_[np.arange(LEVELS), np.arange(CURVE, self.mean.size)]
 
-    def ahead(self, rates: Rates = USUAL) -> State:
-        """Before the next trial."""
+    def predicted(self, rates: Rates = USUAL) -> State:
+        """Prediction for the next trial."""
         move = np.eye(self.mean.size)
         move[:LEVELS, LEVELS:CURVE] = np.eye(LEVELS)
         spread = np.diag(np.r_[rates.step, rates.turn, np.zeros(self.mean.size - CURVE)] ** 2)
@@ -139,10 +139,10 @@ def updated(before: State, vector: np.ndarray, information: np.ndarray) -> tuple
     """The state after a trial, and how odd the trial was.
 
     `information`: inverse of the covariance of the levels and the curve that explain the trial best; zero in a
-    direction of which the trial tells nothing. `vector`: information times those levels and that curve.
+    direction that the trial does not observe. `vector`: information times those levels and that curve.
 
     How odd: the squared distance by which the trial moves the levels, in the standard deviations that are expected of
-    such a move; about 3 on average if the trial tells something of all three.
+    such a move; about 3 on average if the trial observes all three.
     """
     after = _filtered(before, vector, information)
     move = (after.mean - before.mean)[:LEVELS]
@@ -161,11 +161,11 @@ def updated(before: State, vector: np.ndarray, information: np.ndarray) -> tuple
 
 
 def _filtered(before: State, vector: np.ndarray, information: np.ndarray) -> State:
-    """Kalman's update in the information form: it exists too where a trial tells nothing."""
-    lever = before.covariance[:, before.seen]
-    expected = lever[before.seen]
-    solve = np.linalg.solve(np.eye(before.seen.size) + information @ expected, np.c_[information, vector])
-    away = solve[:, -1] - solve[:, :-1] @ before.mean[before.seen]
+    """Kalman update in information form; it also exists where a trial observes nothing."""
+    lever = before.covariance[:, before.observed]
+    expected = lever[before.observed]
+    solve = np.linalg.solve(np.eye(before.observed.size) + information @ expected, np.c_[information, vector])
+    away = solve[:, -1] - solve[:, :-1] @ before.mean[before.observed]
     covariance = before.covariance - lever @ solve[:, :-1] @ lever.T
     return State(before.mean + lever @ away, 0.5 * (covariance + covariance.T), before.trials + 1)
 
@@ -179,17 +179,17 @@ BELIEVED_TRIALS = 12.0
 FIRST = 3
 """Trials from which a session's first trend is taken."""
 
-Told = Mapping[str, Mapping[str, Any]]
+LevelValues = Mapping[str, Mapping[str, Any]]
 
 
-def learn_rates(sessions: Sequence[Sequence[Told]]) -> Rates:
+def learn_rates(sessions: Sequence[Sequence[LevelValues]]) -> Rates:
     """The usual rates, corrected by what a person's earlier sessions say.
 
     Parameters
     ----------
     sessions : sequence of sequences
-        For each earlier session its trials in order, each as `levels_of` tells them (`now` of `Step.to_dict`). Sessions
-        of fewer than three trials say nothing.
+        For each earlier session its trials in order, each as `levels_of` returns them (`now` of `Step.to_dict`).
+        Sessions of fewer than three trials are not used.
 
     Returns
     -------
@@ -206,8 +206,8 @@ def learn_rates(sessions: Sequence[Sequence[Told]]) -> Rates:
     trend = trends.sum(axis=0) / (count + BELIEVED_SESSIONS)
     bends = np.concatenate([np.diff(levels, n=2, axis=0) for levels in known])
     usual = USUAL.turn**2 + 2.0 * USUAL.step**2  # of a bend, which holds one turn and two steps
-    own = np.sum(bends**2, axis=0)
-    faster = np.sqrt((BELIEVED_TRIALS * usual + own) / ((BELIEVED_TRIALS + len(bends)) * usual))
+    bend_squares = np.sum(bends**2, axis=0)
+    faster = np.sqrt((BELIEVED_TRIALS * usual + bend_squares) / ((BELIEVED_TRIALS + len(bends)) * usual))
     return Rates(
         start=_pooled(USUAL.start, starts, count),
         step=faster * USUAL.step,
@@ -218,11 +218,11 @@ def learn_rates(sessions: Sequence[Sequence[Told]]) -> Rates:
     )
 
 
-def _levels(session: Sequence[Told]) -> np.ndarray:
+def _levels(session: Sequence[LevelValues]) -> np.ndarray:
     """Log gain, µs and log time scale of each trial, shape (N, 3)."""
     values = [[float(trial[name]["value"]) for name in QUANTITIES] for trial in session]
     return np.array([Values(*trial).levels for trial in values])
 
 
-def _pooled(usual: np.ndarray, own: np.ndarray, count: int) -> np.ndarray:
-    return np.sqrt((BELIEVED_SESSIONS * usual**2 + np.sum(own**2, axis=0)) / (BELIEVED_SESSIONS + count))
+def _pooled(usual: np.ndarray, personal: np.ndarray, count: int) -> np.ndarray:
+    return np.sqrt((BELIEVED_SESSIONS * usual**2 + np.sum(personal**2, axis=0)) / (BELIEVED_SESSIONS + count))

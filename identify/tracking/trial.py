@@ -1,4 +1,4 @@
-"""What one trial says of the levels: the model is fitted to it by three factors and what no model knows beforehand.
+"""Fit of the levels to one trial: three factors of the model, and nuisance parameters of the trial alone.
 
 The three quantities that are tracked are stages of a simulation: they act on any model, with or without effects. Gain
 and threshold may also move within a trial, in proportion to time, by `…_run` from its first to its last second; the
@@ -37,20 +37,20 @@ DISTURBED = 0.3
 MOST_ALIKE = 0.97
 """Largest correlation of neighbouring errors."""
 LOOSE = np.array([0.2, 20.0, 0.2])
-"""By how much looser than expected the levels are in the fit of a trial, so that a jump is found."""
+"""Standard deviations added to the prior of the levels in the fit of a trial, so that a jump is found."""
 FAR = 1.3
 """An error so many times the expected one is looked at again from another start."""
 GONE_NOT_BELOW = 0.05
 """Least gain, relative to what was expected, from which that starts."""
 DRIFTS = 0.1
-"""Of the trial's torque: standard deviation of the drift of its zero from begin to end (posture, load cell)."""
+"""Share of the trial's torque: standard deviation of the drift of its zero from begin to end (posture, load cell)."""
 NEAR = 1e-4
 """The fit is done when a step is smaller than this share of `LOOSE`."""
 SHAPE = 0.003
-"""Of the largest torque: standard deviation of what is wrong in a coefficient of the curve, as no fit knows it."""
+"""Share of the largest torque: standard deviation of the error of a curve coefficient that the fit cannot estimate."""
 
-OWN = np.array([0.05, 2.0, 0.006])
-"""Standard deviations of what is a trial's own: how far log gain and threshold (µs) run within it, and its lag (s).
+TRIAL_SD = np.array([0.05, 2.0, 0.006])
+"""Standard deviations of the parameters of a trial alone: run of log gain and threshold (µs) within it, lag (s).
 
 The lag is the rig's: after a computer's stall one trial was 7 ms later than its neighbours, which looked like a change
 of the gain by twice its band.
@@ -69,20 +69,20 @@ def _along(scene: Scene) -> np.ndarray:
     Parameter("threshold_run_us", "µs", -50.0, 50.0),
 )
 def shift(width_us: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Of the threshold."""
+    """Shift of the threshold."""
     shift_us = p["threshold_shift_us"] + p["threshold_run_us"] * _along(scene)
     return np.where(width_us > 0.0, np.maximum(width_us - shift_us, 0.0), width_us)
 
 
 @form("gain", "w = gain · f(u)", Parameter("gain_log", "1", -3.0, 3.0), Parameter("gain_run_log", "1", -1.0, 1.0))
 def gain(drive_nm: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Of the drive."""
+    """Gain of the drive."""
     return drive_nm * np.exp(p["gain_log"] + p["gain_run_log"] * _along(scene))
 
 
 @form("additive", "y + drift · share of time", Parameter("drift_nm", "N·m", -100.0, 100.0))
 def drift(_none: None, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """Of the zero."""
+    """Drift of the zero."""
     return p["drift_nm"] * _along(scene)
 
 
@@ -103,11 +103,11 @@ def placed(model: Model, levels: np.ndarray, grid: Grid) -> tuple[Problem, np.nd
 
 
 @dataclass(frozen=True)
-class Seen:
-    """What a trial says.
+class TrialFit:
+    """Estimate of levels and curve from one trial.
 
-    `vector`, shape (3 + n,), is the information times what explains the trial best: log gain, threshold shift (µs), log
-    time scale, and what is to be added to the coefficients of the approved curve (N·m).
+    `vector`, shape (3 + n,), is the information times the best estimate: log gain, threshold shift (µs), log time
+    scale, and corrections of the coefficients of the approved curve (N·m).
     """
 
     vector: np.ndarray
@@ -117,18 +117,18 @@ class Seen:
     before_nm: float  # root mean square of the error before this fit: of the model as it was expected
     torque_nm: float  # standard deviation over the trial of the torque that the fitted model predicts
     wanted_nm: float  # the same of the model as it was expected
-    came: float  # how much of the expected torque came: slope of the measured one on it
+    slope: float  # of the measured torque on the expected one: 1 if all of it came
     disturbed: tuple[tuple[float, float], ...]  # stretches that do not fit, s since the record's begin
     duration_s: float  # of the record
 
     @property
     def misfit(self) -> float:
-        """What is left unexplained, in units of what the approved model left unexplained."""
+        """Error of the fit over that of the approved model on its own record."""
         return self.error_nm / self.expected_nm
 
 
 def curve_covariance(model: Model) -> np.ndarray:
-    """How well the curve of an approved model is known: the covariance of its coefficients, (N·m)², shape (n, n).
+    """Covariance of the curve's coefficients of an approved model, (N·m)², shape (n, n).
 
     That of the fit, for twice the standard deviation, and a little for each coefficient. With more (2 % of the largest
     torque), half of a person's fatigue was taken for an error of the curve; without it, an error of a steep curve was
@@ -136,11 +136,11 @@ def curve_covariance(model: Model) -> np.ndarray:
     """
     size = model.recruitment.basis.size
     top_nm = float(np.ptp(model.recruitment.table()[1]))
-    own, fitted = np.eye(size) * (SHAPE * top_nm) ** 2, model.curve_covariance
-    return own if fitted is None else own + 4.0 * fitted
+    unmodelled, fitted = np.eye(size) * (SHAPE * top_nm) ** 2, model.curve_covariance
+    return unmodelled if fitted is None else unmodelled + 4.0 * fitted
 
 
-def look(model: Model, expected: State, record: Record) -> Seen:
+def fit_trial(model: Model, expected: State, record: Record) -> TrialFit:
     """Fit a trial, from its rest before to its rest after, from what is expected of it on.
 
     Raises BadModel, BadRecord: as `stimrig.identify.simulation.predict.predict`; and a trial shorter than a second.
@@ -149,35 +149,34 @@ def look(model: Model, expected: State, record: Record) -> Seen:
     if not np.sum(grid.fitted) * grid.step_s >= SHORTEST_S:
         fix = "Play a longer trial; rows of `validate` do not count."
         raise BadRecord(f"less than {SHORTEST_S:g} s that can be used", fix=fix)
-    asked = _asked(model, expected, grid)
-    start, expected_nm = expected.mean[expected.seen], _expected(model)
-    first = found = _fitted(asked, start)
-    if found.sd_nm > FAR * expected_nm:
+    setup = _prepare(model, expected, grid)
+    start, expected_nm = expected.mean[expected.observed], _expected(model)
+    first = best = _fitted(setup, start)
+    if best.sd_nm > FAR * expected_nm:
         # After a sudden loss the fit may end where the threshold explains it badly: so much less torque came.
-        lower = (
-            start + np.r_[np.log(np.clip(first.came, GONE_NOT_BELOW, 1.0 / GONE_NOT_BELOW)), np.zeros(start.size - 1)]
-        )
-        other = _fitted(asked, lower)
-        start, found = (lower, other) if other.sd_nm < found.sd_nm else (start, found)
-    vector, information = _marginal(found, start, asked.own_sd)
-    doubt = max(1.0, found.sd_nm / expected_nm) ** 2  # what fits worse than it should may err by more than it scatters
-    return Seen(
-        vector=vector / doubt,
-        information=information / doubt,
-        error_nm=found.sd_nm,
+        share = np.clip(first.expected_slope, GONE_NOT_BELOW, 1.0 / GONE_NOT_BELOW)
+        lower = start + np.r_[np.log(share), np.zeros(start.size - 1)]
+        other = _fitted(setup, lower)
+        start, best = (lower, other) if other.sd_nm < best.sd_nm else (start, best)
+    vector, information = _marginal(best, start, setup.own_sd)
+    inflation = max(1.0, best.sd_nm / expected_nm) ** 2  # a poor fit may be wrong by more than its scatter
+    return TrialFit(
+        vector=vector / inflation,
+        information=information / inflation,
+        error_nm=best.sd_nm,
         expected_nm=expected_nm,
         before_nm=first.before_nm,
-        torque_nm=found.torque_nm,
+        torque_nm=best.torque_nm,
         wanted_nm=first.wanted_nm,
-        came=first.came,
-        disturbed=_stretches(grid, found.weight),
+        slope=first.expected_slope,
+        disturbed=_stretches(grid, best.weight),
         duration_s=grid.size * grid.step_s,
     )
 
 
 @dataclass(frozen=True)
-class _Asked:
-    """What is fitted to a trial: levels and curve, and behind them what is the trial's own."""
+class _Setup:
+    """Problem and priors of a trial's fit; the free parameters are levels and curve, then those of the trial alone."""
 
     problem: Problem
     theta: np.ndarray
@@ -187,18 +186,18 @@ class _Asked:
     own_sd: np.ndarray
 
 
-def _asked(model: Model, expected: State, grid: Grid) -> _Asked:
-    problem, theta = placed(model, np.zeros(expected.seen.size), grid)
+def _prepare(model: Model, expected: State, grid: Grid) -> _Setup:
+    problem, theta = placed(model, np.zeros(expected.observed.size), grid)
     gains, shifts, drifts = (problem.chosen[place].first for place in (0, -2, -1))
     curve = range(problem.coefficients.start, problem.coefficients.stop)
-    own = [gains + 1, shifts + 1, *problem.delay, *problem.baselines, drifts, *problem.initials]
+    trial_parameters = [gains + 1, shifts + 1, *problem.delay, *problem.baselines, drifts, *problem.initials]
     target = problem.setup.to_muscle(grid.torque_nm)
     scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
     theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
     states = np.tile([0.1, 1.0], problem.setup.grid.starts.size)
-    own_sd = np.r_[OWN, np.r_[np.ones(len(problem.baselines)), DRIFTS, states] * scale_nm]
-    free = np.array([gains, shifts, 0, *curve, *own])
-    return _Asked(problem, theta, free, target, _precision(expected, own_sd), own_sd)
+    own_sd = np.r_[TRIAL_SD, np.r_[np.ones(len(problem.baselines)), DRIFTS, states] * scale_nm]
+    free = np.array([gains, shifts, 0, *curve, *trial_parameters])
+    return _Setup(problem, theta, free, target, _precision(expected, own_sd), own_sd)
 
 
 @dataclass(frozen=True)
@@ -213,13 +212,13 @@ class _Fit:
     torque_nm: float
     before_nm: float
     wanted_nm: float
-    came: float
+    expected_slope: float
 
 
-def _fitted(asked: _Asked, levels: np.ndarray) -> _Fit:
+def _fitted(setup: _Setup, levels: np.ndarray) -> _Fit:
     """Gauss and Newton's steps with weights that follow the errors, from such levels and curve."""
-    problem, free, prior, target = asked.problem, asked.free, asked.prior, asked.target
-    theta = asked.theta.copy()
+    problem, free, prior, target = setup.problem, setup.free, setup.prior, setup.target
+    theta = setup.theta.copy()
     theta[free[: levels.size]] += levels
     grid, start = problem.setup.grid, theta[free].copy()
     rows = grid.fitted
@@ -231,8 +230,8 @@ def _fitted(asked: _Asked, levels: np.ndarray) -> _Fit:
         first = first or _compared(target[rows], mean[rows])
         if turn >= TRUSTED_ROUNDS:
             weight = _weights(error, round(LOCAL_S / grid.step_s))
-        sd_nm, alike = _spread(error, weight)
-        precision = weight / (sd_nm**2 * (1.0 + alike) / (1.0 - alike))
+        sd_nm, correlation = _spread(error, weight)
+        precision = weight / (sd_nm**2 * (1.0 + correlation) / (1.0 - correlation))
         bend, slope, moved = (lever * precision) @ lever.T, (lever * precision) @ error, theta[free] - start
         if done or turn == ROUNDS - 1:
             return _Fit(moved, slope, bend, weight, sd_nm, float(np.std(mean[rows])), *first)
@@ -244,22 +243,22 @@ def _fitted(asked: _Asked, levels: np.ndarray) -> _Fit:
 
 
 def _compared(measured_nm: np.ndarray, expected_nm: np.ndarray) -> tuple[float, float, float]:
-    """Standard deviations of the error and of what was expected; and how much of that came."""
+    """Standard deviations of the error and of the expected torque; slope of the measured torque on the expected one."""
     away = expected_nm - expected_nm.mean()
-    came = float(away @ measured_nm / max(away @ away, 1e-300))
-    return float(np.std(measured_nm - expected_nm)), float(np.std(expected_nm)), came
+    slope = float(away @ measured_nm / max(away @ away, 1e-300))
+    return float(np.std(measured_nm - expected_nm)), float(np.std(expected_nm)), slope
 
 
-def _marginal(found: _Fit, seen: np.ndarray, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information vector and matrix on levels and curve, once what is the trial's own has taken its part."""
-    told = seen.size
-    joint = found.bend.copy()
-    joint[told:, told:] += np.diag(1.0 / own_sd**2)
+def _marginal(fit: _Fit, start: np.ndarray, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Information vector and matrix of levels and curve, with the parameters of the trial alone marginalised."""
+    size = start.size
+    joint = fit.bend.copy()
+    joint[size:, size:] += np.diag(1.0 / own_sd**2)
     # Relative to where the fit began: there the trial's own parameters have their prior mean.
-    vector = found.bend @ found.moved + found.slope
-    taken = np.linalg.solve(joint[told:, told:], np.c_[joint[told:, :told], vector[told:]])
-    information = positive(joint[:told, :told] - joint[:told, told:] @ taken[:, :-1])
-    return vector[:told] - joint[:told, told:] @ taken[:, -1] + information @ seen, information
+    vector = fit.bend @ fit.moved + fit.slope
+    nuisance = np.linalg.solve(joint[size:, size:], np.c_[joint[size:, :size], vector[size:]])
+    information = positive(joint[:size, :size] - joint[:size, size:] @ nuisance[:, :-1])
+    return vector[:size] - joint[:size, size:] @ nuisance[:, -1] + information @ start, information
 
 
 def _expected(model: Model) -> float:
@@ -281,17 +280,17 @@ def _spread(error: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     """Standard deviation of the errors, and the correlation of neighbours."""
     power = float(np.sum(weight * error**2) / np.sum(weight))
     pairs = np.sqrt(weight[1:] * weight[:-1])
-    alike = float(np.sum(pairs * error[1:] * error[:-1]) / max(np.sum(pairs) * power, 1e-300))
-    return float(np.sqrt(max(power, 1e-18))), float(np.clip(alike, 0.0, MOST_ALIKE))
+    correlation = float(np.sum(pairs * error[1:] * error[:-1]) / max(np.sum(pairs) * power, 1e-300))
+    return float(np.sqrt(max(power, 1e-18))), float(np.clip(correlation, 0.0, MOST_ALIKE))
 
 
 def _precision(expected: State, own_sd: np.ndarray) -> np.ndarray:
-    """Prior precision of the fit: levels, looser than expected, so that a jump is found; curve; the trial's own."""
-    seen = expected.covariance[np.ix_(expected.seen, expected.seen)].copy()
-    seen[np.arange(LEVELS), np.arange(LEVELS)] += LOOSE**2
-    size = len(seen)
+    """Prior precision of levels (widened by `LOOSE`), curve, and the parameters of the trial alone."""
+    prior = expected.covariance[np.ix_(expected.observed, expected.observed)].copy()
+    prior[np.arange(LEVELS), np.arange(LEVELS)] += LOOSE**2
+    size = len(prior)
     precision = np.zeros((size + own_sd.size,) * 2)
-    precision[:size, :size] = np.linalg.inv(seen)
+    precision[:size, :size] = np.linalg.inv(prior)
     precision[size:, size:] = np.diag(1.0 / own_sd**2)
     return precision
 

@@ -17,7 +17,7 @@ from stimrig.identify.tracking.follow import Step, follow, model_for_next
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Tracked(Result):
-    """How gain, threshold and time scale of a model moved over trials."""
+    """A model followed over trials: gain, threshold and time scale after each."""
 
     approved: Model  # the model that was followed; it stays as it is
     steps: tuple[Step, ...]  # one for each trial
@@ -40,7 +40,7 @@ class Tracked(Result):
 def _levels(step: Step) -> str:
     now = step.after.values
     moved = f"gain {quantity(now.gain, '')}, threshold {now.threshold_shift_us:+.3g} µs"
-    return f"{step.outcome}: {moved}, time scale {quantity(now.time_scale, '')}, error {step.seen.error_nm:.3g} N·m"
+    return f"{step.outcome}: {moved}, time scale {quantity(now.time_scale, '')}, error {step.fit.error_nm:.3g} N·m"
 
 
 def track(model: Model, trials: Sequence[Record]) -> Tracked:

@@ -12,7 +12,7 @@ import numpy as np
 from stimrig.hardware_sim.hidden import recruitment
 from stimrig.hardware_sim.hidden.chain import Chain, split
 from stimrig.hardware_sim.hidden.scenario import Scenario
-from stimrig.identify.experiments.adaptive import Asked, Decision, Target, decide
+from stimrig.identify.experiments.adaptive import AdaptiveGoal, Decision, Target, decide
 from stimrig.identify.records.record import Record
 from tests.harness.muscle import FINE_HZ, Patient, second_order, torque_after
 from tests.harness.patients import as_record
@@ -149,7 +149,7 @@ def play(
     while True:
         before = made.decisions[-1] if made.decisions else None
         left = {"left_s": max(left_s - made.seconds, 0.0), "left_nm_s": max(left_nm_s - made.dose_nm_s(muscle), 0.0)}
-        asked = Asked(target, **left, largest_us=muscle.top_us, **known)
+        asked = AdaptiveGoal(target, **left, largest_us=muscle.top_us, **known)
         made.decision = timed(partial(decide, made.record, made.widths_us, asked, before))
         made.decisions.append(made.decision)
         if made.decision.kind != "next":

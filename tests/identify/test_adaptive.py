@@ -12,7 +12,7 @@ from stimrig import identify
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.earlier import USUAL, Earlier, learn_change
 from stimrig.identify.experiments import adaptive
-from stimrig.identify.experiments.adaptive import SETTLED_S, Asked, Decision, Reach, Target, decide, reach, worse
+from stimrig.identify.experiments.adaptive import SETTLED_S, AdaptiveGoal, Decision, Reach, Target, decide, reach, worse
 from stimrig.identify.experiments.designs import pieces
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
@@ -56,7 +56,7 @@ def test_the_rig_plays_every_piece_as_it_was_weighed():
 
 
 def test_the_first_piece_begins_at_rest_and_keeps_to_the_largest_width():
-    decision = decide(None, [], Asked(**LIMITS))
+    decision = decide(None, [], AdaptiveGoal(**LIMITS))
     widths = decision.segments[0].settings["pulse_width_us"]
     assert decision.kind == "next" and max(widths) <= 300.0
     assert not any(widths[:20])
@@ -131,7 +131,7 @@ def test_torque_that_runs_away_is_never_enough(run_away):
     decision = None
     for pulses in (widths.size - 45, widths.size):
         record = Record.from_arrays(time_s[: 10 * pulses], np.repeat(widths[:pulses], 10), torque[: 10 * pulses])
-        decision = decide(record, widths[:pulses], Asked(**LIMITS), decision)
+        decision = decide(record, widths[:pulses], AdaptiveGoal(**LIMITS), decision)
         assert decision.kind != "enough"
     assert decision is not None and decision.kind == "misfit"
 
@@ -143,7 +143,7 @@ def test_what_fits_badly_once_is_looked_at_again(monkeypatch: pytest.MonkeyPatch
         np.r_[np.zeros(20), np.linspace(0.0, 300.0, 40), np.full(12, 300.0), np.zeros(120)],
     )
     whole = recorded(muscle, widths, ["opening"] * widths.size, noise(4))
-    asked, wrong = Asked(**LIMITS), ["The residual is not noise (whiteness).", None, "Worse."]
+    asked, wrong = AdaptiveGoal(**LIMITS), ["The residual is not noise (whiteness).", None, "Worse."]
 
     def decided(pulses: int, before: Decision | None, found: str | None) -> Decision:
         monkeypatch.setattr(adaptive, "_misfit", lambda _short: found)
@@ -162,29 +162,29 @@ def test_what_fits_badly_once_is_looked_at_again(monkeypatch: pytest.MonkeyPatch
 @pytest.mark.slow
 def test_pulses_that_are_committed_beyond_the_record_count():
     muscle = sigmoid(51_007)
-    opening = np.array(decide(None, [], Asked(**LIMITS)).segments[0].settings["pulse_width_us"])
+    opening = np.array(decide(None, [], AdaptiveGoal(**LIMITS)).segments[0].settings["pulse_width_us"])
     record = recorded(muscle, opening, ["opening"] * opening.size, noise(2))
-    decision = decide(record, np.r_[opening, np.full(40, 200.0)], Asked(**LIMITS))
+    decision = decide(record, np.r_[opening, np.full(40, 200.0)], AdaptiveGoal(**LIMITS))
     assert decision.kind == "next" and decision.expected_torque_time_nm_s >= 0.0
 
 
 @pytest.mark.slow
 def test_nothing_is_played_beyond_what_is_left():
     muscle = sigmoid(51_008)
-    opening = np.array(decide(None, [], Asked(**LIMITS)).segments[0].settings["pulse_width_us"])
+    opening = np.array(decide(None, [], AdaptiveGoal(**LIMITS)).segments[0].settings["pulse_width_us"])
     record = recorded(muscle, opening, ["opening"] * opening.size, noise(3))
     for left in ({"left_s": 0.5}, {"left_s": 0.5, "left_nm_s": 0.0}):
-        assert decide(record, opening, Asked(**(LIMITS | left))).kind == "spent"
-    modest = decide(record, opening, Asked(**(LIMITS | {"left_nm_s": 0.5})))
+        assert decide(record, opening, AdaptiveGoal(**(LIMITS | left))).kind == "spent"
+    modest = decide(record, opening, AdaptiveGoal(**(LIMITS | {"left_nm_s": 0.5})))
     assert modest.kind == "spent" or modest.expected_torque_time_nm_s <= 0.5
-    assert decide(None, [], Asked(**(LIMITS | {"left_s": 1.0}))).kind == "spent"
+    assert decide(None, [], AdaptiveGoal(**(LIMITS | {"left_s": 1.0}))).kind == "spent"
 
 
 @pytest.mark.parametrize("wrong", [math.nan, math.inf, -1.0, True, "2"])
 def test_numbers_that_are_none_are_refused(wrong):
     for name in ("left_s", "left_nm_s", "largest_us"):
         with pytest.raises(BadRequest, match="is no positive number"):
-            decide(None, [], Asked(**(LIMITS | {name: wrong})))
+            decide(None, [], AdaptiveGoal(**(LIMITS | {name: wrong})))
     for name in ("curve_percent", "step_percent"):
         with pytest.raises(BadRequest, match="is no target"):
             Target(**{name: wrong})
@@ -192,13 +192,13 @@ def test_numbers_that_are_none_are_refused(wrong):
 
 @pytest.mark.slow
 def test_what_cannot_be_reached_is_said_before_the_first_pulse():
-    few = reach(Asked(Target(1.0, 1.0), 5.0, 100.0, 300.0), 6.0)
+    few = reach(AdaptiveGoal(Target(1.0, 1.0), 5.0, 100.0, 300.0), 6.0)
     assert not few.reachable and few.curve_percent > 1.0 and "out of reach" in few.words
     assert few.seconds <= 5.0
-    none = reach(Asked(Target(), 1.0, 100.0, 300.0), 6.0)
+    none = reach(AdaptiveGoal(Target(), 1.0, 100.0, 300.0), 6.0)
     assert not none.reachable and none.seconds == 0.0
     with pytest.raises(BadRequest, match="plateau_nm"):
-        reach(Asked(Target(), 30.0, 100.0, 300.0), math.nan)
+        reach(AdaptiveGoal(Target(), 30.0, 100.0, 300.0), math.nan)
 
 
 def test_of_two_muscles_that_reach_the_target_the_one_that_takes_more_is_told():

@@ -23,7 +23,7 @@ from tests.identify.test_join import record
 
 def _covariance(size: int, n: NoiseLevel) -> np.ndarray:
     lag = np.abs(np.arange(size)[:, None] - np.arange(size))
-    band = n.band * n.keep**lag * np.cos(n.turn * lag)
+    band = n.band * n.decay**lag * np.cos(n.turn * lag)
     return n.share * n.ar1**lag + band + (1 - n.share - n.band) * np.eye(size)
 
 
@@ -36,7 +36,7 @@ def test_whitening_is_that_of_the_dense_covariance(noise):
     dense = rows @ np.linalg.solve(_covariance(130, noise), rows.T)
     np.testing.assert_allclose(white @ white.T, dense, rtol=1e-6)
     if noise.band:
-        gain = noise.band * noise.keep ** np.abs(np.arange(130)[:, None] - np.arange(130))
+        gain = noise.band * noise.decay ** np.abs(np.arange(130)[:, None] - np.arange(130))
         gain = gain * np.cos(noise.turn * (np.arange(130)[:, None] - np.arange(130)))
         best = gain @ np.linalg.solve(_covariance(130, noise), rows[0])
         np.testing.assert_allclose(band_part(rows[0].copy(), stretch, noise), best, atol=1e-6)

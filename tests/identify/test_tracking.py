@@ -113,17 +113,17 @@ def test_a_spasm_or_an_effort_moves_nothing_by_more_than_its_band(
     bump = lambda trial, time_s: (trial == 3) * size_nm * np.exp(-0.5 * ((time_s - at_s) / width_s) ** 2)  # noqa: E731
     steps = followed(model, session(Changing(PATIENT, added=bump), 6))
     assert np.all(moves(steps) < 1.0)
-    stretches = steps[3].seen.disturbed
+    stretches = steps[3].fit.disturbed
     assert steps[3].outcome is Outcome.ODD or any(begin <= at_s <= end for begin, end in stretches)
     assert steps[4].outcome is not Outcome.CONTRADICTS
-    assert not any(step.seen.disturbed for step in (*steps[:3], *steps[4:]))
+    assert not any(step.fit.disturbed for step in (*steps[:3], *steps[4:]))
 
 
 def test_a_sudden_change_is_followed_when_the_next_trial_says_the_same(model: Model) -> None:
     muscle = Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else 0.7)
     steps = followed(model, session(muscle, 6))
     assert steps[3].outcome is Outcome.ODD
-    assert steps[3].disturbed_s == [[0.0, steps[3].seen.duration_s]], "from an odd trial nothing is learnt"
+    assert steps[3].disturbed_s == [[0.0, steps[3].fit.duration_s]], "from an odd trial nothing is learnt"
     assert np.all(moves(steps[:4]) < 1.0)
     assert steps[4].outcome is Outcome.FOLLOWED
     gains = [step.after.values.gain for step in steps]
@@ -137,7 +137,7 @@ def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model, left:
     assert {step.outcome for step in steps[3:6]} == {Outcome.NO_TORQUE}
     assert {step.outcome for step in (*steps[:3], *steps[6:])} == {Outcome.FOLLOWED}
     for step in steps[3:6]:
-        assert step.disturbed_s == [[0.0, step.seen.duration_s]]
+        assert step.disturbed_s == [[0.0, step.fit.duration_s]]
         assert np.array_equal(step.after.mean, step.before.mean)
     assert np.all(moves(steps) < 1.0)
 
