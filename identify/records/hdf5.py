@@ -141,7 +141,7 @@ class StrictFile:
 
     @contextmanager
     def _asking(self, path: str) -> Iterator[None]:
-        """Whatever libhdf5 or h5py raises at a damaged file, as one line."""
+        """Raise any error of libhdf5 or h5py at a damaged file as a BadRecord of one line."""
         try:
             yield
         except BadRecord:
