@@ -124,7 +124,7 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     stays = whole.left_out[-1]
     first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
     chains = _extended([*alone, whole], progress, further if named else first)
-    chains = [chain for chain in chains if _asked_for(stays, chain, further if named else ANY)]
+    chains = [chain for chain in chains if _predicts_better(stays, chain, further if named else ANY)]
     return _with_chain(search, chains[-1]) if chains else search
 
 
@@ -149,17 +149,17 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
     """
     best_chains: list[Chain] = []
     beam = list(bases)
-    for number in range(thresholds.MOST_FREE):
+    for number in range(thresholds.MAX_FREE):
         longer: list[Chain] = []
         for at, chain in enumerate(beam):
-            share, part = (number + at / len(beam)) / thresholds.MOST_FREE, 1.0 / len(beam) / thresholds.MOST_FREE
+            share, part = (number + at / len(beam)) / thresholds.MAX_FREE, 1.0 / len(beam) / thresholds.MAX_FREE
             longer += _longer(chain, partial(_within, progress, share, part), first)
         if not longer:
             break
         reference = bases[0].left_out[-1]
         longer.sort(key=lambda chain: -chain.better(reference).gain)
         best = _likeliest(longer)
-        if best_chains and not _asked_for(best_chains[-1].left_out[-1], best, thresholds.FURTHER_FREE):
+        if best_chains and not _predicts_better(best_chains[-1].left_out[-1], best, thresholds.FURTHER_FREE):
             break
         if any(vetoed(*link) for link in best.links):  # of the second best, extended, the first was not yet asked about
             break
@@ -190,7 +190,7 @@ def _within(progress: Progress, begin: float, part: float, done: float, text: st
     progress(begin + part * done, text)
 
 
-def _asked_for(before: LeftOut, chain: Chain, required: tuple[float, float]) -> bool:
+def _predicts_better(before: LeftOut, chain: Chain, required: tuple[float, float]) -> bool:
     comparison = chain.better(before)
     return comparison.errors >= required[0] and comparison.gain >= required[1]
 
@@ -222,7 +222,7 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
         candidate = promising[number]
         progress(0.6 + 0.4 * done / len(promising), f"tried {candidate.effect.name.lower()}")
         longer = chain.with_(replace(fitted, problem=candidate.fitted.problem), left_out, candidate.effect.id)
-        if _asked_for(unseen, longer, required):
+        if _predicts_better(unseen, longer, required):
             accepted[number] = longer
     return [accepted[number] for number in sorted(accepted)]
 

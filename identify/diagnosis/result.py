@@ -23,7 +23,7 @@ from stimrig.identify.experiments import NOTHING, Experiment, plan, plan_further
 from stimrig.identify.results import Diagnosis
 from stimrig.identify.summary import probability, probability_words
 
-MOST_PARAMETERS = 24
+MAX_PARAMETERS = 24
 """The wave of a tremor has hundreds."""
 STATISTICS = (
     "fit_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "ceiling_percent", "held_out_ceiling_percent",
@@ -107,7 +107,7 @@ def _missing(
         "next_experiment_plan": experiment and _plan(experiment),
         "form": fitted.effects[index][1].name,
         "equation": fitted.effects[index][1].equation,
-        "parameters": dict(list(parameters.items())[:MOST_PARAMETERS]),
+        "parameters": dict(list(parameters.items())[:MAX_PARAMETERS]),
         "objection": verdict.objections.get(effect),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,

@@ -322,7 +322,7 @@ FREE_GAIN = Effect("free_gain", "Gain that varies without a law", (free,), "", (
 # ---- what an effect must gain --------------------------------------------------------------------------------------
 
 
-def seen_at_rest(quiet: np.ndarray, fitted: Fitted, effect: str) -> float:
+def share_at_rest(quiet: np.ndarray, fitted: Fitted, effect: str) -> float:
     """Size of an added torque at rest, divided by its size at work. Efforts come at any time, stimulated or not."""
     setup = fitted.problem.setup
     added = dict(fitted.effects)[effect]
@@ -340,7 +340,7 @@ def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
     if effect.band or not effect.sporadic:
         return candidate
     at_rest = candidate.form.stage != "additive" or (
-        seen_at_rest(search.quiet, candidate.fitted, effect.id) >= thresholds.SEEN_AT_REST
+        share_at_rest(search.quiet, candidate.fitted, effect.id) >= thresholds.SHARE_AT_REST
     )
     weight = thresholds.EFFORT_WEIGHT if at_rest else thresholds.EFFORT_WEIGHT_ONLY_AT_WORK
     return replace(candidate, gain=weight * candidate.gain)

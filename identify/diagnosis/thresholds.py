@@ -36,7 +36,7 @@ ONLY_AT_WORK_PROBABILITY = 0.85
 """Largest probability of efforts that do not appear at rest: the stimulation itself may cause them."""
 REPAIR_PROBABILITY = 0.85
 """Largest probability of an effect that may only repair the inexact form of an earlier one."""
-SEEN_AT_REST = 0.15
+SHARE_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
 DYNAMIC = {"speed", "lags", "branch", "delay", "filter"}
 """Stages that change how quickly the torque follows."""
@@ -95,7 +95,7 @@ FORM_ERROR_WITH_EFFECTS = 0.003
 """The same if an effect is named: its law must also hold on held-out pulses."""
 LEAST_HELD_OUT_ROWS = 40
 """With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""
-MOST_FREE = 2
+MAX_FREE = 2
 """Free effects at most."""
 BEAM = 2
 """So many chains of each length, the best on left-out blocks, are extended by a further free effect."""

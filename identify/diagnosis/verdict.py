@@ -8,7 +8,7 @@ import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, vetoed
-from stimrig.identify.diagnosis.search import EffectSearch, resembles_earlier, seen_at_rest
+from stimrig.identify.diagnosis.search import EffectSearch, resembles_earlier, share_at_rest
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import likelihood_warnings
 from stimrig.identify.estimation.effect_fit import Candidate
@@ -58,7 +58,7 @@ def _no_effort(search: EffectSearch, explained: float, structure: bool) -> bool:
         return True
     effort = search.added[0]
     holder = search.chain[1]
-    if seen_at_rest(search.quiet, holder, effort) >= thresholds.SEEN_AT_REST:
+    if share_at_rest(search.quiet, holder, effort) >= thresholds.SHARE_AT_REST:
         return False
     return (
         "resisting" in dict(holder.effects)[effort].name
@@ -72,7 +72,7 @@ def _only_at_work(search: EffectSearch, number: int) -> bool:
     form = dict(holder.effects).get(effect)
     if form is None or form.stage != "additive" or not find_effect(effect).sporadic:
         return False
-    return seen_at_rest(search.quiet, holder, effect) < thresholds.SEEN_AT_REST
+    return share_at_rest(search.quiet, holder, effect) < thresholds.SHARE_AT_REST
 
 
 def _everywhere(search: EffectSearch) -> bool:

@@ -15,9 +15,9 @@ LARGEST_DIFFERENCE = 0.05
 """Mean difference of the widths of two repeats, as a share of the largest, at most."""
 APART = 10
 """Alignments of the same two parts that differ by fewer intervals compete: only the best one counts."""
-MOST_ROWS = 12_000
+MAX_ROWS = 12_000
 """Only so many of the last intervals are looked at (5 min): time grows with the square."""
-MOST_RUNS = 20_000
+MAX_RUNS = 20_000
 
 
 def find_repeats(width_us: np.ndarray, known: np.ndarray, memory: int) -> np.ndarray:
@@ -26,10 +26,10 @@ def find_repeats(width_us: np.ndarray, known: np.ndarray, memory: int) -> np.nda
     `known` says in which intervals stimulation and torque are known, and follow on the one before; after `memory`
     intervals the muscle has forgotten.
     """
-    first = max(width_us.size - MOST_ROWS, 0)
+    first = max(width_us.size - MAX_ROWS, 0)
     width = np.ascontiguousarray(width_us[first:])
     limit = LARGEST_DIFFERENCE * float(width.max(initial=0.0))
-    runs, size = equal_runs(width, known[first:], memory, limit, np.empty((MOST_RUNS, 4)))
+    runs, size = equal_runs(width, known[first:], memory, limit, np.empty((MAX_RUNS, 4)))
     worked = np.convolve(width > 0.0, np.ones(memory))[: width.size] > 0.5
     rows = np.arange(width.size)
     label, touched = rows.copy(), np.zeros(width.size, bool)

@@ -204,7 +204,7 @@ POSITIVE = {FreeLaw.FILL_S: 0.0, FreeLaw.EMPTY_S: 0.0, FreeLaw.GATE_S: 0.0, Free
 """Lower bounds of laws by which, or by one more than which, the kernel divides."""
 OF_STATE = FreeLaw.GAIN, FreeLaw.RATE, FreeLaw.ZERO, FreeLaw.BY_PULSES, FreeLaw.BY_DRIVE
 """Actions of the slow state, and the signals that fill it."""
-MOST_STARTS = 32
+MAX_STARTS = 32
 """Each is a fit."""
 
 
@@ -223,8 +223,8 @@ def _check_parameter(parameter: Parameter, where: str) -> None:
     if not all(isinstance(value, (int, float)) for value in (*values, parameter.neutral)):
         message = "a bound or a start that is no number"
         raise BadEffect(message, place=place, fix="Give lower, upper, neutral, and a tuple of starts.")
-    if len(starts) > MOST_STARTS:
-        raise BadEffect(f"{len(starts)} starts", place=place, fix=f"Give {MOST_STARTS} at most: each is a fit.")
+    if len(starts) > MAX_STARTS:
+        raise BadEffect(f"{len(starts)} starts", place=place, fix=f"Give {MAX_STARTS} at most: each is a fit.")
     numbers = np.array(values, float)
     if not np.isfinite(numbers).all() or not parameter.lower < parameter.upper or numbers.size < 3:
         message = f"bounds {parameter.lower} to {parameter.upper}, starts {parameter.start}"

@@ -44,7 +44,7 @@ def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
     """
     if not best.distrusted:
         return best
-    similar_rows, unseen = alike_rows(grid, rows), leave_out(best)
+    similar_rows, unseen = similar_bout_rows(grid, rows), leave_out(best)
     for choice, white in (
         (rows, True),
         *(((similar_rows, False), (similar_rows, True)) if similar_rows is not None else ()),
@@ -100,7 +100,7 @@ def likelihood_warnings(fitted: Fitted) -> list[str]:
     return sentences
 
 
-def alike_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
+def similar_bout_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
     """The rows of bouts like those of `validate`, with all rests, shape (K,); None where there are few, or no others.
 
     The pulses of `validate` are known; its torque is not looked at.

@@ -22,7 +22,7 @@ EARLIER_DEVIATIONS = (Deviation(0.05, 1.0), Deviation(0.3, 0.8), Deviation(0.9, 
 """As `DEVIATIONS`, from the earlier curve: the posterior decides how far the shape itself changed."""
 
 
-MOST_DOUBT = 1.5
+MAX_SD_SHARE = 1.5
 """Largest standard deviation of the log of a step that is taken from the last model."""
 
 
@@ -159,7 +159,7 @@ class Earlier:
         covariance = slopes @ known.matrix[np.ix_(chosen, chosen)] @ slopes.T
         steps = np.exp(prior.log_steps(prior.mean))
         size = np.maximum(prior.blurred(steps), 1e-9 * steps.sum())
-        determined = np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= MOST_DOUBT * size
+        determined = np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= MAX_SD_SHARE * size
         return np.where(determined[:, None] & determined[None, :], covariance / size[:, None] / size[None, :], 0.0)
 
     def dynamics(self, delay_sd_s: float) -> tuple[np.ndarray, np.ndarray]:

@@ -94,21 +94,21 @@ def fit_statistics(
     predicted_nm: np.ndarray,
     sd_nm: float,
     held_out_change: np.ndarray | None = None,
-    foreseen_nm: np.ndarray | None = None,
+    predictable_nm: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """The key `fit` of MODEL.json, computed at the record's samples.
 
     Percentages are NaN if the torque is constant. Doubted samples are not counted.
 
     `rows`: fitted intervals. `sd_nm`: white noise of a sample. `held_out_change`: of fitted intervals where they are
-    left out of the fit, N·m: see the function of that name. `foreseen_nm`: torque without what could not have been
-    foreseen. By this the model is judged where rows are held out. What it leaves out there (`unforeseen_nm`) counts as
-    noise in the ceiling: it is known, and of no muscle. It is never more than the error there leaves beside the noise:
-    an effect that goes astray there excuses nothing.
+    left out of the fit, N·m: see the function of that name. `predictable_nm`: torque without the
+    effects that cannot be predicted. The held-out figures are computed with it. The torque that it lacks there
+    (`unforeseen_nm`) counts as noise in the ceiling, since it is known and does not come from the muscle; it is at most
+    the error beyond noise there, so that a misplaced effect does not lower the ceiling.
     """
     record = grid.record
     measured = record.torque_nm
-    judged_nm = predicted_nm if foreseen_nm is None else foreseen_nm
+    judged_nm = predicted_nm if predictable_nm is None else predictable_nm
     used = rows[grid.interval] & ~record.held_out & grid.counted
     judged = record.held_out & grid.counted
     result: dict[str, Any] = {

@@ -24,7 +24,7 @@ APART_S = 1.0
 """A pause that separates two bouts of stimulation; the zeros of a PRBS are shorter."""
 PIECES, LEAST_S = 10, 2.0
 """A block has about this part of the rows at most, unless that is less than so many seconds."""
-MOST_BOUTS = 2 * PIECES
+MAX_BOUTS = 2 * PIECES
 """Neighbours are joined if there are more bouts: each block is a fit."""
 START_S = 0.3
 """Rows after a start that stay in the fit: only they show the state in which the record begins."""
@@ -69,7 +69,7 @@ def blocks(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """
     ends, count = np.r_[np.flatnonzero(np.diff(bouts(grid))) + 1, grid.size], np.r_[0, np.cumsum(rows)]
     piece, edges = max(count[-1] / PIECES, LEAST_S / grid.step_s), [0]
-    min_rows = 0.5 * piece if ends.size > MOST_BOUTS else 0.0
+    min_rows = 0.5 * piece if ends.size > MAX_BOUTS else 0.0
     for end in ends.tolist():
         if count[end] - count[edges[-1]] >= min_rows:
             edges.append(end)

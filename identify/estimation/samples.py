@@ -26,7 +26,7 @@ LEAST_LINE = 30.0
 """A line counts as hum if its power is this many times the mean power of its neighbours."""
 FOLLOWED_S = 1.0
 """Window in which amplitude and phase of the hum are taken as constant."""
-MOST_HARMONICS = 8
+MAX_HARMONICS = 8
 
 
 @dataclass(frozen=True)
@@ -210,7 +210,7 @@ def hum_variation(record: Record, torque: np.ndarray, mains_hz: float, known: li
         high[: 2 * width] = high[-2 * width :] = 0.0
         weight = np.convolve(np.abs(high) > 0, window, "same")
         h = 1
-        while h * mains_hz < 0.5 * rate_hz - 1.0 and h <= MOST_HARMONICS:
+        while h * mains_hz < 0.5 * rate_hz - 1.0 and h <= MAX_HARMONICS:
             turn = np.exp(2j * np.pi * h * mains_hz * record.time_s[run])
             half = np.pi * h * mains_hz / rate_hz
             passed = 1.0 - (np.sin(width * half) / (width * np.sin(half))) ** 2

@@ -22,7 +22,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SplineBasis
 
-MOST_TERMS = 14
+MAX_TERMS = 14
 
 
 def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
@@ -40,7 +40,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     used = with_past(rows, max(torque_lags, width_lags))
     lagged = np.stack([np.roll((torque, width)[kind], lag) for kind, lag in variables], axis=1)[used]
     candidates = np.stack([np.prod(lagged[:, list(term)], axis=1) for term in terms], axis=1)
-    chosen, weights = forward_regression(candidates, torque[used], int(options.get("terms", MOST_TERMS)))
+    chosen, weights = forward_regression(candidates, torque[used], int(options.get("terms", MAX_TERMS)))
     recipe = {
         "variables": variables,
         "terms": [list(terms[i]) for i in chosen],
@@ -62,7 +62,7 @@ METHOD = Method(
         "torque_lags": "number of past torques (default: 2)",
         "width_lags": "number of past pulse widths (default: 3)",
         "degree": "highest degree (default: 3)",
-        "terms": f"largest number of terms (default: {MOST_TERMS})",
+        "terms": f"largest number of terms (default: {MAX_TERMS})",
     },
     fit,
 )

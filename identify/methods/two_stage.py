@@ -38,7 +38,7 @@ from stimrig.identify.recruitment.bases import PowerBasis, SplineBasis
 from stimrig.identify.recruitment.smoothing import KNOTS, PILOT_KNOTS, adapted_knots, choose_weight, spline_roughness
 
 LARGEST_POLE = 0.9995
-MOST_DELAYS = 4
+MAX_DELAYS = 4
 DAMPING = Damping(first=1e-3, less=10.0, more=10.0, smallest=1e-12)
 
 
@@ -188,7 +188,7 @@ def choose_order(
     tried: dict[tuple[int, int, int], OutputError] = {}
     for poles in (1, 2, 3):
         zeros = poles - 1
-        for delay in range(earliest, earliest + MOST_DELAYS):
+        for delay in range(earliest, earliest + MAX_DELAYS):
             tried[poles, zeros, delay] = output_error(torque, drive, rows, (poles, zeros, delay))
             better = [fit.bic for (p, _, d), fit in tried.items() if p == poles and d < delay]
             if better and tried[poles, zeros, delay].bic > min(better) + 10:

@@ -18,7 +18,7 @@ from stimrig.identify.diagnosis.search import required_errors
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation import left_out
-from stimrig.identify.estimation.candidates import alike_rows
+from stimrig.identify.estimation.candidates import similar_bout_rows
 from stimrig.identify.estimation.effect_fit import Candidate, fitted_with
 from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, hold_out, leave_out
 from stimrig.identify.estimation.plain import fit_plain
@@ -139,7 +139,7 @@ def test_rows_of_validate_do_not_choose_rows_or_noise():
     record = arm(1)
     grid, _ = prepare(record)
     rows = fitted_rows(grid, None)
-    own = alike_rows(grid, rows)
+    own = similar_bout_rows(grid, rows)
     assert own is not None and 0.2 < own.sum() / rows.sum() < 0.8 and not np.any(own & grid.held_out)
     other = record.with_torque(np.where(record.held_out, -3.0 * record.torque_nm, record.torque_nm))
     models = [identify.fit(one) for one in (record, other)]

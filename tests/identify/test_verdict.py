@@ -57,7 +57,7 @@ class Made:
             record=object(), raw=self.raw, rows=np.ones(4000, bool), plain=base, base=base,  # pyright: ignore[reportArgumentType]
             rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=0.0, residuals=[self.left()],
         )  # fmt: skip
-        monkeypatch.setattr(verdict, "seen_at_rest", self._seen_at_rest)
+        monkeypatch.setattr(verdict, "share_at_rest", self._share_at_rest)
         monkeypatch.setattr(verdict, "vetoed", self._rise)
         monkeypatch.setattr(verdict, "held_out_error", self._unseen)
 
@@ -96,7 +96,7 @@ class Made:
         self.raw.readings = Readings("held", np.arange(9), 400.0 * held_s, held_s=held_s)
         return self
 
-    def _seen_at_rest(self, quiet: Any, holder: Any, effect: str) -> float:
+    def _share_at_rest(self, quiet: Any, holder: Any, effect: str) -> float:
         assert quiet is self.work.quiet
         assert holder is self.work.chain[self.work.added.index(effect) + 1]
         return self.at_rest
