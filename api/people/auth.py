@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import asyncio
+import logging
+import math
 import secrets
 import threading
 from collections import OrderedDict
@@ -12,6 +14,7 @@ from functools import partial
 from typing import Any
 
 from sqlalchemy import select
+from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.orm import Session
 from starlette.requests import HTTPConnection
 
@@ -23,6 +26,7 @@ from stimrig.api.store import Store, audit
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import PageSession, Token
 
+log = logging.getLogger("stimrig.api")
 LOCKED = ("locked", "This page is locked")
 """Code and title of the problem that a locked session meets."""
 MOST_REMEMBERED = 1000
@@ -328,6 +332,7 @@ class IdleLock:
 
     def __init__(self, store: Store, clock: Clock, after_min: float) -> None:
         self.store, self.clock, self.after_s = store, clock, after_min * 60
+        self._retry_s = -math.inf
 
     def locked(self, row: PageSession) -> bool:
         """Return whether this session is locked."""
@@ -337,11 +342,15 @@ class IdleLock:
         return self.clock.unix_s() - (row.acted_unix_s or row.created_unix_s)
 
     def acted(self, row: PageSession) -> None:
-        """Record a person's action in a session that is not locked."""
-        if self._idle_s(row) > RECORD_S:
-            with self.store.write() as session:
-                if (now := session.get(PageSession, row.hash)) is not None:
-                    now.acted_unix_s = self.clock.unix_s()
+        """Record a person's action in a session that is not locked. A database that takes none refuses nothing."""
+        if self._idle_s(row) > RECORD_S and self.clock.monotonic_s() >= self._retry_s:
+            try:
+                with self.store.write() as session:
+                    if (now := session.get(PageSession, row.hash)) is not None:
+                        now.acted_unix_s = self.clock.unix_s()
+            except SQLAlchemyError:
+                self._retry_s = self.clock.monotonic_s() + RECORD_S
+                log.exception("a person's action could not be recorded")
 
     def change(self, session_hash: str, lock: bool, by: str) -> None:
         """Lock a session now, or unlock it, as the person is back."""

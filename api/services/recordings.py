@@ -89,8 +89,12 @@ async def take_in(
     except BaseException:  # refused, or nobody waits for it any more
         part.unlink(missing_ok=True)
         raise
-    row = await asyncio.shield(asyncio.to_thread(_store, context, new, principal.name, of, tags))
-    plain = await asyncio.to_thread(context.versions.add, fitted["json"], code, row.id, principal.name)
+
+    def keep() -> tuple[Recording, Model]:
+        row = _store(context, new, principal.name, of, tags)
+        return row, context.versions.add(fitted["json"], code, row.id, principal.name)
+
+    row, plain = await asyncio.shield(asyncio.to_thread(keep))
     return row, await asyncio.shield(carried_structure.carry(context.analyses, plain, row.path)), warnings
 
 

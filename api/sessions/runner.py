@@ -38,6 +38,7 @@ START_S = 10.0
 """From the request to the command to the rig: nobody waits with a hand on the button for longer."""
 ANSWER_S = 15.0
 """So long the rig may take to answer a start."""
+MOST_PREVIEWS = 4
 PREVIEW_S = 35.0
 """More than the rig takes for one before it says that the computer is too busy."""
 MISSED_POLLS = 3
@@ -54,6 +55,7 @@ class Runner(Playing):
         self.versions, self.pool, self.stops = analyses.versions, analyses.pool, stops
         self.trials, self.limits_lock = trials, limits_lock
         self.previews, self.hub = Previews(self.clock), Hub(self.clock)
+        self._previewing = 0
         self.adaptive = AdaptiveTests(self.clock, rig, self.versions, adviser, self.hub.send)
         self.joint = JointTests(self.clock, rig, self.versions, self.hub.send)
         self.kinds = Kinds(Kind(rig), trials, self.adaptive, self.joint)
@@ -67,10 +69,22 @@ class Runner(Playing):
     # ---- before a test -----------------------------------------------------------------------------------------
 
     async def preview(self, body: TestIn) -> dict[str, Any]:
-        """Return a test's duration, dose and pulse widths. With its `plan_hash` it can be started."""
-        participant = await asyncio.to_thread(self._participant, body.participant)
-        planned = await self._planned(body, participant)
-        answer = await self._previewed(planned.plan)
+        """Return a test's duration, dose and pulse widths. With its `plan_hash` it can be started.
+
+        Raises ApiError: 503 so many are computed already.
+        """
+        if self._previewing >= MOST_PREVIEWS:
+            detail = f"{MOST_PREVIEWS} previews are in work already. Try again in 1 s."
+            problem = ApiError(503, "crowded", "Too many previews at once", detail)
+            problem.headers["Retry-After"] = "1"
+            raise problem
+        self._previewing += 1
+        try:
+            participant = await asyncio.to_thread(self._participant, body.participant)
+            planned = await self._planned(body, participant)
+            answer = await self._previewed(planned.plan)
+        finally:
+            self._previewing -= 1
         return {**answer, **planned.extra, "plan_hash": self.previews.add(body, planned, answer, participant)}
 
     async def joint_overview(self, participant: Participant) -> dict[str, Any]:

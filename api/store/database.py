@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
 
-from sqlalchemy import Engine, create_engine, event, select
+from sqlalchemy import Connection, Engine, create_engine, event, select
 from sqlalchemy.engine import URL, make_url
 from sqlalchemy.exc import ArgumentError, DatabaseError, OperationalError, SQLAlchemyError
 from sqlalchemy.orm import Session, sessionmaker
@@ -24,6 +24,8 @@ from stimrig.api.errors import ApiError
 from stimrig.api.store import audit, migrations
 from stimrig.api.store.tables import Secret
 
+WRITES = "stimrig_writes"
+"""Execution option of the connections that write."""
 OTHER_WRITER_MS = 10_000
 """Timeout for another process's lock."""
 POSTGRESQL = {
@@ -55,6 +57,7 @@ class Store:
         except (ArgumentError, SQLAlchemyError, ImportError, OSError) as error:
             raise ApiError(503, "database", "The database cannot be opened", why_not_opened(error, safe_url)) from error
         self._sessions = sessionmaker(self.engine, expire_on_commit=False)
+        self._writing = sessionmaker(self.engine.execution_options(**{WRITES: True}), expire_on_commit=False)
         self._write_lock = threading.Lock()
 
     @contextmanager
@@ -66,7 +69,7 @@ class Store:
     @contextmanager
     def write(self) -> Iterator[Session]:
         """A transaction: committed at the end, rolled back at an error. One at a time."""
-        with self._write_lock, self._sessions.begin() as session:
+        with self._write_lock, self._writing.begin() as session:
             yield session
 
     def get(self, table: type[Any], key: Any) -> Any:
@@ -133,7 +136,7 @@ def open_engine(url: URL) -> Engine:
             close_to_others(path)
         engine = create_engine(url, hide_parameters=True)
         event.listen(engine, "connect", _durable_sqlite)
-        event.listen(engine, "begin", lambda connection: connection.exec_driver_sql("BEGIN"))
+        event.listen(engine, "begin", _begin_sqlite)
         return engine
     if kind != "postgresql":
         raise ArgumentError(f"{kind}: neither sqlite nor postgresql")
@@ -152,6 +155,12 @@ def _durable_sqlite(connection: Any, _record: Any) -> None:
     connection.isolation_level = None  # the event `begin` begins transactions, not the driver
     for pragma in ("journal_mode=WAL", "synchronous=FULL", "foreign_keys=ON", f"busy_timeout={OTHER_WRITER_MS}"):
         connection.execute(f"PRAGMA {pragma}")
+
+
+def _begin_sqlite(connection: Connection) -> None:
+    # A transaction that reads and then writes never waits for another process's lock: it fails at once.
+    writes = connection.get_execution_options().get(WRITES, False)
+    connection.exec_driver_sql("BEGIN IMMEDIATE" if writes else "BEGIN")
 
 
 def sqlite_file(url: URL) -> Path | None:

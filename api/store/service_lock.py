@@ -75,9 +75,13 @@ class ServiceLock:
     def renew(self) -> None:
         """Take PostgreSQL's lock again where its connection was lost; call it every `KEEP_S`.
 
-        Ends this process where another service has taken it meanwhile.
+        Ends this process where another service may have a lock meanwhile: of the database, or of a folder that was put
+        in the place of the locked one.
         """
         try:
+            for folder, descriptor in self._folders.items():
+                if not folder.exists() or not os.path.samestat(os.fstat(descriptor), folder.stat()):
+                    raise HeldError(f"{folder}: it was moved or replaced while this service ran on it; start it anew")
             if self._database is not None:
                 self._database.acquire()
         except HeldError as error:

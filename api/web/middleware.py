@@ -7,7 +7,6 @@ import json
 import logging
 import re
 import secrets
-from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
@@ -24,7 +23,7 @@ from stimrig.identify.json_text import BadJson, NotJson, parse
 
 log = logging.getLogger("stimrig.api")
 SAFE_METHODS = {"GET", "HEAD", "OPTIONS"}
-STOP, PREVIEW, UPLOAD = "/v1/stop", "/v1/preview", "/recordings"
+STOP, UPLOAD = "/v1/stop", "/recordings"
 """Addresses that are treated in their own way; an upload's ends so."""
 
 NOWHERE = "base-uri 'none'; frame-ancestors 'none'"
@@ -53,7 +52,7 @@ DATA = {  # should a browser be led to show it
 
 BODY_BYTES, BODY_S, UPLOAD_S = 1_000_000, 20.0, 300.0
 """Enough for the longest list of pulse widths; uploads have a bound of their own."""
-MOST_PREVIEWS, MOST_UPLOADS = 4, 8
+MOST_UPLOADS = 8
 """In work at the same time: bodies and answers are long; further ones are refused before they are read."""
 DEEPEST = 16
 """Brackets within one another: a test's segment's settings take six."""
@@ -80,7 +79,7 @@ class Boundary:
 
     def __init__(self, app: ASGIApp, context: Any) -> None:
         self.app, self.context = app, context
-        self._in_work = Counter[str]()
+        self._uploads = 0
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -98,16 +97,15 @@ class Boundary:
             await send(message)
 
         path = scope["path"].rstrip("/")
-        what = "previews" if path == PREVIEW else "uploads" if path.endswith(UPLOAD) else ""
-        max_waiting = {"previews": MOST_PREVIEWS, "uploads": MOST_UPLOADS}.get(what)
-        if max_waiting is not None and self._in_work[what] >= max_waiting:
-            await crowded(what, max_waiting, path)(scope, receive, send_more)
+        uploads = path.endswith(UPLOAD)
+        if uploads and self._uploads >= MOST_UPLOADS:
+            await crowded(path)(scope, receive, send_more)
             return
-        self._in_work[what] += 1
+        self._uploads += uploads
         try:
             await self.app(scope, self._bounded(scope, receive), send_more)
         finally:
-            self._in_work[what] -= 1
+            self._uploads -= uploads
 
     async def _look_again(self) -> None:
         try:
@@ -161,12 +159,11 @@ def add_headers(headers: MutableHeaders) -> None:
         headers.add_vary_header("Cookie")
 
 
-def crowded(what: str, max_waiting: int, path: str) -> JSONResponse:
-    """503: others' previews or uploads are in work."""
-    wait_s = "1" if what == "previews" else "30"
-    detail = f"{max_waiting} {what} are in work already. Try again in {wait_s} s."
-    body = ApiError(503, "crowded", f"Too many {what} at once", detail).body(path)
-    return JSONResponse(body, 503, media_type="application/problem+json", headers={"Retry-After": wait_s})
+def crowded(path: str) -> JSONResponse:
+    """503: others' uploads are in work."""
+    detail = f"{MOST_UPLOADS} uploads are in work already. Try again in 30 s."
+    body = ApiError(503, "crowded", "Too many uploads at once", detail).body(path)
+    return JSONResponse(body, 503, media_type="application/problem+json", headers={"Retry-After": "30"})
 
 
 def refuse_unsound(body: bytes) -> None:

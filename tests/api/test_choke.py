@@ -27,6 +27,7 @@ from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
 from stimrig.api.people.auth import Auth, IdleLock, Scope
 from stimrig.api.people.pace import Guesses
+from stimrig.api.sessions import runner
 from stimrig.api.sessions.rig_client import line_of
 from stimrig.api.store import Store
 from stimrig.api.store.audit import digest
@@ -132,18 +133,20 @@ def test_a_body_that_does_not_come_is_not_waited_for(service: Service, monkeypat
     assert connection.recv(12) == b"HTTP/1.1 408"
 
 
-def test_too_many_previews_at_once_are_refused_before_they_are_read(
+def test_too_many_previews_at_once_are_refused(
     service: Service, client: httpx.Client, participant: str, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(middleware, "MOST_PREVIEWS", 1)
+    monkeypatch.setattr(runner, "MOST_PREVIEWS", 1)
     asked, go_on = threading.Event(), threading.Event()
 
-    async def slow(_body: object) -> dict[str, Any]:
+    whole = service.context.runner._previewed
+
+    async def slow(plan: TestPlan) -> dict[str, Any]:
         asked.set()
         await asyncio.to_thread(go_on.wait, 120)
-        return {"duration_s": 1.0}
+        return await whole(plan)
 
-    monkeypatch.setattr(service.context.runner, "preview", slow)
+    monkeypatch.setattr(service.context.runner, "_previewed", slow)
     with ThreadPoolExecutor(1) as pool:
         first = pool.submit(client.post, "/v1/preview", json={"participant": participant})
         assert asked.wait(60)

@@ -10,12 +10,31 @@ from urllib.parse import parse_qs, urlsplit
 
 import httpx
 import pytest
+from sqlalchemy.exc import OperationalError
 
 from stimrig.api.people.auth import IdleLock
+from stimrig.api.store import Store
+from stimrig.api.store.tables import PageSession
 from tests.api.browser import PASSWORD, without_values
 from tests.api.conftest import HTML, STUB, TOKEN, Service, SetClock, run_service, wait_done
 from tests.api.forms import find, press
 from tests.api.test_people import standing_still
+
+
+def test_an_action_that_cannot_be_recorded_refuses_nothing_and_is_not_tried_at_once_again(tmp_path: Path):
+    store, clock, tries = Store(f"sqlite:///{tmp_path / 'x.db'}"), SetClock(), []
+
+    def refuse() -> None:
+        tries.append(clock.monotonic_s())
+        raise OperationalError("INSERT", {}, Exception("disk full"))
+
+    store.write = refuse
+    idle = IdleLock(store, clock, 10)
+    row = PageSession(hash="h", created_unix_s=clock.unix_s() - 60)
+    idle.acted(row)
+    idle.acted(row)
+    assert len(tries) == 1
+
 
 SCRIPT = {"Sec-Fetch-Dest": "empty", "Sec-Fetch-Mode": "cors"}
 

@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ import pytest
 from stimrig.api.cli import main
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.supervisor import Child, Services
+from stimrig.api.clock import Clock
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.service_lock import HOLDER, INHERITED, HeldError, ServiceLock, reserve
@@ -28,6 +30,40 @@ from tests.api.conftest import PATIENCE_S, TOKEN
 from tests.harness.looks_first import LooksFirst
 
 ROOT = Path(__file__).parents[2]
+
+
+def test_a_change_waits_for_another_process_that_writes(tmp_path: Path):
+    """Also one that reads first: in WAL mode such a transaction fails at once, unless it begins as one that writes."""
+    store = Store(f"sqlite:///{tmp_path / 'x.db'}")
+
+    def change() -> None:
+        with store.write() as session:
+            assert session.get(Participant, "P1") is None
+            session.add(Participant(code="P1", created_utc=Clock().utc(), created_by="Ada"))
+
+    with closing(sqlite3.connect(tmp_path / "x.db", isolation_level=None)) as other, ThreadPoolExecutor(1) as pool:
+        other.execute("BEGIN IMMEDIATE")
+        changed = pool.submit(change)
+        try:
+            with pytest.raises(TimeoutError):
+                changed.result(0.3)
+        finally:
+            other.execute("COMMIT")
+        changed.result(PATIENCE_S)
+    assert store.get(Participant, "P1") is not None
+
+
+def test_a_service_whose_folder_was_replaced_ends(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    ended: list[int] = []
+    monkeypatch.setattr(os, "kill", lambda _pid, number: ended.append(number))
+    lock = ServiceLock(Settings(data_dir=tmp_path / "var"))
+    lock.renew()
+    assert not ended
+    (tmp_path / "var").rename(tmp_path / "old")
+    (tmp_path / "var").mkdir()
+    lock.renew()
+    assert ended == [signal.SIGTERM]
+    lock.release()
 
 
 def command(data: Path, **more: str) -> dict[str, Any]:
