@@ -188,7 +188,7 @@ class People:
             locking.write(session, row, self.clock.utc(), by, "remove user", row.name)
 
 
-CONFIRM_AGAIN = "Nothing was decided. Go back and enter it again."
+CONFIRM_AGAIN = "Nothing was decided. Enter it again."
 UNLOCK_AGAIN = "The page stays locked. Enter it again."
 
 

@@ -168,7 +168,7 @@ const act = (() => {
   }
 
   function showAtTop(title, detail = "", test = "") {
-    const box = make("p", { id: "refused", className: "notice bad", role: "alert" }, make("b", { textContent: title }), " " + detail);
+    const box = make("p", { id: "refused", className: "notice bad", role: "alert" }, make("b", { textContent: title }), detail ? ": " + detail : "");
     if (test) box.append(" ", make("a", { className: "button", href: "/tests/" + test, textContent: "See the running test" }));
     document.getElementById("main").prepend(box);
     box.scrollIntoView({ block: "nearest" });
@@ -180,7 +180,7 @@ const act = (() => {
   }
 
   function changed({ title, detail, changes = [] }, again = "Do it all the same") { // the question of a 412
-    const rows = changes.map((each) => ({ what: each.action, before: each.old, now: each.new, who: [each.who, new Date(each.at_utc).toLocaleTimeString()].filter(Boolean).join(", ") }));
+    const rows = changes.map((each) => ({ what: each.action, before: each.old, now: each.new, who: [each.who, new Date(each.at_utc).toLocaleTimeString("en-GB")].filter(Boolean).join(", ") }));
     const warnings = ["Nothing was done. Look at what is there now; what you decide then is a new decision.", ...(rows.length ? [] : [detail])];
     return { title, warnings, rows, button: again === "reload" ? "Show it anew" : again };
   }
