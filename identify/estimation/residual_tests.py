@@ -104,11 +104,11 @@ def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
         names += ["share"] if noise.share < 2.0 else []
         names += ["ar1"] if noise.ar1 < 1.0 - SHORTEST - LEAST_SHARE else []
     if noise.band > 0.0:
-        names += ["band", "turn", "keep"]
+        names += ["band", "turn", "decay"]
     rows = []
     for name in names:
         # Towards smaller values: away from the bounds, and from the kink of `share` at 1.
-        nudge = -NUDGE * max(1.0 - getattr(noise, name), NUDGE) if name in ("ar1", "keep") else -NUDGE
+        nudge = -NUDGE * max(1.0 - getattr(noise, name), NUDGE) if name in ("ar1", "decay") else -NUDGE
         changed: dict[str, Any] = {name: max(getattr(noise, name) + nudge, 0.0)}
         moved = replace(noise, **changed)
         change = (_log_spectrum(moved) - _log_spectrum(noise)) / nudge

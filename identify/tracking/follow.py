@@ -72,7 +72,7 @@ class Step:
     `coming`, after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that was the first.
     """
 
-    outcome: Outcome
+    outcome: Outcome  # what the trial shows
     fit: TrialFit  # of this trial alone
     before: State  # prediction before it
     after: State  # estimate after it

@@ -100,7 +100,7 @@ def test_a_file_is_sent_and_its_model_is_shown(tab: Any, service: Service, tmp_p
     open_form(tab, service, "A7")
     (tmp_path / "record.csv").write_text("time_s,pulse_width_us,torque_nm,segment\n0,0,0,rest\n")
     tab.get_by_text("Upload a recording of another tool").click()
-    tab.get_by_label("or HDF5").set_input_files(tmp_path / "record.csv")
+    tab.get_by_label("HDF5, MAT or Parquet").set_input_files(tmp_path / "record.csv")
     tab.get_by_role("button", name="Upload and identify").click()
     tab.wait_for_url("**/models/M-*")
     assert tab.errors == []

@@ -109,7 +109,7 @@ def test_held_out_rows_may_object_to_any_link_of_a_chain(monkeypatch: pytest.Mon
     """B, second best, is extended too; its own step from the base is asked about although B alone was not taken."""
 
     def model(name: str) -> SimpleNamespace:
-        return SimpleNamespace(name=name, noise=SimpleNamespace(held=False), log_evidence=0.0)
+        return SimpleNamespace(name=name, noise=SimpleNamespace(white_only=False), log_evidence=0.0)
 
     def longer(chain: free.Chain, *_: object) -> list[free.Chain]:
         further = {(): {"A": 1.0, "B": 0.8}, ("B",): {"C": 3.0}}.get(chain.added, {})
