@@ -19,6 +19,8 @@ LEAST_SPAN = 0.08
 """A panel spans at least this share of its values: what does not change looks as if it did not."""
 DAY_S = 86400.0
 MOST_DATES, MOST_NUMBERS = 4, 12
+MAX_DOTS = 60
+"""More dots than that touch one another, and only make the page heavy: then the line and the bands are shown."""
 
 
 class Point(NamedTuple):
@@ -99,7 +101,9 @@ def history(points: Sequence[Point], unit: str, x: dict[str, Any], levels: Seque
          {"width": 0, "marker": "diamond", "size": 6}),
     )  # fmt: skip
     traces = [
-        curve([x for x, _ in rows], [y for _, y in rows], "", colour, **style) for rows, colour, style in parts if rows
+        curve([x for x, _ in rows], [y for _, y in rows], "", colour, **style)
+        for rows, colour, style in parts
+        if rows and not ("marker" in style and len(known) > MAX_DOTS)
     ]
     rules = [fig.rule(at, colour="width") for at in levels if low <= at <= high]
     return figure(x, [axis(unit, limits=(low, high))], traces, rules, height=TALL_PX)
