@@ -84,7 +84,7 @@ def services(*emulator: str) -> Iterator[Any]:
     from stimrig.api.settings import Settings
 
     with TemporaryDirectory(prefix="stimrig-bench-") as folder:
-        settings = Settings(data_dir=Path(folder), port=0)  # pyright: ignore[reportCallIssue]
+        settings = Settings(data_dir=Path(folder), port=0)
         with Services(settings, list(emulator), TOKEN) as running, Client(running.url, TOKEN, timeout_s=600) as client:
             yield running, client
 

@@ -376,7 +376,7 @@ def learn(
             corrected = demand + share * (update(demand, learnt_nm) - demand)
             demand = np.clip(corrected, 0.0, plant.largest_nm)
         else:
-            demand = follow(plant, demand, predict(widths_us) + STEP * share * learnt_nm, predict)  # pyright: ignore
+            demand = follow(plant, demand, predict(widths_us) + STEP * share * learnt_nm, predict)
     return done
 
 

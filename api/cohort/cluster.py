@@ -74,7 +74,7 @@ def _start_workers(count: int) -> Iterator[Client]:
             processes=True,
             host="127.0.0.1",
             memory_limit="1GiB",  # of the worker itself, which holds the bytes of one record
-            dashboard_address=None,  # pyright: ignore[reportArgumentType]
+            dashboard_address=None,
             silence_logs=logging.CRITICAL,
             security=Security.temporary(),  # whoever reaches an open scheduler's port runs programs as its user
         )

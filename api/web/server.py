@@ -130,7 +130,7 @@ def protocol(request_s: float = REQUEST_S, most_silent: int = MOST_SILENT) -> ty
     silent: dict[asyncio.Transport, asyncio.TimerHandle] = {}
 
     class Visitor(H11Protocol):
-        def connection_made(self, transport: asyncio.Transport) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        def connection_made(self, transport: asyncio.Transport) -> None:
             super().connection_made(transport)
             self._wait()
 

@@ -247,7 +247,7 @@ def test_nothing_pressed_before_a_train_counts_while_it_is_on_its_way(
     for call in ("/step", "/mark", "/finish"):
         answer = press(pages, "", call, html=shown)
         assert answer.status_code == 412 and "Another train was sent" in answer.text, call
-    assert trains(service) == 1 and not service.rig.calibration.marks_us  # pyright: ignore[reportOptionalMemberAccess]
+    assert trains(service) == 1 and not service.rig.calibration.marks_us
 
 
 def test_a_page_that_shows_not_all_marks_finishes_nothing(

@@ -79,7 +79,7 @@ def test_nothing_is_kept_for_later(page: Any, service: Service) -> None:
         document.body.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true })); }""")
     settled(page, 1)
     page.wait_for_timeout(600)
-    assert widths(service) == [10] and not service.rig.calibration.marks_us  # pyright: ignore[reportOptionalMemberAccess]
+    assert widths(service) == [10] and not service.rig.calibration.marks_us
 
 
 def test_the_focus_stays_and_enter_marks_wherever_it_is(page: Any, service: Service) -> None:

@@ -189,7 +189,7 @@ def test_what_cannot_be_joined_is_refused_before_it_is_played(measured_at: Any, 
     )
     participant: Any = SimpleNamespace(code="P1", side=SITE[0], muscle=SITE[1], placement=SITE[2])
     plan: Any = SimpleNamespace(profile=SimpleNamespace(current_ma=20.0))
-    check = partial(Runner._check_joins, SimpleNamespace(versions=versions), "M1", participant, plan)  # pyright: ignore
+    check = partial(Runner._check_joins, SimpleNamespace(versions=versions), "M1", participant, plan)
     with pytest.raises(ApiError) if kind else nullcontext() as refused:
         check()
     assert kind is None or (refused and (refused.value.status, refused.value.code) == (409, kind))

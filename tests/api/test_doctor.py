@@ -35,7 +35,7 @@ def rig_file(folder: Path, port: str = "/dev/null", interface: str = "slcan", ch
 
 
 def finding(name: str, **settings: object) -> Finding:
-    return next(found for found in examine(Settings(**settings)) if found.check == name)  # pyright: ignore[reportArgumentType]
+    return next(found for found in examine(Settings(**settings)) if found.check == name)
 
 
 def test_sound_machine_exits_0_and_one_json_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -68,7 +68,7 @@ def test_each_check_of_the_machine_finds_what_is_wrong(tmp_path: Path, monkeypat
     monkeypatch.setattr(doctor, "check_wake_up", Mock(side_effect=RuntimeError("no such thing")))
     for mode, fix in ((0o755, "chmod o-rwx"), (0o750, "")):
         tmp_path.chmod(mode)
-        found = {one.check: one for one in examine(Settings(data_dir=tmp_path, host="0.0.0.0"))}  # pyright: ignore
+        found = {one.check: one for one in examine(Settings(data_dir=tmp_path, host="0.0.0.0"))}
         assert found["data folder"].fix.partition(" /")[0] == fix
     assert (found["disk"].verdict, found["disk speed"].verdict, found["address"].verdict) == ("fails", "care", "fails")
     assert "no such thing" in found["wake_up"].says

@@ -23,7 +23,7 @@ def test_a_model_that_holds_it_shows_it_and_the_diagnosis_does_not_offer_it_agai
     (card,) = explanation.held_free(document)
     assert card["words"] == "Pulses open a gate." and card["axis"] == SHAPE["effect"]
     drawn = Figures(free_effects([card]))
-    shown = environment.get_template("model_parts.html").module.effect(card, drawn)  # pyright: ignore[reportAttributeAccessIssue]
+    shown = environment.get_template("model_parts.html").module.effect(card, drawn)
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
     row = {"effect": "free_gate", "name": "A gate", "form": "two_lags", "equation": "w = γ f(u)", "parameters": {}}
     diagnosis = {"verdict": "unexplained_structure", "missing": [], "structure": [], "experiment": None, "free": [row]}

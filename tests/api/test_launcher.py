@@ -24,7 +24,7 @@ pytestmark = pytest.mark.wire
 
 
 def settings(tmp_path: Path, **more: object) -> Settings:
-    return Settings(data_dir=tmp_path, port=0, **more)  # pyright: ignore[reportArgumentType]
+    return Settings(data_dir=tmp_path, port=0, **more)
 
 
 @contextmanager
@@ -72,7 +72,7 @@ def test_only_the_emulator_makes_an_emulated_rig(tmp_path: Path) -> None:
 def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path) -> None:
     with running(tmp_path) as (services, client):
         test_id = begin(client)
-        services.rig.process.kill()  # pyright: ignore[reportOptionalMemberAccess]
+        services.rig.process.kill()
         soon(lambda: not client.rig().connected)
         assert any("rig had ended" in event for event in services.watch())
         test = ended(client, test_id)
@@ -90,7 +90,7 @@ def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Pa
     with running(tmp_path) as (_, client):
         test = client.test(test_id)
         assert test.state == "stopped" and "shutting down" in test.reason
-        assert client.recording(test.recording_id).startswith(b"\x89HDF")  # pyright: ignore[reportArgumentType]
+        assert client.recording(test.recording_id).startswith(b"\x89HDF")
 
 
 RIG_FILE = """

@@ -152,7 +152,7 @@ def test_a_removed_lock_file_lets_nobody_in(tmp_path: Path) -> None:
         for refused in (held, lambda **given: reserve(Settings(**given))):
             with pytest.raises(HeldError, match=f"{tmp_path}: another service runs on it"):
                 refused(data_dir=tmp_path)
-        services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
+        services = Services(Settings(data_dir=tmp_path, port=0))
         with pytest.raises(LaunchError, match="another service runs on it") as caught, services:
             pass
         assert caught.value.exit_code == 2 and services.emulator is not None and services.emulator.process is None
@@ -187,7 +187,7 @@ def test_each_process_of_serve_is_started_under_the_lock_and_the_service_takes_i
         return child.ready
 
     monkeypatch.setattr(Child, "start", start)
-    services = Services(Settings(data_dir=tmp_path, port=0))  # pyright: ignore[reportCallIssue]
+    services = Services(Settings(data_dir=tmp_path, port=0))
     services.api.ready = {"port": 1, "url": ""}
     with services:
         assert begun == ["emulator", "rig", "api"]

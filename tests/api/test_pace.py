@@ -173,7 +173,7 @@ def test_guesses_fill_no_thread_that_others_need() -> None:
             return error.status
 
     hashed = passwords.hash("right")
-    passwords.hasher = Slow()  # pyright: ignore[reportAttributeAccessIssue]
+    passwords.hasher = Slow()
     with ThreadPoolExecutor(50) as threads:
         guesses = [threads.submit(check, hashed, "guess", False) for _ in range(50)]
         refused = islice(as_completed(guesses, 30), 50 - MOST_STRANGERS)

@@ -211,7 +211,7 @@ def test_database_holds_no_token(service: Service, client: httpx.Client) -> None
 def test_first_start_draws_a_token_once_and_a_set_one_replaces_the_one_before(tmp_path: Path) -> None:
     contexts = []
     for more in ({}, {}, {"admin_token": "first-one"}, {"admin_token": "second-one"}):
-        contexts.append(build(Settings(data_dir=tmp_path, **more)))  # pyright: ignore[reportArgumentType]
+        contexts.append(build(Settings(data_dir=tmp_path, **more)))
         contexts[-1].lock.release()
     drawn = contexts[0].drawn_token
     assert len(drawn or "") > 40 and [context.drawn_token for context in contexts[1:]] == [None] * 3

@@ -125,7 +125,7 @@ def test_a_model_with_a_free_effect_shows_it_and_the_diagnosis_does_not_offer_it
     }  # fmt: skip
     (card,) = explanation.held_free(json.loads(with_gate(tmp_path / "MODEL.json", shape=shape).read_text("utf-8")))
     drawn, templates = Figures(free_effects([card])), environment.get_template("model_parts.html")
-    shown = templates.module.effect(card, drawn)  # pyright: ignore[reportAttributeAccessIssue]
+    shown = templates.module.effect(card, drawn)
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
     row = {"effect": "free_gate", "name": "A gate", "form": "two_lags", "equation": "w = γ f(u)", "parameters": {}}
     diagnosis = {"verdict": "unexplained_structure", "missing": [], "structure": [], "experiment": None, "free": [row]}

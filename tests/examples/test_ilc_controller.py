@@ -109,7 +109,7 @@ def test_noise_is_not_played_back() -> None:
             slow = np.convolve(rng.standard_normal(widths_us.size + 20), np.ones(20) / np.sqrt(20), "valid")
             return felt(UNLIKE_THE_MODEL, widths_us) + noise_nm * slow[: widths_us.size], widths_us
 
-        muscle.play = play  # pyright: ignore[reportAttributeAccessIssue]
+        muscle.play = play
         trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 10)
         last += [trial.error_percent for trial in trials[-4:]]
     floor = 100 * noise_nm / reference.rms_nm

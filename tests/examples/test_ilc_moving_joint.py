@@ -184,7 +184,7 @@ def test_a_trial_that_did_not_end_well_or_has_no_angle_halts_the_controller(
 
 def test_a_movement_that_does_not_start_stops_the_trial(ilc: ModuleType) -> None:
     client, stops = Answers(recording()), []
-    client.stop = lambda: stops.append("stop")  # pyright: ignore[reportAttributeAccessIssue]
+    client.stop = lambda: stops.append("stop")
     with pytest.raises(ilc.HaltedError, match="did not start: robot"):
         service(ilc, client, Mock(side_effect=FileNotFoundError("robot"))).play_moving(np.full(SIZE, 90.0))
     assert stops == ["stop"]

@@ -29,7 +29,7 @@ class Bench(VirtualHost):
     def __init__(self, **where: str) -> None:
         super().__init__("held", **where, angle_offset_deg=10.0, angle_noise_deg=0.0, angle_bits=20)
         self.faults, self.encoder = self.devices.faults, self.devices.encoder
-        self.encoder._angle_deg = lambda time_s: 60.0 + 5.0 * time_s  # pyright: ignore[reportOptionalMemberAccess]
+        self.encoder._angle_deg = lambda time_s: 60.0 + 5.0 * time_s
 
     def rows(self, seconds: float = 1.0) -> Rows:
         """The angle sensor's next frames."""

@@ -18,7 +18,7 @@ INIT_TO_ACK_S, PULSE_TO_ACK_S = 0.040, 600e-6
 
 def played(step_s: float, arm: str | None = None, faults: tuple[str, ...] = (), **settings: object) -> str:
     """A digest of all that devices do in a second of pulses, advanced by steps."""
-    devices = make_devices(Settings(noise_seed=7, **settings), arm, epoch_us=1)  # pyright: ignore[reportArgumentType]
+    devices = make_devices(Settings(noise_seed=7, **settings), arm, epoch_us=1)
     written, frames = [], []
     devices.received(0.0, ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")))
     for name in faults:
@@ -49,7 +49,7 @@ LOSSES = ("frames_dropped", "torque_nan", "frames_corrupt", "corrupt_answers", "
     ],
 )
 def test_inputs_decide_and_how_often_time_advances_does_not(described: dict[str, object]) -> None:
-    seen = {played(step_s, **described) for step_s in (0.001, 0.0125)}  # pyright: ignore[reportArgumentType]
+    seen = {played(step_s, **described) for step_s in (0.001, 0.0125)}
     assert len(seen) == 1
 
 

@@ -22,7 +22,7 @@ def sigmoid(width_us: np.ndarray, gain_nm: float, a2: float, a3: float) -> np.nd
 def second_order(drive_nm: np.ndarray, time_constant_s: float, damping: float, rate_hz: float) -> np.ndarray:
     """Torque from rest for a drive that is held over each sample, N·m, shape as `drive_nm`."""
     transfer = ([1.0], [time_constant_s**2, 2 * damping * time_constant_s, 1.0])
-    b, a = cont2discrete(transfer, 1 / rate_hz, method="zoh")[:2]  # pyright: ignore
+    b, a = cont2discrete(transfer, 1 / rate_hz, method="zoh")[:2]
     return np.asarray(lfilter(np.ravel(b), np.ravel(a), drive_nm))
 
 

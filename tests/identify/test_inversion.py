@@ -67,7 +67,7 @@ def test_the_bounded_optimum_is_that_of_dense_least_squares():
     found = best_demand(a, b, target, largest)
 
     def dense(taps: np.ndarray) -> np.ndarray:
-        return sum(np.diag(np.full(size - i, x), -i) for i, x in enumerate(taps))  # pyright: ignore
+        return sum(np.diag(np.full(size - i, x), -i) for i, x in enumerate(taps))
 
     G = np.linalg.solve(dense(a), dense(b))
     bend = dense(np.array([1.0, -2.0, 1.0]))[2:]

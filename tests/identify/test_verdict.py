@@ -54,7 +54,7 @@ class Made:
         base = fitted(0.0)
         self.raw = SimpleNamespace(readings=None)
         self.work = EffectSearch(
-            record=object(), raw=self.raw, rows=np.ones(4000, bool), plain=base, base=base,  # pyright: ignore[reportArgumentType]
+            record=object(), raw=self.raw, rows=np.ones(4000, bool), plain=base, base=base,
             rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=0.0, residuals=[self.left()],
         )  # fmt: skip
         monkeypatch.setattr(verdict, "share_at_rest", self._share_at_rest)

@@ -217,10 +217,10 @@ def test_a_start_away_from_the_target_is_refused(tmp_path: Path):
 
     def starts(degrees: float | None, **more: Any) -> None:
         plan = rig.plan.model_copy(update=more)
-        rig.angle._recent.clear()  # pyright: ignore
+        rig.angle._recent.clear()
         if degrees is not None:
             rig.sensor.angle_rad = lambda _: math.radians(degrees)
-            rig.angle.add(rig.sensor.block(10))  # pyright: ignore
+            rig.angle.add(rig.sensor.block(10))
         check_start(rig.angle, plan, limits.for_plan(limits.HARD_LIMITS, plan), rig.clock)
 
     starts(64.0)

@@ -397,7 +397,7 @@ def test_whatever_is_pressed(
     for action in pressed:
         if action in ORDER:
             try:
-                calibration.mark(action)  # pyright: ignore[reportArgumentType]
+                calibration.mark(action)
             except PlanError:
                 continue
             marked = [calibration.status().marks_us.get(name) for name in ORDER]
@@ -409,7 +409,7 @@ def test_whatever_is_pressed(
         except (PlanError, RefusedError):
             assert action not in told.next_us
             continue
-        assert told.next_us[action] == device.width_us(width_us) >= shortest_us  # pyright: ignore[reportArgumentType]
+        assert told.next_us[action] == device.width_us(width_us) >= shortest_us
         assert width_us <= told.ceiling_us <= (most_us or 500)
         charge_uc = current_ma * 1e-3
         if now_us:

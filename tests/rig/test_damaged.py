@@ -386,6 +386,6 @@ def test_mistakes_are_named(tmp_path: Path):
     with pytest.raises(RecordingError, match="is not a journal"):
         journal.read(tmp_path / "other")
     journal_at(tmp_path / "j").close()
-    store = RecordingStore(SimpleNamespace(data_dir=tmp_path), VirtualMachine())  # pyright: ignore[reportArgumentType]
+    store = RecordingStore(SimpleNamespace(data_dir=tmp_path), VirtualMachine())
     with pytest.raises(JournalError, match="File exists"):
         store._create(tmp_path / "j")

@@ -205,7 +205,7 @@ def marked(make: Make) -> LiveRig:
 
 def restarted(make: Make, live: LiveRig) -> LiveRig:
     """As after a kill: nothing is written any more."""
-    live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
+    live.machine.disk.process_ended()
     return make(disk=live.machine.disk, clock=live.clock)
 
 

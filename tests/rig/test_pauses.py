@@ -174,7 +174,7 @@ def slow_to_tell(rig: VirtualRig, answers_s: float) -> None:
 def test_who_stops_during_it_is_heard_before_the_next_pulse(rig: VirtualRig, cause: str):
     """What came while it stood still is taken first; also where it comes while all is looked at anew."""
     for after_s in (0.0, 0.05):
-        rig.at(BEGAN_S + 0.4 + after_s, lambda: rig.halt.set(cause, "enough"))  # pyright: ignore[reportArgumentType]
+        rig.at(BEGAN_S + 0.4 + after_s, lambda: rig.halt.set(cause, "enough"))
     paused(rig, (BEGAN_S, 0.4))
     began_s = rig.clock.now_s() + 0.165 + BEGAN_S
     assert rig.execute().outcome == "stopped"

@@ -187,7 +187,7 @@ def test_an_end_of_the_process_at_each_moment_of_a_start(make: Make):
         assert task.error is None or isinstance(task.error, RigError)
         assert len(live.stimulator.sent) == sent
         assert not live.stimulator.armed
-        live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
+        live.machine.disk.process_ended()
         again = make(disk=live.machine.disk, clock=live.clock)
         assert again.states[-1] == ("latched" if live.states[-1] == "latched" else "ready")
 
@@ -277,7 +277,7 @@ def test_a_later_reason_is_told_and_outlives_the_process(make: Make, state: str)
     assert remembered(live) == {"state": "latched", "reason": both}
     assert live.finished.reason == "the session is over (by nurse)"
     live.close()
-    live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
+    live.machine.disk.process_ended()
     again = make(disk=live.machine.disk, clock=live.clock)
     assert again.rig.status().reason == both
     with pytest.raises(LatchChangedError):
@@ -287,7 +287,7 @@ def test_a_later_reason_is_told_and_outlives_the_process(make: Make, state: str)
 def test_a_stop_while_uncertain_is_told_after_the_next_restart_too(make: Make):
     live = make(disk=SimulatedDisk(World(0)), clock=None)
     live.close()
-    live.machine.disk.process_ended()  # pyright: ignore[reportAttributeAccessIssue]
+    live.machine.disk.process_ended()
     live.machine.disk.replace(live.config.data_dir / "latch.json", b"damaged")
     live = make(disk=live.machine.disk, clock=live.clock)
     seen = live.rig.latch

@@ -405,7 +405,7 @@ def test_torque_that_falls_long_after_the_time_for_it_confirms_no_stop():
     heard.machine.clock.call_at(heard.began_s + 15.0, lambda: setattr(heard, "torque_nm", 0.0))
     tasks = heard.machine.tasks
     sleep = tasks.sleep
-    tasks.sleep = lambda real_s: sleep(real_s + 0.06)  # pyright: ignore[reportAttributeAccessIssue]
+    tasks.sleep = lambda real_s: sleep(real_s + 0.06)
     confirmed, _ = heard.confirms(at_stop_nm=20.0)
     assert heard.waited_s() <= 2 * DECAY_S
     assert not confirmed

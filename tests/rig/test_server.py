@@ -35,7 +35,7 @@ READY = Status(state="ready")
 def test_who_left_before_the_answer_is_told_nothing_more(tmp_path: Path, leaves: bool) -> None:
     async def subscribers_later() -> int:
         server, asked = Server(), list[Future[Any]]()
-        server.rig = SimpleNamespace()  # pyright: ignore[reportAttributeAccessIssue]
+        server.rig = SimpleNamespace()
 
         def ask(_: object) -> Future[Any]:
             asked.append(Future())
@@ -132,7 +132,7 @@ def test_a_long_plan_is_parsed_beside_no_test_only(
 def test_a_rig_whose_thread_hangs_is_in_trouble(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program, "HUNG_S", 0.05)
     hangs: Any = lambda _: Future()  # noqa: E731
-    found = asyncio.run(program._trouble(None, hangs))  # pyright: ignore[reportArgumentType]
+    found = asyncio.run(program._trouble(None, hangs))
     assert found == "the rig's thread hangs: no answer for 0.05 s"
 
 

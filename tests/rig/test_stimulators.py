@@ -85,7 +85,7 @@ def test_a_single_pulse_and_what_cannot_be_one():
         with pytest.raises(WireError):
             rehastim2.single_pulse(1, *wrong)
     with pytest.raises(WireError):
-        rehastim2.single_pulse(1, 0, 299.5, 20)  # pyright: ignore[reportArgumentType]
+        rehastim2.single_pulse(1, 0, 299.5, 20)
     with pytest.raises(WireError):
         rehastim2.single_pulse(1, 0, 300, float("nan"))
 

@@ -166,7 +166,7 @@ def test_the_driver_waits_for_times_and_passes_on_errors(driver: Driver):
 
 
 def test_a_mistake_in_what_comes_ends_no_driver(driver: Driver, caplog: pytest.LogCaptureFixture):
-    driver.post(lambda: 1 // 0)  # pyright: ignore[reportArgumentType]
+    driver.post(lambda: 1 // 0)
     signal = Signal()
     waiting = driver.submit(lambda: driver.tasks.wait(math.inf, signal))
     driver.post(signal.set)

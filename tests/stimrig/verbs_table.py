@@ -31,7 +31,7 @@ MORE = ("read", "join", "save", "carry", "next_experiment", "track", "plot", "Cl
 def verbs() -> dict[str, Any]:
     """All verbs of the command line, those of a group as `cohort fit`."""
     found: dict[str, Any] = {}
-    for name, command in sorted(get_command(build()).commands.items()):  # pyright: ignore[reportAttributeAccessIssue]
+    for name, command in sorted(get_command(build()).commands.items()):
         below = {} if name in COMMAND_ONLY else getattr(command, "commands", {})
         below = dict.fromkeys(get_args(Verb), command) if name == "cohort" else below
         found |= {f"{name} {verb}": one for verb, one in below.items()} or {name: command}

@@ -152,7 +152,7 @@ def test_a_test_stops_itself_and_is_identified(tmp_path: Path) -> None:
     try:
         bench.start_rig().wait_state("ready")
         folder = tmp_path / "service"
-        app = create_app(Settings(data_dir=folder, admin_token=TOKEN, rig_socket=bench.socket, port=0))  # pyright: ignore[reportArgumentType]
+        app = create_app(Settings(data_dir=folder, admin_token=TOKEN, rig_socket=bench.socket, port=0))
         with Server(app) as url, httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=PATIENCE_S) as client:
             client.post("/v1/participants", json={"code": "P017"})
             target = {"curve_percent": 4.0, "step_percent": 4.0}

@@ -94,7 +94,7 @@ def test_mixed_folder_gives_a_row_for_each_file(client: Client, folder: Path, tm
     assert parameters["time_constant_s"]["value"] == pytest.approx(model["linear"]["time_constant_s"])
     assert parameters["threshold_us"]["unit"] == "µs" and parameters["threshold_us"]["sd"] > 0
     left = client.run(lambda dask_worker: [str(path) for path in Path(dask_worker.local_directory).rglob("*.h5")])
-    assert list(left.values()) == [[], []], "no recording stays in a worker's folder"  # pyright: ignore
+    assert list(left.values()) == [[], []], "no recording stays in a worker's folder"
     assert go(client, folder, tmp_path / "r.parquet") == {DONE_BEFORE: 16} and len(read(tmp_path / "r.parquet")) == 16
 
 
@@ -214,7 +214,7 @@ def test_record_with_which_workers_are_lost_is_a_row(
 ) -> None:
     def deadly(entry: Entry, **more: Any) -> Any:
         if entry.name == "17":
-            raise KilledWorker("it", SimpleNamespace(address="tcp://gone"), 0)  # pyright: ignore[reportArgumentType]
+            raise KilledWorker("it", SimpleNamespace(address="tcp://gone"), 0)
         return record_row(entry, **more)
 
     monkeypatch.setattr(run, "record_row", deadly)
