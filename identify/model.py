@@ -47,7 +47,6 @@ class Noise:
     white_sd_nm: float = 0.0  # white measurement noise of a sample
     block_sd_nm: float = 0.0  # standard deviation of the noise on the grid of pulses
     ar1: float = 0.0  # correlation of neighbouring pulse intervals; 0 if white noise describes the residual better
-    delta_bic: float = 0.0  # evidence for AR(1) over white noise (positive: AR(1))
 
 
 @dataclass(frozen=True)

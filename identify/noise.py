@@ -45,6 +45,11 @@ class NoiseLevel:
         """Return true if hardly any of it is correlated from one interval to the next."""
         return self.band <= 0.0 and min(self.share, 1.0) * self.ar1 < 0.05
 
+    @property
+    def correlation(self) -> float:
+        """Correlation of neighbours of the slow part; 0 where hardly any of the noise is slow."""
+        return 0.0 if self.is_white else self.ar1
+
 
 WHITE = NoiseLevel(0.0, 0.0, 1.0, white_only=True)
 """White noise of any size."""
@@ -65,6 +70,11 @@ def profile(
     share = min(near.share / max(1.0 - near.band, 1e-9), 1.0)
     x = np.array([slow, share, near.turn, fading, near.band])
     return _search(residual, stretches, x, 0.15, 0.03, (near.slowest, near.fastest))
+
+
+def correlation(residual: np.ndarray, stretches: Stretches) -> float:
+    """Correlation of neighbours of the slow part of a residual, N·m, shape (K,); 0 where it is white."""
+    return profile(residual, stretches, NoiseLevel(0.0, 0.5, 1.0))[0].correlation
 
 
 def _search(

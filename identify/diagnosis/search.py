@@ -32,9 +32,9 @@ from stimrig.identify.estimation.effect_fit import (
     try_effect,
 )
 from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.joint import Fitted, solve, start_from
+from stimrig.identify.estimation.joint import Fitted, knows_joint, solve, start_from
 from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
-from stimrig.identify.estimation.plain import fit_plain, knows_joint, renewed_curve
+from stimrig.identify.estimation.plain import fit_plain, renewed_curve
 from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record

@@ -12,8 +12,8 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.earlier import Change, Earlier
 from stimrig.identify.estimation.joint import Fitted, gram
-from stimrig.identify.estimation.plain import joint_of
 from stimrig.identify.estimation.short_record import Short, fit_short
+from stimrig.identify.estimation.still import joint_of
 from stimrig.identify.model import Model
 from stimrig.identify.noise import profile
 from stimrig.identify.recruitment.near_shape import DEVIATIONS

@@ -10,17 +10,17 @@ from uuid import uuid4
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import Grid, runs
+from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
 from stimrig.identify.estimation.fit_statistics import evaluate, fit_statistics, white_sd
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.joint_sensor import sensor_of, words
-from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.uncertainty import bands, covariance_of, unexplained
 from stimrig.identify.model import Covariance, Model, Noise
+from stimrig.identify.noise import correlation
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.simulation.joint_surface import Surfaces, joint_tables
 from stimrig.identify.simulation.predict import fingerprint, predict_on
@@ -56,7 +56,7 @@ def finish(
         noise=Noise(
             white_sd_nm=statistics["noise_sd_nm"],
             block_sd_nm=fitted.noise.sd_nm,
-            ar1=0.0 if fitted.noise.is_white else fitted.noise.ar1,
+            ar1=fitted.noise.correlation,
         ),
         effects=tuple(_effect(written, index, matrix) for index in range(len(problem.chosen))),
         fit=statistics,
@@ -186,7 +186,6 @@ def finish_discrete(
     residual = np.nan_to_num(grid.torque_nm) - np.nan_to_num(response, nan=1e6, posinf=1e6, neginf=-1e6)
     baseline = float(np.mean(residual[rows]))
     free = curve.basis.size + len(block.a) + len(block.b)
-    ar1, delta_bic = ar1_or_white(residual - baseline, runs(rows))
     spread = float(np.sum((residual - baseline)[rows] ** 2)) / max(int(rows.sum()) - free, 1)
     model = Model(
         method=method_id,
@@ -195,7 +194,7 @@ def finish_discrete(
         pulse_rate_hz=1.0 / grid.step_s,
         sample_rate_hz=grid.record.sample_rate_hz,
         baseline_nm=baseline,
-        noise=Noise(block_sd_nm=float(np.sqrt(spread)), ar1=ar1, delta_bic=delta_bic),
+        noise=Noise(block_sd_nm=float(np.sqrt(spread)), ar1=correlation(residual - baseline, ends_of(runs(rows)))),
         reasons=tuple(reasons),
         extra=extra or {},
     )

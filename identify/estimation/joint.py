@@ -8,10 +8,12 @@ from functools import cached_property
 import numpy as np
 from numba import njit
 
+from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.effects import depend_on_joint, find_effect, registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.noise import NoiseLevel, band_part, profile
+from stimrig.identify.recruitment import Curve
 from stimrig.identify.simulation.problem import Problem
 
 
@@ -88,6 +90,16 @@ class Fitted:
     def physical(self) -> np.ndarray:
         """Parameters in their units."""
         return self.problem.physical(self.theta)
+
+    @property
+    def linear(self) -> SecondOrder:
+        """The dynamics of the plain structure."""
+        return SecondOrder(*(float(value) for value in self.physical[:3]))
+
+    @property
+    def curve(self) -> Curve:
+        """The recruitment curve, positive as the set-up's target."""
+        return Curve(self.problem.setup.basis, self.theta[self.problem.coefficients])
 
     @property
     def rms_nm(self) -> float:

@@ -15,10 +15,12 @@ from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
 from stimrig.identify.estimation.curve_posterior import CurvePosterior, Mode, Quadratic
 from stimrig.identify.estimation.earlier import Earlier
-from stimrig.identify.estimation.projection import Projection
+from stimrig.identify.estimation.joint import gram
 from stimrig.identify.noise import NoiseLevel, profile, whitened
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.near_shape import FINE_KNOTS, KNOTS, LOGISTIC_RISE, NearShape, dense_knots, new_person
+from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.simulation.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -143,24 +145,43 @@ class _Search:
 
     # ---- the record ----
 
-    def projection(self, basis: SplineBasis) -> Projection:
-        return Projection(self.grid, basis, np.zeros((basis.size, basis.size)), self.rows)
+    def problem(self, basis: SplineBasis) -> Problem:
+        """The plain structure with a curve of this basis, in the record's own zero."""
+        return Problem(
+            Setup(
+                grid=self.grid,
+                target_nm=self.sign * self.grid.torque_nm,
+                fitted=self.rows,
+                basis=basis,
+                roughness=np.zeros((basis.size, basis.size)),
+                scale_nm=self.scale_nm,
+                noise_sd_nm=self.grid.noise_sd_nm,
+                delay_bounds_s=self.grid.delay_bounds_s,
+            ),
+            [],
+        )
+
+    @staticmethod
+    def theta(linear: SecondOrder, x: np.ndarray, size: int) -> np.ndarray:
+        """Parameters of the problem, from steps of the curve, baselines and initial states."""
+        return np.r_[np.log(linear.core), linear.delay_s, x[size:], np.cumsum(x[:size])]
 
     def quadratic(self, basis: SplineBasis, linear: SecondOrder, noise: NoiseLevel, x: np.ndarray | None) -> Quadratic:
         """The quadratic form at some dynamics; with the derivatives by the dynamics if a curve is given."""
-        projection, n = self.projection(basis), basis.size
-        columns = projection.columns(linear)
-        columns[:, :n] = np.cumsum(columns[:, :n][:, ::-1], axis=1)[:, ::-1]
+        problem, n = self.problem(basis), basis.size
+        known = np.zeros(n + self.others_mean.size) if x is None else x[: n + self.others_mean.size]
+        slopes = problem.run(self.theta(linear, known, n), derivatives=True)[1]
+        assert slopes is not None
+        steps = np.cumsum(slopes[problem.coefficients][::-1], axis=0)[::-1]
+        rows = [steps, slopes[problem.baselines.start : problem.initials.stop]]
         mean, precision = self.others_mean, self.others_precision
         if x is not None:
-            coefficients = np.r_[np.cumsum(x[:n]), x[n : columns.shape[1]]]
-            columns = np.concatenate([columns, projection.slopes(linear, coefficients)], axis=1)
+            rows.append(slopes[:3])
             at = np.array([np.log(linear.time_constant_s), np.log(linear.damping), linear.delay_s])
             mean = np.r_[mean, self.dynamics_mean - at]
             precision = np.asarray(block_diag(precision, self.dynamics_precision))
-        target = np.where(self.rows, self.sign * self.grid.torque_nm, 0.0)
-        white = whitened(np.vstack([columns.T, target]), self.stretches, noise)
-        products = white @ white.T
+        target = np.where(self.rows, problem.setup.target_nm, 0.0)
+        products = gram(whitened(np.vstack([*rows, target]), self.stretches, noise))
         return Quadratic(products[:-1, :-1], products[:-1, -1], float(products[-1, -1]), mean, precision)
 
     def moved(self, linear: SecondOrder, by: np.ndarray) -> SecondOrder:
@@ -170,9 +191,9 @@ class _Search:
 
     def noise(self, basis: SplineBasis, linear: SecondOrder, x: np.ndarray, near: NoiseLevel) -> NoiseLevel:
         """The noise of the residual; at least that of the samples, and correlated only where that is plain."""
-        n = basis.size
-        mean = self.projection(basis).columns(linear) @ np.r_[np.cumsum(x[:n]), x[n:]]
-        residual = np.where(self.grid.count > 0, self.sign * self.grid.torque_nm, 0.0) - mean
+        problem = self.problem(basis)
+        mean = problem.run(self.theta(linear, x, basis.size))[0]
+        residual = np.nan_to_num(problem.setup.target_nm) - mean
         sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
         white = replace(self.quiet, sd_nm=max(sd, self.quiet.sd_nm))
         slow, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)

@@ -11,15 +11,15 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import Grid, runs
+from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import completed
-from stimrig.identify.estimation.projection import ar1_or_white
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import near_rest, quiet_level, segment_rows
 from stimrig.identify.model import Model, Noise
+from stimrig.identify.noise import correlation
 from stimrig.identify.recruitment import fit_points
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import choose_weight
@@ -45,7 +45,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     curve = fit_points(width[ramp], drive[ramp])
     residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
     rows = near_rest(grid, ramp)
-    ar1, delta_bic = ar1_or_white(residual, runs(rows))
+    ar1 = correlation(residual, ends_of(runs(rows)))
     model = Model(
         method=METHOD.id,
         recruitment=curve,
@@ -53,7 +53,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         pulse_rate_hz=1.0 / grid.step_s,
         sample_rate_hz=grid.record.sample_rate_hz,
         baseline_nm=baseline,
-        noise=Noise(block_sd_nm=float(np.std(residual[rows])), ar1=ar1, delta_bic=delta_bic),
+        noise=Noise(block_sd_nm=float(np.std(residual[rows])), ar1=ar1),
         reasons=(f"given dynamics: critically damped, {frequency:.4g} rad/s",),
         extra={"deconvolved": {half: _curve(width[rows], drive[rows]) for half, rows in halves.items()}},
     )

@@ -28,11 +28,12 @@ from stimrig.identify.dynamics.second_order import recursion
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.estimation.finish import finish, finish_discrete
-from stimrig.identify.estimation.plain import pilot_solution, to_fitted
-from stimrig.identify.estimation.projection import Projection, Solution, search
+from stimrig.identify.estimation.joint import Fitted, solve
+from stimrig.identify.estimation.plain import curve_at, final_spline, fit_from, pilot, plain_setup, start_at
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted, with_past
 from stimrig.identify.model import Model
+from stimrig.identify.noise import WHITE, NoiseLevel
 from stimrig.identify.recruitment import Curve, FixedShape
 from stimrig.identify.recruitment.bases import PowerBasis, SplineBasis
 from stimrig.identify.recruitment.smoothing import KNOTS, PILOT_KNOTS, adapted_knots, choose_weight, spline_roughness
@@ -220,8 +221,8 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     inverse = flag(options.get("inverse", False), "inverse")
     order = order_option(options.get("order", "second-order"))
     if order == "second-order" and not literal and not inverse:
-        solution, reasons = physical(grid, prbs, ramp, iterations, knots)
-        return finish(METHOD.id, to_fitted(solution, solution.projection.rows, max_steps=0), reasons)
+        fitted, reasons = physical(grid, prbs, ramp, iterations, knots)
+        return finish(METHOD.id, fitted, reasons)
     return general(METHOD.id, grid, prbs, ramp, iterations, knots, order, literal, inverse)
 
 
@@ -241,41 +242,36 @@ METHOD = Method(
 
 def physical(
     grid: Grid, prbs: np.ndarray, ramp: np.ndarray, iterations: int = 1, knots: int = KNOTS
-) -> tuple[Solution, list[str]]:
+) -> tuple[Fitted, list[str]]:
     """Two stages with the linear part in physical terms.
 
     `prbs` and `ramp`, bool, shape (K,), are the rows for the dynamics and for the recruitment; of `iterations` and
     `knots` see `METHOD.options`.
     """
-    largest = float(np.max(grid.pulse_width_us))
+    rows, none = near_rest(grid, ramp), np.zeros((1, 1))
     # Two levels only, so f can be taken as a straight line through both (15).
-    straight = Projection(grid, PowerBasis(1, largest), np.zeros((1, 1)), near_rest(grid, prbs))
-    starts = [Solution(straight, SecondOrder(t, 0.9, 0.02)) for t in STARTS_S]
-    linear = search(straight, min(starts, key=lambda s: s.variance).linear).linear
+    straight = plain_setup(grid, near_rest(grid, prbs), PowerBasis(1, float(np.max(grid.pulse_width_us))))
+    linear = fit_from(straight, STARTS_S, none).linear
     reasons = [f"PRBS alone: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}"]
-    both = near_rest(grid, prbs) | near_rest(grid, ramp)
-    solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
+    both = plain_setup(grid, near_rest(grid, prbs) | rows, straight.basis)
+    curve, roughness = _recruitment(grid, rows, linear, knots)
     for _ in range(iterations):
-        basis = solution.projection.basis
-        shape = FixedShape(Curve(basis, solution.coefficients[: basis.size]))
-        linear = search(Projection(grid, shape, np.zeros((1, 1)), both), linear).linear
-        solution = _recruitment(grid, near_rest(grid, ramp), linear, knots)
+        problem, theta, _ = start_at(both.with_(basis=FixedShape(curve)), linear, none)
+        linear = solve(problem, theta, WHITE).linear
+        curve, roughness = _recruitment(grid, rows, linear, knots)
     reasons.append(f"after stage two: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}")
     # The last curve and the last dynamics; baseline and noise are estimated from both segments.
-    final = Projection(grid, solution.projection.basis, solution.projection.roughness, both)
-    return Solution(final, linear, weight=solution.weight), reasons
+    problem, theta, white = start_at(both.with_(basis=curve.basis), linear, roughness)
+    return solve(problem, theta, NoiseLevel(0.0, 0.5, white.sd_nm), max_steps=0), reasons
 
 
-def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) -> Solution:
-    """Stage one: the spline for given dynamics, fitted to the output of G."""
-    largest = float(np.max(grid.pulse_width_us))
-    coarse = SplineBasis(np.linspace(0.0, largest, PILOT_KNOTS))
-    pilot = Solution(Projection(grid, coarse, spline_roughness(coarse), rows), linear)
-    first = SplineBasis(adapted_knots(pilot.curve, largest, knots))
-    rough = Solution(Projection(grid, first, spline_roughness(first), rows), linear)
-    basis = SplineBasis(adapted_knots(rough.curve, largest, knots))
-    roughness = spline_roughness(basis, (first, rough.coefficients[: first.size]))
-    return Solution(Projection(grid, basis, roughness, rows), linear)
+def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) -> tuple[Curve, np.ndarray]:
+    """Stage one: the spline for given dynamics, fitted to the output of G, and the penalty on its bending."""
+    basis = SplineBasis(np.linspace(0.0, float(np.max(grid.pulse_width_us)), PILOT_KNOTS))
+    setup = plain_setup(grid, rows, basis)
+    coarse = curve_at(setup, linear, spline_roughness(basis))
+    basis, roughness = final_spline(setup, linear, coarse, knots)
+    return curve_at(setup.with_(basis=basis), linear, roughness), roughness
 
 
 def general(
@@ -332,9 +328,8 @@ def straight_drive(grid: Grid, prbs: np.ndarray) -> np.ndarray:
 
 def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
     """Drive if all segments are used at once: the curve of a second-order pilot fit, scaled to a range of 1."""
-    u, curve = pilot_solution(grid, rows).curve
-    drive = np.interp(grid.pulse_width_us, u, curve)
-    return drive / max(float(np.ptp(curve)), 1e-300)
+    drive = pilot(grid, rows).curve(grid.pulse_width_us)
+    return drive / max(float(np.ptp(drive)), 1e-300)
 
 
 def _curve_through(

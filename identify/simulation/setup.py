@@ -164,5 +164,8 @@ class Setup:
         return self.zero_nm + self.sign * torque_nm
 
     def with_(self, **changes: object) -> Setup:
-        """The set-up with some fields changed (derived arrays are computed again)."""
-        return replace(self, **changes)  # type: ignore
+        """The set-up with some fields changed; other arrays than the curve's are computed again."""
+        changed = replace(self, **changes)  # type: ignore
+        if changed.basis is self.basis and changed.grid is self.grid and "design" in self.__dict__:
+            changed.__dict__["design"] = self.design
+        return changed

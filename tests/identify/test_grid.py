@@ -11,7 +11,7 @@ from stimrig.identify.dynamics import grid as pulse_grid
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
-from stimrig.identify.estimation.projection import log_likelihood, whiten
+from stimrig.identify.noise import NoiseLevel, whitened
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
 
@@ -103,20 +103,15 @@ def test_the_pulses_are_found_wherever_the_record_starts(phase: float, rate_hz: 
     assert np.array_equal(grid.pulse_width_us[inside], expected[inside])
 
 
-def test_whitening_is_the_exact_likelihood() -> None:
-    """Against the dense covariance of the stationary process."""
-    rng = np.random.default_rng(3)
-    residual, ar1, parts = rng.normal(size=12), 0.7, [slice(0, 7), slice(8, 12)]
-    expected = 0.0
-    quadratic, count, logdet = 0.0, 0, 0.0
-    for part in parts:
-        e = residual[part]
-        lag = np.abs(np.subtract.outer(np.arange(e.size), np.arange(e.size)))
-        covariance = ar1**lag / (1 - ar1**2)
-        quadratic += e @ np.linalg.solve(covariance, e)
-        logdet += np.linalg.slogdet(covariance)[1]
-        count += e.size
-    variance = quadratic / count
-    expected = -0.5 * (count * (np.log(2 * np.pi * variance) + 1) + logdet)
-    assert log_likelihood(residual, parts, ar1) == pytest.approx(expected, rel=1e-12)
-    assert whiten(residual, parts, ar1).size == count
+@pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
+def test_whitening_is_exact(share: float) -> None:
+    """Against the dense covariance of the stationary process, white and slow."""
+    rows, noise, parts = np.random.default_rng(3).normal(size=(2, 12)), NoiseLevel(0.7, share, 1.3), [(0, 7), (8, 12)]
+    expected = np.zeros((2, 2))
+    for start, stop in parts:
+        lag = np.abs(np.subtract.outer(np.arange(stop - start), np.arange(stop - start)))
+        covariance = 1.3**2 * (share * 0.7**lag + (1.0 - share) * np.eye(stop - start))
+        expected += rows[:, start:stop] @ np.linalg.solve(covariance, rows[:, start:stop].T)
+    starts, stops = np.array(parts).T
+    white = whitened(rows, (starts, stops), noise)
+    assert white @ white.T == pytest.approx(expected, rel=1e-9)
