@@ -36,6 +36,9 @@ class Settings(BaseSettings):
     time_zone: str | None = Field(default=None, description="as Europe/Berlin; default: the machine's")
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")
     tls_proxy: bool = Field(default=False, description="True: a TLS proxy stands in front; needed to leave loopback")
+    database_url: str | None = Field(
+        default=None, description="URL of a SQLite or PostgreSQL database; default: SQLite in the data folder"
+    )
     port: Annotated[int, Field(ge=0, le=65535)] = 8000
     rig_socket: Path | None = Field(default=None, description="Unix socket of the rig process")
     rig_file: Path | None = Field(default=None, description="rig.toml; default: the emulated rig")
@@ -59,9 +62,9 @@ class Settings(BaseSettings):
         return zone or None
 
     @property
-    def database(self) -> Path:
-        """The database, a file of SQLite."""
-        return self.data_dir.absolute() / "stimrig.db"
+    def database(self) -> str:
+        """The database's SQLAlchemy URL."""
+        return self.database_url or f"sqlite:///{self.data_dir.absolute() / 'stimrig.db'}"
 
     @property
     def exports_dir(self) -> Path:

@@ -66,6 +66,9 @@ if [ "$what" = test ] && ! command -v $shell >/dev/null 2>&1; then
     debian $shell
   fi
 fi
+if [ "$what" = test ] && ! compgen -G '/usr/lib/postgresql/*/bin/postgres' >/dev/null; then
+  debian postgresql
+fi
 touch "$venv/.$what"
 # The list of tests holds the run list.
 if [ "$what" = test ]; then touch "$venv/.run"; fi

@@ -194,7 +194,7 @@ UNLOCK_AGAIN = "The page stays locked. Enter it again."
 
 def user_named(session: Session, name: str) -> User | None:
     """Return the person of a name as it was typed."""
-    if "\0" in name:  # SQLite ends a text there, and nobody is called so
+    if "\0" in name:  # PostgreSQL takes no such text, and nobody is called so
         return None
     return session.scalars(select(User).where(User.folded_name == folded_name(name))).first()
 

@@ -112,5 +112,5 @@ def digest(text: str) -> str:
 
 
 def storable(text: str) -> str:
-    """The text without what SQLite or UTF-8 does not take, so that what somebody sent can be written down."""
+    """The text without what PostgreSQL or UTF-8 does not take, so that what somebody sent can be written down."""
     return text.replace("\x00", "\ufffd").encode("utf-8", "replace").decode()

@@ -20,15 +20,15 @@ from stimrig.api.store.tables import Table
 
 REVISIONS = Path(__file__).parent / "revisions"
 BEFORE = "before-upgrade"
-"""Folder beside the database for the copies that are made before an upgrade."""
+"""Folder beside a SQLite database for the copies that are made before an upgrade."""
 
 
 class SchemaError(Exception):
     """The database cannot be used by this version."""
 
 
-def migrate(engine: Engine, path: Path) -> None:
-    """Bring the tables to the newest revision in one transaction; the file is copied before.
+def migrate(engine: Engine) -> None:
+    """Bring the tables to the newest revision in one transaction; a SQLite file is copied before.
 
     Raises SchemaError: the database is newer than the software, lacks a column, or cannot be copied.
     """
@@ -46,19 +46,22 @@ def migrate(engine: Engine, path: Path) -> None:
             f"it is of version {current}, this stimrig knows versions up to {newest}; "
             "install the stimrig that wrote it, or set STIMRIG_DATA_DIR to another folder"
         )
-    with copied_before(path, current), engine.begin() as writer:
+    with copied_before(engine.url.database, current), engine.begin() as writer:
         config.attributes["connection"] = writer
         command.upgrade(config, "head")
         refuse_incomplete(writer)
 
 
 @contextmanager
-def copied_before(path: Path, current: str | None) -> Iterator[None]:
-    """Keep a copy of the database, if it has tables; it is removed again if the upgrade fails, which changes nothing.
+def copied_before(database: str | None, current: str | None) -> Iterator[None]:
+    """Keep a copy of a SQLite file; it is removed again if the upgrade fails, which leaves the database unchanged.
+
+    Nothing is copied where there is no file with tables yet, and of a PostgreSQL database: pg_dump makes its backups.
 
     Raises SchemaError: no copy can be made.
     """
-    if current is None:
+    path = Path(database or "")
+    if current is None or not path.is_file():
         yield
         return
     copy = copies.free_name(path.parent / BEFORE, f"{path.stem}-{current}")

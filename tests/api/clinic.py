@@ -22,7 +22,7 @@ class Clinic:
 
     def __init__(self, folder: Path) -> None:
         put_database(folder)
-        self.folder, self.store, self.clock = folder, Store(folder / "stimrig.db"), Clock()
+        self.folder, self.store, self.clock = folder, Store(f"sqlite:///{folder}/stimrig.db"), Clock()
         self.versions = Versions(self.store, self.clock)
         self.count = 0
         with self.store.write() as session:

@@ -248,7 +248,7 @@ def empty_database() -> bytes:
     """SQLite's file with the tables of today, made once a process: each fresh service gets a copy."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "empty.sqlite"
-        Store(path).close()
+        Store(f"sqlite:///{path}").close()
         return path.read_bytes()
 
 
@@ -262,7 +262,8 @@ def put_database(folder: Path) -> None:
 def run_service(tmp_path: Path, short_dir: Path, worker: Any, speed: float = 30.0, **more: Any) -> Iterator[Service]:
     socket = short_dir / f"rig-{time.time_ns()}.sock"
     settings = Settings(data_dir=tmp_path, admin_token=TOKEN, rig_socket=socket, port=0, **more)
-    put_database(tmp_path)
+    if settings.database == f"sqlite:///{tmp_path / 'stimrig.db'}":
+        put_database(tmp_path)
     with RigThread(socket, settings.recordings_dir, speed=speed) as rig:
         app = create_app(settings, worker=worker)
         with Server(app) as url:

@@ -30,7 +30,7 @@ class Machine:
         self.rig, self.api, self.backups = root / "rig", root / "api", root / "backups"
         for folder in (self.rig / "journals", self.rig / "recordings", self.api / "recordings/rig"):
             folder.mkdir(parents=True)
-        with closing(Store(self.api / "stimrig.db")) as store, store.write() as session:
+        with closing(Store(f"sqlite:///{self.api}/stimrig.db")) as store, store.write() as session:
             session.add(Participant(code="P1", created_utc="2026-11-23T10:00:00.000Z", created_by="Ada"))
         self.record(self.rig / "recordings/20260101T080000Z_t1.h5", b"first" * 1000)
         self.record(self.rig / "recordings/20260101T090000Z_t2.h5", os.urandom(100_000))
@@ -41,7 +41,7 @@ class Machine:
     def record(self, path: Path, content: bytes) -> None:
         """A recording that is sealed, and then named by the database."""
         path.write_bytes(content)
-        with closing(Store(self.api / "stimrig.db")) as store, store.write() as session:
+        with closing(Store(f"sqlite:///{self.api}/stimrig.db")) as store, store.write() as session:
             row = Recording(id=path.stem, participant="P1", path=str(path), file_sha256=sha256_of(path))
             row.created_utc = "2026-11-23T10:00:00.000Z"
             session.add(row)
@@ -49,7 +49,7 @@ class Machine:
     def back_up(self, capsys: pytest.CaptureFixture[str]) -> Path:
         assert main.run(["backup", str(self.backups), *self.folders, "--json"]) == 0
         found = json.loads(capsys.readouterr().out)
-        assert unmet("backup", found) == []
+        assert unmet("backup", found) == [] and found["database"]
         return Path(found["backup"])
 
     @property
@@ -102,7 +102,7 @@ def test_restored_by_hand_the_rig_comes_up_latched_or_uncertain(
     there = VirtualMachine()
     found, reason = there.run(LatchFile(new, there).read())
     assert found == state and (kept.name in reason) == (state == "latched")
-    with closing(Store(new / "stimrig.db")) as store:
+    with closing(Store(f"sqlite:///{new}/stimrig.db")) as store:
         assert len(store.all(Recording)) == 3
     assert (new / "recordings/20260101T080000Z_t1.h5").read_bytes() == b"first" * 1000
 
@@ -164,6 +164,13 @@ def test_a_bad_disk_leaves_no_backup(
     assert line.count("\n") == 1 and "is the disk sound?" in line and list(machine.backups.iterdir()) == []
 
 
-def test_without_a_database_it_says_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_a_database_it_says_what_to_do(
+    machine: Machine, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     assert main.run(["backup", str(tmp_path / "b"), "--data", str(tmp_path / "nowhere")]) == 2
     assert "no database" in capsys.readouterr().err
+    monkeypatch.setenv("STIMRIG_DATABASE_URL", "postgresql://db/stimrig")
+    assert main.run(["backup", str(machine.backups), *machine.folders]) == 0
+    assert "pg_dump" in capsys.readouterr().out
+    (kept,) = machine.backups.iterdir()
+    assert not (kept / "api/stimrig.db").exists() and (kept / "rig/journals/t3.journal").exists()

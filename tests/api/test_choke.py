@@ -251,7 +251,7 @@ def test_a_token_that_is_read_while_it_is_revoked_is_not_valid_afterwards(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Every live channel looks once a second: one of the looks may be under way."""
-    store, clock = Store(tmp_path / "a.db"), Clock()
+    store, clock = Store(f"sqlite:///{tmp_path}/a.db"), Clock()
     auth = Auth(store, clock, Guesses(clock), IdleLock(store, clock, 0))
     text = auth.issue("bench", [Scope.READ_LIVE], "settings")
     get, was_read, is_revoked = store.get, threading.Event(), threading.Event()

@@ -22,7 +22,7 @@ from tests.api.test_people import standing_still
 
 
 def test_an_action_that_cannot_be_recorded_refuses_nothing_and_is_not_tried_at_once_again(tmp_path: Path):
-    store, clock, tries = Store(tmp_path / "x.db"), SetClock(), []
+    store, clock, tries = Store(f"sqlite:///{tmp_path / 'x.db'}"), SetClock(), []
 
     def refuse() -> None:
         tries.append(clock.monotonic_s())

@@ -211,7 +211,7 @@ asyncio.run(main())
 
 
 def test_a_worker_has_no_secret_is_limited_and_ends_with_the_service() -> None:
-    secrets = dict.fromkeys(("STIMRIG_ADMIN_TOKEN", "SOME_PASSWORD"), "secret-of-the-test")
+    secrets = dict.fromkeys(("STIMRIG_ADMIN_TOKEN", "STIMRIG_DATABASE_URL", "SOME_PASSWORD"), "secret-of-the-test")
     pipes: dict[str, Any] = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True}
     service = subprocess.Popen([sys.executable, "-c", LOOK], cwd=ROOT, env={**os.environ, **secrets}, **pipes)
     try:

@@ -37,7 +37,7 @@ def test_a_restored_backup_takes_no_version_that_was_shown_before_it(tmp_path: P
     at_utc = "2026-11-23T10:00:00.000Z"
 
     def change(current_ma: float, tags: locking.Tags | None) -> int:
-        with closing(Store(live)) as store, store.write() as session:
+        with closing(Store(f"sqlite:///{live}")) as store, store.write() as session:
             row = session.get(Participant, "P1") or Participant(code="P1", created_utc=at_utc, created_by="Ada")
             if tags is not None:
                 locking.check(session, row, tags)

@@ -78,7 +78,7 @@ def test_a_worker_that_fails_says_so_in_such_a_line() -> None:
 
 
 def test_an_error_of_the_database_names_no_participant(tmp_path) -> None:
-    store = Store(tmp_path / "a.db")
+    store = Store(f"sqlite:///{tmp_path / 'a.db'}")
     with pytest.raises(Exception, match="UNIQUE") as told:
         for _ in range(2):
             with store.write() as session:

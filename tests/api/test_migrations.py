@@ -50,7 +50,7 @@ def dump(path: Path) -> list[str]:
 def database(tmp_path: Path) -> Path:
     """A database of today's version with a participant."""
     path = tmp_path / "stimrig.db"
-    with closing(Store(path)) as store, store.write() as session:
+    with closing(Store(f"sqlite:///{path}")) as store, store.write() as session:
         session.add(Participant(code="P1", created_utc="2026-11-23T10:00:00.000Z", created_by="Ada"))
     return path
 
@@ -65,7 +65,7 @@ def revisions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def test_a_new_database_holds_the_tables_of_today(tmp_path: Path) -> None:
-    store = Store(tmp_path / "stimrig.db")
+    store = Store(f"sqlite:///{tmp_path}/stimrig.db")
     with store.engine.connect() as connection:
         assert compare_metadata(MigrationContext.configure(connection), Table.metadata) == []
     store.close()
@@ -78,7 +78,7 @@ def test_an_upgrade_keeps_the_rows_and_a_copy_of_the_database_as_it_was(database
     before = dump(database)
     (revisions / "0002.py").write_text(NEXT.format(statement="UPDATE participants SET shoe_size = 43"))
     for _ in range(2):  # the second start has nothing to do
-        Store(database).close()
+        Store(f"sqlite:///{database}").close()
         with closing(sqlite3.connect(database)) as connection:
             assert connection.execute("SELECT code, shoe_size FROM participants").fetchall() == [("P1", 43)]
     (copy,) = (database.parent / migrations.BEFORE).iterdir()
@@ -91,7 +91,7 @@ def test_an_upgrade_that_fails_or_cannot_be_copied_leaves_the_database_as_it_was
     before = dump(database)
     (revisions / "0002.py").write_text(NEXT.format(statement="UPDATE nowhere SET shoe_size = 43"))
     with pytest.raises(ApiError, match="no such table: nowhere"):
-        Store(database)
+        Store(f"sqlite:///{database}")
     assert dump(database) == before and not list((database.parent / migrations.BEFORE).iterdir())
 
     def full(*_: object) -> str:
@@ -99,7 +99,7 @@ def test_an_upgrade_that_fails_or_cannot_be_copied_leaves_the_database_as_it_was
 
     monkeypatch.setattr(copies, "copy_database", full)
     with pytest.raises(ApiError, match="is upgraded only with a copy: no space left"):
-        Store(database)
+        Store(f"sqlite:///{database}")
     assert dump(database) == before
 
 
@@ -116,7 +116,7 @@ def test_what_does_not_fit_is_refused(database: Path, statement: str, words: str
     execute(database, statement)
     before = database.read_bytes()
     with pytest.raises(ApiError, match=words):
-        Store(database)
+        Store(f"sqlite:///{database}")
     assert database.read_bytes() == before, "nothing was changed in it"
 
 

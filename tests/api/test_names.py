@@ -79,7 +79,7 @@ def test_what_is_no_name_is_refused_and_signs_nobody_in(service: Service, http: 
         assert browser.post("/v1/sessions", json={"name": name, "password": PASSWORD}).status_code == 401
 
 
-def test_a_try_under_a_name_with_a_nul_is_written_down(service: Service, http: httpx.Client) -> None:
+def test_a_try_under_a_name_that_postgresql_takes_not_is_written_down(service: Service, http: httpx.Client) -> None:
     with service.client(token=None) as browser:
         assert browser.post("/v1/sessions", json={"name": "a\x00b", "password": PASSWORD}).status_code == 401
     trail = http.get("/v1/audit").json()

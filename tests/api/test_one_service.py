@@ -1,4 +1,4 @@
-"""One service on a data folder; the second is told who holds it. What it writes is its owner's alone."""
+"""One service on a data folder and a database; the second is told who holds it. What it writes is its owner's alone."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ROOT = Path(__file__).parents[2]
 
 def test_a_change_waits_for_another_process_that_writes(tmp_path: Path):
     """Also one that reads first: in WAL mode such a transaction fails at once, unless it begins as one that writes."""
-    store = Store(tmp_path / "x.db")
+    store = Store(f"sqlite:///{tmp_path / 'x.db'}")
 
     def change() -> None:
         with store.write() as session:
@@ -104,7 +104,7 @@ def test_a_second_service_is_told_who_holds_the_data_and_a_kill_lets_go(tmp_path
         first.send_signal(signal.SIGKILL)
         first.wait(20)
     held(data_dir=data).release()
-    with closing(Store(data / "stimrig.db")) as store:
+    with closing(Store(f"sqlite:///{data}/stimrig.db")) as store:
         assert store.get(Participant, "P1") is not None
 
 
@@ -119,19 +119,30 @@ def closing_lock(**given: Any) -> Iterator[ServiceLock]:
     lock.release()
 
 
-@pytest.mark.parametrize("way", ["one", "link", "two/../one", "two"])
-def test_whichever_way_leads_to_it_it_is_held_once(tmp_path: Path, way: str) -> None:
-    """In `two` the database is a link to that of `one`."""
+WAYS: list[dict[str, Any]] = [
+    {"data_dir": "one"}, {"data_dir": "link"}, {"data_dir": "two/../one"}, {"data_dir": "one", "database_url": "sqlite://"},
+    {"data_dir": "two", "database_url": "sqlite:///PLACE/one/stimrig.db"},
+    {"data_dir": "two", "database_url": "sqlite:///PLACE/link/stimrig.db"},
+    {"data_dir": "two", "database_url": "sqlite:///PLACE/link.db"},
+    {"data_dir": "two", "database_url": "sqlite:///file:PLACE/link.db?uri=true"},
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("way", WAYS, ids=lambda way: " ".join(way.values()))
+def test_whichever_way_leads_to_it_it_is_held_once(tmp_path: Path, way: dict[str, Any]) -> None:
     (tmp_path / "two").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "one")
-    (tmp_path / "two/stimrig.db").symlink_to(tmp_path / "one/stimrig.db")
+    (tmp_path / "link.db").symlink_to(tmp_path / "one/stimrig.db")
+    given = {"data_dir": tmp_path / way["data_dir"]}
+    if "database_url" in way:
+        given["database_url"] = way["database_url"].replace("PLACE", str(tmp_path))
     with closing_lock(data_dir=tmp_path / "one") as first:
         first.write_holder("http://127.0.0.1:1234")
         with pytest.raises(HeldError, match=f"process {os.getpid()} on .* at http://127.0.0.1:1234; stop it"):
-            held(data_dir=tmp_path / way)
-        held(data_dir=tmp_path / "three").release()
-    with closing_lock(data_dir=tmp_path / way), pytest.raises(HeldError) as caught:
-        held(data_dir=tmp_path / way)
+            held(**given)
+        held(data_dir=tmp_path / "two").release()
+    with closing_lock(**given), pytest.raises(HeldError) as caught:
+        held(**given)
     assert "1234" not in str(caught.value), "the message names nobody who is gone"
 
 
@@ -148,10 +159,13 @@ def test_a_removed_lock_file_lets_nobody_in(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_held_is_refused(tmp_path: Path) -> None:
-    Store(tmp_path / "stimrig.db").close()
+    Store(f"sqlite:///{tmp_path}/stimrig.db").close()
     os.link(tmp_path / "stimrig.db", tmp_path / "again.db")
     with pytest.raises(HeldError, match="2 names"):
         held(data_dir=tmp_path)
+    with pytest.raises(HeldError, match=r"127\.0\.0\.1:1/stimrig: .*STIMRIG_DATABASE_URL") as caught:
+        held(data_dir=tmp_path / "b", database_url="postgresql://ann:secret@127.0.0.1:1/stimrig")
+    assert "secret" not in str(caught.value) and "\n" not in str(caught.value)
     (tmp_path / "c" / HOLDER).mkdir(parents=True)
     with pytest.raises(HeldError, match="this user may write"):
         held(data_dir=tmp_path / "c")
@@ -207,7 +221,7 @@ def test_a_database_that_was_open_to_others_is_closed(tmp_path: Path) -> None:
         database.commit()
         for name in ("stimrig.db", "stimrig.db-wal", "stimrig.db-shm"):
             (tmp_path / name).chmod(0o664)
-        Store(path).close()
+        Store(f"sqlite:///{path}").close()
         assert {mode(found) for found in tmp_path.glob("stimrig.db*")} == {0o600}
     assert mode(tmp_path / "stimrig.db") == 0o600
 

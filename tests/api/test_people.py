@@ -256,7 +256,7 @@ def test_approval_ends_with_its_day(client: httpx.Client, service: Service, part
 
 def test_services_of_one_host_leave_one_anothers_cookies_alone(tmp_path: Path) -> None:
     """Browsers tell hosts apart, not ports."""
-    stores = [Store(tmp_path / f"{name}.db") for name in "ab"]
+    stores = [Store(f"sqlite:///{tmp_path}/{name}.db") for name in "ab"]
     clock = Clock()
     names = [Auth(store, clock, Guesses(clock), IdleLock(store, clock, 0)).cookie_name for store in stores * 2]
     assert len(set(names)) == 2 and names[:2] == names[2:], "one for each, over a restart, too"

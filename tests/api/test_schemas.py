@@ -43,7 +43,7 @@ def unmet(name: str, document: dict[str, Any]) -> list[str]:
 def test_a_verbs_json_holds_to_its_schema(verb: str, record: Path, model: Path, capsys: pytest.CaptureFixture[str]):
     folder, reference = record.parent, record.with_name("reference.csv")
     reference.write_text("time_s,torque_nm\n0,0\n1,2\n2,0\n")
-    Store(folder / "stimrig.db").close()
+    Store(f"sqlite:///{folder}/stimrig.db").close()
     words = {
         "predict": f"{model} {record} -o {folder}/out.csv", "compare": f"{model} {record}", "effects": "",
         "invert": f"{model} {reference} -o {folder}/widths.csv", "doctor": f"--data {folder}",

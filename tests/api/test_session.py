@@ -157,7 +157,7 @@ def test_every_deed_is_in_the_audit_trail_and_the_chain_holds(client: httpx.Clie
 
 def test_database_is_durable(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(database, "_durable_sqlite", DURABLE)
-    store = Store(tmp_path / "durable.db")
+    store = Store(f"sqlite:///{tmp_path}/durable.db")
     with store.engine.connect() as connection:
         assert connection.exec_driver_sql("PRAGMA journal_mode").scalar() == "wal"
         assert connection.exec_driver_sql("PRAGMA synchronous").scalar() == 2

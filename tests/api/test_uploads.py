@@ -99,7 +99,7 @@ def test_no_path_of_this_machine_is_told_of_an_upload(tmp_path: Path, short_dir:
 def test_a_start_with_another_database_deletes_no_upload(
     tmp_path: Path, short_dir: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """An empty or an older database put back, names none of the files that are there."""
+    """A mistyped STIMRIG_DATABASE_URL, or an older database put back, names none of the files that are there."""
     kept = ""
     with serving(tmp_path, short_dir, STUB) as (_, client):
         client.post("/v1/participants", json={"code": "P017"})
@@ -108,10 +108,8 @@ def test_a_start_with_another_database_deletes_no_upload(
     names = {f"{kept}.csv", "upload-00ff.h5", "joined-00ff.csv", "20260101T000000Z_T-1.h5", "upload-notes.txt"}
     for name in names - {f"{kept}.csv"}:
         (folder / name).write_bytes(b"x")
-    right = (tmp_path / "stimrig.db").rename(tmp_path / "right.db")
-    for _ in run_service(tmp_path, short_dir, STUB):
+    for _ in run_service(tmp_path, short_dir, STUB, database_url=f"sqlite:///{tmp_path}/fresh.db"):
         assert f"{kept}.csv" in caplog.text and "Is it the right database?" in caplog.text
-    right.replace(tmp_path / "stimrig.db")
     with serving(tmp_path, short_dir, STUB) as (_, client):
         assert client.get(f"/v1/recordings/{kept}").text == "a,b\n"
     assert {path.name for path in folder.iterdir() if path.is_file()} == names

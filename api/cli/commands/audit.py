@@ -73,8 +73,9 @@ def settings_of(data: Path | None) -> Settings:
 
 def open_store(settings: Settings) -> closing[Store]:
     """The database, let go at the end of a `with` statement. Raises InputError: there is none. ApiError."""
-    if not settings.database.is_file():
-        raise InputError(f"{settings.database}: there is no database. Give the data folder with --data.")
+    place = settings.data_dir / "stimrig.db"
+    if settings.database_url is None and not place.is_file():
+        raise InputError(f"{place}: there is no database. Give the data folder with --data.")
     return closing(Store(settings.database))
 
 

@@ -13,12 +13,14 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from sqlalchemy.engine import make_url
 
 from stimrig.api.cli.commands.audit import DataDir, settings_of
 from stimrig.api.cli.errors import CommandError, InputError
 from stimrig.api.cli.options import Json, RigData
 from stimrig.api.cli.terminal import report
 from stimrig.api.store.copies import copy_database
+from stimrig.api.store.database import sqlite_file
 from stimrig.api.whole_file import sha256_of, to_disk
 
 DATABASE, SUMS = "api/stimrig.db", "SHA256SUMS"
@@ -32,7 +34,8 @@ def backup(
 ) -> None:
     """Copy database, recordings and journals into a new folder below FOLDER, and check it; also while a test runs."""
     settings = settings_of(data)
-    if not (database := settings.database).is_file():
+    database = sqlite_file(make_url(settings.database))
+    if database is not None and not database.is_file():
         raise InputError(f"{database}: there is no database. Give the data folder with --data.")
     created = to / f"stimrig-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}"
     partial = created.with_name(f"{created.name}.partial")
@@ -40,9 +43,9 @@ def backup(
         to.mkdir(parents=True, exist_ok=True)
         partial.mkdir(mode=0o700)
         # the database first: every file that it names exists by then and is copied afterwards
-        sums = {DATABASE: copy_database(database, partial / DATABASE)}
+        sums = {} if database is None else {DATABASE: copy_database(database, partial / DATABASE)}
         sums |= copy_files(partial, rig_data or settings.data_dir, settings.data_dir)
-        damaged = damaged_recordings(partial / DATABASE, sums)
+        damaged = [] if database is None else damaged_recordings(partial / DATABASE, sums)
         (partial / SUMS).write_text("".join(f"{digest}  {name}\n" for name, digest in sorted(sums.items())), "utf-8")
         to_disk(partial / SUMS)
         partial.rename(created)
@@ -51,9 +54,10 @@ def backup(
         shutil.rmtree(partial, ignore_errors=True)
         raise CommandError(f"{error}. No backup was made.") from error
     size = sum((created / name).stat().st_size for name in sums)
-    document = {"backup": str(created), "files": len(sums), "bytes": size}
+    document = {"backup": str(created), "files": len(sums), "bytes": size, "database": database is not None}
     words = f"{created}: {len(sums)} files, {size / 1e6:.1f} MB; `sha256sum --check {SUMS}` checks them again"
-    report(document | {"damaged": damaged}, as_json, words)
+    dump = "The database is not in it. Before each backup of the files make a dump: pg_dump --format=custom"
+    report(document | {"damaged": damaged}, as_json, words, *([dump] if database is None else []))
     if damaged:
         raise CommandError(f"{'; '.join(damaged)}. All else is saved. Restore the recording from an earlier backup.")
 

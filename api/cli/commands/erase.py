@@ -47,7 +47,7 @@ def erase(
             stack.callback(ServiceLock(settings).release)
         except HeldError as error:
             raise InputError(f"{error}. Stop the service first.") from error
-        files = find_files(store, code, settings.data_dir, rig_data or settings.data_dir, clock.utc())
+        files = find_files(store, code, [settings.data_dir, rig_data or settings.data_dir], clock.utc())
         if not yes:
             typer.confirm(f"Delete {code} with {len(files)} files for good?", abort=True)
         for path in files:
@@ -65,7 +65,7 @@ def erase(
     report({"rows": counts, "files": len(files)}, as_json, words, ELSEWHERE)
 
 
-def find_files(store: Store, code: str, data: Path, rig_data: Path, now_utc: str) -> list[Path]:
+def find_files(store: Store, code: str, folders: list[Path], now_utc: str) -> list[Path]:
     """Return the participant's files below the data folders, and the copies of the database from before upgrades.
 
     Raises InputError: there is no such participant; a test goes on; a controller may still use the participant's model;
@@ -85,13 +85,14 @@ def find_files(store: Store, code: str, data: Path, rig_data: Path, now_utc: str
         tests = set(session.scalars(sa.select(Test.id).where(Test.participant == code)))
         named = [Path(path) for path in session.scalars(sa.select(Recording.path).where(Recording.participant == code))]
     names = {path.name for path in named}
-    roots = [(folder / kind).resolve() for folder in (data, rig_data) for kind in ("recordings", "journals")]
+    roots = [(folder / kind).resolve() for folder in folders for kind in ("recordings", "journals")]
     below = [path for root in roots for path in root.rglob("*") if path.resolve() == path]  # through no link
     files = {path for path in below if path.name in names or test_of(path) in tests}
     for path in named:
         if path.is_file() and path.resolve() not in files:
             raise InputError(f"{path}: it is in none of the data folders. Name its folder with --rig-data.")
-    return sorted(files.union((data / migrations.BEFORE).glob("*")))
+    database = store.engine.url.database
+    return sorted(files.union((Path(database).parent / migrations.BEFORE).glob("*")) if database else files)
 
 
 def test_of(path: Path) -> str:
