@@ -17,7 +17,7 @@ UNITS = (
 
 @cache
 def library() -> dict[str, dict[str, Any]]:
-    """Read the constants of each `EFFECT = Effect(…)` in the library, by id; without forms.
+    """Read the constants of each `Effect(…)` in the library, by id; without forms.
 
     The files are parsed and not imported: the web process does without their physics.
     """
@@ -27,7 +27,7 @@ def library() -> dict[str, dict[str, Any]]:
     for path in sorted(Path(spec.origin).parent.glob("*.py")):
         for line in ast.parse(path.read_text(encoding="utf-8")).body:
             match line:
-                case ast.Assign(targets=[ast.Name(name)], value=ast.Call(keywords=keywords)) if name == "EFFECT":
+                case ast.Assign(value=ast.Call(func=ast.Name("Effect"), keywords=keywords)):
                     plain = [part for part in keywords if isinstance(part.value, ast.Constant | ast.Dict)]
                     values = {str(part.arg): ast.literal_eval(part.value) for part in plain}
                     effects[values["id"]] = values

@@ -4,10 +4,9 @@ import sys
 from types import ModuleType
 from typing import Any
 
-from stimrig.identify.dynamics.free_lags import FreeLaw
 from stimrig.identify.effects import Effect, Form, Parameter, Scene, form, library
 
-__all__ = ["Effect", "Form", "FreeLaw", "Parameter", "Scene", "form"]
+__all__ = ["Effect", "Form", "Parameter", "Scene", "form"]
 
 
 class _Library(ModuleType):

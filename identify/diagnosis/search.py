@@ -285,7 +285,7 @@ def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     """
     grid = base.problem.setup.grid
     record, jumps = grid.record, base.heavy_tails and grid.readings is not None
-    applicable = not effect.raw and not effect.shape and effect.id not in present
+    applicable = effect.detect is None and not effect.shape and effect.id not in present
     applicable = applicable and not (effect.sporadic and jumps) and not (effect.band and base.noise.white_only)
     applicable = applicable and not replaced_by(base.effects, effect.forms)
     return applicable and all(record.knows(need) for need in effect.needs)

@@ -27,7 +27,7 @@ def warm() -> None:
     evaluate(base)
     find_band(base.residual_nm, setup.stretches, setup.grid.step_s)
     for effect in registry().values():
-        if effect.raw or effect.band:
+        if effect.detect is not None or effect.band:
             continue
         for form in effect.forms[:6] if not effect.sporadic else effect.forms[:1]:
             problem = Problem(setup, [(effect.id, form)])

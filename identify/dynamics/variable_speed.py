@@ -110,19 +110,17 @@ def _second(law, y, v, lag_s, scale_nm):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, scale_nm, step_s):  # pragma: no cover
+def run_core(drive, time_constant_s, damping, law, begins, initial, scale_nm, step_s):  # pragma: no cover
     """Boundary states of rows of drives, torque, N·m, and its rate, each of shape (M, K + 1).
 
     `drive`, (M, K), is held in each interval; T, s, and ζ have shape (M,), `law` (M, len(Lag), len(SpeedLaw)).
-    `multiplier`, (M or 0, K), is a further, given factor on T; no rows if there is none. Each part begins at an
-    interval of `begins`, (B,), the first 0, with its torque and rate in `initial`, (M, B, 2). `scale_nm` is the full
-    torque.
+    Each part begins at an interval of `begins`, (B,), the first 0, with its torque and rate in `initial`, (M, B, 2).
+    `scale_nm` is the full torque.
 
     Rows that differ from row 0 in their drive alone use its transitions. Their derivative then ignores that the drive
     changes the speed: ten times faster, and good enough for the fit.
     """
     rows, size = drive.shape
-    factor_rows = multiplier.shape[0]
     torque = np.zeros((rows, size + 1))
     rate = np.zeros((rows, size + 1))
     first, none, even = np.empty((4, size)), np.empty((4, 0)), np.zeros((rows, 4))
@@ -138,7 +136,7 @@ def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, 
         slow_second, quick_second, last = _is_second(slow), _is_second(quick), 1.0
         forget = np.exp(-step_s / PARTS / max(quick_s if slow[SpeedLaw.CALCIUM] != 0.0 else slow_s, 1e-4))
         kind = 1 if same_law and varied else 0
-        if kind or not (on_both or on_slow or on_quick or factor_rows > 0):
+        if kind or not (on_both or on_slow or on_quick):
             kinds[m] = kind
             even[m, 0], even[m, 1], even[m, 2], even[m, 3] = step_matrix(base, damping[m], step_s)
             continue
@@ -149,7 +147,6 @@ def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, 
                 torque[m, k], rate[m, k] = y, v
                 part += 1
             w = drive[m, k]
-            given_factor = multiplier[m, k] if factor_rows > 0 else 1.0
             p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
             # The law is evaluated several times in an interval, since its sign may change within it.
             for _ in range(PARTS):
@@ -163,7 +160,6 @@ def run_core(drive, time_constant_s, damping, law, multiplier, begins, initial, 
                     d, q = (d * second, q) if slow_second else (d, q * second)
                     turned, last = last / second, second
                 v *= turned  # y' = (a - y) / lag: a stays the same when the lag changes
-                f *= given_factor
                 # The slower lag times d, the quicker times q: T² = quick·slow, 2 ζ T = quick + slow.
                 t = base * f * np.sqrt(d * q)
                 z = 0.5 * f * (quick_s * q + slow_s * d) / t

@@ -22,20 +22,19 @@ from stimrig.identify.errors import BadRequest
 
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"
-_NOT_EFFECTS = {"base", "own_file", "use"}
 
 
 def _library() -> list[Effect]:
-    names = sorted(module.name for module in pkgutil.iter_modules(__path__) if module.name not in _NOT_EFFECTS)
-    return [importlib.import_module(f"{__name__}.{name}").EFFECT for name in names]
+    modules = (importlib.import_module(f"{__name__}.{module.name}") for module in pkgutil.iter_modules(__path__))
+    effects = [getattr(module, "EFFECTS", None) or (getattr(module, "EFFECT", None),) for module in modules]
+    return [effect for listed in effects for effect in listed if effect is not None]
 
 
 @lru_cache(maxsize=8)
 def _everything(folder: str) -> dict[str, Effect]:
     effects = {effect.id: effect for effect in _library()}
-    added = [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]
     places: dict[str, str] = {}
-    for place, effect in added:
+    for place, effect in [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]:
         if effect.id in places:
             message = f"the effect {effect.id!r} is also in {places[effect.id]}"
             raise BadEffect(message, place=place, fix="Give one of them another id.")
@@ -71,13 +70,7 @@ def registry() -> dict[str, Effect]:
 
 
 def find_effect(effect_id: str) -> Effect:
-    """One effect by its id. Raises BadRequest: no effect has this id.
-
-    Parameters
-    ----------
-    effect_id : str
-        Id of an effect.
-    """
+    """One effect by its id. Raises BadRequest: no effect has this id."""
     effects = registry()
     if effect_id not in effects:
         known = ", ".join(sorted(effects))
@@ -87,37 +80,21 @@ def find_effect(effect_id: str) -> Effect:
 
 
 def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
-    """The effect and the form of a model's row; None if either is unknown here.
-
-    Parameters
-    ----------
-    entry : mapping
-        As in `Model.effects`.
-    """
-    effect, name = registry().get(entry["id"]), entry.get("form", "")
-    forms = effect.forms if effect else ()
-    return next(((effect, form) for form in forms if effect and name in ("", form.name)), None)
+    """The effect and the form of an entry of `Model.effects`; None if either is unknown here."""
+    try:
+        effect = registry()[entry["id"]]
+        return effect, effect.form(entry.get("form", ""))
+    except KeyError:
+        return None
 
 
 def depend_on_joint(names: Iterable[str]) -> bool:
-    """Return True if one of the effects depends on the angle or the velocity of the joint.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Ids of effects.
-    """
+    """Return True if one of the effects depends on the angle or the velocity of the joint."""
     return any(find_effect(name).moves_with_joint for name in names)
 
 
 def any_free(names: Iterable[str]) -> bool:
-    """Return True if one of the effects is free: it describes the error and names no cause.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Ids of effects.
-    """
+    """Return True if one of the effects is free: it describes the error and names no cause."""
     return any(find_effect(name).shape for name in names)
 
 

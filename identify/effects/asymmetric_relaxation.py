@@ -44,7 +44,7 @@ EFFECT = Effect(
     name="Contraction and relaxation differ in speed",
     forms=(
         *(
-            Form(name, "speed", words, (_RATIO,), law={"ratio": (lag, law)})
+            Form(name, "speed", words, (_RATIO,), law={(lag, law): "ratio"})
             for name, words, lag, law in (
                 ("by_drive", "T·ratio while the drive is below the torque, else T", Lag.BOTH, SpeedLaw.RATIO_BY_DRIVE),
                 ("by_rate", "T·ratio while the torque falls, else T", Lag.BOTH, SpeedLaw.RATIO_BY_RATE),
@@ -66,7 +66,7 @@ EFFECT = Effect(
                 f"{lag_name}·ratio·c^-power while the drive is below the torque, else {lag_name}·c^power; "
                 "c = 0.5 + 1.5 y/y_max",
                 (_RATIO, Parameter("power", "1", 0.1, 2.0, 0.0, (0.5, 1.0), about="influence of the level")),
-                law={"ratio": (lag, SpeedLaw.RATIO_BY_DRIVE), "power": (lag, SpeedLaw.LEVEL)},
+                law={(lag, SpeedLaw.RATIO_BY_DRIVE): "ratio", (lag, SpeedLaw.LEVEL): "power"},
                 source="Winters 1995; Thelen 2003",
             )
             for name, lag_name, lag in (("by_level", "T", Lag.BOTH), ("slow_lag_by_level", "slower lag", Lag.SLOW))

@@ -1,4 +1,4 @@
-"""Classes of an effect: one or more published forms, each a pure function of arrays, with its parameters."""
+"""What an effect is: forms with their parameters and laws, and its words; `Effect` and `Form` are the entry points."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from numba import njit
 from numpy.polynomial.chebyshev import chebvander
 
 from stimrig.identify.dynamics.free_lags import FreeLaw, filled
-from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 
 IDLE_SHARE = 0.1
 """Pulses of this share of the largest width are as good as none: some stimulators never send 0."""
@@ -103,6 +102,8 @@ class Scene:
     s."""
     states: Mapping[str, float] = field(default_factory=dict)
     """By effect id, where the slow state of an effect begins (`Form.state`), 0 to 1; 0 where there is none."""
+    within: Scene | None = None
+    """The same at several places of each interval, (n K,), for what turns round within one; None: no intervals."""
 
     @property
     def rest_s(self) -> np.ndarray:
@@ -123,6 +124,11 @@ class Scene:
     def span_s(self) -> float:
         """Length of the record, s."""
         return float(self.time_s[-1] - self.time_s[0])
+
+    @cached_property
+    def share_of_span(self) -> np.ndarray:
+        """Place of each time in the record, from 0 to 1, shape (K,)."""
+        return np.clip((self.time_s - self.time_s[0]) / max(self.span_s, 1e-9), 0.0, 1.0)
 
     @property
     def angle(self) -> np.ndarray:
@@ -155,12 +161,6 @@ class Scene:
         return (chebvander(self.place, degrees) - chebvander(np.array([home]), degrees)).T[1:]
 
 
-def weighted(weights: Sequence[Any], columns: np.ndarray) -> np.ndarray:
-    """Sum of columns (n, K) by n weights, each of shape (M, 1), or a number: shape (M, K), or (K,)."""
-    factors = np.array(weights, float)
-    return (factors if factors.ndim == 1 else factors[:, :, 0].T) @ columns
-
-
 Values = dict[str, Any]
 """Parameters by name, each of shape (M, 1), or a number where a form is called row by row."""
 Apply = Callable[[Any, Values, Scene], Any]
@@ -170,12 +170,12 @@ Apply = Callable[[Any, Values, Scene], Any]
 class Form:
     """One published form of an effect.
 
-    `apply(x, p, scene)` depends on the stage. x and the result have shape (K,); p holds the parameters by name:
+    `apply(x, p, scene)` depends on the stage. x and the result have shape (K,); p holds the parameters by name. At the
+    neutral values it must return x itself, bit for bit.
 
     - "pulse_width": x is the pulse width, µs; returns the pulse width that acts.
     - "gain": x is the drive f(u), N·m; returns the drive.
-    - "speed": x is (drive, torque); returns a factor on the time constant.
-    - "lags": `apply` is not called: `law` says what of `stimrig.identify.dynamics.free_lags` each parameter sets.
+    - "speed", "lags": no `apply`; `law` says what sets the time constant, or both lags.
     - "branch": x is the drive; returns a list of (drive, factor on the time constant), whose responses are added.
     - "delay": x is None; returns a delay, s.
     - "filter": x is (torque, rate) at the ends of the pulse intervals, shape (K + 1,); returns the same.
@@ -190,63 +190,50 @@ class Form:
     parameters: tuple[Parameter, ...]
     """The parameters; their first starting values form the first run, their second ones the second, and so on."""
     apply: Apply | None = None
-    """See above. At the neutral values it must return x itself, bit for bit."""
     batched: bool = False
     """True if `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row."""
-    law: Mapping[str, tuple[Lag, SpeedLaw] | FreeLaw] = field(default_factory=dict)
-    """For "speed": the `Lag` and the `SpeedLaw` that each parameter sets, by its logarithm where it is varied on that
-    scale; for "lags" the `FreeLaw`. `apply` is then not called."""
-    held: Mapping[FreeLaw, float] = field(default_factory=dict)  # for "lags" only: what of the same has a given value
+    law: Mapping[Any, str | float] = field(default_factory=dict)
+    """What sets each column of the compiled table: a parameter, or a number. Columns are (`Lag`, `SpeedLaw`) for
+    "speed", set by the logarithm of what is varied on that scale; `FreeLaw` for "lags"."""
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     """`propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
     there are none. `previous` holds the parameters of the form before it in a chain."""
     grows: bool = False
     """True if the form is the next in a chain. It is tried only while the forms before it gain."""
-    accept: Callable[[dict[str, float], Scene], bool] | None = None
-    """`accept(parameters, scene)`: whether the result of a fit is plausible."""
-    restarts: tuple[dict[str, float], ...] = ()
-    """Further starts that also set `base.time_constant_s` and `base.damping`, of the linear dynamics, by which the
-    model without the effect may have imitated it."""
     fixed: bool = False
     """True if its parameters are estimated from the samples before the fit, and the torque is corrected for it then."""
     scales: bool = False
     """For "output" only: whether it multiplies the torque by what does not depend on it; x may then be 1."""
-    fine: bool = False
-    """For "additive" only: whether it is averaged over each pulse interval in the fit, not taken in its middle."""
     source: str = ""  # publication
     state: Callable[[np.ndarray, dict[str, Any], Scene], np.ndarray] | None = None
     """For "gain" only, and for a form with a slow state between 0 (rested) and 1 that begins at `scene.states`:
     `state(x, p, scene)`, called as a batched `apply` is, returns it after the last interval, shape (M,)."""
 
-    def to_dict(self, source: str) -> dict[str, Any]:
-        """Return the entry of the library; `source` is that of the effect."""
-        return {
-            "name": self.name,
-            "stage": self.stage,
-            "equation": self.equation,
-            "parameters": [p.to_dict() for p in self.parameters],
-            "source": self.source or source,
-        }
-
     def starts(self, scene: Scene) -> list[dict[str, float]]:
-        """Starting values, one dict per run."""
+        """Starting values, one dict per run.
+
+        A form may add others, also with `base.time_constant_s` and `base.damping`: values of the linear dynamics, by
+        which the model without the effect may have imitated it.
+        """
         on = [p.on(scene) for p in self.parameters]
         runs = max((len(p.start) for p in on), default=1)
-        listed = [{p.name: p.start[min(i, len(p.start) - 1)] for p in on} for i in range(runs)]
-        return listed + [dict(start) for start in self.restarts]
+        return [{p.name: p.start[min(i, len(p.start) - 1)] for p in on} for i in range(runs)]
+
+    def accepts(self, parameters: dict[str, float], scene: Scene) -> bool:  # noqa: ARG002
+        """Return True if the result of a fit is plausible."""
+        return True
 
     def call(self, x: Any, p: dict[str, np.ndarray], scene: Scene) -> Any:
         """`apply` for M rows of parameters: x of shape (M, K), a tuple of such arrays, or None; p of shape (M, 1)."""
         assert self.apply is not None
         if self.batched:
             return self.apply(x, p, scene)
-        rows = next(iter(p.values())).shape[0]
         results = []
-        for m in range(rows):
+        for m in range(next(iter(p.values())).shape[0]):
             row = None if x is None else tuple(part[m] for part in x) if isinstance(x, tuple) else x[m]
             results.append(self.apply(row, {name: float(value[m, 0]) for name, value in p.items()}, scene))
         if isinstance(results[0], tuple):
-            return tuple(np.stack([result[i] for result in results]) for i in range(len(results[0])))
+            return tuple(np.stack(parts) for parts in zip(*results, strict=True))
         return np.stack([np.broadcast_to(np.asarray(result, float), scene.time_s.shape) for result in results])
 
 
@@ -283,20 +270,19 @@ class Effect:
     sporadic: bool = False
     """True if it comes and goes by no law, as efforts and tremor do. It can repair any error, so more evidence is
     required for it; its mean does not stay either."""
-    raw: bool = False  # whether it is detected in the samples, before the means over pulse intervals are taken
     band: bool = False
     """True if it is a narrow band of noise: detected in the residual's spectrum, part of the noise beside other
     effects."""
     detect: Callable[[Any], tuple[str, dict[str, float]] | None] | None = None
-    """`detect(raw)` returns the form and its parameters if the samples show the effect beyond doubt, else None. Such an
-    effect is added before any fit. `raw` is what `stimrig.identify.estimation.samples.inspect` gives."""
+    """For an effect that is sought in the samples, before any fit: `detect(raw)` returns the form and its parameters if
+    they show it beyond doubt, else None. `raw` is what `stimrig.identify.estimation.samples.inspect` gives."""
     prior: float = 0.0  # logarithm of its prior odds, relative to other effects
     muscle: bool = True
     """True if it is a property of the muscle. Otherwise it belongs to one record, its sensor or the person's mood:
     differences of its parameters between sessions say nothing about the muscle."""
     main: dict[str, str] = field(default_factory=dict)
     """The parameters that stand for it in the trend, first choice first, and their names for people, without units; the
-    form's first one where none of them is its own."""
+    form's first one where none of them is its own. The service reads this, `muscle` and `name` without an import."""
     shape: Callable[[Form, Mapping[str, float]], Shape] | None = None
     """For a free effect only: `shape(form, values)` returns the fitted curves and a sentence. A free effect describes
     an error that no other effect explains. It is tried last, and its name claims no physics."""
@@ -327,15 +313,20 @@ class Effect:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the entry of the library, without forms of a great many parameters."""
-        first = self.forms[0]
+        forms = [
+            {name: getattr(form, name) for name in ("name", "stage", "equation")}
+            | {"parameters": [p.to_dict() for p in form.parameters], "source": form.source or self.source}
+            for form in self.forms
+            if form is self.forms[0] or len(form.parameters) < 40
+        ]
         return {
             "id": self.id,
             "name": self.name,
             "stage": self.stage,
             "part": self.part,
-            "equation": first.equation,
-            "parameters": [p.to_dict() for p in first.parameters],
-            "forms": [form.to_dict(self.source) for form in self.forms if len(form.parameters) < 40],
+            "equation": forms[0]["equation"],
+            "parameters": forms[0]["parameters"],
+            "forms": forms,
             "source": self.source,
             "signature": self.signature,
             "confused_with": list(self.resembles),
@@ -347,29 +338,40 @@ class Effect:
         }
 
 
-def form(stage: str, equation: str, *parameters: Parameter, name: str = "", **more: Any) -> Callable[[Apply], Form]:
-    """Decorator that makes a function of all rows at once (`batched`) a form, which is called as the function is.
+def form(
+    stage: str, equation: str, *parameters: Parameter, name: str = "", kind: type[Form] = Form, **more: Any
+) -> Callable[[Apply], Form]:
+    """Decorator that makes a form of a function of all rows at once (`batched`); its name is the function's.
 
-    Parameters
-    ----------
-    stage : str
-        Where it acts.
-    equation : str
-        In words and signs.
-    *parameters
-        Those that are fitted.
-    name : str
-        Of the form.
-    **more
-        Other fields of `Form`.
+    `more` are other fields of `Form`; `kind` is a subclass with starts of its own.
     """
+    return lambda apply: kind(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
 
-    def make_form(apply: Apply) -> Form:
-        new_form = Form(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
-        apply.__qualname__ += ".apply"  # under the function's name stands the form: so a pickle finds the function
-        return new_form
 
-    return make_form
+Columns = dict[str, np.ndarray]
+"""By parameter, what it multiplies: (K,), or (M, K) where that depends on other parameters."""
+
+
+def basis(equation: str, *parameters: Parameter, **more: Any) -> Callable[[Callable[[Values, Scene], Columns]], Form]:
+    """Decorator for a torque that is linear in some of its parameters: the function returns their columns."""
+    return lambda columns: Form(
+        columns.__name__,
+        "additive",
+        equation,
+        parameters,
+        lambda _, p, scene: weighted(p, columns(p, scene)),
+        batched=True,
+        **more,
+    )
+
+
+def weighted(p: Values, columns: Columns) -> np.ndarray:
+    """Sum of columns by the parameters that weigh them, shape (M, K)."""
+    common = [name for name, column in columns.items() if column.ndim == 1]
+    total = sum((p[name] * column for name, column in columns.items() if column.ndim > 1), np.zeros(1))
+    if not common:
+        return total
+    return total + np.concatenate([p[name] for name in common], axis=1) @ np.stack([columns[name] for name in common])
 
 
 def slow_gain(
@@ -447,12 +449,9 @@ def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> s
     """
     against = {"lags": "speed", "speed": "lags"}
     stages, alone = {against.get(form.stage, "") for form in forms}, set().union(*map(_alone, forms))
-    return next(
-        (name for name, present_form in present if present_form.stage in stages or alone & _alone(present_form)), None
-    )
+    return next((name for name, form in present if form.stage in stages or alone & _alone(form)), None)
 
 
 def _alone(form: Form) -> set[int]:
     """Columns of free lags that only one form may set: all but the rates, whose logarithms add up."""
-    columns = [*form.law.values(), *form.held] if form.stage == "lags" else []
-    return {column for column in columns if isinstance(column, FreeLaw) and column > FreeLaw.COUPLING}
+    return {column for column in form.law if form.stage == "lags" and column > FreeLaw.COUPLING}

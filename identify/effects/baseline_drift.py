@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Columns, Effect, Parameter, Scene, Values, basis
 
 KNOTS = 6
 
@@ -18,50 +18,44 @@ def _shift(name: str, reach: float, about: str = "", start: float = 0.0, unit: s
 _SLOPE = _shift("slope_nm_per_s", 0.04, "drift per second", unit="N·m/s")
 
 
-@form("additive", "y + slope·t", _SLOPE)
-def linear(_: None, p: Values, scene: Scene) -> np.ndarray:
-    return p["slope_nm_per_s"] * scene.time_s
+@basis("y + slope·t", _SLOPE)
+def linear(_p: Values, scene: Scene) -> Columns:
+    return {"slope_nm_per_s": scene.time_s}
 
 
-@form(
-    "additive",
+@basis(
     "y + shift (1 - exp(-t/time_constant))",
     _shift("shift_nm", 0.6, "final shift"),
     Parameter("time_constant_s", "s", 2.0, 80.0, 15.0, (5.0, 20.0), "log", about="time constant of the shift"),
 )
-def warming(_: None, p: Values, scene: Scene) -> np.ndarray:
-    return p["shift_nm"] * -np.expm1(-scene.time_s / p["time_constant_s"])
+def warming(p: Values, scene: Scene) -> Columns:
+    return {"shift_nm": -np.expm1(-scene.time_s / p["time_constant_s"])}
 
 
-@form("additive", "y + slope·t + bend (t/60)²", _SLOPE, _shift("bend_nm", 1.8, "curvature over one minute"))
-def bent(_: None, p: Values, scene: Scene) -> np.ndarray:
-    s = scene.time_s / 60.0
-    return 60.0 * p["slope_nm_per_s"] * s + p["bend_nm"] * s * s
+@basis("y + slope·t + bend (t/60)²", _SLOPE, _shift("bend_nm", 1.8, "curvature over one minute"))
+def bent(_p: Values, scene: Scene) -> Columns:
+    return {"slope_nm_per_s": scene.time_s, "bend_nm": (scene.time_s / 60.0) ** 2}
 
 
-@form(
-    "additive",
+@basis(
     "y + cos·(cos(2πt/period) - 1) + sin·sin(2πt/period)",
     Parameter("period_s", "s", 9.0, 90.0, 30.0, (12.0, 25.0, 50.0), "log", about="period of a slow wave"),
     _shift("cos_nm", 0.22, start=0.003),
     _shift("sin_nm", 0.22, start=0.003),
 )
-def wave(_: None, p: Values, scene: Scene) -> np.ndarray:
+def wave(p: Values, scene: Scene) -> Columns:
     turn = 2 * np.pi * scene.time_s / p["period_s"]
-    return p["cos_nm"] * (np.cos(turn) - 1.0) + p["sin_nm"] * np.sin(turn)
+    return {"cos_nm": np.cos(turn) - 1.0, "sin_nm": np.sin(turn)}
 
 
-@form(
-    "additive",
-    "y + s(t), s: a natural cubic spline with six knots over the record",
-    *(_shift(f"knot_{i}_nm", 0.3, f"shift at {i}/6 of the record") for i in range(1, KNOTS + 1)),
-)
-def wander(_: None, p: Values, scene: Scene) -> np.ndarray:
+_KNOTS = tuple(_shift(f"knot_{i}_nm", 0.3, f"shift at {i}/{KNOTS} of the record") for i in range(1, KNOTS + 1))
+
+
+@basis("y + s(t), s: a natural cubic spline with six knots over the record", *_KNOTS)
+def wander(_p: Values, scene: Scene) -> Columns:
     """Evenly spaced knots, zero at the start."""
-    knots = np.linspace(0.0, 1.0, KNOTS + 1)
-    values = np.concatenate([np.zeros_like(p["knot_1_nm"]), *(p[f"knot_{i}_nm"] for i in range(1, KNOTS + 1))], axis=1)
-    place = np.clip((scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9), 0.0, 1.0)
-    return CubicSpline(knots, np.eye(KNOTS + 1), bc_type="natural")(place).dot(values.T).T
+    spline = CubicSpline(np.linspace(0.0, 1.0, KNOTS + 1), np.eye(KNOTS + 1)[:, 1:], bc_type="natural")
+    return dict(zip((knot.name for knot in _KNOTS), spline(scene.share_of_span).T, strict=True))
 
 
 EFFECT = Effect(

@@ -44,7 +44,6 @@ EFFECT = Effect(
     plain="The mains supply disturbs the load cell; the muscle is not the cause. Check shielding and earth.",
     source="Electrical interference",
     predictable=False,
-    raw=True,
     detect=lambda raw: None if raw.hum is None else ("line", raw.hum),
     muscle=False,
     main={"frequency_hz": "frequency"},

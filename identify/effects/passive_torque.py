@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form, weighted
+from stimrig.identify.effects.base import (
+    Apply,
+    Columns,
+    Effect,
+    Form,
+    Parameter,
+    Scene,
+    Values,
+    basis,
+    weighted,
+)
 
 SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
 """Sizes of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""
@@ -22,37 +33,34 @@ _STIFF = _part("stiffness_nm_per_rad", "N·m/rad", 3.0, "elastic part, at the re
 _VISCOUS = _part("viscosity_nm_s_per_rad", "N·m·s/rad", 0.6, "viscous part")
 
 
-@form("additive", "y + stiffness·Δ + viscosity·velocity, Δ = angle - reference angle", _STIFF, _VISCOUS)
-def linear(_: None, p: Values, scene: Scene) -> np.ndarray:
-    return p["stiffness_nm_per_rad"] * scene.away_rad + p["viscosity_nm_s_per_rad"] * scene.speed
+@basis("y + stiffness·Δ + viscosity·velocity, Δ = angle - reference angle", _STIFF, _VISCOUS)
+def linear(_p: Values, scene: Scene) -> Columns:
+    return {_STIFF.name: scene.away_rad, _VISCOUS.name: scene.speed}
 
 
-@form(
-    "additive",
+@basis(
     "y + stiffness (exp(k·Δ) - 1)/k + viscosity·velocity",
     _STIFF,
     Parameter("steepness_per_rad", "1/rad", 0.3, 10.0, 2.0, (2.0,), "log", about="k"),
     _VISCOUS,
     source="(exp(4(l - 1)/0.6) - 1)/(e⁴ - 1), De Groote et al. 2016, and viscous",
 )
-def exponential(_: None, p: Values, scene: Scene) -> np.ndarray:
+def exponential(p: Values, scene: Scene) -> Columns:
     k = p["steepness_per_rad"]
-    elastic = p["stiffness_nm_per_rad"] * np.expm1(np.clip(k * scene.away_rad, -30.0, 8.0)) / k
-    return elastic + p["viscosity_nm_s_per_rad"] * scene.speed
+    return {_STIFF.name: np.expm1(np.clip(k * scene.away_rad, -30.0, 8.0)) / k, _VISCOUS.name: scene.speed}
 
 
-@form(
-    "additive",
+@basis(
     "y + stiffness·Δ + bend·Δ² + hardening·Δ³ + viscosity·velocity",
     _STIFF,
     _part("bend_nm_per_rad2", "N·m/rad²", 3.0, "one-sided part"),
     _part("hardening_nm_per_rad3", "N·m/rad³", 4.5, "stiffening at both ends"),
     _VISCOUS,
 )
-def two_sided(_: None, p: Values, scene: Scene) -> np.ndarray:
+def two_sided(_p: Values, scene: Scene) -> Columns:
     away = scene.away_rad
-    elastic = p["stiffness_nm_per_rad"] * away + p["bend_nm_per_rad2"] * away**2 + p["hardening_nm_per_rad3"] * away**3
-    return elastic + p["viscosity_nm_s_per_rad"] * scene.speed
+    elastic = {_STIFF.name: away, "bend_nm_per_rad2": away**2, "hardening_nm_per_rad3": away**3}
+    return elastic | {_VISCOUS.name: scene.speed}
 
 
 _FREE = (
@@ -66,23 +74,38 @@ _FREE = (
 )
 
 
-@form(
-    "additive",
-    "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
-    "inertia·acceleration, x: place in the fitted range, -1 to 1",
-    *_FREE,
-    fine=True,
-    source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
-)
-def surface(_: None, p: Values, scene: Scene) -> np.ndarray:
+def _surface(p: Values, scene: Scene) -> Columns:
     velocity, place = scene.speed, scene.place
-    acceleration = np.zeros_like(velocity) if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
-    names = [f"elastic_{i}_nm" for i in range(1, len(SIZES) + 1)]
-    names += ["viscosity_nm_s_per_rad", "tilt_nm_s_per_rad", "bow_nm_s_per_rad", "inertia_nm_s2_per_rad"]
-    columns = [*scene.bends(len(SIZES)), velocity, place * velocity, place**2 * velocity, acceleration]
     below_rad_s, row = np.unique(p["dry_below_rad_s"], return_inverse=True)
-    dry = np.tanh(velocity / below_rad_s[:, None])[row.ravel()]
-    return weighted([p[name] for name in names], np.stack(columns)) + p["dry_nm"] * dry
+    return {f"elastic_{i}_nm": bend for i, bend in enumerate(scene.bends(len(SIZES)), start=1)} | {
+        _VISCOUS.name: velocity,
+        "tilt_nm_s_per_rad": place * velocity,
+        "bow_nm_s_per_rad": place**2 * velocity,
+        "dry_nm": np.tanh(velocity / below_rad_s[:, None])[row.ravel()],
+        "inertia_nm_s2_per_rad": np.zeros_like(velocity)
+        if scene.acceleration_rad_s2 is None
+        else scene.acceleration_rad_s2,
+    }
+
+
+def _relaxing(p: Values, scene: Scene) -> Columns:
+    """As `surface`, and a spring behind a dashpot."""
+    away = scene.away_rad
+    begins = np.zeros(away.size, bool) if scene.begins is None else scene.begins
+    time_constants, row = np.unique(p["relaxation_s"], return_inverse=True)
+    followed = relaxed(away, scene.time_s, begins, time_constants)
+    return _surface(p, scene) | {"relaxing_nm_per_rad": away - followed[row.ravel()]}
+
+
+def _over_intervals(columns: Callable[[Values, Scene], Columns]) -> Apply:
+    """Average over each pulse interval: where a joint turns round, dry friction has both signs within one."""
+
+    def apply(_: None, p: Values, scene: Scene) -> np.ndarray:
+        at = scene.within or scene
+        torque = weighted(p, columns(p, at))
+        return torque.reshape(len(torque), scene.time_s.size, -1).mean(axis=2)
+
+    return apply
 
 
 @njit(cache=True, nogil=True)
@@ -110,22 +133,29 @@ def relaxed(
     return out
 
 
-@form(
+surface = Form(
+    "surface",
+    "additive",
+    "y + Σ elastic_k (T_k(x) - T_k(reference)) + (viscosity + tilt·x + bow·x²)·velocity + dry·tanh(velocity/below) + "
+    "inertia·acceleration, x: place in the fitted range, -1 to 1",
+    _FREE,
+    _over_intervals(_surface),
+    batched=True,
+    source="shape free: Riener and Edrich 1999 for what it has to follow; Coulomb friction; Newton",
+)
+relaxing = Form(
+    "relaxing",
     "additive",
     "surface + relaxing·(Δ - z), z' = (Δ - z)/relaxation",
-    *_FREE,
-    replace(_STIFF, name="relaxing_nm_per_rad", start=(0.0,), about="stiffness that gives way"),
-    Parameter("relaxation_s", "s", 0.3, 10.0, 1.0, (1.0,), "log", about="time in which it does"),
-    fine=True,
+    (
+        *_FREE,
+        replace(_STIFF, name="relaxing_nm_per_rad", start=(0.0,), about="stiffness that gives way"),
+        Parameter("relaxation_s", "s", 0.3, 10.0, 1.0, (1.0,), "log", about="time in which it does"),
+    ),
+    _over_intervals(_relaxing),
+    batched=True,
     source="standard linear solid, Fung 1981",
 )
-def relaxing(_: None, p: Values, scene: Scene) -> np.ndarray:
-    """As `surface`, and a spring behind a dashpot."""
-    away = scene.away_rad
-    begins = np.zeros(away.size, bool) if scene.begins is None else scene.begins
-    time_constants, row = np.unique(p["relaxation_s"], return_inverse=True)
-    followed = relaxed(away, scene.time_s, begins, time_constants)
-    return surface.call(None, p, scene) + p["relaxing_nm_per_rad"] * (away - followed[row.ravel()])
 
 
 EFFECT = Effect(

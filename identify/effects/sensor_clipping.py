@@ -63,7 +63,6 @@ EFFECT = Effect(
     plain="The measurement reaches the end of its range: the muscle gives more torque than the load cell shows. "
     "Reduce the amplifier's gain, or the charge.",
     source="Range of the analogue-to-digital converter",
-    raw=True,
     detect=_detect,
     muscle=False,
     main={"ceiling_nm": "ceiling", "floor_nm": "floor"},

@@ -7,14 +7,21 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
+from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values, form
 
 Motion = tuple[np.ndarray, np.ndarray]
 """Torque and its rate."""
-_RESTARTS = tuple(
-    {"resonance_hz": hz, "damping": 0.15, "share": 0.4, "base.time_constant_s": t, "base.damping": 1.0}
-    for hz, t in ((1.6, 0.1), (3.0, 0.15))
-)
+
+
+class _Slow(Form):
+    """A form of a slow resonance, which a model without it imitates by slow dynamics."""
+
+    def starts(self, scene: Scene) -> list[dict[str, float]]:
+        slow = {"damping": 0.15, "share": 0.4, "base.damping": 1.0}
+        further = [{"resonance_hz": hz, "base.time_constant_s": t} for hz, t in ((1.6, 0.1), (3.0, 0.15))]
+        return super().starts(scene) + [start | slow for start in further]
+
+
 _RESONANCE = (
     Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="resonance of the series spring"),
     Parameter("damping", "1", 0.02, 0.7, 0.2, (0.15,), "log", about="damping of the resonance, 1 is critical"),
@@ -67,7 +74,7 @@ def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarr
     return phi[:2, :2], phi[:2, 2:] @ cubic
 
 
-@form("filter", "z'' + 2 ζ ω z' + ω² z = ω² y", *_RESONANCE, restarts=_RESTARTS)
+@form("filter", "z'' + 2 ζ ω z' + ω² z = ω² y", *_RESONANCE, kind=_Slow)
 def series(x: Motion, p: Values, scene: Scene) -> Motion:
     torque, rate = x
     frequency, damping = p["resonance_hz"][:, 0], p["damping"][:, 0]
@@ -85,7 +92,7 @@ def series(x: Motion, p: Values, scene: Scene) -> Motion:
     *_RESONANCE,
     Parameter("share", "1", 0.0, 1.0, 0.0, (0.5,), about="share of torque through the spring"),
     grows=True,
-    restarts=_RESTARTS,
+    kind=_Slow,
 )
 def partly(x: Motion, p: Values, scene: Scene) -> Motion:
     torque, rate = series.call(x, p, scene)

@@ -94,7 +94,7 @@ def curve(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     scales=True,
 )
 def smooth(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    bent = weighted([p[f"bend_{i}"] for i in range(1, len(SIZES) + 1)], scene.bends(len(SIZES)))
+    bent = weighted(p, {f"bend_{i}": bend for i, bend in enumerate(scene.bends(len(SIZES)), start=1)})
     return y * np.maximum(1.0 + bent, 0.0)
 
 

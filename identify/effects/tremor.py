@@ -14,7 +14,7 @@ _FREQUENCY = Parameter("frequency_hz", "Hz", 2.6, 14.0, 5.0, (5.0,), "log", abou
 def _wave(p: Values, scene: Scene, knots: int) -> np.ndarray:
     turn = 2 * np.pi * p["frequency_hz"] * scene.time_s
     cos, sin = np.cos(turn), np.sin(turn)
-    place = np.clip((scene.time_s - scene.time_s[0]) / max(scene.span_s, 1e-9), 0.0, 1.0) * (knots - 1)
+    place = scene.share_of_span * (knots - 1)
     total = np.zeros(turn.shape)
     for i in range(knots):
         hat = np.maximum(1.0 - np.abs(place - i), 0.0)

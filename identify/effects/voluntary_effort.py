@@ -16,6 +16,17 @@ Kernels = dict[float, tuple[np.ndarray, int]]
 """Shapes by their duration, s, each with the place in it that its `centre` is."""
 
 
+class _Bumps(Form):
+    """A form of bumps in fitted rows: in other rows they could only repair errors in the rows beside them."""
+
+    def accepts(self, parameters: dict[str, float], scene: Scene) -> bool:
+        if scene.fitted is None:
+            return True
+        at = [value for name, value in parameters.items() if name.startswith("centre_")]
+        place = np.clip(np.searchsorted(scene.time_s, at), 0, scene.time_s.size - 1)
+        return bool(np.all(scene.fitted[place]))
+
+
 def _forms(
     name: str,
     equation: Callable[[int], str],
@@ -47,15 +58,7 @@ def _forms(
                 for _, duration_s, at, height_nm in _matches(residual_nm, sign, kernels(scene.step_s))[:proposals]
             ]
 
-        def accept(p: dict[str, float], scene: Scene) -> bool:
-            """Only bumps in fitted rows: in other rows they could only repair errors in the rows beside them."""
-            if scene.fitted is None:
-                return True
-            at = np.array([p[bump_parameters[0].name.format(i)] for i in range(count)])
-            place = np.clip(np.searchsorted(scene.time_s, at), 0, scene.time_s.size - 1)
-            return bool(np.all(scene.fitted[place]))
-
-        return Form(
+        return _Bumps(
             f"{name}_{count}",
             "additive",
             equation(count),
@@ -63,7 +66,6 @@ def _forms(
             lambda _, p, scene: apply(p, scene, count),
             batched=True,
             propose=propose,
-            accept=accept,
             grows=count > 1,
         )
 

@@ -124,7 +124,7 @@ def fit_form(
             continue  # the lags of the base model already differ
         theta = start_from(problem, base, {len(base.effects): start})
         fitted = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor)
-        if form.accept is not None and not form.accept(fitted.parameters_of(effect.id), scene):
+        if not form.accepts(fitted.parameters_of(effect.id), scene):
             continue
         if best is None or fitted.log_evidence > best.log_evidence:
             best = fitted

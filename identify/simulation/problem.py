@@ -20,7 +20,7 @@ from stimrig.identify.dynamics.states import read_means
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw, run_core
 from stimrig.identify.effects.base import Form, Parameter, Values
 from stimrig.identify.recruitment import Basis
-from stimrig.identify.simulation.setup import WITHIN, Setup
+from stimrig.identify.simulation.setup import Setup
 
 
 @dataclass(frozen=True)
@@ -287,27 +287,14 @@ class _StagePass:
         self.cores, initial = self.grown(core), self.grown(initial)
         if lags and np.any(np.concatenate([values for _, values in lags], axis=None)):
             return self.respond_freely(branches, self.free_laws(lags, len(initial)), initial)
-        law, custom_laws = np.zeros((len(initial), len(Lag), len(SpeedLaw))), []
+        law = np.zeros((len(initial), len(Lag), len(SpeedLaw)))
         for chosen, values in speeds:
             p = self.named(chosen, self.grown(values))
-            if not chosen.form.law:
-                custom_laws.append((chosen.form, p))
-            for parameter in chosen.parameters:
-                column = chosen.form.law.get(parameter.name)
-                if isinstance(column, tuple):
-                    value = p[parameter.name][:, 0]
-                    law[:, *column] += np.log(value) if parameter.scale == "log" else value
-        torque, rate = self.respond(branches, law, initial, np.zeros((0, 1)))
-        # A speed law given as a Python function needs the torque: it is iterated, starting from the torque without it.
-        for _ in range(4 if custom_laws else 0):
-            drive, middle = self.grown(drive), 0.5 * (torque[:, 1:] + torque[:, :-1])
-            factor = np.ones_like(drive)
-            for form, p in custom_laws:
-                factor = factor * np.asarray(form.call((drive, middle), p, self.setup.scene))
-            if np.all(factor == 1.0):
-                break
-            torque, rate = self.respond(branches, law, initial, np.ascontiguousarray(np.clip(factor, 0.02, 50.0)))
-        return torque, rate
+            on_log_scale = {parameter.name for parameter in chosen.parameters if parameter.scale == "log"}
+            for column, name in chosen.form.law.items():
+                value = p[str(name)][:, 0]
+                law[:, *column] += np.log(value) if name in on_log_scale else value
+        return self.respond(branches, law, initial)
 
     def respond_freely(self, branches: list, laws: np.ndarray, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """As `respond`, where the rates of both lags are free."""
@@ -326,19 +313,16 @@ class _StagePass:
         """Sum of the laws of all forms of the stage "lags", shape (M, len(FreeLaw))."""
         laws = np.zeros((rows, len(FreeLaw)))
         for chosen, values in lags:
-            for column, value in chosen.form.held.items():
-                laws[:, column] = value
-            for parameter, value in zip(chosen.parameters, self.grown(values).T, strict=True):
-                laws[:, chosen.form.law[parameter.name]] += value  # type: ignore
+            p = self.named(chosen, self.grown(values))
+            for column, value in chosen.form.law.items():
+                laws[:, column] += p[value][:, 0] if isinstance(value, str) else value
         return laws
 
-    def respond(
-        self, branches: list, law: np.ndarray, initial: np.ndarray, multiplier: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def respond(self, branches: list, law: np.ndarray, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Sum of the responses of all branches; each starts with its share of the initial state."""
         setup, (time_constant_s, damping) = self.setup, np.ascontiguousarray(self.cores.T)
         begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
-        shared = law, multiplier, setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
+        shared = law, setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
         responses = [
             run_core(np.ascontiguousarray(part), time_constant_s * slower[:, 0], damping, *shared)
             for part, slower in branches
@@ -406,11 +390,7 @@ class _StagePass:
                 continue
             # An added torque does not depend on the signal: rows with the same parameters share one evaluation.
             distinct = np.r_[0, np.arange(present, len(value))]
-            fine = chosen.form.fine and scene is self.setup.scene
-            at = self.setup.scene_within if fine else scene
-            added = np.asarray(chosen.form.call(None, self.named(chosen, values[distinct]), at))
-            if fine:
-                added = added.reshape(len(distinct), -1, WITHIN).mean(axis=2)
+            added = np.asarray(chosen.form.call(None, self.named(chosen, values[distinct]), scene))
             value[:present] += added[:1]
             value[present:] += added[1:]
         return value

@@ -72,7 +72,8 @@ class Setup:
         scene = self._scene((np.arange(grid.size) + self._middle) * grid.step_s, grid.pulse_width_us, grid.begins)
         pauses = np.zeros(grid.size)
         pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
-        return replace(scene, fitted=self.fitted, pauses_s=pauses, states=self.states)
+        states, within = self.states, self._scene_within()
+        return replace(scene, fitted=self.fitted, pauses_s=pauses, states=states, within=within)
 
     @cached_property
     def present(self) -> np.ndarray:
@@ -86,8 +87,7 @@ class Setup:
         mean = np.bincount(grid.interval, grid.fraction, minlength=grid.size) / np.maximum(grid.count, 1)
         return np.where(grid.count > 0, mean, 0.5)
 
-    @cached_property
-    def scene_within(self) -> Scene:
+    def _scene_within(self) -> Scene:
         """At `WITHIN` places of each interval, evenly about the middle of its samples, shape (WITHIN K,)."""
         grid = self.grid
         about = (np.arange(WITHIN) + 0.5) / WITHIN - 0.5

@@ -23,7 +23,7 @@ from stimrig.identify import effects
 from stimrig.identify.healing import healed_places, place_words
 from stimrig.identify.json_text import json_value
 from tests.api.conftest import Service, run_test
-from tests.api.test_own_effect_export import with_gate
+from tests.api.test_free_shown import with_gate
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record, ramp
 

@@ -93,7 +93,7 @@ def test_a_form_changes_something_and_stays_finite_at_its_starts(setup, effect, 
         values[place] = p.lower + 0.7 * (p.upper - p.lower) if p.scale == "linear" else np.sqrt(p.lower * p.upper)
     mean, slopes = problem.run(problem.from_physical(values), derivatives=True)
     assert slopes is not None and np.all(np.isfinite(mean)) and np.all(np.isfinite(slopes))
-    if not find_effect(effect).raw or effect == "sensor_clipping":
+    if find_effect(effect).detect is None or effect == "sensor_clipping":
         assert np.max(np.abs(mean - problem.run(theta)[0])) > 1e-4
 
 

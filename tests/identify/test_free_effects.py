@@ -19,7 +19,7 @@ from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.dynamics.states import boundary_states
-from stimrig.identify.effects import BadEffect, own_file, registry
+from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.estimation.quality import _stable
@@ -204,27 +204,6 @@ def test_beside_a_free_effect_a_name_may_only_repair_its_form():
 
 
 @pytest.mark.slow
-@named(("effect", "form"), FORMS)
-def test_a_written_file_holds_the_same_form_about_what_was_found(effect, form: Form, tmp_path):
-    found = {p.name: (p.start[0], 0.01) for p in form.parameters}
-    path = tmp_path / "mine.py"
-    path.write_text(own_file.text_of(effect, form, found, "mine"), "utf-8")
-    own = own_file.effect_of(path)
-    (written,) = own.forms
-    assert (own.id, written.stage, written.law, written.held) == ("mine", form.stage, form.law, form.held)
-    for mine, theirs in zip(written.parameters, form.parameters, strict=True):
-        assert theirs.lower <= mine.lower < mine.upper <= theirs.upper
-        assert mine.lower <= mine.start[0] <= mine.upper and mine.scale == theirs.scale
-
-
-@pytest.mark.parametrize("name", ["free_gate", "Gate", "", "1st", "a-b", "x" * 65])
-def test_a_written_file_needs_a_name_of_its_own(name: str):
-    effect = registry()["free_gate"]
-    with pytest.raises(BadRequest, match="name"):
-        own_file.text_of(effect, effect.forms[0], {p.name: (p.start[0], 0.1) for p in effect.forms[0].parameters}, name)
-
-
-@pytest.mark.slow
 def test_one_structure_is_one_model_whether_it_was_found_or_asked_for():
     record, (_, improvement) = as_record(record_of_physics("physics", 0)), found()
     wanted = [f"{effect['id']}:{effect['form']}" for effect in improvement.models[-1].effects]
@@ -320,30 +299,3 @@ def test_a_model_whose_free_effect_cannot_be_run_is_refused(wrong, says: str):
     document["effects"] = wrong(document["effects"][0])
     with pytest.raises(BadModel, match=says):
         Model.from_json(json.dumps(document)).predict(hidden_muscles.record(seed=3, rate_hz=100))
-
-
-STATE = "Parameter('a', 's', 1.0, 9.0, 0.0, (2.0,)), Parameter('b', 's', 1.0, 9.0, 0.0, (2.0,))"
-BOTH = "'a': FreeLaw.FILL_S, 'b': FreeLaw.EMPTY_S"
-
-
-@pytest.mark.parametrize(
-    ("parameters", "law", "held", "says"),
-    [
-        (STATE, BOTH, "FreeLaw.GAIN: 'x'", "finite numbers"),
-        (STATE, BOTH, "FreeLaw.GAIN: float('nan')", "finite numbers"),
-        (STATE, BOTH, "FreeLaw.FILL_S: 3.0", "set twice"),
-        (STATE.partition("), ")[0] + "),", "'a': FreeLaw.FILL_S", "", "FILL_S without EMPTY_S"),
-        ("Parameter('a', '1', -2.0, 9.0, 0.0, (2.0,)),", "'a': FreeLaw.BEND", "", "values above -1"),
-    ],
-)
-def test_an_edited_file_that_the_kernel_cannot_run_is_refused(tmp_path, parameters, law, held, says: str):
-    path = tmp_path / "mine.py"
-    path.write_text(
-        "from stimrig.identify.dynamics.free_lags import FreeLaw\n"
-        "from stimrig.identify.effects.base import Effect, Form, Parameter\n"
-        f"form = Form('one', 'lags', 'y', ({parameters}), law={{{law}}}, held={{{held}}})\n"
-        "EFFECT = Effect('mine', 'Mine', (form,), 'a', (), 'b', 'c')\n",
-        "utf-8",
-    )
-    with pytest.raises(BadEffect, match=says):
-        own_file.effect_of(path)

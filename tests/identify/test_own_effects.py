@@ -124,7 +124,11 @@ def told(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> str:
         ("EFFECT = Effect(", "EFFECT = dict(", "EFFECT is a dict, not an Effect"),
         ("        apply=swing,\n", "", "no apply"),
         ("    return torque_nm * (1", "    return torque_nm, (1", "apply gives 160 numbers, not one for each of 80"),
-        ("apply=swing", 'law={"period_s": 5}', "law 'period_s': 5. Give law={parameter: (Lag, SpeedLaw)}"),
+        (
+            'stage="output"',
+            'stage="speed", law={5: "period_s"}',
+            "law 5: 'period_s'. Give law={(Lag, SpeedLaw): parameter}",
+        ),
     ],
 )
 def test_what_cannot_be_an_effect_is_told_with_its_file(tmp_path, monkeypatch, old: str, new: str, says: str) -> None:
