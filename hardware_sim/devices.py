@@ -19,10 +19,9 @@ from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.sampling import take_in_order
-from stimrig.hardware_sim.settings import Settings
+from stimrig.hardware_sim.settings import Settings, pick
 from stimrig.hardware_sim.stimulators import STIMULATORS
 from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware
-from stimrig.hardware_sim.tables import pick
 from stimrig.hardware_sim.timeline import Timeline
 
 

@@ -15,7 +15,7 @@ from stimrig.hardware_sim.control import Control
 from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.load_cells import TRANSPORTS
 from stimrig.hardware_sim.ports import PseudoTerminal, Reactor
-from stimrig.hardware_sim.tables import pick
+from stimrig.hardware_sim.settings import pick
 from stimrig.hardware_sim.timeline import WallClock
 
 TICK_S = 0.0025

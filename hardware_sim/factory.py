@@ -24,9 +24,9 @@ def make_devices(
 ) -> Devices:
     """The devices of these settings, at emulated time 0, with their muscle at rest.
 
-    The patient is a name, the path of a file, or `hidden:SEED`. `arm`: as `--arm` takes it, a mode with settings, or a
-    file; for a hidden patient also `design`; None: the joint is held still and has no sensor. `arm_laws`: other laws of
-    the arm's tissue, each `PLACE=NAME[,PARAMETER=NUMBER…]`. `epoch_us`: what the sensors' clocks show at time 0, µs.
+    The patient is a name, the path of a file, or `hidden:SEED`. `arm`: as `--arm` takes it, a mode with settings; for a
+    hidden patient also `design`; None: the joint is held still and has no sensor. `arm_laws`: as `--arm-law` takes
+    them. `epoch_us`: what the sensors' clocks show at time 0, µs.
 
     Raises HardwareSimError: patient, arm or a setting cannot be used.
     """
@@ -50,10 +50,8 @@ def _hidden_seed(patient: str) -> int | None:
 
 def _muscle(patient: str) -> Muscle:
     file = Path(patient)
-    read = file.suffix.lower() in {".toml", ".json"} or (len(patient) < LONGEST_NAME and file.is_file())
-    if patient not in patients.NAMES and read:
-        return patients.from_file(file)
-    return patients.make(patient)
+    is_file = file.suffix.lower() == ".toml" or (len(patient) < LONGEST_NAME and file.is_file())
+    return patients.from_file(file) if is_file and patient not in patients.PATIENTS else patients.make(patient)
 
 
 def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:

@@ -9,13 +9,12 @@ from collections.abc import Callable, Sequence
 from dataclasses import fields
 from typing import NoReturn
 
-from stimrig.hardware_sim.arm.laws import LAWS
 from stimrig.hardware_sim.arm.movers import MOVERS
-from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS
+from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES
 from stimrig.hardware_sim.errors import SettingsError
 from stimrig.hardware_sim.load_cells import CELLS, TRANSPORTS
 from stimrig.hardware_sim.load_cells.cells import WithAngle
-from stimrig.hardware_sim.patients import NAMES
+from stimrig.hardware_sim.patients import PATIENTS
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators import STIMULATORS
 
@@ -71,8 +70,7 @@ def _patient(group: argparse._ArgumentGroup) -> None:
         "--patient",
         default=DEFAULTS.patient,
         metavar="NAME|FILE",
-        help=f"{', '.join(NAMES)}, or a TOML or JSON file with 'patient' and a table 'parameters' "
-        "(default: %(default)s)",
+        help=f"{', '.join(PATIENTS)}, or a TOML file with 'patient' and a table 'parameters' (default: %(default)s)",
     )
     exclusive.add_argument(
         "--hidden",
@@ -118,8 +116,8 @@ def _add(group: argparse._ArgumentGroup, names: Callable[[str], bool]) -> None:
 def _arm(group: argparse._ArgumentGroup) -> None:
     group.add_argument(
         "--arm",
-        metavar="MODE[,SETTING=NUMBER…]|FILE",
-        help=f"what holds or moves the elbow: {', '.join(MOVERS)}, or a TOML or JSON file; with --hidden also "
+        metavar="MODE[,SETTING=NUMBER…]",
+        help=f"what holds or moves the elbow: {', '.join(MOVERS)}; with --hidden also "
         "'design', the movement that its effect was sized on (default: no arm, the joint is still and has no sensor)",
     )
     group.add_argument(
@@ -127,8 +125,8 @@ def _arm(group: argparse._ArgumentGroup) -> None:
         action="append",
         default=[],
         metavar="PLACE=NAME[,PARAMETER=NUMBER…]",
-        help=f"another law of its tissue, at {', '.join(LAWS)}; may be repeated (default: "
-        f"{', '.join(f'{place}={name}' for place, name in DEFAULT_LAWS.items())}; each place has 'none')",
+        help=f"another law of its tissue, or other numbers, at {', '.join(PLACES)}; may be repeated (default: "
+        f"{', '.join(f'{place}={name}' for place, name in DEFAULT_LAWS.items())}; 'none' for no law)",
     )
     _add(group, lambda name: name.startswith("angle"))
 

@@ -168,7 +168,7 @@ def emulate(options: str = "", data: str | Path | None = None) -> Iterator[Clien
     Parameters
     ----------
     options : str
-        Of the emulator, as "--patient calcium".
+        Of the emulator, as "--patient changing".
     data : path, optional
         Folder for its recordings and models; default: one that is deleted at the end.
 

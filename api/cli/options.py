@@ -49,7 +49,7 @@ HeldModel = Annotated[
 RigFile = Annotated[Path | None, typer.Option(help="rig file (TOML); default: the emulated rig")]
 DataDir = Annotated[Path | None, typer.Option(help="data folder; default ./var, or STIMRIG_DATA_DIR")]
 RigData = Annotated[Path | None, typer.Option(help="the rig's data folder, where it has one of its own")]
-Emulate = Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient calcium"')]
+Emulate = Annotated[str, typer.Option(help='options for the emulator, e.g. "--patient changing"')]
 
 
 def set_options(**options: Any) -> dict[str, Any]:

@@ -189,7 +189,7 @@ def _moved(request: RecordRequest, moves: Moves, parts: Parts) -> Floats:
     angle = np.empty(_fine(parts).size)
     for k in range(angle.size):
         time_s = k / SIMULATION_HZ
-        motion = mover.advance(time_s, lambda _angle_rad, _velocity_rad_s: 0.0) if mover else motion
+        motion = mover(time_s) if mover else motion
         while coming and coming[0][0] <= time_s:
             _, mode, settings = coming.pop(0)
             mover = make_mover(mode, Begin(time_s, motion, seeds[len(coming)]), settings)

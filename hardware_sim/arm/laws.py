@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,29 +19,18 @@ Number = Any
 Floats = NDArray[np.float64]
 
 
-class AngleLaw(Protocol):
-    """Share of active torque at an angle."""
-
-    def share(self, angle_rad: Number) -> Number: ...
-
-
-class VelocityLaw(Protocol):
-    """Share of active torque at a velocity, which may depend on the angle."""
-
-    def share(self, angle_rad: Number, velocity_rad_s: Number) -> Number: ...
-
-
 def above(lowest: float, default: float) -> Any:
     """A parameter that must be above `lowest`."""
     return field(default=default, metadata={"above": lowest})
 
 
+@dataclass(frozen=True)
 class PassiveLaw:
-    """Base of passive laws. Most have no memory: their torque follows from angle and velocity."""
+    """Base of passive laws, by itself no tissue. Most have no memory: their torque follows from angle and velocity."""
 
     def torque_nm(self, angle_rad: Number, velocity_rad_s: Number) -> Number:
         """Passive torque after the joint has been there for long, N·m."""
-        raise NotImplementedError
+        return 0.0 * angle_rad + 0.0 * velocity_rad_s
 
     def begin(self, angle_rad: float) -> float:  # noqa: ARG002
         """The memory of a joint that has been at this angle for long."""
@@ -156,14 +145,6 @@ class StandardLinearSolid(PassiveLaw):
 
 
 @dataclass(frozen=True)
-class NoTissue(PassiveLaw):
-    """No tissue at all: the torque at the joint is the muscle's alone."""
-
-    def torque_nm(self, angle_rad: Number, velocity_rad_s: Number) -> Number:
-        return 0.0 * angle_rad + 0.0 * velocity_rad_s
-
-
-@dataclass(frozen=True)
 class MomentArm:
     """r_0 + (1 - r_0) cos(c (x - x_best)): a moment arm, largest in mid-range, as that of biceps brachii.
 
@@ -206,9 +187,8 @@ class ArmAndLength:
 
     def share(self, angle_rad: Number) -> Number:
         arm = MomentArm(self.arm_best_rad, self.arm_least, self.sharpness)
-        return arm.share(angle_rad) * ForceLength(self.length_best_rad, self.lengths_per_rad, self.gamma).share(
-            angle_rad
-        )
+        fibre = ForceLength(self.length_best_rad, self.lengths_per_rad, self.gamma)
+        return arm.share(angle_rad) * fibre.share(angle_rad)
 
 
 @dataclass(frozen=True)
@@ -301,7 +281,7 @@ LAWS: dict[str, dict[str, Any]] = {
         "double_exponential": DoubleExponential,
         "fibre_exponential": FibreExponential,
         "linear_friction": LinearFriction,
-        "none": NoTissue,
+        "none": PassiveLaw,
         "standard_linear_solid": StandardLinearSolid,
     },
     "torque_angle": {

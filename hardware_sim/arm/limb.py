@@ -6,7 +6,7 @@ Of the forearm: I ẍ = active + passive + gravity − cell. So the cell measure
 
 where `isometric` is the muscle's torque at the reference angle, h is passive torque, stops and gravity, and I is the
 inertia of forearm, hand and all that moves with them on the muscle's side of the cell. What the holder's side of the
-cell weighs does not appear. A forearm that nobody holds loads no cell: T = 0, and I ẍ is the sum of the others.
+cell weighs does not appear.
 """
 
 from __future__ import annotations
@@ -19,7 +19,6 @@ from typing import Any
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.motion import Begin, Motion
 from stimrig.hardware_sim.arm.movers import make_mover
-from stimrig.hardware_sim.errors import ArmError
 from stimrig.hardware_sim.patients.muscle import Muscle
 
 LONGEST_STEP_S = 1.0 / 1600.0
@@ -41,7 +40,6 @@ class Limb:
         self._muscle, self._tissue = muscle, arm.tissue
         self._tell_joint: Callable[[float, float], None] | None = getattr(muscle, "joint", None)
         self._laws = lru_cache(1)(self._laws_at)  # an arm that is held asks for one place again and again
-        self._inertia_kg_m2 = arm.tissue.mechanics.inertia_kg_m2
         self._memory = arm.tissue.passive.begin(self.motion.angle_rad)
         self._time_s = 0.0
         self._isometric_nm = 0.0
@@ -54,11 +52,8 @@ class Limb:
         """
         self._advance(time_s)
         begin = Begin(self._time_s, self.motion, self._seed + SEEDS_APART * self._moves)
-        mover = make_mover(mode, begin, settings)
-        if not (mover.holds_forearm or self._inertia_kg_m2 > 0.0):
-            raise ArmError(f"mode '{mode}': a forearm without inertia (a hidden patient's) cannot be let go")
-        self._mover, self._moves = mover, self._moves + 1
-        self.mode = mode
+        self._motion_at = make_mover(mode, begin, settings)
+        self.mode, self._moves = mode, self._moves + 1
 
     def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
         """A pulse of `width_us` a phase and `current_ma` reaches the electrodes at `time_s`."""
@@ -68,10 +63,11 @@ class Limb:
     def torque_nm(self, time_s: float) -> float:
         """Advance to `time_s` and give the torque on the load cell, N·m, without the sensor's noise."""
         self._advance(time_s)
-        if not self._mover.holds_forearm:
-            return 0.0
         angle_rad, velocity_rad_s, acceleration_rad_s2 = self.motion
-        return self._net_nm(angle_rad, velocity_rad_s) - self._inertia_kg_m2 * acceleration_rad_s2
+        share, passive_nm = self._laws(angle_rad, velocity_rad_s)
+        remembered_nm = self._tissue.passive.remembered_nm(self._memory, angle_rad)
+        held_nm = float(share * self._isometric_nm + passive_nm + remembered_nm)
+        return held_nm - self._tissue.mechanics.inertia_kg_m2 * acceleration_rad_s2
 
     def angle_deg(self, time_s: float) -> float:
         """Advance to `time_s` and give the true angle there, degrees."""
@@ -96,7 +92,7 @@ class Limb:
             self._step_to(begin_s + step * span_s / steps)
 
     def _step_to(self, time_s: float) -> None:
-        self.motion = self._mover.advance(time_s, lambda x, v: self._net_nm(x, v) / self._inertia_kg_m2)
+        self.motion = self._motion_at(time_s)
         angle_rad, velocity_rad_s, _ = self.motion
         self._memory = self._tissue.passive.step(self._memory, angle_rad, time_s - self._time_s)
         if self._tell_joint is not None:
@@ -107,8 +103,3 @@ class Limb:
     def _laws_at(self, angle_rad: float, velocity_rad_s: float) -> tuple[Any, Any]:
         """Share of active torque, and the torque of what is passive, N·m."""
         return self._tissue.g(angle_rad, velocity_rad_s), self._tissue.h_nm(angle_rad, velocity_rad_s)
-
-    def _net_nm(self, angle_rad: float, velocity_rad_s: float) -> float:
-        share, passive_nm = self._laws(angle_rad, velocity_rad_s)
-        remembered_nm = self._tissue.passive.remembered_nm(self._memory, angle_rad)
-        return float(share * self._isometric_nm + passive_nm + remembered_nm)

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.hardware_sim.arm.laws import LAWS, AngleLaw, Number, PassiveLaw, VelocityLaw, above
+from stimrig.hardware_sim.arm.laws import LAWS, Number, PassiveLaw, above
 from stimrig.hardware_sim.errors import ArmError
 
 REFERENCE_RAD = math.pi / 2.0
@@ -55,16 +55,29 @@ class Mechanics:
         return self.stop_nm_per_rad * (extended - flexed)
 
 
-def law(place: str, name: str, parameters: Mapping[str, Any] | None = None) -> Any:
+PLACES: dict[str, dict[str, Any]] = {**LAWS, "mechanics": {"forearm": Mechanics}}
+"""What can be chosen of an arm: a law of each place, and the numbers of the forearm."""
+
+
+def law(place: str, name: str, parameters: Mapping[str, float] | None = None) -> Any:
     """The named law of a place, with some of its parameters overridden.
 
     Raises ArmError: there is no such place, law or parameter, or a value is not a finite number or out of range.
     """
-    if place not in LAWS:
-        raise ArmError(f"the arm has no laws of {place!r}; it has {', '.join(LAWS)}")
-    if name not in LAWS[place]:
-        raise ArmError(f"unknown law of {place} {name!r}; there are {', '.join(LAWS[place])}")
-    return build(LAWS[place][name], f"law {name} of {place}", parameters or {})
+    if place not in PLACES:
+        raise ArmError(f"the arm has no laws of {place!r}; it has {', '.join(PLACES)}")
+    if name not in PLACES[place]:
+        raise ArmError(f"unknown law of {place} {name!r}; there are {', '.join(PLACES[place])}")
+    kind, what, values = PLACES[place][name], f"law {name} of {place}", parameters or {}
+    lowest = {each.name: each.metadata.get("above", -math.inf) for each in dataclasses.fields(kind)}
+    for key, value in values.items():
+        if key not in lowest:
+            raise ArmError(f"{what} has no parameter '{key}'; it has {', '.join(lowest) or 'none'}")
+        if not math.isfinite(value):
+            raise ArmError(f"parameter '{key}' of {what} must be a finite number, not {value!r}")
+        if not value > lowest[key]:
+            raise ArmError(f"parameter '{key}' of {what} must be above {lowest[key]:g}, not {value!r}")
+    return kind(**values)
 
 
 def law_name(place: str, law: Any) -> str:
@@ -72,29 +85,13 @@ def law_name(place: str, law: Any) -> str:
     return next(name for name, kind in LAWS[place].items() if type(law) is kind)
 
 
-def build(kind: Any, what: str, parameters: Mapping[str, Any]) -> Any:
-    """The dataclass of numbers `kind` with these parameters, each above what its field says.
-
-    Raises ArmError: it has no such parameter, or a value is not a finite number or out of range.
-    """
-    known = {each.name: each.metadata.get("above", -math.inf) for each in dataclasses.fields(kind)}
-    for key, value in parameters.items():
-        if key not in known:
-            raise ArmError(f"{what} has no parameter '{key}'; it has {', '.join(known) or 'none'}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-            raise ArmError(f"parameter '{key}' of {what} must be a finite number, not {value!r}")
-        if not value > known[key]:
-            raise ArmError(f"parameter '{key}' of {what} must be above {known[key]:g}, not {value!r}")
-    return kind(**parameters)
-
-
 @dataclass(frozen=True)
 class Tissue:
     """The laws of one arm and its mechanics."""
 
     passive: PassiveLaw = field(default_factory=LAWS["passive"][DEFAULT_LAWS["passive"]])
-    torque_angle: AngleLaw = field(default_factory=LAWS["torque_angle"][DEFAULT_LAWS["torque_angle"]])
-    torque_velocity: VelocityLaw = field(default_factory=LAWS["torque_velocity"][DEFAULT_LAWS["torque_velocity"]])
+    torque_angle: Any = field(default_factory=LAWS["torque_angle"][DEFAULT_LAWS["torque_angle"]])
+    torque_velocity: Any = field(default_factory=LAWS["torque_velocity"][DEFAULT_LAWS["torque_velocity"]])
     mechanics: Mechanics = field(default_factory=Mechanics)
 
     def g(self, angle_rad: Number, velocity_rad_s: Number) -> Number:

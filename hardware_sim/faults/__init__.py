@@ -2,6 +2,9 @@
 
 A fault is a function marked `@fault` in any file of this folder. It takes the target and, by keyword, its settings
 with their defaults. It makes the fault happen and returns a function that undoes it. Its name is the fault's name.
+
+One marked `@hook(place)` returns a hook instead, which stands at that place while the fault is on. With
+`@hook(name=place, other_name=other_place)` it is a fault of these names.
 """
 
 from __future__ import annotations
@@ -11,19 +14,18 @@ import inspect
 import math
 import pkgutil
 import random
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
+from functools import wraps
 from typing import Any, Protocol, TypeVar
 
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.errors import FaultError
-from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.stimulators.board import Board, Firmware
 from stimrig.hardware_sim.timeline import Timeline
 
 Undo = Callable[[], None]
-Make = TypeVar("Make", bound=Callable[..., Undo])
-Hook = TypeVar("Hook")
+Make = TypeVar("Make", bound=Callable[..., Any])
 _FAULTS: dict[str, Callable[..., Undo]] = {}
 
 
@@ -48,10 +50,26 @@ class Target(Protocol):
         """Connect the load cell's adapter, or pull it."""
 
 
+Place = Callable[[Target], list[Any]]
+"""The hooks of a target at one place."""
+
+
 def fault(make: Make) -> Make:
     """Register a fault under its function's name."""
     _FAULTS[make.__name__] = make
     return make
+
+
+def hook(place: Place | None = None, **places: Place) -> Callable[[Make], Make]:
+    """Register faults that are a hook at a place."""
+
+    def register(make: Make) -> Make:
+        for name, where in ({make.__name__: place} if place else places).items():
+            at = lambda target, where=where, **settings: hooked(make(target, **settings), where(target))  # noqa: E731
+            _FAULTS[name] = wraps(make)(at)
+        return make
+
+    return register
 
 
 def library() -> dict[str, Callable[..., Undo]]:
@@ -61,14 +79,14 @@ def library() -> dict[str, Callable[..., Undo]]:
     return dict(sorted(_FAULTS.items()))
 
 
-def hooked(hook: Hook, *places: list[Hook]) -> Undo:
-    """Add `hook` to the hooks at these places; the result removes it."""
+def hooked(function: Any, *places: list[Any]) -> Undo:
+    """Add a function to the hooks at these places; the result removes it."""
     for hooks in places:
-        hooks.append(hook)
+        hooks.append(function)
 
     def unhook() -> None:
         for hooks in places:
-            hooks.remove(hook)
+            hooks.remove(function)
 
     return unhook
 
@@ -80,43 +98,10 @@ def replaced(owner: object, attribute: str, value: object) -> Undo:
     return lambda: setattr(owner, attribute, before)
 
 
-def sometimes(
-    target: Target,
-    probability: float,
-    change: Callable[[Any], Any],
-    otherwise: Callable[[Any], Any] = lambda what: what,
-) -> Any:
-    """A hook that gives `change(what)` with this probability, else `otherwise(what)`."""
-    return lambda what, *_: change(what) if target.random.random() < probability else otherwise(what)
-
-
-def frames_sometimes(target: Target, probability: float, change: Callable[[Frame], Iterable[Frame]]) -> Any:
-    """A hook that sends `change(frame)` instead of a frame with this probability."""
-    return sometimes(target, probability, change, lambda frame: (frame,))
-
-
-def stuck() -> Callable[[float, float], float]:
-    """A hook that holds the first reading."""
-    first: list[float] = []
-
-    def repeat_first(reading: float, _time_s: float) -> float:
-        if not first:
-            first.append(reading)
-        return first[0]
-
-    return repeat_first
-
-
-def at_another_rate(clock: Any, percent: float) -> Undo:
-    """Sample by `percent` faster than nominal."""
-    clock.set_rate_factor(1.0 + percent / 100.0)
-    return lambda: clock.set_rate_factor(1.0)
-
-
-def check_not_negative(fault_name: str, setting: str, value: float) -> None:
+def check_not_negative(setting: str, value: float) -> None:
     """Refuse a setting of a fault that is no number from 0 on."""
     if not 0 <= value < math.inf:
-        raise FaultError(f"setting '{setting}' of fault '{fault_name}' must be a number from 0 on, not {value:g}")
+        raise FaultError(f"setting '{setting}' must be a number from 0 on, not {value:g}")
 
 
 class Faults:
@@ -143,26 +128,24 @@ class Faults:
 
         Raises FaultError: no such fault, or no such setting, or a setting of another type than its default.
         """
-        make = self._find(name)
-        known = _settings(make)
+        known = _settings(self._find(name))
         for key, value in settings.items():
             if key not in known:
                 raise FaultError(f"fault '{name}' has no setting '{key}'; it has {', '.join(known) or 'none'}")
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if isinstance(known[key], bool) != isinstance(value, bool) or not (number or isinstance(value, bool)):
+            if not isinstance(value, int | float) or isinstance(known[key], bool) != isinstance(value, bool):
                 raise FaultError(f"setting '{key}' of fault '{name}' must be like {known[key]!r}, not {value!r}")
-        if name in self._on:
-            self.off(name)
-        undo = make(self._target, **settings)
-        self._on[name] = undo
+        self.off(name)
+        try:
+            undo = self._on[name] = self._library[name](self._target, **settings)
+        except FaultError as error:
+            raise FaultError(f"fault '{name}': {error}") from None
         if for_s is not None:
             self._target.timeline.after(for_s, lambda: self._end(name, undo))
 
     def off(self, name: str) -> None:
         """Switch a fault off; nothing happens if it is off already. Raises FaultError: no such fault."""
         self._find(name)
-        undo = self._on.pop(name, None)
-        if undo is not None:
+        if undo := self._on.pop(name, None):
             undo()
 
     def _end(self, name: str, undo: Undo) -> None:

@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
-from stimrig.hardware_sim.faults import Target, Undo, fault, hooked, replaced, sometimes
+from typing import Any
+
+from stimrig.hardware_sim.faults import Target, Undo, fault, hook, replaced
 
 HALF_A_FRAME = bytes.fromhex("f0815581")
+STOPS = 4, 34
+"""Commands that stop stimulation, of ScienceMode 4's low level and of ScienceMode 2."""
+
+
+def answers(target: Target) -> list[Any]:
+    """Hooks of the frames to the host."""
+    return target.board.outgoing
+
+
+def commands(target: Target) -> list[Any]:
+    """Hooks of the bytes from the host."""
+    return target.board.incoming
 
 
 @fault
@@ -16,59 +30,20 @@ def stimulator_unplugged(target: Target, mid_frame: bool = True) -> Undo:
     return target.plug_stimulator
 
 
-@fault
-def no_ack(target: Target) -> Undo:
+@hook(answers)
+def no_ack(target: Target) -> Any:  # noqa: ARG001
     """The stimulator obeys but answers nothing."""
-    return hooked(lambda _frame: None, target.board.outgoing)
+    return lambda _frame: None
 
 
-@fault
-def late_ack(target: Target, delay_s: float = 0.2) -> Undo:
+@hook(answers)
+def late_ack(target: Target, delay_s: float = 0.2) -> Any:
     """The stimulator's answers come `delay_s` late."""
 
     def delay(frame: bytes) -> None:
         target.timeline.after(delay_s, lambda: target.board.write(frame))
 
-    return hooked(delay, target.board.outgoing)
-
-
-@fault
-def line_stalled(target: Target, to_device: bool = True, to_host: bool = True) -> Undo:
-    """The line stores all bytes in one direction or both. When undone, it delivers all of them at once."""
-    commands, answers = bytearray(), bytearray()
-    undo = []
-    if to_device:
-        undo.append(hooked(lambda data: commands.extend(data), target.board.incoming))
-    if to_host:
-        undo.append(hooked(lambda data: answers.extend(data), target.board.outgoing))
-
-    def deliver() -> None:
-        for take_out in undo:
-            take_out()
-        if answers:
-            target.board.write(bytes(answers))
-        if commands:
-            target.firmware.received(bytes(commands))
-
-    return deliver
-
-
-@fault
-def frames_doubled(target: Target, probability: float = 1.0) -> Undo:
-    """Deliver bytes from the host twice, with this probability for each piece read."""
-    return hooked(sometimes(target, probability, lambda data: data * 2), target.board.incoming)
-
-
-@fault
-def corrupt_answers(target: Target, probability: float = 1.0) -> Undo:
-    """One byte of an answer is changed, with this probability."""
-    return hooked(lambda frame: _corrupted(target, frame, probability), target.board.outgoing)
-
-
-@fault
-def corrupt_commands(target: Target, probability: float = 1.0) -> Undo:
-    """One byte of what the host sends is changed, with this probability for each piece read."""
-    return hooked(lambda data: _corrupted(target, data, probability), target.board.incoming)
+    return delay
 
 
 @fault
@@ -98,8 +73,8 @@ def device_reset(target: Target, mid_frame: bool = False) -> Undo:
     return lambda: None
 
 
-@fault
-def stop_lost(target: Target, within_s: float = 5.0) -> Undo:
+@hook(commands)
+def stop_lost(target: Target, within_s: float = 5.0) -> Any:
     """A stop that comes within so many seconds of a pulse is lost, and nobody answers it."""
     wire, log = target.firmware.wire(), target.board.electrodes.log
 
@@ -109,16 +84,4 @@ def stop_lost(target: Target, within_s: float = 5.0) -> Undo:
             return data
         return None if log and now_s - log[-1].time_s < within_s else data
 
-    return hooked(lose, target.board.incoming)
-
-
-STOPS = 4, 34
-"""Commands that stop stimulation, of ScienceMode 4's low level and of ScienceMode 2."""
-
-
-def _corrupted(target: Target, data: bytes, probability: float) -> bytes:
-    if not data or target.random.random() >= probability:
-        return data
-    corrupted = bytearray(data)
-    corrupted[target.random.randrange(len(data))] ^= target.random.randrange(1, 256)
-    return bytes(corrupted)
+    return lose

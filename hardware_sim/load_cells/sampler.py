@@ -10,8 +10,7 @@ from stimrig.hardware_sim.load_cells.cells import CELLS, Cell
 from stimrig.hardware_sim.load_cells.frames import AngleReading, Frame, Sample
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.sampling import Noise, SampleClock
-from stimrig.hardware_sim.settings import Settings
-from stimrig.hardware_sim.tables import pick
+from stimrig.hardware_sim.settings import Settings, pick
 
 TorqueHook = Callable[[float, float], float]
 FrameHook = Callable[[Frame], Iterable[Frame]]

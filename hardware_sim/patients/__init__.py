@@ -1,6 +1,6 @@
 """Patients by name. A patient is one file with `Parameters`, a frozen dataclass of numbers, and a muscle made of them.
 
-A file in TOML or JSON names one of them and overrides its parameters::
+A TOML file names one of them and overrides its parameters::
 
     patient = "paper"
     [parameters]
@@ -11,33 +11,31 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from stimrig.hardware_sim.errors import PatientError
-from stimrig.hardware_sim.patients import calcium, changing, paper
+from stimrig.hardware_sim.patients import changing, paper
 from stimrig.hardware_sim.patients.muscle import Muscle
-from stimrig.hardware_sim.tables import read_table
 
 PATIENTS: dict[str, tuple[type[Any], Callable[[Any], Muscle]]] = {
-    "calcium": (calcium.Parameters, calcium.CalciumMuscle),
     "changing": (changing.Parameters, changing.ChangingMuscle),
     "paper": (paper.Parameters, paper.PaperMuscle),
 }
 """Parameters and muscle, in alphabetical order."""
-NAMES = tuple(PATIENTS)
 
 
 def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
-    """The named patient (one of `NAMES`) at rest, with some of its parameters overridden.
+    """The named patient (one of `PATIENTS`) at rest, with some of its parameters overridden.
 
     Raises PatientError: there is no such patient, or it has no such parameter, or a value is not a finite number or out
     of range.
     """
     values = parameters or {}
     if name not in PATIENTS:
-        raise PatientError(f"patient '{name}' is neither a file nor one of {', '.join(NAMES)}")
+        raise PatientError(f"patient '{name}' is neither a file nor one of {', '.join(PATIENTS)}")
     kind, muscle = PATIENTS[name]
     known: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(kind)}
     for key, value in values.items():
@@ -51,18 +49,22 @@ def make(name: str, parameters: Mapping[str, float] | None = None) -> Muscle:
 
 
 def from_file(path: Path) -> Muscle:
-    """The patient that a TOML or JSON file describes.
+    """The patient that a TOML file describes.
 
     Raises PatientError: the file cannot be read, is malformed, or describes no patient; names the file.
     """
-    described = read_table(path, PatientError, "a table with 'patient' and 'parameters'")
-    unknown = sorted(set(described) - {"patient", "parameters"})
-    if unknown:
-        raise PatientError(f"{path}: unknown key '{unknown[0]}'; a patient's file has 'patient' and 'parameters'")
-    parameters = described.get("parameters", {})
+    try:
+        described = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError) as reason:
+        raise PatientError(f"{path}: cannot be read ({reason}); give a readable TOML file") from None
+    except (ValueError, RecursionError) as reason:  # the decoder's ValueError names line and column
+        raise PatientError(f"{path}: not valid TOML: {reason}") from None
+    name, parameters = described.pop("patient", "paper"), described.pop("parameters", {})
+    if described:
+        raise PatientError(f"{path}: unknown key '{min(described)}'; a patient's file has 'patient' and 'parameters'")
     if not isinstance(parameters, dict):
         raise PatientError(f"{path}: 'parameters' must be a table of names and numbers")
     try:
-        return make(str(described.get("patient", "paper")), parameters)
+        return make(str(name), parameters)
     except PatientError as error:
         raise PatientError(f"{path}: {error}") from None

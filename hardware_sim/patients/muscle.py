@@ -101,17 +101,10 @@ class HeldPulses:
 @lru_cache(maxsize=256)
 def _transition(sigma: float, omega2: float, discriminant: float, dt: float) -> tuple[float, float, float, float]:
     """The matrix exponential over `dt`, row by row; a sampled muscle asks for the same few steps again and again."""
-    decay = math.exp(-sigma * dt)
-    c, s = _oscillation(discriminant, dt)
-    return decay * (c + sigma * s), decay * s, -decay * omega2 * s, decay * (c - sigma * s)
-
-
-def _oscillation(discriminant: float, dt: float) -> tuple[float, float]:
-    """cos(w dt) and sin(w dt) / w for w² = `discriminant`, also where it is zero or negative."""
+    decay, w = math.exp(-sigma * dt), math.sqrt(abs(discriminant))
+    c, s = 1.0, dt  # cos(w dt) and sin(w dt) / w, also where the square of w is zero or negative
     if discriminant > 0.0:
-        w = math.sqrt(discriminant)
-        return math.cos(w * dt), math.sin(w * dt) / w
-    if discriminant < 0.0:
-        w = math.sqrt(-discriminant)
-        return math.cosh(w * dt), math.sinh(w * dt) / w
-    return 1.0, dt
+        c, s = math.cos(w * dt), math.sin(w * dt) / w
+    elif discriminant < 0.0:
+        c, s = math.cosh(w * dt), math.sinh(w * dt) / w
+    return decay * (c + sigma * s), decay * s, -decay * omega2 * s, decay * (c - sigma * s)

@@ -35,7 +35,7 @@ class PaperMuscle(HeldPulses):
         self.parameters = p = parameters or Parameters()
         super().__init__(p.natural_period_s, p.damping_ratio, p.pulse_period_s, p.late_periods)
 
-    def recruitment_nm(self, width_us: float, current_ma: float) -> float:
+    def drive_nm(self, time_s: float, width_us: float, current_ma: float) -> float:  # noqa: ARG002
         """Steady torque of a train of such pulses, N·m; eq. (35)."""
         p = self.parameters
         exponent = p.a2 * width_us * current_ma / p.nominal_current_ma
@@ -43,7 +43,3 @@ class PaperMuscle(HeldPulses):
             return 0.0
         decay = math.exp(-exponent)  # divided through by exp(a2 u): no overflow at 4095 µs
         return p.a1 * (1.0 - decay) / (1.0 + p.a3 * decay)
-
-    def drive_nm(self, time_s: float, width_us: float, current_ma: float) -> float:  # noqa: ARG002
-        """As `recruitment_nm`: this muscle does not change."""
-        return self.recruitment_nm(width_us, current_ma)

@@ -31,7 +31,6 @@ class FiredPulse:
     current_ma: float
     delivered: bool
     balanced: bool
-    source: str
     output: Output = (0, 0)
 
 
@@ -51,11 +50,11 @@ class Electrodes:
         self._muscle = muscle
         self._raise_sync = raise_sync
 
-    def fire(self, time_s: float, points: Sequence[Point], output: Output, source: str) -> bool:
+    def fire(self, time_s: float, points: Sequence[Point], output: Output) -> bool:
         """One pulse of this shape; True if it flowed through the muscle."""
         width_us, current_ma, balanced = phase(points)
         flows = self.attached and not self.cut and output == FIRST and width_us > 0
-        self.log.append(FiredPulse(time_s, width_us, current_ma, flows, balanced, source, output))
+        self.log.append(FiredPulse(time_s, width_us, current_ma, flows, balanced, output))
         if not balanced:
             self.unbalanced_pulses += 1
         if flows:

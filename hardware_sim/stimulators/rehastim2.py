@@ -6,7 +6,8 @@ by itself, even if the host is dead.
 
 Where its documentation is silent this firmware is strict, so that a driver that works here works on the device: without
 a connection commands are neither obeyed nor answered, and Init comes again after the watchdog has expired. Odd currents
-are rounded down to a multiple of 2 mA.
+are rounded down to a multiple of 2 mA. Of channel lists it takes single pulses at one period; low-frequency channels,
+doublets, triplets and lists that play once are refused.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from stimrig.hardware_sim.stimulators.board import Board, Firmware, Point
+from stimrig.hardware_sim.stimulators.board import Board, Firmware
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2
 from stimrig.hardware_sim.timeline import Event, cancel
 
@@ -25,52 +26,13 @@ SHORTEST_US, LONGEST_US = 20, 500
 LARGEST_MA, STEP_MA = 126, 2
 GAP_US = 100
 SHORTEST_INTERVAL_S = 0.008
-LARGEST_LOW_FREQUENCY_FACTOR = 7
-MOST_PULSES = 3
-"""Modes 0, 1, 2 of a channel: single, doublet, triplet."""
 
 
 class Pulse(NamedTuple):
-    """One phase of a symmetric biphasic pulse; `pulses` of them an interpulse interval apart."""
+    """A symmetric biphasic pulse: the width of each phase and its current."""
 
     width_us: int
     current_ma: int
-    pulses: int = 1
-
-    @property
-    def duration_s(self) -> float:
-        """Duration of one pulse: both phases and the gap between them."""
-        return (2 * self.width_us + GAP_US) * 1e-6
-
-    def points(self) -> list[Point]:
-        """The pulse's shape."""
-        return [(self.width_us, self.current_ma), (GAP_US, 0), (self.width_us, -self.current_ma)]
-
-
-class Setup(NamedTuple):
-    """The settings of InitChannelList; `period_s` is 0 for one group of pulses per Start."""
-
-    channels: tuple[int, ...]
-    low_frequency: frozenset[int]
-    low_frequency_factor: int
-    interpulse_s: float
-    period_s: float
-
-
-def parse_init(data: bytes) -> Setup | None:
-    """InitChannelList: factor, active mask, low-frequency mask, interpulse code, period code u16, execution.
-
-    Execution other than 0 is refused, since its meaning is not known.
-    """
-    if len(data) != 7 or data[0] > LARGEST_LOW_FREQUENCY_FACTOR or data[6] != 0:
-        return None
-    factor, active, low, interpulse = data[:4]
-    interpulse_s = 0.5e-3 * interpulse + 1.5e-3
-    code = int.from_bytes(data[4:6], "big")
-    period_s = 0.5e-3 * code + 1e-3 if code else 0.0
-    if not active or interpulse_s < SHORTEST_INTERVAL_S or 0 < period_s < SHORTEST_INTERVAL_S:
-        return None
-    return Setup(_numbers(active), frozenset(_numbers(low)), factor, interpulse_s, period_s)
 
 
 def parse_pulse(data: bytes) -> Pulse | None:
@@ -81,20 +43,29 @@ def parse_pulse(data: bytes) -> Pulse | None:
     return Pulse(width_us, current_ma - current_ma % STEP_MA)
 
 
-def parse_start(data: bytes, setup: Setup) -> dict[int, Pulse] | None:
-    """Start or Update: mode, width u16, mA for each active channel, in their order."""
-    if len(data) != 4 * len(setup.channels):
+def parse_init(data: bytes) -> tuple[tuple[int, ...], float] | None:
+    """InitChannelList: factor, active mask, low-frequency mask, interpulse code, period code u16, execution.
+
+    The channels and their period, s. Execution other than 0 is refused, since its meaning is not known.
+    """
+    if len(data) != 7 or data[0] or not data[1] or data[2] or data[6]:
         return None
-    pulses = {}
-    for place, channel in enumerate(setup.channels):
-        count, pulse = data[4 * place] + 1, parse_pulse(data[4 * place + 1 : 4 * place + 4])
-        if pulse is None or count > MOST_PULSES or 0 < setup.period_s < count * setup.interpulse_s:
-            return None
-        pulses[channel] = pulse._replace(pulses=count)
-    return pulses
+    interpulse_s, period_s = 0.5e-3 * data[3] + 1.5e-3, 0.5e-3 * int.from_bytes(data[4:6], "big") + 1e-3
+    if min(interpulse_s, period_s) < SHORTEST_INTERVAL_S:
+        return None
+    return tuple(channel for channel in range(CHANNELS) if data[1] >> channel & 1), period_s
 
 
-def fire(board: Board, time_s: float, channel: int, pulse: Pulse, source: str) -> int:
+def parse_start(data: bytes, channels: tuple[int, ...]) -> dict[int, Pulse] | None:
+    """Start or Update: mode (0, single pulses), width u16, mA for each active channel, in their order."""
+    if len(data) != 4 * len(channels):
+        return None
+    rows = [data[at : at + 4] for at in range(0, len(data), 4)]
+    pulses = {channel: pulse for channel, row in zip(channels, rows, strict=True) if (pulse := parse_pulse(row[1:]))}
+    return pulses if len(pulses) == len(channels) and not any(row[0] for row in rows) else None
+
+
+def fire(board: Board, time_s: float, channel: int, pulse: Pulse) -> int:
     """Fire one pulse at one output; returns 0 or the error for StimulationError."""
     if board.electrodes.cut:
         return EMERGENCY_SWITCH
@@ -102,80 +73,43 @@ def fire(board: Board, time_s: float, channel: int, pulse: Pulse, source: str) -
         return MODULE
     if pulse.current_ma == 0:
         return NO_ERROR
-    flowed = board.electrodes.fire(time_s, pulse.points(), (channel >> 2, channel & 3), source)
-    return NO_ERROR if flowed else ELECTRODE
+    points = [(pulse.width_us, pulse.current_ma), (GAP_US, 0), (pulse.width_us, -pulse.current_ma)]
+    return NO_ERROR if board.electrodes.fire(time_s, points, (channel >> 2, channel & 3)) else ELECTRODE
 
 
 class ChannelList:
     """The running channels; `failed` is called with the error of a pulse that did not flow."""
 
     def __init__(self, board: Board, failed: Callable[[int], None]) -> None:
-        self.setup = Setup((), frozenset(), 0, SHORTEST_INTERVAL_S, 0.0)
         self._board, self._failed = board, failed
+        self.channels: tuple[int, ...] = ()
+        self._period_s = SHORTEST_INTERVAL_S
         self._pulses: dict[int, Pulse] = {}
-        self._group = 0
         self._next_group: Event | None = None
-        self._rest: list[Event] = []
-        self._one_shot_ends_s = 0.0
 
-    @property
-    def one_shot_runs(self) -> bool:
-        """True while the group of an earlier Start still runs."""
-        return self.setup.period_s == 0 and self._board.timeline.now_s < self._one_shot_ends_s
-
-    def set_up(self, setup: Setup) -> None:
-        """Use this setup; nothing runs."""
+    def set_up(self, channels: tuple[int, ...], period_s: float) -> None:
+        """Use these settings; nothing runs."""
         self.stop()
-        self.setup = setup
+        self.channels, self._period_s = channels, period_s
 
     def start(self, pulses: dict[int, Pulse]) -> None:
         """Fire the first group at once. If the list runs already, the pulses apply from the next group on."""
         self._pulses = pulses
-        if self.setup.period_s == 0:
-            self._one_shot_ends_s = self._board.timeline.now_s + max(
-                (pulse.pulses - 1) * self.setup.interpulse_s + pulse.duration_s for pulse in pulses.values()
-            )
         if self._next_group is None:
             self._fire_group(self._board.timeline.now_s)
 
     def stop(self) -> None:
         """No pulse after this."""
-        cancel(self._next_group, *self._rest)
+        cancel(self._next_group)
         self._next_group = None
-        self._rest.clear()
-        self._pulses = {}
-        self._group = 0
-        self._one_shot_ends_s = 0.0
 
     def _fire_group(self, time_s: float) -> None:
-        self._rest.clear()
-        if self.setup.period_s > 0:
-            next_s = time_s + self.setup.period_s
-            self._next_group = self._board.timeline.at(next_s, lambda: self._fire_group(next_s))
-        due = [channel for channel in self._pulses if self._is_due(channel)]
-        self._group += 1
-        for index in range(1, MOST_PULSES):
-            at_s = time_s + index * self.setup.interpulse_s
-            channels = [channel for channel in due if self._pulses[channel].pulses > index]
-            if channels:
-                self._rest.append(self._board.timeline.at(at_s, lambda c=channels, t=at_s: self._fire(c, t)))
-        self._fire(due, time_s)  # last, since a failure cancels all that was planned
-
-    def _is_due(self, channel: int) -> bool:
-        """A low-frequency channel skips as many groups as the factor says after each one it fires in."""
-        return channel not in self.setup.low_frequency or self._group % (self.setup.low_frequency_factor + 1) == 0
-
-    def _fire(self, channels: list[int], time_s: float) -> None:
-        for channel in channels:
-            pulse = self._pulses.get(channel)
-            error = fire(self._board, time_s, channel, pulse, "channel list") if pulse else NO_ERROR
-            if error != NO_ERROR:
-                self._failed(error)
+        next_s = time_s + self._period_s
+        self._next_group = self._board.timeline.at(next_s, lambda: self._fire_group(next_s))
+        for channel, pulse in self._pulses.items():
+            if error := fire(self._board, time_s, channel, pulse):
+                self._failed(error)  # it stops the list
                 return
-
-
-def _numbers(mask: int) -> tuple[int, ...]:
-    return tuple(channel for channel in range(CHANNELS) if mask >> channel & 1)
 
 
 INIT, INIT_ACK, UNKNOWN_COMMAND, WATCHDOG = 1, 2, 3, 4
@@ -285,7 +219,7 @@ class RehaStim2(Firmware):
         elif wanted is None:
             self._ack(packet, PARAMETER)
         else:
-            self._channels.set_up(wanted)
+            self._channels.set_up(*wanted)
             self._mode = INITIALISED
             self._ack(packet, OK)
 
@@ -294,11 +228,9 @@ class RehaStim2(Firmware):
         if self._mode == START_MODE:
             self._ack(packet, WRONG_MODE)
             return
-        pulses = parse_start(packet.data, self._channels.setup)
+        pulses = parse_start(packet.data, self._channels.channels)
         if pulses is None:
             self._ack(packet, PARAMETER)
-        elif self._channels.one_shot_runs:
-            self._ack(packet, BUSY)
         else:
             self._mode = STARTED
             self._ack(packet, OK)
@@ -310,8 +242,8 @@ class RehaStim2(Firmware):
         self._ack(packet, OK)
 
     def _single_pulse(self, packet: Packet) -> None:
-        channel, pulse = self._parse_single(packet.data)
-        now_s = self._board.timeline.now_s
+        data, now_s = packet.data, self._board.timeline.now_s
+        pulse = parse_pulse(data[1:]) if len(data) == 4 and data[0] < CHANNELS else None
         if self._mode != START_MODE:
             self._ack(packet, WRONG_MODE)
         elif pulse is None:
@@ -320,13 +252,6 @@ class RehaStim2(Firmware):
             self._ack(packet, BUSY)
         else:
             self._ack(packet, OK)
-            self._single_ends_s = now_s + pulse.duration_s
-            error = fire(self._board, now_s, channel, pulse, "single pulse")
-            if error != NO_ERROR:
+            self._single_ends_s = now_s + (2 * pulse.width_us + GAP_US) * 1e-6
+            if error := fire(self._board, now_s, data[0], pulse):
                 self._stimulation_failed(error)
-
-    @staticmethod
-    def _parse_single(data: bytes) -> tuple[int, Pulse | None]:
-        if len(data) != 4 or data[0] >= CHANNELS:
-            return 0, None
-        return data[0], parse_pulse(data[1:])

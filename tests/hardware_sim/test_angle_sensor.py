@@ -143,12 +143,10 @@ class TestOverTheWire:
 
     def test_the_control_line_moves_the_arm(self) -> None:
         with emulated("--arm", "held,angle_deg=70") as rig:
-            assert rig.ask(cmd="arm", mode="free")["ok"]
-            assert rig.ask(cmd="state")["arm"] == "free"
-            assert rig.ask(cmd="arm", mode="script", points=[[0, 90], [1, 130]])["ok"]
+            assert rig.ask(cmd="arm", mode="held", angle_deg=130, deg_s=200)["ok"]
             wait_for(lambda: rig.ask(cmd="state")["angle_deg"] > 129.0)
-            for bad in ({"mode": "fly"}, {"mode": "held", "angle_deg": math.nan}, {"mode": "script", "points": [[0]]}):
+            for bad in ({"mode": "fly"}, {"mode": "held", "angle_deg": math.nan}, {"mode": "waves", "hz": [1, 2]}):
                 answer = rig.ask(cmd="arm", **bad)
                 assert not answer["ok"]
                 assert "arm" in answer["error"]
-            assert rig.ask(cmd="state")["arm"] == "script"
+            assert rig.ask(cmd="state")["arm"] == "held"

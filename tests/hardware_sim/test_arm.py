@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -49,6 +48,13 @@ def heavy(**mechanics: Any) -> Tissue:
 
 
 class TestLaws:
+    def test_stops_push_back_and_never_pull(self) -> None:
+        mechanics = Mechanics()
+        assert mechanics.stops_nm(math.radians(150.0), 0.0) == pytest.approx(-200.0 * math.radians(5.0))
+        assert np.all(mechanics.stops_nm(math.radians(150.0), np.linspace(-50.0, 50.0, 101)) <= 0.0)
+        assert np.all(mechanics.stops_nm(math.radians(-7.0), np.linspace(-50.0, 50.0, 101)) >= 0.0)
+        assert mechanics.stops_nm(1.5, 5.0) == 0.0
+
     @pytest.mark.parametrize("name", LAWS["passive"])
     def test_tissue_pushes_back_from_both_ends_and_never_gives_energy(self, name: str) -> None:
         passive = law("passive", name)
@@ -131,7 +137,7 @@ class TestWhatTheCellMeasures:
             assert Limb(Constant(), arm).torque_nm(1.0) == pytest.approx(wanted, abs=1e-9)
 
     def test_a_forearm_that_is_speeded_up_pulls_the_other_way(self) -> None:
-        limb = Limb(Constant(), Arm("script", {"points": [[0, 90], [1, 120]]}, heavy()))
+        limb = Limb(Constant(), Arm("robot", {"from_deg": 90, "to_deg": 120}, heavy()))
         found = rows(limb, 1.5)
         assert np.abs(found[:, 3]).max() > 1.0
         assert found[:, 0] == pytest.approx(-0.07 * found[:, 3], abs=1e-12)
@@ -152,55 +158,6 @@ class TestWhatTheCellMeasures:
         assert limb.torque_nm(1.0) == pytest.approx(alone.torque_nm(1.0), rel=1e-9)
 
 
-class TestFree:
-    def test_a_pendulums_period(self) -> None:
-        tissue = heavy(weight_nm=2.8, least_deg=-90.0)
-        limb = Limb(Constant(), Arm("held", {"angle_deg": 6.0}, tissue))
-        limb.move("free", {})
-        angle = rows(limb, 6.0)[:, 1]
-        crossings = STEP_S * np.flatnonzero((angle[:-1] > 0) & (angle[1:] <= 0))
-        period_s = 2.0 * math.pi * math.sqrt(0.07 / 2.8) * (1.0 + math.radians(6.0) ** 2 / 16.0)
-        assert np.diff(crossings).mean() == pytest.approx(period_s, rel=1e-3)
-
-    def test_energy_is_kept_without_loss_and_lost_with_tissue(self) -> None:
-        def energy_j(found: np.ndarray) -> np.ndarray:
-            return 0.5 * 0.07 * found[:, 2] ** 2 - 2.8 * np.cos(found[:, 1])
-
-        mechanics = {"weight_nm": 2.8, "least_deg": -170.0, "most_deg": 170.0}
-        ideal = Limb(Constant(), Arm("free", {}, heavy(**mechanics)))
-        kept = energy_j(rows(ideal, 5.0))
-        assert np.ptp(kept) < 1e-6
-        real = replace(heavy(**mechanics), passive=law("passive", "linear_friction", {"stiffness_nm_per_rad": 0.0}))
-        lost = energy_j(rows(Limb(Constant(), Arm("free", {}, real)), 5.0))
-        assert np.all(np.diff(lost) <= 1e-9)
-        assert lost[-1] < lost[0] - 1.0
-
-    @pytest.mark.slow
-    def test_it_loads_no_cell_and_the_flexor_flexes_it(self) -> None:
-        tissue = replace(Tissue(), mechanics=Mechanics(weight_nm=2.8))
-        found = rows(Limb(Constant(1.0), Arm("free", {}, tissue)), 8.0)
-        assert not found[:, 0].any()
-        assert abs(found[-1, 2]) < 0.02, "it has come to rest"
-        balance_nm = tissue.g(found[-1, 1], 0.0) + tissue.h_nm(found[-1, 1], 0.0)
-        assert balance_nm == pytest.approx(0.0, abs=0.03)
-
-    def test_stops_end_the_range_and_never_pull(self) -> None:
-        for torque_nm, ends_deg in ((15.0, 145.0), (-15.0, -5.0)):
-            found = rows(Limb(Constant(torque_nm), Arm("free", {}, heavy())), 6.0)
-            assert np.degrees(found[-1, 1]) == pytest.approx(ends_deg, abs=math.degrees(15.5 / 200.0))
-            assert np.degrees(np.abs(found[:, 1] - math.radians(70.0))).max() < 75.0 + 18.0
-        mechanics = Mechanics()
-        away = mechanics.stops_nm(math.radians(150.0), np.linspace(-50.0, 50.0, 101))
-        assert np.all(away <= 0.0)
-        assert mechanics.stops_nm(1.5, 5.0) == 0.0
-
-    def test_a_forearm_without_inertia_is_not_let_go(self) -> None:
-        limb = Limb(Constant(), Arm(tissue=bare()))
-        with pytest.raises(ArmError, match="without inertia"):
-            limb.move("free", {})
-        assert limb.state()["arm"] == "held"
-
-
 class TestMovers:
     @pytest.mark.slow
     def test_angle_velocity_and_acceleration_belong_together_whatever_is_asked_of_it(self) -> None:
@@ -210,8 +167,6 @@ class TestMovers:
             ("robot", {"from_deg": 20, "to_deg": 130, "deg_s": 120}),
             ("hand", {"from_deg": 110, "to_deg": 40, "deg_s": 60}),
             ("held", {}),
-            ("script", {"points": [[0, 100], [0.5, 90], [1.5, 30]]}),
-            ("free", {}),
             ("waves", {"hz": [0.2, 0.3], "deg": [20, 10], "phase_rad": [0.3, 2.0]}),
             ("held", {"angle_deg": 70}),
             ("hand", {}),
@@ -228,15 +183,13 @@ class TestMovers:
 
     @pytest.mark.parametrize("mode", MOVERS)
     def test_the_movement_does_not_depend_on_when_it_is_looked_at(self, mode: str) -> None:
-        if mode == "free":
-            return
-        settings = {"script": {"points": [[0, 40], [1, 60], [2, 50]]}, "held": {"angle_deg": 40}}.get(mode, {})
+        settings = {"held": {"angle_deg": 40}}.get(mode, {})
         begin = Begin(0.0, Motion(1.2), seed=5)
         often, seldom = make_mover(mode, begin, settings), make_mover(mode, begin, settings)
         for k in range(1, 3001):
-            seen = often.advance(0.001 * k, lambda _x, _v: 0.0)
+            seen = often(0.001 * k)
             if k % 377 == 0:
-                assert seldom.advance(0.001 * k, lambda _x, _v: 0.0) == pytest.approx(seen)
+                assert seldom(0.001 * k) == pytest.approx(seen)
 
     def test_a_robot_keeps_its_limit_and_comes_to_rest_between(self) -> None:
         robot = {"from_deg": 30, "to_deg": 120, "deg_s": 200, "limit_deg_s": 50, "pause_s": 2.5}
@@ -256,26 +209,14 @@ class TestMovers:
         first, again, other = (rows(Limb(Constant(), Arm("hand", sweep, heavy()), seed), 2.0) for seed in (1, 1, 2))
         assert np.array_equal(first, again) and not np.allclose(first, other)
 
-    def test_a_script_goes_through_its_points(self) -> None:
-        points = [[0.0, 90], [1.0, 60], [2.5, 100], [3.0, 100], [4.0, 80]]
-        limb = Limb(Constant(), Arm("script", {"points": points}))
-        found = rows(limb, 6.0)
-        angle, lead_s = np.degrees(found[:, 1]), 0.2
-        seen = np.interp([time_s + lead_s for time_s, _ in points], STEP_S * np.arange(1, angle.size + 1), angle)
-        assert seen == pytest.approx([deg for _, deg in points], abs=0.1)
-        assert angle.min() > 59.9 and angle.max() < 100.1
-        assert abs(found[-1, 2]) < 1e-9
-
     @pytest.mark.parametrize(
         ("mode", "settings", "told"),
         [
-            ("fly", {}, "unknown mode of the arm 'fly'; there are free, hand, held, robot, script, waves"),
+            ("fly", {}, "unknown mode of the arm 'fly'; there are hand, held, robot, waves"),
             ("held", {"angle": 3}, "no setting 'angle'; it has angle_deg, deg_s"),
             ("held", {"angle_deg": 161}, "'angle_deg' must be between -10 and 160"),
-            ("held", {"angle_deg": math.inf}, "must be a finite number"),
+            ("held", {"angle_deg": math.inf}, "'angle_deg' must be between -10 and 160"),
             ("robot", {"deg_s": 0}, "'deg_s' must be between"),
-            ("script", {"points": [[1, 2], [0, 3]]}, "must rise"),
-            ("script", {"points": "abc"}, "two or more"),
             ("waves", {"hz": [1.0], "deg": [1.0, 2.0]}, "equally long"),
             ("waves", {"hz": 3}, "lists of numbers"),
         ],
@@ -287,36 +228,10 @@ class TestMovers:
         assert limb.mode == "robot"
 
 
-class TestFile:
-    def test_everything_that_it_may_say(self, tmp_path: Path) -> None:
-        path = tmp_path / "arm.toml"
-        path.write_text(
-            'mode = "robot"\n[movement]\nfrom_deg = 50\n[mechanics]\nweight_nm = 2.5\n'
-            '[passive]\nlaw = "linear_friction"\ndry_nm = 0.3\n[torque_velocity]\nlaw = "none"\n'
-        )
-        arm = description.read(str(path))
-        assert (arm.mode, arm.movement, arm.start_deg) == ("robot", {"from_deg": 50}, 50.0)
-        assert arm.tissue.mechanics.weight_nm == 2.5
-        assert arm.tissue.passive == law("passive", "linear_friction", {"dry_nm": 0.3})
-        assert arm.tissue.torque_angle == Tissue().torque_angle
-        path.with_suffix(".json").write_text('{"mode": "held", "movement": {"angle_deg": 30}}')
-        assert description.read(str(path.with_suffix(".json"))).start_deg == 30.0
-
-    @pytest.mark.parametrize(
-        ("text", "told"),
-        [
-            ('colour = "red"', "a table of mode, movement, mechanics"),
-            ("movement = 3", "'movement' must be a table"),
-            ("mode = ", "not valid TOML"),
-            ('[passive]\nlaw = "jelly"', "arm.toml: unknown law of passive 'jelly'"),
-            ("[mechanics]\ninertia_kg_m2 = 0", "'inertia_kg_m2' of mechanics must be above 0"),
-            ("[mechanics]\nmass_kg = 1", "arm.toml: mechanics has no parameter 'mass_kg'"),
-            (None, "cannot be read"),
-        ],
-    )
-    def test_mistakes_name_the_file(self, text: str | None, told: str, tmp_path: Path) -> None:
-        path = tmp_path / "arm.toml"
-        if text is not None:
-            path.write_text(text)
-        with pytest.raises(ArmError, match=told):
-            description.read(str(path))
+def test_the_command_lines_arm() -> None:
+    arm = description.read("robot,from_deg=50")
+    assert (arm.mode, arm.movement, arm.start_deg) == ("robot", {"from_deg": 50.0}, 50.0)
+    other = description.set_laws(arm, ["passive=linear_friction,dry_nm=0.3", "mechanics=forearm,weight_nm=2.5"])
+    assert other.tissue.mechanics.weight_nm == 2.5
+    assert other.tissue.passive == law("passive", "linear_friction", {"dry_nm": 0.3})
+    assert other.tissue.torque_angle == Tissue().torque_angle

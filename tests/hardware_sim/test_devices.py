@@ -36,7 +36,7 @@ def played(step_s: float, arm: str | None = None, faults: tuple[str, ...] = (), 
     return hashlib.sha256(repr((written, frames, devices.electrodes.log, devices.state())).encode()).hexdigest()
 
 
-LOSSES = ("frames_dropped", "torque_nan", "frames_corrupt", "corrupt_answers", "delivery_jitter")
+LOSSES = ("frames_dropped", "torque_nan", "frames_corrupt", "delivery_jitter")
 
 
 @pytest.mark.parametrize(

@@ -20,7 +20,6 @@ from tests.hardware_sim.emulated import Emulated, emulated, wait_for
 from tests.hardware_sim.virtual_host import VirtualHost
 
 PULSE = config(*biphasic(250, 20))
-GENERAL_ERROR = 66
 
 
 @pytest.fixture
@@ -55,35 +54,6 @@ def test_late_ack(host: VirtualHost) -> None:
         sent_s = host.devices.timeline.now_s
         assert host.result(LL_CONFIG, PULSE) == 0
     assert host.answered_s == pytest.approx(sent_s + 0.15 + 600e-6)
-
-
-def test_a_stalled_line_holds_and_lets_go_of_what_it_held(host: VirtualHost) -> None:
-    with broken(host, "line_stalled", to_host=False):
-        assert host.ask(LL_CONFIG, PULSE) == []
-        assert delivered(host) == 0
-    assert len(host.read()) == 1
-    assert delivered(host) == 1
-    with broken(host, "line_stalled", to_device=False):
-        assert host.ask(LL_CONFIG, PULSE) == []
-        assert delivered(host) == 2
-    assert len(host.read()) == 1
-    assert host.result(LL_CONFIG, PULSE) == 0
-
-
-def test_a_doubled_command_is_done_twice(host: VirtualHost) -> None:
-    with broken(host, "frames_doubled"):
-        assert len(host.ask(LL_CONFIG, PULSE)) == 2
-    assert delivered(host) == 2
-
-
-def test_corrupt_both_ways(host: VirtualHost) -> None:
-    with broken(host, "corrupt_answers"):
-        assert host.ask(LL_CONFIG, PULSE) == []
-    host.read()
-    with broken(host, "corrupt_commands"):
-        answers = [packet for _ in range(6) for packet in host.ask(LL_CONFIG, PULSE)]
-    assert {packet.command for packet in answers} == {GENERAL_ERROR}
-    assert delivered(host) == 1
 
 
 def test_electrode_high_voltage_and_reset(host: VirtualHost) -> None:

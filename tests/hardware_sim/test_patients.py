@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.signal import lsim
 
 from bench.muscles.offline import simulate
 from stimrig.hardware_sim import patients
 from stimrig.hardware_sim.errors import PatientError
-from stimrig.hardware_sim.patients.calcium import CalciumMuscle
 from stimrig.hardware_sim.patients.paper import PaperMuscle
 from stimrig.hardware_sim.patients.paper import Parameters as PaperParameters
 from tests.harness.muscle import Patient
@@ -36,9 +33,9 @@ def second_order(held_nm: np.ndarray, damping: float = ZETA) -> np.ndarray:
 class TestPaper:
     def test_recruitment_is_equation_35(self) -> None:
         widths = np.arange(0.0, 501.0)
-        curve = [PaperMuscle().recruitment_nm(w, 20.0) for w in widths]
+        curve = [PaperMuscle().drive_nm(0.0, w, 20.0) for w in widths]
         np.testing.assert_allclose(curve, PAPER.recruitment(widths), atol=1e-12)
-        assert PaperMuscle().recruitment_nm(4095.0, 130.0) == pytest.approx(6.8994)
+        assert PaperMuscle().drive_nm(0.0, 4095.0, 130.0) == pytest.approx(6.8994)
 
     @pytest.mark.parametrize("damping", [ZETA, 0.3, 1.0, 1.7])
     def test_prbs_against_scipy(self, damping: float) -> None:
@@ -67,54 +64,6 @@ class TestPaper:
         np.testing.assert_allclose(torque, second_order(np.repeat(PAPER.recruitment(widths), 40)), atol=1e-7)
 
 
-class TestCalcium:
-    def test_against_an_independent_integration(self) -> None:
-        """Cn as the published sum over all pulses, F by an adaptive stiff solver."""
-        rng = np.random.default_rng(4)
-        times = np.cumsum(rng.uniform(0.015, 0.06, 30))
-        widths = rng.uniform(120.0, 500.0, 30)
-        sample_s = np.arange(2000) / 1600
-        torque = simulate(CalciumMuscle(), times, widths, 20.0, 1600.0, 1.25)
-
-        felt = widths > 131.0
-        tc, km = 0.020, 0.103
-        ti, gains = times[felt], 4920.0 * (1 - np.exp(-(widths[felt] - 131.0) / 194.0))
-        ri = np.append(1.0, 1 + (km + 1.04 - 1) * np.exp(-np.diff(ti) / tc))
-
-        def slope(t: float, x: np.ndarray, gain: float, n: int) -> list[float]:
-            release = float(np.sum(ri[:n] * np.exp(-(t - ti[:n]) / tc)))
-            bound = x[0] / (km + x[0])
-            return [release / tc - x[0] / tc, gain * bound - x[1] / (0.051 + 0.060 * bound)]
-
-        state, expected = np.zeros(2), np.zeros(sample_s.size)
-        edges = np.append(ti, max(ti[-1], sample_s[-1]) + 1e-6)
-        for n in range(ti.size):
-            inside = (sample_s >= edges[n]) & (sample_s < edges[n + 1])
-            solved = solve_ivp(
-                slope,
-                (edges[n], edges[n + 1]),
-                state,
-                method="LSODA",
-                t_eval=np.append(sample_s[inside], edges[n + 1]),
-                args=(gains[n], n + 1),
-                rtol=1e-9,
-                atol=1e-10,
-            )
-            expected[inside] = 0.035 * solved.y[1][:-1]
-            state = solved.y[:, -1]
-        assert expected.max() > 5
-        assert np.abs(torque - expected).max() < 2e-3
-
-    def test_below_threshold_nothing(self) -> None:
-        widths = np.full(40, 131.0)
-        assert not simulate(CalciumMuscle(), train(widths), widths, 20.0, 1600.0, 1.0).any()
-
-    def test_coarse_reading_is_stable(self) -> None:
-        muscle = CalciumMuscle()
-        muscle.pulse(0.0, 500.0, 20.0)
-        assert 0.0 <= muscle.torque_nm(100.0) < 1e-6
-
-
 def test_width_zero_is_no_pulse_and_records_repeat() -> None:
     widths = np.array([300.0, 0.0, 300.0, 0.0])
     for name in patients.PATIENTS:
@@ -124,21 +73,17 @@ def test_width_zero_is_no_pulse_and_records_repeat() -> None:
 
 
 class TestRegistry:
-    @pytest.mark.parametrize("suffix", [".toml", ".json"])
-    def test_file_overrides_by_name(self, tmp_path: Path, suffix: str) -> None:
-        path = tmp_path / f"patient{suffix}"
-        if suffix == ".toml":
-            path.write_text('patient = "paper"\n[parameters]\na1 = 2.0\n')
-        else:
-            path.write_text(json.dumps({"patient": "paper", "parameters": {"a1": 2.0}}))
+    def test_file_overrides_by_name(self, tmp_path: Path) -> None:
+        path = tmp_path / "patient.toml"
+        path.write_text('patient = "paper"\n[parameters]\na1 = 2.0\n')
         muscle = patients.from_file(path)
         assert isinstance(muscle, PaperMuscle)
-        assert muscle.recruitment_nm(4000.0, 20.0) == pytest.approx(2.0)
+        assert muscle.drive_nm(0.0, 4000.0, 20.0) == pytest.approx(2.0)
 
     @pytest.mark.parametrize(
         ("text", "told"),
         [
-            ('patient = "papr"', "calcium, changing, paper"),
+            ('patient = "papr"', "changing, paper"),
             ('patient = "paper"\n[parameters]\na9 = 1.0', "no parameter 'a9'"),
             ('patient = "paper"\n[parameters]\na1 = "x"', "finite number"),
             ('patient = "paper"\n[parameters]\na1 = nan', "finite number"),

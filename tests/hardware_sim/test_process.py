@@ -58,7 +58,7 @@ def test_it_ends_with_its_parent() -> None:
 
 def test_patient_file_faults_and_readable_lines(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
-    path.write_text('patient = "calcium"\n[parameters]\nmoment_arm_m = 0.04\n')
+    path.write_text('patient = "changing"\n[parameters]\nlargest_nm = 4.0\n')
     faults = "--fault", "torque_saturated,limit_nm=0.01", "--fault", "no_ack"
     with emulated("--patient", str(path), *faults) as rig:
         assert rig.ready["patient"] == str(path)
@@ -74,7 +74,7 @@ def test_patient_file_faults_and_readable_lines(tmp_path: Path) -> None:
 
 
 BAD_INPUT = {
-    "--patient nobody": "calcium, changing, paper",
+    "--patient nobody": "changing, paper",
     "--patient nobody.toml": "nobody.toml: cannot be read",
     "--noise-nm much": "--noise-nm",
     "--noise-nm nan": "--noise-nm must be between 0 and 10",
@@ -92,7 +92,7 @@ BAD_INPUT = {
     "--samples-per-frame 2": "--samples-per-frame must be 1 or 3 with --cell plain, not 2",
     "--cell canopen --samples-per-frame 3": "must be 1 with --cell canopen",
     "--wrong": "--wrong",
-    "--arm fly": "neither a file nor one of",
+    "--arm fly": "unknown mode of the arm 'fly'",
     "--arm held,angle_deg=ten": "'angle_deg=ten' must be SETTING=NUMBER",
     "--arm held --angle-bits 30": "--angle-bits must be between 8 and 20",
     "--arm held --angle-noise-deg nan": "--angle-noise-deg must be between",

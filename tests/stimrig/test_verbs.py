@@ -124,7 +124,7 @@ def exports(at: Path, new: Path) -> None:
 def emulates(_at: Path, new: Path) -> None:
     with pytest.MonkeyPatch.context() as environment, contextlib.ExitStack() as stack:
         environment.setenv("STIMRIG_RIG_FILE", "/a/rig/that/has/devices.toml")
-        client = stack.enter_context(stimrig.emulate("--patient calcium", data=new))
+        client = stack.enter_context(stimrig.emulate("--patient changing", data=new))
         assert client.health() and client.make_participant("P017")["code"] == "P017"
         assert client.preview("P017")["duration_s"] > 10
     with pytest.raises(stimrig.errors.Unreachable), stimrig.Client(client.url) as gone:
