@@ -28,7 +28,8 @@ from stimrig import identify
 from stimrig.hardware_sim import patients
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
-from stimrig.identify.tracking import QUANTITIES, follow, model_for_next
+from stimrig.identify.tracking import follow, model_for_next
+from stimrig.identify.tracking.state import QUANTITIES
 
 RATE_HZ, NOISE_NM, CURRENT_MA, LARGEST_US = 400.0, 0.05, 20.0, 300.0
 TRIALS, REST_S, APPROVAL_S = 10, 15.0, 60.0

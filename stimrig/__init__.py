@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from stimrig.api.schemas import load as schema
     from stimrig.identify import Model, Record, compare, next_experiment, predict, read
     from stimrig.identify.effects import library as effects
-    from stimrig.identify.tracking.trials import track
+    from stimrig.identify.tracking import track
     from stimrig.progress import carry, diagnose, explain, fit, improve
     from stimrig.verbs import emulate, export, invert, join, recover, table1
 
@@ -36,7 +36,7 @@ _PLACES = {
     "predict": ("stimrig.identify.simulation.predict", "predict"),
     "compare": ("stimrig.identify.criticism", "compare"),
     "next_experiment": ("stimrig.identify.diagnosis", "next_experiment"),
-    "track": ("stimrig.identify.tracking.trials", "track"),
+    "track": ("stimrig.identify.tracking", "track"),
     "effects": ("stimrig.identify.effects", "library"),
     "schema": ("stimrig.api.schemas", "load"),
     "plot": ("stimrig.api.charts.plot", "plot"),

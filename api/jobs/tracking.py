@@ -42,7 +42,8 @@ def track(
     Returns `error_percent`, None without a reference; `step` and the text of the `model` for the next trial, or the
     `reason` why the trial was not followed.
     """
-    from stimrig.identify.tracking import State, begin, follow, learn_rates, model_for_next, passed, slow_forms
+    from stimrig.identify.tracking.follow import begin, follow, model_for_next, passed, slow_forms
+    from stimrig.identify.tracking.state import State, learn_rates
 
     progress(0.1, "reading the recording")
     record = dated(Path(data))

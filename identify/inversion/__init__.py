@@ -8,11 +8,13 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.grid import runs
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.inversion.demand import best_demand
 from stimrig.identify.inversion.plant import NOTHING, Plant
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
+from stimrig.identify.recruitment import THRESHOLD_SHARE
 from stimrig.identify.results import Result
 from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.pulses import above_rest
@@ -32,6 +34,8 @@ TOLERANCE = 0.02
 """A torque that is missed by less of the largest one that the widest pulse gives counts as reached."""
 JOINED = 3
 """Stretches of one reason with fewer pulses between them are one."""
+LEAST_GAIN = 0.05
+"""Where less than this share of the torque is left, stimulation is not the way to have more of it."""
 REASONS = ("above-plateau", "below-zero", "rises-too-fast", "falls-too-fast", "under-threshold", "not-followed")
 """Too high for the largest width; the wrong sign, a muscle only pulls; faster than the muscle, or than the rise limit
 allows; a pulse there gives too little or too much; the rest, for example an effect that cannot be undone."""
@@ -46,14 +50,6 @@ class Stretch:
     reason: str  # one of `REASONS`
     shortfall_nm: float  # the largest difference between reference and prediction in it, positive
 
-    def to_dict(self) -> dict[str, Any]:
-        """As JSON."""
-        return {name: value if name == "reason" else round(value, 6) for name, value in vars(self).items()}
-
-    def row(self) -> tuple[str, str]:
-        """As a line of a sheet."""
-        return f"{self.begin_s:.2f} to {self.end_s:.2f} s", f"lacks {self.shortfall_nm:.2g} N·m: {self.reason}"
-
 
 @dataclass(frozen=True, repr=False, eq=False)
 class Inversion(Result):
@@ -63,13 +59,16 @@ class Inversion(Result):
     pulse_width_us: np.ndarray  # one for each pulse, shape (K,)
     predicted_nm: np.ndarray  # torque above rest that the model predicts for them, mean in each pulse's period
     unreachable: tuple[Stretch, ...]  # where it is not reached, in order of time
-    fit_percent: float | None  # best fit where it can be reached; None if the reference does not change there
-    whole_fit_percent: float | None  # of all of it
+    fit_percent: float  # best fit where it can be reached; NaN if the reference does not change there
+    whole_fit_percent: float  # of all of it
     tolerance_nm: float  # a smaller difference counts as reached
 
     def _sheet(self) -> Sheet:
         fit = f"fit {quantity(self.fit_percent, '%')} where it can be reached"
-        missed = [stretch.row() for stretch in self.unreachable[:8]]
+        missed = [
+            (f"{part.begin_s:.2f} to {part.end_s:.2f} s", f"lacks {part.shortfall_nm:.2g} N·m: {part.reason}")
+            for part in self.unreachable[:8]
+        ]
         rows = [("widths", f"up to {quantity(self.pulse_width_us.max(), 'µs')}"), *missed]
         return Sheet(f"Pulse widths for a torque: {self.pulse_width_us.size} pulses, {fit}", tuple(rows))
 
@@ -84,7 +83,7 @@ class Inversion(Result):
                 **({} if reference.angle_rad is None else {"angle_rad": reference.angle_rad.round(6)}),
                 "pulse_width_us": self.pulse_width_us,
                 "predicted_torque_nm": self.predicted_nm.round(6),
-                "unreachable": [stretch.to_dict() for stretch in self.unreachable],
+                "unreachable": [vars(stretch) for stretch in self.unreachable],
                 "fit_percent": self.fit_percent,
                 "whole_fit_percent": self.whole_fit_percent,
                 "tolerance_nm": self.tolerance_nm,
@@ -132,97 +131,55 @@ def invert(
         A limit is not a positive number.
     """
     plant = Plant.of(model, reference, largest_us, rise_us, whole, shortest_us)
-    wanted, motion = plant.sign * reference.torque_nm, reference.motion
-    gain, passive_nm = _joint(model, reference, plant.sign)
+    wanted, motion, rate_hz = plant.sign * reference.torque_nm, reference.motion, reference.pulse_rate_hz
+    gain, passive_nm = np.ones(wanted.size), np.zeros(wanted.size)
+    if (surfaces := Surfaces.of(model.effects)) is not None:
+        passive_nm = plant.sign * above_rest(model, passive_nm, rate_hz, motion)
+        assert motion is not None  # `above_rest` has refused
+        gain = np.maximum(surfaces.g(motion.angle_rad, motion.velocity_rad_s), LEAST_GAIN)
     needed = (wanted - passive_nm) / gain  # what the muscle has to give at the model's own angle
-    demand, best, least_rms_nm = np.zeros(wanted.size), None, np.inf
-    target, idle = needed, 0
+    demand = widths = got = np.zeros(wanted.size)
+    target, planned, least_rms_nm, idle = needed, demand, np.inf, 0
     for _ in range(TURNS):
-        demand = best_demand(plant.a, plant.b, target, plant.largest_nm, plant.rises(demand))
-        widths = plant.widths(demand)
-        got = plant.sign * above_rest(model, widths, reference.pulse_rate_hz, motion)
-        error = wanted - got
-        rms_nm = float(np.sqrt(np.mean(error**2)))
+        planned = best_demand(plant.a, plant.b, target, plant.largest_nm, plant.rises(planned))
+        planned_us = plant.widths(planned)
+        expected = plant.sign * above_rest(model, planned_us, rate_hz, motion)
+        rms_nm = float(np.sqrt(np.mean((wanted - expected) ** 2)))
         idle = idle + 1 if rms_nm > GAIN * least_rms_nm else 0
         if rms_nm < least_rms_nm:
-            best, least_rms_nm = (demand, widths, got), rms_nm
+            demand, widths, got, least_rms_nm = planned, planned_us, expected, rms_nm
         if idle > 1 or rms_nm < ENOUGH * plant.largest_nm or (not model.effects and rise_us is None):
             break
-        target = plant.linear(demand) + STEP * error / gain
-    assert best is not None
-    return _judged(plant, reference, needed, *best)
-
-
-LEAST_GAIN = 0.05
-"""Where less than this share of the torque is left, stimulation is not the way to have more of it."""
-
-
-def _joint(model: Model, reference: Reference, sign: float) -> tuple[np.ndarray | float, np.ndarray | float]:
-    """g at each pulse, at least `LEAST_GAIN`, and h, N·m above rest and positive in the direction of pull.
-
-    Of a model that does not depend on the joint 1 and 0. Raises BadModel as `above_rest`.
-    """
-    surfaces, motion = Surfaces.of(model.effects), reference.motion
-    if surfaces is None:
-        return 1.0, 0.0
-    passive_nm = sign * above_rest(model, np.zeros(reference.torque_nm.size), reference.pulse_rate_hz, motion)
-    assert motion is not None  # `above_rest` has refused
-    return np.maximum(surfaces.g(motion.angle_rad, motion.velocity_rad_s), LEAST_GAIN), passive_nm
+        target = plant.linear(planned) + STEP * (wanted - expected) / gain
+    tolerance_nm = TOLERANCE * plant.largest_nm
+    missed = np.abs(wanted - got) > tolerance_nm
+    reasons = _reasons(plant, needed, demand, missed, wanted > got, tolerance_nm)
+    return Inversion(
+        reference=reference,
+        pulse_width_us=widths,
+        predicted_nm=plant.sign * got,
+        unreachable=_stretches(reasons, np.abs(wanted - got), rate_hz),
+        fit_percent=best_fit_percent(wanted[~missed], got[~missed]),
+        whole_fit_percent=best_fit_percent(wanted, got),
+        tolerance_nm=tolerance_nm,
+    )
 
 
 # ---- where and why it is not reached ----
 
 
-def _judged(
-    plant: Plant,
-    reference: Reference,
-    needed_nm: np.ndarray,
-    demand_nm: np.ndarray,
-    widths_us: np.ndarray,
-    got_nm: np.ndarray,
-) -> Inversion:
-    """The result, with torque `got_nm` positive in the direction of pull.
-
-    `needed_nm` is what the muscle itself has to give: the reference, but for what the joint adds and takes.
-    """
-    wanted = plant.sign * reference.torque_nm
-    error_nm, tolerance_nm = np.abs(wanted - got_nm), TOLERANCE * plant.largest_nm
-    missed = error_nm > tolerance_nm
-    reasons = _reasons(plant, needed_nm, demand_nm, missed, wanted > got_nm, tolerance_nm)
-    return Inversion(
-        reference=reference,
-        pulse_width_us=widths_us,
-        predicted_nm=plant.sign * got_nm,
-        unreachable=_stretches(reasons, error_nm, reference.pulse_rate_hz),
-        fit_percent=_best_fit(wanted[~missed], got_nm[~missed]),
-        whole_fit_percent=_best_fit(wanted, got_nm),
-        tolerance_nm=tolerance_nm,
-    )
-
-
 def _stretches(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float) -> tuple[Stretch, ...]:
     """The stretches that are not reached, in order of time, by the reason and the error of each pulse."""
-    stretches = [
-        Stretch(float(run.start / pulse_rate_hz), float(run.stop / pulse_rate_hz), reason, float(np.max(error_nm[run])))
-        for index, reason in enumerate(REASONS)
-        for run in runs(_joined(reasons == index))
-    ]
+    stretches = []
+    for index, reason in enumerate(REASONS):
+        rows = reasons == index
+        for gap in runs(~rows):
+            if gap.start > 0 and gap.stop < rows.size and gap.stop - gap.start < JOINED:
+                rows[gap] = True
+        for run in runs(rows):
+            begin_s, end_s = (round(float(place / pulse_rate_hz), 6) for place in (run.start, run.stop))
+            stretches.append(Stretch(begin_s, end_s, reason, round(float(np.max(error_nm[run])), 6)))
     return tuple(sorted(stretches, key=lambda stretch: stretch.begin_s))
-
-
-def _best_fit(wanted: np.ndarray, got: np.ndarray) -> float | None:
-    """100 (1 - ||y - ŷ|| / ||y - mean y||), as in the paper; None where the reference does not change."""
-    spread = float(np.linalg.norm(wanted - wanted.mean())) if wanted.size else 0.0
-    return None if spread < 1e-9 else 100.0 * (1.0 - float(np.linalg.norm(wanted - got)) / spread)
-
-
-def _joined(rows: np.ndarray) -> np.ndarray:
-    """Short gaps filled."""
-    filled = rows.copy()
-    for gap in runs(~rows):
-        if gap.start > 0 and gap.stop < rows.size and gap.stop - gap.start < JOINED:
-            filled[gap] = True
-    return filled
 
 
 def _reasons(
@@ -242,7 +199,7 @@ def _reasons(
         elif change := _change(wanted, int(k), plant.settled, tolerance_nm):
             reason = "rises-too-fast" if change > 0.0 else "falls-too-fast"
         else:
-            reason = "under-threshold" if 0.0 < wanted[k] < plant.threshold_nm else "not-followed"
+            reason = "under-threshold" if 0.0 < wanted[k] < THRESHOLD_SHARE * plant.largest_nm else "not-followed"
         reasons[k] = REASONS.index(reason)
     return reasons
 

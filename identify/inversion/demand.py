@@ -61,60 +61,43 @@ def best_demand(
     sides = [(A, 1.0, np.ones(size)), (A, -1.0, np.zeros(size))]
     if rise_nm is not None:
         sides.append((Banded(np.convolve(a, [1.0, -1.0]), size), 1.0, rise_nm / largest_nm))
-    return np.clip(largest_nm * A(_Programme(P, q, sides, bands).solve()), 0.0, largest_nm)
+    return np.clip(largest_nm * A(_minimise(P, q, sides, bands)), 0.0, largest_nm)
 
 
-class _Programme:
-    """argmin ½ vᵀ P v + qᵀ v with sign · (T v) ≤ limit for each of the sides."""
+def _minimise(P: np.ndarray, q: np.ndarray, sides: list[tuple[Banded, float, np.ndarray]], bands: int) -> np.ndarray:
+    """argmin ½ vᵀ P v + qᵀ v with sign · (T v) ≤ limit for each of the sides, shape (K,)."""
+    limit = np.stack([bound for *_, bound in sides])
 
-    def __init__(self, P: np.ndarray, q: np.ndarray, sides: list[tuple[Banded, float, np.ndarray]], bands: int) -> None:
-        self.P, self.q, self.sides, self.bands = P, q, sides, bands
-        self.limit = np.stack([limit for *_, limit in sides])
+    def constrained(v: np.ndarray) -> np.ndarray:
+        return np.stack([sign * T(v) for T, sign, _ in sides])
 
-    def constrained(self, v: np.ndarray) -> np.ndarray:
-        """Values that the limits bound, shape (sides, K)."""
-        return np.stack([sign * T(v) for T, sign, _ in self.sides])
+    def back(y: np.ndarray) -> np.ndarray:
+        return np.sum([sign * T.transposed(row) for (T, sign, _), row in zip(sides, y, strict=True)], axis=0)
 
-    def back(self, y: np.ndarray) -> np.ndarray:
-        """The transpose of `constrained`."""
-        return np.sum([sign * T.transposed(row) for (T, sign, _), row in zip(self.sides, y, strict=True)], axis=0)
-
-    def solve(self) -> np.ndarray:
-        """v, shape (K,)."""
-        v = np.asarray(cho_solve_banded((cholesky_banded(self.P, lower=True), True), -self.q))
-        if np.all(self.constrained(v) <= self.limit):
-            return v
-        slack = np.maximum(self.limit - self.constrained(v), 0.1)
-        dual = np.full(slack.shape, 0.1)
-        for _ in range(ROUNDS):
-            gradient = _times(self.P, v) + self.q + self.back(dual)
-            outside = self.constrained(v) + slack - self.limit
-            gap = float(np.mean(slack * dual))
-            if gap < CLOSE and np.max(np.abs(outside)) < CLOSE and np.max(np.abs(gradient)) < 100 * CLOSE:
-                break
-            grams = [T.gram(w, self.bands) for (T, *_), w in zip(self.sides, dual / slack, strict=True)]
-            at = gradient, outside, slack, dual, np.asarray(cholesky_banded(self.P + np.sum(grams, axis=0), lower=True))
-            _, ds, dz = self._step(*at, slack * dual)
-            length = min(_longest(slack, ds), _longest(dual, dz))
-            affine_gap = float(np.mean((slack + length * ds) * (dual + length * dz)))
-            dv, ds, dz = self._step(*at, slack * dual + ds * dz - gap * (affine_gap / gap) ** 3)
-            length = 0.99 * min(_longest(slack, ds), _longest(dual, dz))
-            v, slack, dual = v + length * dv, slack + length * ds, dual + length * dz
+    v = np.asarray(cho_solve_banded((cholesky_banded(P, lower=True), True), -q))
+    if np.all(constrained(v) <= limit):
         return v
-
-    def _step(
-        self,
-        gradient: np.ndarray,
-        outside: np.ndarray,
-        slack: np.ndarray,
-        dual: np.ndarray,
-        factor: np.ndarray,
-        product: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Newton's step of v, slack and dual that takes `product` off slack times dual; `factor` is of its matrix."""
-        dv = np.asarray(cho_solve_banded((factor, True), -gradient - self.back((dual * outside - product) / slack)))
-        ds = -outside - self.constrained(dv)
-        return dv, ds, (-product - dual * ds) / slack
+    slack = np.maximum(limit - constrained(v), 0.1)
+    dual = np.full(slack.shape, 0.1)
+    for _ in range(ROUNDS):
+        gradient = _times(P, v) + q + back(dual)
+        outside = constrained(v) + slack - limit
+        gap = float(np.mean(slack * dual))
+        if gap < CLOSE and np.max(np.abs(outside)) < CLOSE and np.max(np.abs(gradient)) < 100 * CLOSE:
+            break
+        grams = [T.gram(w, bands) for (T, *_), w in zip(sides, dual / slack, strict=True)]
+        factor = np.asarray(cholesky_banded(P + np.sum(grams, axis=0), lower=True)), True
+        product = slack * dual
+        for corrected in (False, True):  # Newton's step that takes `product` off slack times dual
+            dv = np.asarray(cho_solve_banded(factor, -gradient - back((dual * outside - product) / slack)))
+            ds = -outside - constrained(dv)
+            dz = (-product - dual * ds) / slack
+            length = min(_longest(slack, ds), _longest(dual, dz))
+            if not corrected:
+                left = float(np.mean((slack + length * ds) * (dual + length * dz)))
+                product = slack * dual + ds * dz - gap * (left / gap) ** 3
+        v, slack, dual = v + 0.99 * length * dv, slack + 0.99 * length * ds, dual + 0.99 * length * dz
+    return v
 
 
 def _longest(x: np.ndarray, dx: np.ndarray) -> float:

@@ -12,7 +12,6 @@ from stimrig.identify.dynamics.second_order import recursion, transition
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.model import Model
-from stimrig.identify.recruitment import THRESHOLD_SHARE
 from stimrig.identify.simulation.joint_surface import Surfaces
 from stimrig.identify.simulation.predict import LARGEST_RATE_CHANGE
 from stimrig.identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest
@@ -21,8 +20,8 @@ OWED = 0.05
 """Most that one pulse leaves to those after it, as a share of the largest torque."""
 NOTHING = 2e-3
 """A demand below this share of the largest one gets no pulse."""
-QUIET = (2e-3, 5e-3, 0.01, 0.02)
-"""Shares of the largest torque that count for nothing before a rise; the first that leads into no wave is taken."""
+WORTH = 0.02
+"""A torque of more than this share of the largest one is worth a rise."""
 PROBE_S = 3.0
 
 
@@ -80,11 +79,6 @@ class Plant:
         """The largest demand, N·m."""
         return float(self.inverse_nm[-1])
 
-    @property
-    def threshold_nm(self) -> float:
-        """Torque at the threshold, N·m."""
-        return THRESHOLD_SHARE * self.largest_nm
-
     def level(self, width_us: np.ndarray | float) -> np.ndarray:
         """f, N·m."""
         return np.asarray(np.interp(width_us, self.width_us, self.level_nm))
@@ -99,25 +93,28 @@ class Plant:
             return None
         before = np.r_[0.0, demand_nm[:-1]]
         width_us = np.maximum(np.interp(before, self.inverse_nm, self.inverse_us), self._ready_us)
-        return np.maximum(self.level(np.minimum(width_us + self.rise_us, self.width_us[-1])) - before, 0.0)
+        return np.maximum(np.interp(width_us + self.rise_us, self.inverse_us, self.inverse_nm) - before, 0.0)
 
     @cached_property
     def _ready_us(self) -> float:
-        """The widest pulse that gives no torque worth speaking of: to be there before a rise costs nothing.
+        """Width at which a train waits for a rise: it gives next to no torque, and one rise from it leads to more.
 
-        A fitted curve waves below its threshold. A wave must not keep the train there, so from the pulse that is taken
-        one rise leads to more than the largest of the shares.
+        A fitted curve waves below its threshold. Behind a crest that no pulse within one rise exceeds, a train would
+        stay on the crest; then it waits in the trough before the pulse that does.
         """
-        for share in QUIET:
-            quiet = np.flatnonzero(np.maximum.accumulate(np.abs(self.level_nm)) <= share * self.largest_nm)
-            ready_us = float(self.width_us[quiet[-1]]) if quiet.size else 0.0
-            ready_us = ready_us if ready_us >= self.shortest_us else 0.0  # it would not be sent
-            if self.level(ready_us + (self.rise_us or np.inf)) > QUIET[-1] * self.largest_nm:
-                return ready_us
-        # it waves more than that: the torque on the way, of some pulses, cannot be helped
-        before_top = self.level_nm[: np.argmax(self.level_nm) + 1]
-        ready_us = float(self.width_us[np.flatnonzero(before_top <= QUIET[-1] * self.largest_nm)[-1]])
-        return max(ready_us, self.shortest_us)
+        assert self.rise_us is not None
+        size_nm = np.abs(self.level_nm)
+        quiet = np.maximum.accumulate(size_nm) <= NOTHING * self.largest_nm
+        waits_us = float(self.width_us[quiet][-1])
+        waits_us = waits_us if waits_us >= self.shortest_us else 0.0  # it would not be sent
+        climbs = (self.inverse_nm > WORTH * self.largest_nm) & (self.inverse_us > waits_us)
+        crests_us = np.r_[waits_us, self.inverse_us[climbs]]
+        blocked = np.flatnonzero(np.diff(crests_us) >= self.rise_us)
+        if not blocked.size:
+            return waits_us
+        end = int(np.searchsorted(self.width_us, crests_us[blocked[-1] + 1]))
+        first = min(int(np.searchsorted(self.width_us, self.width_us[end] - self.rise_us, side="right")), end - 1)
+        return max(float(self.width_us[first + np.argmin(size_nm[first:end])]), self.shortest_us)
 
     def widths(self, demand_nm: np.ndarray) -> np.ndarray:
         """f⁻¹ of a demand, µs, shape (K,); what rounding and the rise limit take, the pulses after give back."""

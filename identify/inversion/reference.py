@@ -79,61 +79,57 @@ class Reference:
         if not RATES_HZ[0] <= pulse_rate_hz <= RATES_HZ[1]:
             fix = f"Give {RATES_HZ[0]:g} to {RATES_HZ[1]:g}, the rate at which the model was identified."
             raise BadRequest(f"{pulse_rate_hz:g} pulses a second", place="pulse_rate_hz", fix=fix)
-        torque = _column(torque_nm, name)
-        _refuse_larger(torque, LARGEST_NM, "N·m", name, f"At most {LARGEST_NM:g} N·m; is it in mN·m?")
-        angle = None
-        if angle_rad is not None:
-            angle = _matching_column(angle_rad, "angle_rad", "angle", torque.size, name)
-            _refuse_larger(angle, LARGEST_RAD, "rad", "angle_rad", f"At most {LARGEST_RAD:g}; is it in degrees?")
-        if time_s is not None:
-            times_s = _times(time_s, torque.size, name)
-            torque = _on_pulses(times_s, torque, pulse_rate_hz)
-            angle = None if angle is None else _on_pulses(times_s, angle, pulse_rate_hz)
-        if torque.size > LONGEST_S * pulse_rate_hz:
-            raise _too_long(torque.size / pulse_rate_hz, name)
+        torque = _column(torque_nm, name, LARGEST_NM, "N·m", "mN·m")
+        like = torque.size, name
+        angle = None if angle_rad is None else _column(angle_rad, "angle_rad", LARGEST_RAD, "rad", "degrees", like)
+        times = None if time_s is None else _column(time_s, "time_s", like=like)
+        seconds = torque.size / pulse_rate_hz if times is None else _span_s(times)
+        if seconds > LONGEST_S:
+            place, fix = name if times is None else "time_s", f"Give at most {LONGEST_S:g} s, one trial."
+            raise BadRequest(f"{seconds:.5g} s long", place=place, fix=fix)
+        if times is not None:
+            torque = _on_pulses(times, torque, pulse_rate_hz)
+            angle = None if angle is None else _on_pulses(times, angle, pulse_rate_hz)
         return cls(torque, float(pulse_rate_hz), angle)
 
 
-def _column(values: object, name: str) -> np.ndarray:
+def _column(
+    values: object,
+    place: str,
+    largest: float = np.inf,
+    unit: str = "",
+    mistaken_unit: str = "",
+    like: tuple[int, str] | None = None,
+) -> np.ndarray:
+    """Finite numbers, none larger than `largest`; `like`: size and name of the torques that they go with."""
     try:
         column = np.asarray(values, float)
     except (TypeError, ValueError, OverflowError) as error:
-        raise BadRequest("not a list of numbers", place=name, fix="Give one number for each pulse, N·m.") from error
+        raise BadRequest("not a list of numbers", place=place, fix="Give one number for each pulse, N·m.") from error
     if column.ndim != 1:
-        raise BadRequest(f"{column.ndim} dimensions", place=name, fix="Give a plain list of numbers.")
+        raise BadRequest(f"{column.ndim} dimensions", place=place, fix="Give a plain list of numbers.")
     if column.size == 0:
-        raise BadRequest("empty", place=name, fix="Give at least one number.")
+        raise BadRequest("empty", place=place, fix="Give at least one number.")
     if column.size > MOST_SAMPLES:
-        raise BadRequest(f"{column.size} numbers", place=name, fix=f"Give at most {MOST_SAMPLES}.")
+        raise BadRequest(f"{column.size} numbers", place=place, fix=f"Give at most {MOST_SAMPLES}.")
     bad = np.flatnonzero(~np.isfinite(column))
     if bad.size:
         fix = "Give a finite number at every place."
-        raise BadRequest(f"{column[bad[0]]} is not a number that can be followed", place=f"{name}[{bad[0]}]", fix=fix)
-    return column
-
-
-def _matching_column(values: object, place: str, what: str, size: int, name: str) -> np.ndarray:
-    """A column with one value for each torque."""
-    column = _column(values, place)
-    if column.size != size:
-        message = f"{column.size} {what}s for {size} of {name}"
+        raise BadRequest(f"{column[bad[0]]} is not a number that can be followed", place=f"{place}[{bad[0]}]", fix=fix)
+    if like is not None and column.size != like[0]:
+        what = place.partition("_")[0]
+        message = f"{column.size} {what}s for {like[0]} of {like[1]}"
         raise BadRequest(message, place=place, fix=f"Give one {what} for each torque.")
+    large = np.flatnonzero(np.abs(column) > largest)
+    if large.size:
+        fix = f"At most {largest:g} {unit}; is it in {mistaken_unit}?"
+        raise BadRequest(f"{column[large[0]]:g} {unit}", place=f"{place}[{large[0]}]", fix=fix)
     return column
 
 
-def _refuse_larger(column: np.ndarray, largest: float, unit: str, name: str, fix: str) -> None:
-    large = np.flatnonzero(~(np.abs(column) <= largest))
-    if large.size:
-        raise BadRequest(f"{column[large[0]]:g} {unit}", place=f"{name}[{large[0]}]", fix=fix)
-
-
-def _too_long(seconds: float, place: str) -> BadRequest:
-    return BadRequest(f"{seconds:.5g} s long", place=place, fix=f"Give at most {LONGEST_S:g} s, one trial.")
-
-
-def _times(values: object, size: int, name: str) -> np.ndarray:
-    time_s = _matching_column(values, "time_s", "time", size, name)
-    if size < 2:
+def _span_s(time_s: np.ndarray) -> float:
+    """Length of a time axis. Raises BadRequest: it has one time only, or does not rise in steps that can be."""
+    if time_s.size < 2:
         raise BadRequest("one time only", place="time_s", fix="Give two or more, or leave the times out.")
     step_s = np.diff(time_s)
     wrong = np.flatnonzero(~((step_s >= LEAST_GAP_S) & (step_s <= LONGEST_GAP_S)))
@@ -141,22 +137,17 @@ def _times(values: object, size: int, name: str) -> np.ndarray:
         at = wrong[0] + 1
         fix = f"Times must rise, by at least {LEAST_GAP_S:g} s and at most {LONGEST_GAP_S:g} s."
         raise BadRequest(f"{time_s[at]:.9g} s after {time_s[at - 1]:.9g} s", place=f"time_s[{at}]", fix=fix)
-    if time_s[-1] - time_s[0] > LONGEST_S:
-        raise _too_long(time_s[-1] - time_s[0], "time_s")
-    return time_s
+    return float(time_s[-1] - time_s[0])
 
 
 def _on_pulses(time_s: np.ndarray, torque_nm: np.ndarray, pulse_rate_hz: float) -> np.ndarray:
     """Means of straight lines between the samples over each pulse interval, shape (K,)."""
     size = max(1, round((time_s[-1] - time_s[0]) * pulse_rate_hz))
     edges = time_s[0] + np.arange(size + 1) / pulse_rate_hz
-    area = np.r_[0.0, np.cumsum(np.diff(time_s) * (torque_nm[1:] + torque_nm[:-1]) / 2)]
-    at = np.clip(np.searchsorted(time_s, edges, side="right") - 1, 0, time_s.size - 2)
-    offset_s = np.clip(edges, time_s[0], time_s[-1]) - time_s[at]
-    slope = (torque_nm[at + 1] - torque_nm[at]) / (time_s[at + 1] - time_s[at])
-    whole = area[at] + offset_s * (torque_nm[at] + slope * offset_s / 2)
-    whole += np.maximum(edges - time_s[-1], 0.0) * torque_nm[-1]
-    return np.diff(whole) * pulse_rate_hz
+    fine = np.union1d(time_s, edges)  # between neighbours of these a line is straight
+    value = np.interp(fine, time_s, torque_nm)
+    area = np.r_[0.0, np.cumsum(np.diff(fine) * (value[1:] + value[:-1]) / 2)]
+    return np.diff(np.interp(edges, fine, area)) * pulse_rate_hz
 
 
 # ---- tables ----
@@ -181,38 +172,21 @@ def read_reference(content: bytes, name: str, pulse_rate_hz: float = 40.0) -> Re
         raise BadRecord("no header with torque_nm", place=f"{name}, line {number}", fix=FIX)
     columns: dict[str, list[float]] = {column: [] for column in known}
     for count, (number, line) in enumerate(rows, 1):
+        place, cells = f"{name}, line {number}", line.split(separator)
         if count > MOST_SAMPLES:
             fix = f"Give at most {MOST_SAMPLES}: one for each pulse is enough."
-            raise BadRecord(f"more than {MOST_SAMPLES} rows", place=f"{name}, line {number}", fix=fix)
-        cells = line.split(separator)
-        _refuse_wider(cells, len(header), separator, f"{name}, line {number}")
+            raise BadRecord(f"more than {MOST_SAMPLES} rows", place=place, fix=fix)
+        if any(cell.strip() for cell in cells[len(header) :]):  # the comma of a decimal makes two cells of one number
+            decimals = "with decimal commas, separate the cells with semicolons, or write decimal points"
+            fix = f"Name every column; {decimals}." if separator == "," else "Name every column."
+            raise BadRecord(f"{len(cells)} cells under a header of {len(header)}", place=place, fix=fix)
         for at, cell in enumerate(header):
             if cell in NAMES:
-                place = f"{name}, line {number}, column {cell}"
-                columns[NAMES[cell]].append(_number(cells[at] if at < len(cells) else "", separator, place))
-    return Reference.of(
-        np.array(columns["torque_nm"]),
-        columns.get("time_s"),
-        angle_rad=columns.get("angle_rad"),
-        pulse_rate_hz=pulse_rate_hz,
-        name=f"{name}, torque_nm",
-    )
-
-
-def _refuse_wider(cells: list[str], width: int, separator: str, place: str) -> None:
-    """Refuse a row with more cells than the header: the comma of a decimal makes two cells of one number."""
-    if any(cell.strip() for cell in cells[width:]):
-        fix = "Name every column."
-        if separator == ",":
-            fix = "Name every column; with decimal commas, separate the cells with semicolons, or write decimal points."
-        raise BadRecord(f"{len(cells)} cells under a header of {width}", place=place, fix=fix)
-
-
-def _number(cell: str, separator: str, place: str) -> float:
-    written = cell.strip().strip('"')
-    if separator != ",":
-        written = written.replace(",", ".")
-    value = float(written) if is_number(written) else np.nan
-    if not np.isfinite(value):
-        raise BadRecord(f"{written[:20]!r} is not a finite number", place=place, fix=FIX)
-    return value
+                text = cells[at].strip().strip('"') if at < len(cells) else ""
+                text = text if separator == "," else text.replace(",", ".")
+                value = float(text) if is_number(text) else np.nan
+                if not np.isfinite(value):
+                    raise BadRecord(f"{text[:20]!r} is not a finite number", place=f"{place}, column {cell}", fix=FIX)
+                columns[NAMES[cell]].append(value)
+    torque_nm = columns.pop("torque_nm")
+    return Reference.of(torque_nm, **columns, pulse_rate_hz=pulse_rate_hz, name=f"{name}, torque_nm")  # type: ignore

@@ -1,4 +1,4 @@
-"""Tracking over one trial: prediction, fit of the trial, updated estimate, and the outcome for people.
+"""Tracking over trials: prediction, fit of a trial, updated estimate, and the outcome for people.
 
 The approved model stands as it is now: its effects' slow states, its curve with gain and shift, its time scale. A slow
 state x (fatigue, potentiation) goes from 0 (rested) to 1. The pulses fill it by the effect's own law, with the gain and
@@ -9,7 +9,7 @@ up.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Any
 
@@ -19,14 +19,17 @@ from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.effects import known_form
 from stimrig.identify.effects.base import Form, Scene
-from stimrig.identify.errors import BadModel
+from stimrig.identify.errors import BadModel, BadRequest
+from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
 from stimrig.identify.model_schema import parameter_value
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SplineBasis
+from stimrig.identify.results import Result
 from stimrig.identify.simulation.predict import refuse_rate
-from stimrig.identify.tracking.state import LEVELS, QUANTITIES, USUAL, Rates, State, Values, updated
+from stimrig.identify.summary import Sheet, quantity
+from stimrig.identify.tracking.state import CURVE, LEVELS, QUANTITIES, USUAL, Rates, State
 from stimrig.identify.tracking.trial import TrialFit, curve_covariance, fit_trial, placed
 
 UNEXPLAINED = 4.0
@@ -47,7 +50,8 @@ EVEN = 31
 CLOSEST_US = 0.5
 """Knots are no closer than this."""
 PER_KNOT = 6
-Bounds = Mapping[str, Sequence[float]]
+MOST_SHOWN = 9
+"""Trials that a summary shows."""
 
 
 class Outcome(StrEnum):
@@ -68,8 +72,8 @@ class Outcome(StrEnum):
 class Step:
     """One trial followed.
 
-    `effects` holds by effect id its slow state at the trial's end, `now`, and as expected at the begin of the next one,
-    `coming`, after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that was the first.
+    `coming_effects` are expected after a rest as long as the one before this trial, but at most `USUAL_REST_S` if that
+    was the first.
     """
 
     outcome: Outcome  # what the trial shows
@@ -77,8 +81,8 @@ class Step:
     before: State  # prediction before it
     after: State  # estimate after it
     coming: State  # prediction for the next trial, for the controller
+    coming_effects: Mapping[str, float]  # their slow states when the next trial begins
     distance: float | None  # squared, of what was seen from what was expected, in sd; None if it moved nothing
-    effects: dict[str, dict[str, float]] = field(default_factory=dict)  # their states
 
     @property
     def disturbed_s(self) -> list[list[float]]:
@@ -92,42 +96,24 @@ class Step:
         return {
             "outcome": str(self.outcome),
             "trial": self.after.trials,
-            "now": levels_of(self.after),
-            "coming": levels_of(self.coming),
+            "now": self.after.bands(),
+            "coming": self.coming.bands(),
             "error_nm": self.fit.error_nm,
             "expected_error_nm": self.fit.expected_nm,
             "error_before_nm": self.fit.before_nm,
             "torque_nm": self.fit.torque_nm,
             "disturbed_s": self.disturbed_s,
             "distance": self.distance,
-            "effects": self.effects,
+            "effects": {
+                effect: {"now": now, "coming": self.coming_effects[effect]}
+                for effect, now in self.after.effects.items()
+            },
             "state": self.coming.to_dict(),
         }
 
 
-def levels_of(state: State) -> dict[str, dict[str, float]]:
-    """`value`, `low` and `high` (95 %) of each tracked quantity.
-
-    Parameters
-    ----------
-    state : State
-        What is known of the muscle.
-    """
-    mean, half = state.mean[:LEVELS], 1.96 * np.sqrt(np.diag(state.covariance)[:LEVELS])
-    ends = {"value": state.values, "low": Values.of(mean - half), "high": Values.of(mean + half)}
-    return {name: {end: getattr(values, name) for end, values in ends.items()} for name in QUANTITIES}
-
-
 def begin(model: Model, rates: Rates = USUAL) -> State:
-    """Predict the first trial after an approval.
-
-    Parameters
-    ----------
-    model : Model
-        The approved one.
-    rates : Rates
-        How fast muscles change.
-    """
+    """Predict the first trial after an approval; `rates`: how fast muscles change."""
     return State.start(curve_covariance(model), rates)
 
 
@@ -160,7 +146,7 @@ def follow(
     """
     refuse_rate(model, record)
     before = begin(model, rates) if state is None else state
-    rest_s = rest_before(before, record, rest_s)
+    rest_s = _rest_before(before, record, rest_s)
     begun = rested(model, before.effects, rest_s)
     fit = fit_trial(set_states(model, begun), before, record)
     if fit.slope < GONE and fit.wanted_nm > ENOUGH * float(np.ptp(model.recruitment.table()[1])):
@@ -169,22 +155,16 @@ def follow(
         after, distance = replace(before, trials=before.trials + 1, unexplained=before.unexplained + 1), None
         outcome = Outcome.CONTRADICTS if after.unexplained > 1 else Outcome.ODD
     else:
-        after, distance = updated(before, fit.vector, fit.information)
-        outcome = Outcome.ODD if after.odd is not None else _describe(fit)
+        after, distance = before.updated(fit.vector, fit.information)
+        information = fit.information[:LEVELS, :LEVELS] + np.diag(1e-3 / LITTLE**2)
+        little = np.all(np.sqrt(np.diag(np.linalg.inv(information))) > LITTLE)
+        outcome = Outcome.ODD if after.odd is not None else Outcome.LITTLE if little else Outcome.FOLLOWED
     after = passed(model, replace(after, effects=begun), record, 0.0)
     next_s = rest_s if before.trials or rest_s is None else min(rest_s, USUAL_REST_S)
-    coming = rested(model, after.effects, next_s)
-    effects = {effect: {"now": now, "coming": coming[effect]} for effect, now in after.effects.items()}
-    return Step(outcome, fit, before, after, after.predicted(rates), distance, effects)
+    return Step(outcome, fit, before, after, after.predicted(rates), rested(model, after.effects, next_s), distance)
 
 
-def _describe(fit: TrialFit) -> Outcome:
-    information = fit.information[:LEVELS, :LEVELS] + np.diag(1e-3 / LITTLE**2)
-    little = np.all(np.sqrt(np.diag(np.linalg.inv(information))) > LITTLE)
-    return Outcome.LITTLE if little else Outcome.FOLLOWED
-
-
-def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Model:
+def model_for_next(model: Model, step: Step, bounds: Mapping[str, Sequence[float]] | None = None) -> Model:
     """The approved model as it is expected to be in the next trial, as far as it may move.
 
     Parameters
@@ -198,28 +178,75 @@ def model_for_next(model: Model, step: Step, bounds: Bounds | None = None) -> Mo
         nevertheless: a fixed one would be taken for a change of the others. By default all move freely.
         The caller checks that the expected values themselves are inside.
     """
-    coming, effects = step.coming, {effect: states["coming"] for effect, states in step.effects.items()}
-    if bounds is None:
-        return moved_model(model, coming.values, coming.curve_nm, effects)
-    values = replace(Values(), **{name: getattr(coming.values, name) for name in QUANTITIES if name in bounds})
-    low, high = bounds.get("gain", (1.0, 1.0))
-    # The torque of every pulse stays within what the gain may be; if it does not, the curve keeps its shape.
-    away = values.gain * largest_change(model, coming.curve_nm)
-    inside = low <= values.gain - away and values.gain + away <= high
-    return moved_model(model, values, coming.curve_nm if inside else 0.0, effects)
+    levels, curve_nm = step.coming.mean[:LEVELS], step.coming.mean[CURVE:]
+    if bounds is not None:
+        levels = np.where([name in bounds for name in QUANTITIES], levels, 0.0)
+        low, high = bounds.get("gain", (1.0, 1.0))
+        # The torque of every pulse stays within what the gain may be; if it does not, the curve keeps its shape.
+        change = replace(model.recruitment, coefficients_nm=curve_nm).table()[1]
+        share = float(np.max(np.abs(change)) / max(np.ptp(model.recruitment.table()[1]), 1e-9))
+        gain = float(np.exp(levels[0]))
+        curve_nm = curve_nm if low <= gain * (1.0 - share) and gain * (1.0 + share) <= high else 0.0 * curve_nm
+    return moved_model(model, levels, curve_nm, step.coming_effects)
+
+
+@dataclass(frozen=True, repr=False, eq=False)
+class Tracked(Result):
+    """A model followed over trials: gain, threshold and time scale after each."""
+
+    approved: Model  # the model that was followed; it stays as it is
+    steps: tuple[Step, ...]  # one for each trial
+
+    @property
+    def model(self) -> Model:
+        """The model as it is expected to be in the next trial."""
+        return model_for_next(self.approved, self.steps[-1])
+
+    def to_dict(self) -> dict[str, Any]:
+        """For each trial its outcome, and the levels `now` and `coming` with their bands (95 %)."""
+        return {"model_id": self.approved.model_id, "trials": [json_value(step.to_dict()) for step in self.steps]}
+
+    def _sheet(self) -> Sheet:
+        rows = []
+        for number, step in enumerate(self.steps, 1):
+            now = step.after.values
+            words = f"gain {quantity(now['gain'], '')}, threshold {now['threshold_shift_us']:+.3g} µs, time scale "
+            words += f"{quantity(now['time_scale'], '')}, error {quantity(step.fit.error_nm, 'N·m')}"
+            rows.append((f"trial {number}", f"{step.outcome}: {words}"))
+        hidden = [("", f"and {len(rows) - MOST_SHOWN} trials before")] if len(rows) > MOST_SHOWN else []
+        return Sheet(f"Model {self.approved.model_id[:8]} over {len(rows)} trials", (*hidden, *rows[-MOST_SHOWN:]))
+
+
+def track(model: Model, trials: Sequence[Record]) -> Tracked:
+    """Follow a model over trials, in their order: how the muscle's gain, threshold and time scale have moved.
+
+    Parameters
+    ----------
+    model : Model
+        With second-order dynamics.
+    trials : sequence of Record
+        At least one, each with its rest before and after.
+
+    Raises
+    ------
+    BadModel, BadRecord
+        As `stimrig.identify.tracking.follow`.
+    BadRequest
+        No trial is given.
+    """
+    steps: list[Step] = []
+    for trial in trials:
+        steps.append(follow(model, steps[-1].coming if steps else None, trial))
+    if not steps:
+        raise BadRequest("no trial", place="trials", fix="Give at least one record.")
+    return Tracked(model, tuple(steps))
 
 
 # ---- the approved model as it stands now ----
 
 
 def slow_forms(model: Model) -> dict[str, tuple[Form, dict[str, Any]]]:
-    """By effect id, the form and the parameters of each of the model's effects that has a slow state.
-
-    Parameters
-    ----------
-    model : Model
-        The model.
-    """
+    """By effect id, the form and the parameters of each of the model's effects that has a slow state."""
     forms = {}
     for entry in model.effects:
         known = known_form(entry)
@@ -231,13 +258,39 @@ def slow_forms(model: Model) -> dict[str, tuple[Form, dict[str, Any]]]:
 
 def set_states(model: Model, states: Mapping[str, float]) -> Model:
     """The model with its effects' states at the begin of what is predicted."""
-    if not states:
-        return model
     entries = (entry | {"state": states[entry["id"]]} if entry["id"] in states else entry for entry in model.effects)
     return model.with_(effects=tuple(entries))
 
 
-def rest_before(state: State, record: Record, rest_s: float | None = None) -> float | None:
+def rested(model: Model, states: Mapping[str, float], rest_s: float | None) -> dict[str, float]:
+    """States after a rest; a rest of unknown length is taken for one after which all have recovered."""
+    states_after = {}
+    for effect, (form, values) in slow_forms(model).items() if states else ():
+        states_after[effect] = 0.0
+        if rest_s is not None and form.state is not None:
+            scene = Scene(np.zeros(1), np.zeros(1), 0.0, 1.0, 1.0, pauses_s=np.array([rest_s]), states=states)
+            states_after[effect] = float(form.state(np.zeros((1, 1)), values, scene)[0])
+    return states_after
+
+
+def passed(model: Model, state: State, record: Record, rest_s: float | None = None) -> State:
+    """The state with what a record's pulses and the rest before it have done to the effects; levels and trends stay.
+
+    For a record that teaches nothing else: the test before the session, or a trial that cannot be followed. `rest_s`:
+    rest before the record, s; None: by the clocks. Raises BadModel, BadRecord: as `follow`, but for any pulse rate.
+    """
+    if not slow_forms(model):
+        return state
+    begun = rested(model, state.effects, _rest_before(state, record, rest_s))
+    problem, theta = placed(set_states(model, begun), state.mean[state.observed], make_grid(record))
+    last, ended_s = record.parts[-1], None
+    if last.begun_s is not None:
+        part_s = float(record.time_s[-1] - record.time_s[last.first]) + 1.0 / record.sample_rate_hz
+        ended_s = last.begun_s + last.own_s + part_s
+    return replace(state, effects=problem.states(theta), ended_s=ended_s)
+
+
+def _rest_before(state: State, record: Record, rest_s: float | None) -> float | None:
     """Rest between what was seen last and a record, s: as given, else by their clocks; None: not known."""
     begun_s = record.parts[0].begun_s
     if rest_s is None and begun_s is not None and state.ended_s is not None:
@@ -245,108 +298,36 @@ def rest_before(state: State, record: Record, rest_s: float | None = None) -> fl
     return max(rest_s, 0.0) if rest_s is not None and rest_s >= -CLOCK_S else None
 
 
-def rested(model: Model, states: Mapping[str, float], rest_s: float | None) -> dict[str, float]:
-    """States after a rest; a rest of unknown length is taken for one after which all have recovered."""
-    states_after = {}
-    for effect, (form, values) in slow_forms(model).items() if states else ():
-        if rest_s is None:
-            states_after[effect] = 0.0
-            continue
-        assert form.state is not None
-        scene = Scene(np.zeros(1), np.zeros(1), 0.0, 1.0, 1.0, pauses_s=np.array([rest_s]), states=states)
-        states_after[effect] = float(form.state(np.zeros((1, 1)), values, scene)[0])
-    return states_after
-
-
-def passed(model: Model, state: State, record: Record, rest_s: float | None = None) -> State:
-    """The state with what a record's pulses and the rest before it have done to the effects; levels and trends stay.
-
-    For a record that teaches nothing else: the test before the session, or a trial that cannot be followed.
-
-    Raises BadModel, BadRecord: as `stimrig.identify.tracking.trial.look`, of any pulse rate.
-
-    Parameters
-    ----------
-    model : Model
-        The model.
-    state : State
-        What is known of the muscle.
-    record : Record
-        The measurement.
-    rest_s : float, optional
-        Before the record, s; None: not known.
-    """
-    if not slow_forms(model):
-        return state
-    begun = rested(model, state.effects, rest_before(state, record, rest_s))
-    problem, theta = placed(set_states(model, begun), state.mean[state.observed], make_grid(record))
-    return replace(state, effects=problem.states(theta), ended_s=_end_s(record))
-
-
-def _end_s(record: Record) -> float | None:
-    """When the last sample's interval ended, as Unix time; None: not known."""
-    last = record.parts[-1]
-    if last.begun_s is None:
-        return None
-    return (
-        last.begun_s + last.own_s + float(record.time_s[-1] - record.time_s[last.first]) + 1.0 / record.sample_rate_hz
-    )
-
-
-def moved_curve(curve: Curve, values: Values) -> Curve:
-    """gain · f(u - shift), as a spline if it is shifted; beyond the curve's end it goes on level."""
-    if values.threshold_shift_us == 0.0:
-        return replace(curve, coefficients_nm=values.gain * curve.coefficients_nm)
-    largest = curve.basis.largest_us
-    shifted_us = np.asarray(getattr(curve.basis, "knots_us", np.zeros(0))) + values.threshold_shift_us
-    basis = SplineBasis(_apart(np.r_[shifted_us, np.linspace(0.0, largest, EVEN)], largest))
-    # Between every two knots the same number of places, so that a steep rise counts as much as a long plateau.
-    share = np.arange(PER_KNOT) / PER_KNOT
-    u = np.r_[(basis.knots_us[:-1, None] + share * np.diff(basis.knots_us)[:, None]).ravel(), largest]
-    wanted = values.gain * curve(np.clip(u - values.threshold_shift_us, 0.0, largest))
-    return Curve(basis, np.linalg.lstsq(basis.design(u), wanted, rcond=None)[0])
-
-
-def _apart(knots_us: np.ndarray, largest_us: float) -> np.ndarray:
-    """The knots within 0 and the largest width, both included, without those too close to one before them."""
-    inner = np.sort(knots_us[(knots_us > CLOSEST_US) & (knots_us < largest_us - CLOSEST_US)])
-    spaced = [0.0]
-    for knot in inner.tolist():
-        if knot - spaced[-1] >= CLOSEST_US:
-            spaced.append(knot)
-    return np.array([*spaced, largest_us])
-
-
-def largest_change(model: Model, curve_nm: np.ndarray) -> float:
-    """Largest change of the curve by `curve_nm`, as a share of its largest torque."""
-    change = replace(model.recruitment, coefficients_nm=curve_nm).table()[1]
-    return float(np.max(np.abs(change)) / max(np.ptp(model.recruitment.table()[1]), 1e-9))
-
-
 def moved_model(
-    model: Model, values: Values, curve_nm: np.ndarray | float = 0.0, effects: Mapping[str, float] | None = None
+    model: Model, levels: np.ndarray, curve_nm: np.ndarray | float = 0.0, effects: Mapping[str, float] | None = None
 ) -> Model:
-    """The model with the levels of `values`, with `curve_nm` added to the coefficients of its curve, and its effects
-    where `effects` says that they begin.
+    """The model at such `levels` (log gain, threshold shift in µs, log time scale), with `curve_nm` added to the
+    coefficients of its curve, and its effects where `effects` says by id that they begin.
 
     Raises BadModel: the model's dynamics are not of second order.
-
-    Parameters
-    ----------
-    model : Model
-        The model.
-    values : Values
-        The levels.
-    curve_nm : ndarray or float
-        Added to the coefficients of the curve, N·m.
-    effects : mapping, optional
-        By effect id, where it begins.
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics are tracked", fix="Fit with maximum-likelihood.")
-    linear = replace(model.linear, time_constant_s=model.linear.time_constant_s * values.time_scale)
+    gain, shift_us, time_scale = float(np.exp(levels[0])), float(levels[1]), float(np.exp(levels[2]))
+    linear = replace(model.linear, time_constant_s=model.linear.time_constant_s * time_scale)
     sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
-    curve = replace(model.recruitment, coefficients_nm=model.recruitment.coefficients_nm + sign * curve_nm)
+    coefficients_nm = gain * (model.recruitment.coefficients_nm + sign * curve_nm)
+    curve = _shifted(replace(model.recruitment, coefficients_nm=coefficients_nm), shift_us)
     # Covariance and bands of the approved parameters do not hold for the moved ones.
-    begun = set_states(model, effects or {})
-    return begun.with_(recruitment=moved_curve(curve, values), linear=linear, covariance=None, bands={})
+    return set_states(model, effects or {}).with_(recruitment=curve, linear=linear, covariance=None, bands={})
+
+
+def _shifted(curve: Curve, shift_us: float) -> Curve:
+    """f(u - shift), as a spline if it is shifted; beyond the curve's end it goes on level."""
+    if shift_us == 0.0:
+        return curve
+    largest = curve.basis.largest_us
+    knots_us = np.r_[np.asarray(getattr(curve.basis, "knots_us", ())) + shift_us, np.linspace(0.0, largest, EVEN)]
+    inner = np.unique(np.round(knots_us / CLOSEST_US)) * CLOSEST_US
+    inner = inner[(inner >= CLOSEST_US) & (inner <= largest - CLOSEST_US)]
+    basis = SplineBasis(np.r_[0.0, inner, largest])
+    # Between every two knots the same number of places, so that a steep rise counts as much as a long plateau.
+    share = np.arange(PER_KNOT) / PER_KNOT
+    u = np.r_[(basis.knots_us[:-1, None] + share * np.diff(basis.knots_us)[:, None]).ravel(), largest]
+    wanted = curve(np.clip(u - shift_us, 0.0, largest))
+    return Curve(basis, np.linalg.lstsq(basis.design(u), wanted, rcond=None)[0])

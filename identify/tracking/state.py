@@ -38,7 +38,6 @@ class Rates:
     trend: np.ndarray  # mean trend at the first trial, per trial
     trend_sd: np.ndarray  # standard deviation of the first trend
     turn: np.ndarray  # standard deviation of its change from trial to trial
-    sessions: int = 0  # that they were learnt from; 0 for the usual ones
 
 
 USUAL = Rates(
@@ -50,23 +49,10 @@ USUAL = Rates(
 )
 
 
-@dataclass(frozen=True)
-class Values:
-    """Gain and time scale as factors on the approved model's, the shift of its threshold in µs."""
-
-    gain: float = 1.0  # 1: as approved
-    threshold_shift_us: float = 0.0  # 0: as approved
-    time_scale: float = 1.0  # 1: as approved
-
-    @classmethod
-    def of(cls, levels: np.ndarray) -> Values:
-        """From log gain, µs, log time scale."""
-        return cls(float(np.exp(levels[0])), float(levels[1]), float(np.exp(levels[2])))
-
-    @property
-    def levels(self) -> np.ndarray:
-        """Log gain, µs, log time scale, shape (3,)."""
-        return np.array([np.log(self.gain), self.threshold_shift_us, np.log(self.time_scale)])
+def values_of(levels: np.ndarray) -> dict[str, float]:
+    """By quantity: factors on the approved gain and time scale, and the shift of the threshold, µs."""
+    gain_log, shift_us, time_log = levels[:LEVELS].tolist()
+    return dict(zip(QUANTITIES, (float(np.exp(gain_log)), shift_us, float(np.exp(time_log))), strict=True))
 
 
 @dataclass(frozen=True)
@@ -77,7 +63,7 @@ class State:
     curve, N·m.
     """
 
-    mean: np.ndarray  # of levels and trends
+    mean: np.ndarray  # of levels, trends and curve
     covariance: np.ndarray  # of the same
     trials: int = 0  # that it was learnt from
     odd: np.ndarray | None = None  # how far the last trial would have moved the levels, if it was odd
@@ -95,19 +81,20 @@ class State:
         return cls(np.r_[np.zeros(LEVELS), rates.trend, np.zeros(size)], covariance)
 
     @property
-    def values(self) -> Values:
-        """The levels in their units."""
-        return Values.of(self.mean[:LEVELS])
-
-    @property
-    def curve_nm(self) -> np.ndarray:
-        """Corrections of the coefficients of the approved curve, N·m, shape (n,)."""
-        return self.mean[CURVE:]
+    def values(self) -> dict[str, float]:
+        """By quantity, its value: gain and time scale as factors, the threshold's shift in µs."""
+        return values_of(self.mean)
 
     @property
     def observed(self) -> np.ndarray:
         """Indices of the elements of `mean` that a trial observes: levels and curve, not the trends."""
         return np.r_[np.arange(LEVELS), np.arange(CURVE, self.mean.size)]
+
+    def bands(self) -> dict[str, dict[str, float]]:
+        """`value`, `low` and `high` (95 %) of each quantity."""
+        half = 1.96 * np.sqrt(np.diag(self.covariance))
+        ends = {"value": self.values, "low": values_of(self.mean - half), "high": values_of(self.mean + half)}
+        return {name: {end: values[name] for end, values in ends.items()} for name in QUANTITIES}
 
     def predicted(self, rates: Rates = USUAL) -> State:
         """Prediction for the next trial."""
@@ -116,6 +103,39 @@ class State:
         spread = np.diag(np.r_[rates.step, rates.turn, np.zeros(self.mean.size - CURVE)] ** 2)
         return replace(self, mean=move @ self.mean, covariance=move @ self.covariance @ move.T + spread)
 
+    def updated(self, vector: np.ndarray, information: np.ndarray) -> tuple[State, float]:
+        """The state after a trial, and how odd the trial was.
+
+        `information`: inverse of the covariance of the levels and the curve that explain the trial best; zero in a
+        direction that the trial does not observe. `vector`: information times those levels and that curve.
+
+        How odd: the squared distance by which the trial moves the levels, in the standard deviations that are expected
+        of such a move; about 3 on average if the trial observes all three.
+        """
+        after = self._filtered(vector, information)
+        move = (after.mean - self.mean)[:LEVELS]
+        allowed = (self.covariance - after.covariance)[:LEVELS, :LEVELS]
+        whitened = np.linalg.pinv(allowed, rcond=1e-6, hermitian=True) @ move
+        distance = max(float(move @ whitened), 0.0)
+        if distance <= SURPRISING:
+            return after, distance
+        if self.odd is None or not float(self.odd @ whitened) > 0.5 * distance:
+            # No further than the band of what was expected, and nothing is known better than before.
+            mean = self.mean + (after.mean - self.mean) * (MOST_BY_ODD / np.sqrt(distance))
+            return replace(self, mean=mean, trials=self.trials + 1, odd=move, unexplained=0), distance
+        wider = self.covariance.copy()
+        wider[:LEVELS, :LEVELS] += np.outer(move, move)
+        return replace(self, covariance=wider)._filtered(vector, information), distance
+
+    def _filtered(self, vector: np.ndarray, information: np.ndarray) -> State:
+        """Kalman update in information form; it also exists where a trial observes nothing."""
+        lever = self.covariance[:, self.observed]
+        expected = lever[self.observed]
+        solve = np.linalg.solve(np.eye(self.observed.size) + information @ expected, np.c_[information, vector])
+        away = solve[:, -1] - solve[:, :-1] @ self.mean[self.observed]
+        covariance = self.covariance - lever @ solve[:, :-1] @ lever.T
+        return State(self.mean + lever @ away, 0.5 * (covariance + covariance.T), self.trials + 1)
+
     def to_dict(self) -> dict[str, Any]:
         """As JSON."""
         return json_value(vars(self))
@@ -123,51 +143,10 @@ class State:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> State:
         """The state that `to_dict` wrote."""
-        odd = data["odd"]
-        return cls(
-            np.array(data["mean"], float),
-            np.array(data["covariance"], float),
-            int(data["trials"]),
-            None if odd is None else np.array(odd, float),
-            int(data["unexplained"]),
-            dict(data["effects"]),
-            data["ended_s"],
-        )
-
-
-def updated(before: State, vector: np.ndarray, information: np.ndarray) -> tuple[State, float]:
-    """The state after a trial, and how odd the trial was.
-
-    `information`: inverse of the covariance of the levels and the curve that explain the trial best; zero in a
-    direction that the trial does not observe. `vector`: information times those levels and that curve.
-
-    How odd: the squared distance by which the trial moves the levels, in the standard deviations that are expected of
-    such a move; about 3 on average if the trial observes all three.
-    """
-    after = _filtered(before, vector, information)
-    move = (after.mean - before.mean)[:LEVELS]
-    allowed = (before.covariance - after.covariance)[:LEVELS, :LEVELS]
-    whitened = np.linalg.pinv(allowed, rcond=1e-6, hermitian=True) @ move
-    distance = max(float(move @ whitened), 0.0)
-    if distance <= SURPRISING:
-        return after, distance
-    if before.odd is None or not float(before.odd @ whitened) > 0.5 * distance:
-        # No further than the band of what was expected, and nothing is known better than before.
-        mean = before.mean + (after.mean - before.mean) * (MOST_BY_ODD / np.sqrt(distance))
-        return replace(before, mean=mean, trials=before.trials + 1, odd=move, unexplained=0), distance
-    wider = before.covariance.copy()
-    wider[:LEVELS, :LEVELS] += np.outer(move, move)
-    return _filtered(replace(before, covariance=wider), vector, information), distance
-
-
-def _filtered(before: State, vector: np.ndarray, information: np.ndarray) -> State:
-    """Kalman update in information form; it also exists where a trial observes nothing."""
-    lever = before.covariance[:, before.observed]
-    expected = lever[before.observed]
-    solve = np.linalg.solve(np.eye(before.observed.size) + information @ expected, np.c_[information, vector])
-    away = solve[:, -1] - solve[:, :-1] @ before.mean[before.observed]
-    covariance = before.covariance - lever @ solve[:, :-1] @ lever.T
-    return State(before.mean + lever @ away, 0.5 * (covariance + covariance.T), before.trials + 1)
+        arrays: dict[str, Any] = {
+            name: np.array(data[name], float) for name in ("mean", "covariance", "odd") if data[name] is not None
+        }
+        return cls(**data | arrays)
 
 
 # ---- how fast a person changes, learnt from earlier sessions of their own ----
@@ -179,25 +158,18 @@ BELIEVED_TRIALS = 12.0
 FIRST = 3
 """Trials from which a session's first trend is taken."""
 
-LevelValues = Mapping[str, Mapping[str, Any]]
 
-
-def learn_rates(sessions: Sequence[Sequence[LevelValues]]) -> Rates:
+def learn_rates(sessions: Sequence[Sequence[Mapping[str, Mapping[str, Any]]]]) -> Rates:
     """The usual rates, corrected by what a person's earlier sessions say.
 
-    Parameters
-    ----------
-    sessions : sequence of sequences
-        For each earlier session its trials in order, each as `levels_of` returns them (`now` of `Step.to_dict`).
-        Sessions of fewer than three trials are not used.
-
-    Returns
-    -------
-    Rates
-        Each variance is a mean of the usual one and of the person's own, weighted by how many there are. The person's
-        own holds the scatter of the trials, too.
+    `sessions`: for each earlier session its trials in order, each as `State.bands` returns them (`now` of
+    `Step.to_dict`); those of fewer than three trials are not used. Each variance is a mean of the usual one and of the
+    person's own, weighted by how many there are. The person's own holds the scatter of the trials, too.
     """
-    known = [_levels(session) for session in sessions if len(session) >= FIRST]
+    known = []
+    for session in (session for session in sessions if len(session) >= FIRST):
+        gain, shift_us, scale = np.array([[float(trial[name]["value"]) for name in QUANTITIES] for trial in session]).T
+        known.append(np.c_[np.log(gain), shift_us, np.log(scale)])
     if not known:
         return USUAL
     count = len(known)
@@ -206,23 +178,12 @@ def learn_rates(sessions: Sequence[Sequence[LevelValues]]) -> Rates:
     trend = trends.sum(axis=0) / (count + BELIEVED_SESSIONS)
     bends = np.concatenate([np.diff(levels, n=2, axis=0) for levels in known])
     usual = USUAL.turn**2 + 2.0 * USUAL.step**2  # of a bend, which holds one turn and two steps
-    bend_squares = np.sum(bends**2, axis=0)
-    faster = np.sqrt((BELIEVED_TRIALS * usual + bend_squares) / ((BELIEVED_TRIALS + len(bends)) * usual))
-    return Rates(
-        start=_pooled(USUAL.start, starts, count),
-        step=faster * USUAL.step,
-        trend=trend,
-        trend_sd=_pooled(USUAL.trend_sd, trends - trend, count),
-        turn=faster * USUAL.turn,
-        sessions=count,
-    )
+    squares = BELIEVED_TRIALS * usual + np.sum(bends**2, axis=0)
+    faster = np.sqrt(squares / ((BELIEVED_TRIALS + len(bends)) * usual))
 
+    def pooled(usual_sd: np.ndarray, personal: np.ndarray) -> np.ndarray:
+        squares = BELIEVED_SESSIONS * usual_sd**2 + np.sum(personal**2, axis=0)
+        return np.sqrt(squares / (BELIEVED_SESSIONS + count))
 
-def _levels(session: Sequence[LevelValues]) -> np.ndarray:
-    """Log gain, µs and log time scale of each trial, shape (N, 3)."""
-    values = [[float(trial[name]["value"]) for name in QUANTITIES] for trial in session]
-    return np.array([Values(*trial).levels for trial in values])
-
-
-def _pooled(usual: np.ndarray, personal: np.ndarray, count: int) -> np.ndarray:
-    return np.sqrt((BELIEVED_SESSIONS * usual**2 + np.sum(personal**2, axis=0)) / (BELIEVED_SESSIONS + count))
+    start, trend_sd = pooled(USUAL.start, starts), pooled(USUAL.trend_sd, trends - trend)
+    return Rates(start, faster * USUAL.step, trend, trend_sd, faster * USUAL.turn)

@@ -10,10 +10,11 @@ unexplained is correlated in time; it counts as such, so a model that fits a tri
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from stimrig.identify.dynamics.grid import Grid, make_grid, runs
 from stimrig.identify.effects import Parameter, Scene, form
@@ -134,9 +135,8 @@ def curve_covariance(model: Model) -> np.ndarray:
     torque), half of a person's fatigue was taken for an error of the curve; without it, an error of a steep curve was
     taken for a change of the gain by 30 %.
     """
-    size = model.recruitment.basis.size
     top_nm = float(np.ptp(model.recruitment.table()[1]))
-    unmodelled, fitted = np.eye(size) * (SHAPE * top_nm) ** 2, model.curve_covariance
+    unmodelled, fitted = np.eye(model.recruitment.basis.size) * (SHAPE * top_nm) ** 2, model.curve_covariance
     return unmodelled if fitted is None else unmodelled + 4.0 * fitted
 
 
@@ -149,124 +149,87 @@ def fit_trial(model: Model, expected: State, record: Record) -> TrialFit:
     if not np.sum(grid.fitted) * grid.step_s >= SHORTEST_S:
         fix = "Play a longer trial; rows of `validate` do not count."
         raise BadRecord(f"less than {SHORTEST_S:g} s that can be used", fix=fix)
-    setup = _prepare(model, expected, grid)
-    start, expected_nm = expected.mean[expected.observed], _expected(model)
-    first = best = _fitted(setup, start)
-    if best.sd_nm > FAR * expected_nm:
+    trial, start = _Trial(model, expected, grid), expected.mean[expected.observed]
+    best = first = trial.fit_from(start)
+    if best.misfit > FAR:
         # After a sudden loss the fit may end where the threshold explains it badly: so much less torque came.
-        share = np.clip(first.expected_slope, GONE_NOT_BELOW, 1.0 / GONE_NOT_BELOW)
-        lower = start + np.r_[np.log(share), np.zeros(start.size - 1)]
-        other = _fitted(setup, lower)
-        start, best = (lower, other) if other.sd_nm < best.sd_nm else (start, best)
-    vector, information = _marginal(best, start, setup.own_sd)
-    inflation = max(1.0, best.sd_nm / expected_nm) ** 2  # a poor fit may be wrong by more than its scatter
-    return TrialFit(
-        vector=vector / inflation,
-        information=information / inflation,
-        error_nm=best.sd_nm,
-        expected_nm=expected_nm,
-        before_nm=first.before_nm,
-        torque_nm=best.torque_nm,
-        wanted_nm=first.wanted_nm,
-        slope=first.expected_slope,
-        disturbed=_stretches(grid, best.weight),
-        duration_s=grid.size * grid.step_s,
-    )
+        share = np.clip(first.slope, GONE_NOT_BELOW, 1.0 / GONE_NOT_BELOW)
+        other = trial.fit_from(start + np.r_[np.log(share), np.zeros(start.size - 1)])
+        best = other if other.error_nm < best.error_nm else best
+    return replace(best, before_nm=first.before_nm, wanted_nm=first.wanted_nm, slope=first.slope)
 
 
-@dataclass(frozen=True)
-class _Setup:
+class _Trial:
     """Problem and priors of a trial's fit; the free parameters are levels and curve, then those of the trial alone."""
 
-    problem: Problem
-    theta: np.ndarray
-    free: np.ndarray
-    target: np.ndarray
-    prior: np.ndarray
-    own_sd: np.ndarray
+    def __init__(self, model: Model, expected: State, grid: Grid) -> None:
+        self.grid, size = grid, expected.observed.size
+        self.problem, theta = placed(model, np.zeros(size), grid)
+        problem, self.theta = self.problem, theta
+        gains, shifts, drifts = (problem.chosen[place].first for place in (0, -2, -1))
+        curve = range(problem.coefficients.start, problem.coefficients.stop)
+        trial_parameters = [gains + 1, shifts + 1, *problem.delay, *problem.baselines, drifts, *problem.initials]
+        self.free = np.array([gains, shifts, 0, *curve, *trial_parameters])
+        target = problem.setup.to_muscle(grid.torque_nm)[grid.fitted]
+        scale_nm = max(float(np.ptp(target)), 1e-6)
+        theta[list(problem.baselines)] = np.median(target[: max(4, round(0.5 / grid.step_s))])
+        states = np.tile([0.1, 1.0], grid.starts.size)
+        own_sd = np.r_[TRIAL_SD, np.r_[np.ones(len(problem.baselines)), DRIFTS, states] * scale_nm]
+        self.target, self.own_precision = target, np.diag(1.0 / own_sd**2)
+        prior = expected.covariance[np.ix_(expected.observed, expected.observed)].copy()
+        prior[np.arange(LEVELS), np.arange(LEVELS)] += LOOSE**2
+        self.prior = block_diag(np.linalg.inv(prior), self.own_precision)
+        # What the model left on the record that it was fitted on, of an interval's mean.
+        rms_nm = max(float(model.fit.get(key) or 0.0) for key in ("rms_nm", "held_out_rms_nm"))
+        structure = max(rms_nm**2 - model.noise.white_sd_nm**2, 0.0)
+        self.expected_nm = float(np.sqrt(structure + model.noise.block_sd_nm**2)) or 1e-3
 
-
-def _prepare(model: Model, expected: State, grid: Grid) -> _Setup:
-    problem, theta = placed(model, np.zeros(expected.observed.size), grid)
-    gains, shifts, drifts = (problem.chosen[place].first for place in (0, -2, -1))
-    curve = range(problem.coefficients.start, problem.coefficients.stop)
-    trial_parameters = [gains + 1, shifts + 1, *problem.delay, *problem.baselines, drifts, *problem.initials]
-    target = problem.setup.to_muscle(grid.torque_nm)
-    scale_nm = max(float(np.ptp(target[grid.fitted])), 1e-6)
-    theta[list(problem.baselines)] = np.median(target[grid.fitted][: max(4, round(0.5 / grid.step_s))])
-    states = np.tile([0.1, 1.0], problem.setup.grid.starts.size)
-    own_sd = np.r_[TRIAL_SD, np.r_[np.ones(len(problem.baselines)), DRIFTS, states] * scale_nm]
-    free = np.array([gains, shifts, 0, *curve, *trial_parameters])
-    return _Setup(problem, theta, free, target, _precision(expected, own_sd), own_sd)
-
-
-@dataclass(frozen=True)
-class _Fit:
-    """The last round of a fit: where it was, relative to where it began, and the likelihood's slope and bend there."""
-
-    moved: np.ndarray
-    slope: np.ndarray
-    bend: np.ndarray
-    weight: np.ndarray
-    sd_nm: float
-    torque_nm: float
-    before_nm: float
-    wanted_nm: float
-    expected_slope: float
-
-
-def _fitted(setup: _Setup, levels: np.ndarray) -> _Fit:
-    """Gauss and Newton's steps with weights that follow the errors, from such levels and curve."""
-    problem, free, prior, target = setup.problem, setup.free, setup.prior, setup.target
-    theta = setup.theta.copy()
-    theta[free[: levels.size]] += levels
-    grid, start = problem.setup.grid, theta[free].copy()
-    rows = grid.fitted
-    weight, first, done = np.ones(int(rows.sum())), None, False
-    for turn in range(ROUNDS):
-        mean, jacobian = problem.run(theta, derivatives=True)
-        assert jacobian is not None
-        error, lever = (target - mean)[rows], jacobian[free][:, rows]
-        first = first or _compared(target[rows], mean[rows])
-        if turn >= TRUSTED_ROUNDS:
-            weight = _weights(error, round(LOCAL_S / grid.step_s))
-        sd_nm, correlation = _spread(error, weight)
-        precision = weight / (sd_nm**2 * (1.0 + correlation) / (1.0 - correlation))
-        bend, slope, moved = (lever * precision) @ lever.T, (lever * precision) @ error, theta[free] - start
-        if done or turn == ROUNDS - 1:
-            return _Fit(moved, slope, bend, weight, sd_nm, float(np.std(mean[rows])), *first)
-        step = np.linalg.solve(bend + prior, slope - prior @ moved)
-        step[:LEVELS] = np.clip(step[:LEVELS], -LOOSE, LOOSE)
-        theta[free] += step
-        done = turn > TRUSTED_ROUNDS and bool(np.all(np.abs(step[:LEVELS]) < NEAR * LOOSE))
-    raise AssertionError("the last round returns")
-
-
-def _compared(measured_nm: np.ndarray, expected_nm: np.ndarray) -> tuple[float, float, float]:
-    """Standard deviations of the error and of the expected torque; slope of the measured torque on the expected one."""
-    away = expected_nm - expected_nm.mean()
-    slope = float(away @ measured_nm / max(away @ away, 1e-300))
-    return float(np.std(measured_nm - expected_nm)), float(np.std(expected_nm)), slope
-
-
-def _marginal(fit: _Fit, start: np.ndarray, own_sd: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Information vector and matrix of levels and curve, with the parameters of the trial alone marginalised."""
-    size = start.size
-    joint = fit.bend.copy()
-    joint[size:, size:] += np.diag(1.0 / own_sd**2)
-    # Relative to where the fit began: there the trial's own parameters have their prior mean.
-    vector = fit.bend @ fit.moved + fit.slope
-    nuisance = np.linalg.solve(joint[size:, size:], np.c_[joint[size:, :size], vector[size:]])
-    information = positive(joint[:size, :size] - joint[:size, size:] @ nuisance[:, :-1])
-    return vector[:size] - joint[:size, size:] @ nuisance[:, -1] + information @ start, information
-
-
-def _expected(model: Model) -> float:
-    """Error of an interval's mean that the model left on the record it was fitted on, N·m."""
-    fit = model.fit
-    rms_nm = max(float(fit.get(key) or 0.0) for key in ("rms_nm", "held_out_rms_nm"))
-    structure = max(rms_nm**2 - model.noise.white_sd_nm**2, 0.0)
-    return float(np.sqrt(structure + model.noise.block_sd_nm**2)) or 1e-3
+    def fit_from(self, levels: np.ndarray) -> TrialFit:
+        """Gauss and Newton's steps with weights that follow the errors, from such levels and curve."""
+        grid, free, theta, size = self.grid, self.free, self.theta.copy(), levels.size
+        theta[free[:size]] += levels
+        start, weight, done = theta[free].copy(), np.ones(self.target.size), False
+        before_nm = wanted_nm = slope = np.nan
+        turn = 0
+        while True:
+            mean, jacobian = self.problem.run(theta, derivatives=True)
+            assert jacobian is not None
+            mean, lever = mean[grid.fitted], jacobian[free][:, grid.fitted]
+            error = self.target - mean
+            if turn == 0:
+                away = mean - mean.mean()
+                slope = float(away @ self.target / max(away @ away, 1e-300))
+                before_nm, wanted_nm = float(np.std(error)), float(np.std(mean))
+            if turn >= TRUSTED_ROUNDS:
+                weight = _weights(error, round(LOCAL_S / grid.step_s))
+            sd_nm, correlation = _spread(error, weight)
+            precision = weight / (sd_nm**2 * (1.0 + correlation) / (1.0 - correlation))
+            bend, gradient, moved = (lever * precision) @ lever.T, (lever * precision) @ error, theta[free] - start
+            if done or turn == ROUNDS - 1:
+                break
+            step = np.linalg.solve(bend + self.prior, gradient - self.prior @ moved)
+            step[:LEVELS] = np.clip(step[:LEVELS], -LOOSE, LOOSE)
+            theta[free] += step
+            done = turn > TRUSTED_ROUNDS and bool(np.all(np.abs(step[:LEVELS]) < NEAR * LOOSE))
+            turn += 1
+        # The parameters of the trial alone are marginalised; their prior mean is where the fit began.
+        vector, own = bend @ moved + gradient, bend[size:, size:] + self.own_precision
+        nuisance = np.linalg.solve(own, np.c_[bend[size:, :size], vector[size:]])
+        information = positive(bend[:size, :size] - bend[:size, size:] @ nuisance[:, :-1])
+        vector = vector[:size] - bend[:size, size:] @ nuisance[:, -1] + information @ levels
+        inflation = max(1.0, sd_nm / self.expected_nm) ** 2  # a poor fit may be wrong by more than its scatter
+        return TrialFit(
+            vector=vector / inflation,
+            information=information / inflation,
+            error_nm=sd_nm,
+            expected_nm=self.expected_nm,
+            before_nm=before_nm,
+            torque_nm=float(np.std(mean)),
+            wanted_nm=wanted_nm,
+            slope=slope,
+            disturbed=_stretches(grid, weight),
+            duration_s=grid.size * grid.step_s,
+        )
 
 
 def _weights(error: np.ndarray, window: int) -> np.ndarray:
@@ -282,17 +245,6 @@ def _spread(error: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
     pairs = np.sqrt(weight[1:] * weight[:-1])
     correlation = float(np.sum(pairs * error[1:] * error[:-1]) / max(np.sum(pairs) * power, 1e-300))
     return float(np.sqrt(max(power, 1e-18))), float(np.clip(correlation, 0.0, MOST_ALIKE))
-
-
-def _precision(expected: State, own_sd: np.ndarray) -> np.ndarray:
-    """Prior precision of levels (widened by `LOOSE`), curve, and the parameters of the trial alone."""
-    prior = expected.covariance[np.ix_(expected.observed, expected.observed)].copy()
-    prior[np.arange(LEVELS), np.arange(LEVELS)] += LOOSE**2
-    size = len(prior)
-    precision = np.zeros((size + own_sd.size,) * 2)
-    precision[:size, :size] = np.linalg.inv(prior)
-    precision[size:, size:] = np.diag(1.0 / own_sd**2)
-    return precision
 
 
 def _stretches(grid: Grid, weight: np.ndarray) -> tuple[tuple[float, float], ...]:

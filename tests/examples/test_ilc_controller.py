@@ -16,7 +16,8 @@ import pytest
 from examples import ilc_controller as ilc
 from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
-from stimrig.identify.tracking import QUANTITIES, State, follow, model_for_next
+from stimrig.identify.tracking import State, follow, model_for_next
+from stimrig.identify.tracking.state import QUANTITIES
 from tests.harness.changing import Changing
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record

@@ -55,7 +55,7 @@ def test_another_implementation_of_the_muscle_follows_the_reference():
     found = invert(muscle(), Reference.of(wanted), whole=False)
     came = mean_of_pulses(found.pulse_width_us, Patient(6.9, 0.041, 2389.7, 0.2, 0.8))
     assert np.sqrt(np.mean((came - wanted) ** 2)) < 0.01 * np.sqrt(np.mean(wanted**2))
-    assert found.unreachable == () and found.fit_percent is not None and found.fit_percent > 98.0
+    assert found.unreachable == () and found.fit_percent > 98.0
     np.testing.assert_allclose(found.predicted_nm, came, atol=0.05)
 
 
@@ -96,7 +96,6 @@ def test_what_is_too_high_is_named_with_what_lacks():
     (last,) = [one for one in found.unreachable if one.reason == "above-plateau"]
     assert last.end_s == pytest.approx(8.0) and last.begin_s > 4.5
     assert last.shortfall_nm == pytest.approx(9.0 - float(np.max(muscle().recruitment.table()[1])), abs=0.05)
-    assert found.fit_percent is not None and found.whole_fit_percent is not None
     assert found.fit_percent > 97.0 > found.whole_fit_percent
 
 
@@ -315,25 +314,35 @@ def test_a_table_that_is_none_is_refused_at_its_place(content: bytes, place: str
     assert caught.value.place == place and caught.value.fix
 
 
-@pytest.mark.parametrize("wave", [1.0, 20.0])
-def test_a_curve_that_waves_below_its_threshold_does_not_keep_a_train_with_a_rise_limit_at_0(wave: float):
-    """As fits have it: 0.4 % of the largest torque at 20 µs (or 9 %), nothing at 40 µs, its threshold near 110 µs."""
-    knots_us = np.r_[0.0:241.0:20.0]
-    values = np.array([0.0, 0.015, -0.003, 0.006, 0.027, 0.055, 0.4, 1.6, 2.7, 3.2, 3.4, 3.5, 3.5])
-    values[1:4] *= [-wave if wave > 1.0 else 1.0, wave, -wave if wave > 1.0 else 1.0]
-    basis = SplineBasis(knots_us)
-    model = muscle().with_(recruitment=Curve(basis, np.linalg.lstsq(basis.design(knots_us), values)[0]))
-    wanted = smooth(2.5)
-    found = invert(model, Reference.of(wanted), rise_us=50.0)
-    assert np.max(np.diff(np.r_[0.0, found.pulse_width_us])) <= 50.0
-    assert found.whole_fit_percent is not None and found.whole_fit_percent > (95.0 if wave == 1.0 else 80.0)
+KNOTS_US = np.r_[0.0:241.0:20.0]
+RISEN_NM = [0.4, 1.6, 2.7, 3.2, 3.4, 3.5, 3.5]
 
 
-def test_a_wave_and_a_shortest_pulse_do_not_keep_a_train_at_0():
-    """The pulse that the rise would begin with is below the shortest, and one rise from 0 leads into the wave."""
-    knots_us = np.r_[0.0:241.0:20.0]
-    values = np.array([0.0, 0.02, 0.05, -0.05, 0.3, 0.6, 1.0, 1.6, 2.7, 3.2, 3.4, 3.5, 3.5])
-    basis = SplineBasis(knots_us)
-    model = muscle().with_(recruitment=Curve(basis, np.linalg.lstsq(basis.design(knots_us), values)[0]))
-    found = invert(model, Reference.of(smooth(2.5)), rise_us=60.0, shortest_us=20.0)
-    assert found.whole_fit_percent is not None and found.whole_fit_percent > 80.0
+def waving(below_nm: list[float]) -> Model:
+    """A muscle with such torques at 0 to 100 µs, below its threshold, as fits have it."""
+    basis = SplineBasis(KNOTS_US)
+    coefficients_nm = np.linalg.lstsq(basis.design(KNOTS_US), np.array(below_nm + RISEN_NM), rcond=None)[0]
+    return muscle().with_(recruitment=Curve(basis, coefficients_nm))
+
+
+@pytest.mark.parametrize(
+    ("below_nm", "limits", "least_percent"),
+    [
+        ([0.0, 0.015, -0.003, 0.006, 0.027, 0.055], {"rise_us": 50.0}, 95.0),
+        ([0.0, -0.3, -0.06, -0.12, 0.027, 0.055], {"rise_us": 50.0}, 80.0),
+        ([0.0, 0.02, 0.05, -0.05, 0.3, 0.6], {"rise_us": 60.0, "shortest_us": 20.0}, 80.0),
+    ],
+)
+def test_a_curve_that_waves_below_its_threshold_does_not_keep_a_train_at_0(below_nm, limits, least_percent):
+    """The last one: the pulse that a rise would begin with is not sent, and one rise from 0 leads into the wave."""
+    found = invert(waving(below_nm), Reference.of(smooth(2.5)), **limits)
+    assert np.max(np.diff(found.pulse_width_us, prepend=0.0)) <= limits["rise_us"]
+    assert found.whole_fit_percent > least_percent
+
+
+def test_a_nudge_of_a_curve_changes_no_plan():
+    """At this height of a wave a train waited at 4 or at 90 µs, and followed by 79 or 74 %."""
+    wave_nm = 1.63567327020285 * np.array([0.0, 0.096, -0.024, -0.085, -0.043, -0.077])
+    risen_nm, wanted = np.array([0.0, 0.0, 0.0, 0.0, 0.03, 0.06]), Reference.of([1.5] * 100 + [0.5] * 60)
+    lower, higher = (invert(waving([*(risen_nm + (1.0 + e) * wave_nm)]), wanted, rise_us=30.0) for e in (-1e-9, 1e-9))
+    assert np.max(np.abs(lower.predicted_nm - higher.predicted_nm)) < 1e-6

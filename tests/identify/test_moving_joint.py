@@ -195,7 +195,7 @@ def test_widths_follow_a_torque_while_the_joint_moves():
     bell = np.sin(np.pi * np.clip(at_s - 0.5, 0.0, 9.0) / 9.0) ** 2
     wanted = passive + 0.4 * surfaces(model()).g(motion.angle_rad, motion.velocity_rad_s) * 8.0 * bell
     found = invert(model(), Reference.of(wanted, angle_rad=angle))
-    assert found.fit_percent is not None and found.fit_percent > 97.0
+    assert found.fit_percent > 97.0
     still = Motion.still(float(angle[0]), 400)
     as_if_still = above_rest(model(), found.pulse_width_us, 40.0, still)
     moving = above_rest(model(), found.pulse_width_us, 40.0, motion)

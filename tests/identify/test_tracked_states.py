@@ -20,8 +20,8 @@ from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Part, Record
 from stimrig.identify.simulation.predict import predict, problem_of
-from stimrig.identify.tracking import State, begin, follow, model_for_next, moved_model, passed
-from stimrig.identify.tracking.follow import rested, set_states, slow_forms
+from stimrig.identify.tracking import State, follow, model_for_next
+from stimrig.identify.tracking.follow import begin, moved_model, passed, rested, set_states, slow_forms
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
@@ -128,13 +128,13 @@ def test_rests_are_told_by_the_clocks_of_the_records(plain: Model) -> None:
     assert tested.ended_s == pytest.approx(1000.0 + span_s, abs=1e-6)
     by_clock = follow(model, tested, trial_of(model, 1000.0 + span_s + 30.0))
     given = follow(model, tested, trial_of(model), rest_s=30.0)
-    assert by_clock.effects["fatigue"]["now"] == pytest.approx(given.effects["fatigue"]["now"], abs=1e-6)
+    assert by_clock.after.effects["fatigue"] == pytest.approx(given.after.effects["fatigue"], abs=1e-6)
     rested_first = follow(model, None, trial_of(model))
-    assert given.effects["fatigue"]["now"] > 1.05 * rested_first.effects["fatigue"]["now"]
+    assert given.after.effects["fatigue"] > 1.05 * rested_first.after.effects["fatigue"]
     # A rest that nobody knows is taken for a long one; so is one that cannot be.
     for record, rest_s in ((trial_of(model), None), (trial_of(model), math.nan), (trial_of(model, 500.0), None)):
-        assert follow(model, tested, record, rest_s=rest_s).effects["fatigue"]["now"] == pytest.approx(
-            rested_first.effects["fatigue"]["now"], abs=1e-9
+        assert follow(model, tested, record, rest_s=rest_s).after.effects["fatigue"] == pytest.approx(
+            rested_first.after.effects["fatigue"], abs=1e-9
         )
 
 
@@ -144,7 +144,7 @@ def test_the_tracked_gain_takes_part_in_what_tires(plain: Model) -> None:
     weak = replace(weak, mean=np.r_[np.log(0.5), weak.mean[1:]])
     usual, less = passed(model, begin(model), record_of(WIDTHS)), passed(model, weak, record_of(WIDTHS))
     assert less.effects["fatigue"] < 0.75 * usual.effects["fatigue"]
-    served = moved_model(model, weak.values)
+    served = moved_model(model, weak.mean)
     assert less.effects == pytest.approx(passed(served, begin(served), record_of(WIDTHS)).effects, abs=1e-6)
 
 
@@ -152,7 +152,7 @@ def test_a_model_without_such_effects_is_followed_as_ever(plain: Model) -> None:
     record = trial_of(plain, 1000.0)
     step = follow(plain, passed(plain, begin(plain), record), record)
     other = follow(plain, None, record, rest_s=7.0)
-    assert slow_forms(plain) == {} and step.effects == {} and step.coming.ended_s is None
+    assert slow_forms(plain) == {} and step.after.effects == {} and step.coming.ended_s is None
     assert step.to_dict() == other.to_dict()
 
 
@@ -183,17 +183,10 @@ def _test_widths() -> np.ndarray:
     return np.r_[np.zeros(60), ramp, np.zeros(60), steps, np.zeros(60), ramp, np.zeros(60)].round()
 
 
-@pytest.mark.parametrize(
-    ("effect", "changes"),
-    [
-        ("fatigue", {"fatigue_share": 0.5, "fatigue_recovery_s": 90.0}),
-        ("potentiation", {"potentiation_share": 0.4, "potentiation_recovery_s": 60.0}),
-    ],
-)
-def test_the_next_trial_is_foretold_better_with_the_states(effect: str, changes: dict[str, float]) -> None:
-    person = Person(**changes)
+def test_the_next_trial_is_foretold_better_with_the_states() -> None:
+    person = Person(fatigue_share=0.5, fatigue_recovery_s=90.0)
     test = person.play(_test_widths())
-    model = fit(test, effects=[effect])
+    model = fit(test, effects=["fatigue"])
     widths = np.r_[np.zeros(40), np.linspace(60.0, 170.0, 160), np.full(160, 170.0), np.full(80, 110.0), np.zeros(40)]
     carried, forgot = passed(model, begin(model), test), begin(model)
     errors = []
@@ -201,7 +194,7 @@ def test_the_next_trial_is_foretold_better_with_the_states(effect: str, changes:
     for rest_s in (10.0, 10.0, 60.0, 120.0, 10.0, 150.0):
         trial = person.play(widths, rest_s)
         expected = [
-            moved_model(model, state.values, state.curve_nm, rested(model, state.effects, rest_s))
+            moved_model(model, state.mean, state.mean[6:], rested(model, state.effects, rest_s))
             for state in (carried, forgot)
         ]
         errors.append([float(np.std(one.predict(trial) - trial.torque_nm)) for one in expected])
