@@ -83,7 +83,7 @@ def times(browser: Any, service: Service, ids: list[str], runs: int) -> dict[str
     newest, page = f"/models/{ids[-1]}", opened(browser, service)
     paths = {
         "home": "/", "participant": "/participants/P200", "model": newest + "?diagnose=0", "report": newest + "/report",
-        "trend": "/participants/P200/trend", "compare": f"/compare?model={ids[-1]}&model={ids[-2]}&model={ids[-3]}",
+        "trend": "/participants/P200/trend",
         "test": f"/tests/t{SESSIONS - 1:04d}", "administration": "/administration",
     }  # fmt: skip
     by_page = {}

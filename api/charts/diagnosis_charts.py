@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from stimrig.api.charts import figure as fig
-from stimrig.api.charts.figure import Figure, axis, curve, figure, time_axis
+from stimrig.api.charts.figure import Axis, Figure, Line, Mark, Note, Rule, Shade, time_axis
 from stimrig.api.charts.model_charts import broken_at_pauses, free_effects, segment_marks
 from stimrig.api.models import explanation
 from stimrig.identify.healing import looks_like_noise
@@ -38,57 +37,54 @@ def places_of(comparison: dict[str, Any]) -> list[dict[str, Any]]:
     return [explanation.place(entry, number) for number, entry in enumerate(comparison.get("where") or [], start=1)]
 
 
-def _marks(places: Places) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+def _marks(places: Places) -> list[Mark]:
     """Return a shade and a number for each place."""
-    shades, badges = [], []
+    marks: list[Mark] = []
     for place in places:
         ground, start_s, end_s = "good" if place.get("healed") else "worst", place["start_s"], place["end_s"]
-        shades.append(fig.shade("healed-band" if place.get("healed") else "worst-band", start_s, end_s))
-        badges.append(fig.badge((start_s + end_s) / 2, str(place["number"]), ground))
-    return shades, badges
+        marks.append(Shade("healed-band" if place.get("healed") else "worst-band", start_s, end_s))
+        marks.append(Note((start_s + end_s) / 2, str(place["number"]), ground))
+    return marks
 
 
 def residual(comparison: dict[str, Any], segments: list[dict[str, Any]], places: Places) -> Figure:
     """Return measurement minus model over time, the noise band, the worst places marked with their numbers."""
     series = comparison["series"]
     time_s, noise_nm = series["time_s"], series.get("noise_band_nm") or 0.0
-    (shades, names), (bands, badges) = segment_marks(segments), _marks(places)
-    line = curve(time_s, series["residual_nm"], "measured − model", "residual", 0.9, hover=fig.RESIDUAL,
-                 notes=fig.segment_names(time_s, segments))  # fmt: skip
-    shapes = [*shades, fig.level("noise-band", -noise_nm, noise_nm), *bands]
-    x, y = time_axis(time_s[0], time_s[-1]), axis("Measured − model (N·m)")
-    return figure(x, [y], [line], shapes, [*names, *badges], 320)
+    line = Line(time_s, series["residual_nm"], "measured − model", "residual", 0.9)
+    marks = [*segment_marks(segments), Shade("noise-band", -noise_nm, noise_nm, 0), *_marks(places), line]
+    return Figure(time_axis(time_s[0], time_s[-1]), [Axis("Measured − model (N·m)")], marks, 320)
 
 
 def signature(time_s: list[float], effect: dict[str, list[float]]) -> Figure:
     """Return what is left without an effect, and what adding it explains of that."""
     lines = (
-        curve(time_s, effect["seen_nm"], "seen: left without it", "measured", 3.2, hover=fig.RESIDUAL),
-        curve(time_s, effect["expected_nm"], "expected: what it explains", "model", 1.8, hover=fig.RESIDUAL),
+        Line(time_s, effect["seen_nm"], "seen: left without it", "measured", 3.2),
+        Line(time_s, effect["expected_nm"], "expected: what it explains", "model", 1.8),
     )
-    return figure(time_axis(time_s[0], time_s[-1]), [axis("Torque (N·m)")], lines, height=250)
+    return Figure(time_axis(time_s[0], time_s[-1]), [Axis("Torque (N·m)")], lines, 250)
 
 
 def falling(rows: list[dict[str, Any]]) -> Figure:
     """Return the error over the versions, with the noise as the line to fall to."""
     numbers = list(range(len(rows)))
-    lines = []
+    marks: list[Mark] = []
     for key, label, colour, marker in (
-        ("rms_nm", "fitted pulses", "measured", "circle"),
-        ("held_out_rms_nm", "held-out pulses", "model", "diamond"),
+        ("rms_nm", "fitted pulses", "measured", "o"),
+        ("held_out_rms_nm", "held-out pulses", "model", "D"),
     ):
         values = [row[key] for row in rows]
         if key == "rms_nm" or any(value is not None for value in values):
-            lines.append(curve(numbers, values, label, colour, 2.2, marker=marker, hover=fig.ERROR))
-            lines += [curve([number], [values[number]], "", colour, 0, marker=marker, size=13)
+            marks.append(Line(numbers, values, label, colour, 2.2, marker=marker))
+            marks += [Line([number], [values[number]], "", colour, 0, marker=marker, size=13)
                       for number in numbers if rows[number]["current"]]  # fmt: skip
     repeats = rows[-1].get("repetition") or {}
     between = "scatter at rest" if repeats.get("found_by") == "estimate" else "between repeats"
     levels = ((rows[-1].get("noise_sd_nm"), "noise", False), (floor_nm(repeats), between, True))
-    rules = [fig.rule(level, f"{name} {level:.3f} N·m", right=right) for level, name, right in levels if level]
+    marks += [Rule(level, f"{name} {level:.3f} N·m", right=right) for level, name, right in levels if level]
     ticks = [(number, f"{number + 1}. {row['label']}") for number, row in enumerate(rows)]
-    x = axis("Version", limits=(-0.4, len(rows) - 0.6), ticks=ticks)
-    return figure(x, [axis("Error (N·m)", from_zero=True)], lines, rules, height=320)
+    x = Axis("Version", (-0.4, len(rows) - 0.6), ticks)
+    return Figure(x, [Axis("Error (N·m)", from_zero=True)], marks, 320)
 
 
 # ---- the story of a model's improvement -----------------------------------------------------------------------------
@@ -115,26 +111,25 @@ def side_by_side(before: dict[str, Any], after: dict[str, Any], places: Places, 
     With `close` only what is around the first place is drawn.
     """
     curves, changed = before["curves"], before is not after
-    start_s, end_s = curves["time_s"][0], curves["time_s"][-1]
-    (shapes, names), (bands, badges) = segment_marks(curves["segments"]), _marks(places)
+    start_s, end_s, marks = curves["time_s"][0], curves["time_s"][-1], []
     if close:
         start_s, end_s = max(start_s, places[0]["start_s"] - AROUND_S), min(end_s, places[0]["end_s"] + AROUND_S)
-        shapes, names = [], []
+    else:
+        marks = segment_marks(curves["segments"])
     noise_nm = after["comparison"]["series"].get("noise_band_nm") or 0.0
-    shapes += [fig.level("noise-band", -noise_nm, noise_nm, panel=1), *bands]
+    marks += [Shade("noise-band", -noise_nm, noise_nm, 1), *_marks(places)]
 
-    def line(data: dict[str, Any], key: str, label: str, colour: str, width: float, **more: Any) -> dict[str, Any]:
+    def line(data: dict[str, Any], key: str, label: str, colour: str, width: float, **more: Any) -> Line:
         series = broken_at_pauses(data)
         rows = [row for row in zip(series["time_s"], series[key], strict=True) if start_s <= row[0] <= end_s]
-        hover = fig.RESIDUAL if key == "residual_nm" else fig.TORQUE
-        return curve([row[0] for row in rows], [row[1] for row in rows], label, colour, width, hover=hover, **more)
+        return Line([row[0] for row in rows], [row[1] for row in rows], label, colour, width, **more)
 
     predicted, below = "predicted_torque_nm", {"panel": 1, "listed": False}
-    lines = [line(curves, "torque_nm", "measured", "measured", 3.2)]
+    marks.append(line(curves, "torque_nm", "measured", "measured", 3.2))
     if changed:
-        lines.append(line(curves, predicted, "model at first", "series-2", 1.6, dash="dot"))
-        lines.append(line(before["comparison"]["series"], "residual_nm", "left at first", "series-2", 0.9, **below))
-    lines.append(line(after["curves"], predicted, "model at last" if changed else "model", "model", 1.8))
-    lines.append(line(after["comparison"]["series"], "residual_nm", "left", "residual", 1.0, **below))
-    panels = [axis("Torque (N·m)"), axis("Residual (N·m)")]
-    return figure(time_axis(start_s, end_s), panels, lines, shapes, [*names, *badges], 420, (0.6, 0.35))
+        marks.append(line(curves, predicted, "model at first", "series-2", 1.6, dash="dot"))
+        marks.append(line(before["comparison"]["series"], "residual_nm", "left at first", "series-2", 0.9, **below))
+    marks.append(line(after["curves"], predicted, "model at last" if changed else "model", "model", 1.8))
+    marks.append(line(after["comparison"]["series"], "residual_nm", "left", "residual", 1.0, **below))
+    panels = [Axis("Torque (N·m)"), Axis("Residual (N·m)")]
+    return Figure(time_axis(start_s, end_s), panels, marks, 420, (0.6, 0.35))

@@ -6,9 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 from stimrig.api import local_time
-from stimrig.api.charts import figure as fig
-from stimrig.api.charts.drawing import svg
-from stimrig.api.charts.figure import Figure, axis, curve, figure
+from stimrig.api.charts.figure import Axis, Figure, Line, Mark, Rule
 from stimrig.api.clock import unix_of, utc_label
 from stimrig.api.models import changes
 from stimrig.api.models.changes import BEYOND, OF_THE_CURVE, UNBROKEN
@@ -62,7 +60,7 @@ def panels(sessions: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     return pictures
 
 
-def _dates(start_s: float, days: float) -> dict[str, Any]:
+def _dates(start_s: float, days: float) -> Axis:
     """Return the time axis with a few days, or times of day where all was within two."""
     count, ticks = MOST_DATES if days else 1, []
     for number in range(count):
@@ -70,18 +68,18 @@ def _dates(start_s: float, days: float) -> dict[str, Any]:
         label = utc_label(start_s + at * DAY_S)
         ticks.append((at, local_time.clock(label)[:5] if 0 < days < 2 else local_time.day(label, year=False)))
     room = 0.06 * days or 0.5
-    return axis("", limits=(-room, days + room), ticks=ticks)
+    return Axis("", (-room, days + room), ticks)
 
 
 def _panel(
-    points: Sequence[Point], title: str, unit: str, latest: str, x: dict[str, Any], levels: Sequence[float] = ()
+    points: Sequence[Point], title: str, unit: str, latest: str, x: Axis, levels: Sequence[float] = ()
 ) -> dict[str, Any]:
     known = any(point.value is not None for point in points)
-    picture = svg(history(points, unit, x, levels), WIDE_PX, label=f"{title}, {unit}") if known else ""
+    picture = history(points, unit, x, levels).svg(WIDE_PX, label=f"{title}, {unit}") if known else ""
     return {"title": title, "unit": unit, "latest": latest, "svg": picture}
 
 
-def history(points: Sequence[Point], unit: str, x: dict[str, Any], levels: Sequence[float] = ()) -> Figure:
+def history(points: Sequence[Point], unit: str, x: Axis, levels: Sequence[float] = ()) -> Figure:
     """Return values with their bands; dots are hollow where nothing is approved, flags say that something is noted."""
     known = [(point, point.value, point.half or 0.0) for point in points if point.value is not None]
     low, high = span([(value - half, value, value + half) for _point, value, half in known])
@@ -91,22 +89,20 @@ def history(points: Sequence[Point], unit: str, x: dict[str, Any], levels: Seque
             line.append((point.x, None))
         line.append((point.x, point.value))
     bars = [(point.x, end) for point, value, half in known if half for end in (value - half, value + half, None)]
-    parts: Any = (
-        (line, "model", {"width": 1.6}),
-        (bars, "model-band", {"width": 7.0}),
-        ([(point.x, value) for point, value, _half in known], "model", {"width": 0, "marker": "circle", "size": 7}),
-        ([(point.x, value) for point, value, _half in known if not point.approved], "chart",
-         {"width": 0, "marker": "circle", "size": 3.6}),
-        ([(point.x, high - 0.04 * (high - low)) for point in points if point.flagged], "width",
-         {"width": 0, "marker": "diamond", "size": 6}),
-    )  # fmt: skip
-    traces = [
-        curve([x for x, _ in rows], [y for _, y in rows], "", colour, **style)
-        for rows, colour, style in parts
-        if rows and not ("marker" in style and len(known) > MAX_DOTS)
-    ]
-    rules = [fig.rule(at, colour="width") for at in levels if low <= at <= high]
-    return figure(x, [axis(unit, limits=(low, high))], traces, rules, height=TALL_PX)
+    marks: list[Mark] = [Line([x for x, _ in line], [y for _, y in line])]
+    if bars:
+        marks.append(Line([x for x, _ in bars], [y for _, y in bars], "", "model-band", 7.0))
+    if len(known) <= MAX_DOTS:
+        top = high - 0.04 * (high - low)
+        for rows, colour, marker, size in (
+            ([(point.x, value) for point, value, _half in known], "model", "o", 7),
+            ([(point.x, value) for point, value, _half in known if not point.approved], "chart", "o", 3.6),
+            ([(point.x, top) for point in points if point.flagged], "width", "D", 6),
+        ):
+            if rows:
+                marks.append(Line([x for x, _ in rows], [y for _, y in rows], "", colour, 0, marker=marker, size=size))
+    marks += [Rule(at, colour="width") for at in levels if low <= at <= high]
+    return Figure(x, [Axis(unit, (low, high))], marks, TALL_PX)
 
 
 def span(ranges: Sequence[tuple[float, float, float]]) -> tuple[float, float]:
@@ -140,7 +136,7 @@ def trial_panels(trials: Sequence[Mapping[str, Any]], bounds: Bounds) -> list[di
     """
     numbers = [trial["number"] for trial in trials]
     ticks = [(number, str(number)) for number in numbers[:: -(-len(numbers) // MOST_NUMBERS)]]
-    x = axis("Number of the trial", limits=(numbers[0] - 0.5, numbers[-1] + 0.5), ticks=ticks)
+    x = Axis("Number of the trial", (numbers[0] - 0.5, numbers[-1] + 0.5), ticks)
     pictures = []
     for name, (title, unit, factor) in TRIAL_FIGURES.items():
         points = [

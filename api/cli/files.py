@@ -103,7 +103,6 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
         It cannot be written.
     """
     from stimrig.api.export.record_file import WRITERS, write_record
-    from stimrig.api.models import inverted
     from stimrig.identify.inversion import Inversion
 
     path = Path(path)
@@ -116,13 +115,23 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
         with whole_path(path) as place:
             write_record(what, place, kind[1:])
     elif isinstance(what, Inversion) and kind == ".csv":
-        write(path, inverted.table(what.to_dict()))
+        write(path, inversion_table(what.to_dict()))
     else:
         fix = (
             "A model is .json, .mat or .html, an explanation .html, a record .csv, .mat or .parquet, an inversion .csv."
         )
         raise identify.BadRequest(f"no {kind or 'such'} file of a {type(what).__name__}", place=str(path), fix=fix)
     return path
+
+
+def inversion_table(inversion: dict[str, Any]) -> str:
+    """Write pulse widths for a reference torque as a CSV table, a row for each pulse."""
+    names = ("pulse_width_us", "reference_torque_nm", "predicted_torque_nm")
+    rows = zip(*(inversion[name] for name in names), strict=True)
+    lines = [
+        f"{k / inversion['pulse_rate_hz']:.6g}," + ",".join(f"{each:g}" for each in row) for k, row in enumerate(rows)
+    ]
+    return "\r\n".join([",".join(["time_s", *names]), *lines, ""])
 
 
 def html_report(what: Any, record: identify.Record | None, name: str) -> str:

@@ -94,21 +94,17 @@ def newest_changes(sessions: Sequence[Session]) -> dict[str, Any] | None:
 
 def changes_to(store: Store, model: Model) -> dict[str, Any] | None:
     """Return what changed to a model from the last approved session before it; None where there is none."""
-    (now,) = sessions_of_models(store, model.participant, [model.id])
-    earlier = [session for session in sessions(store, model.participant) if session.at_utc < now.at_utc]
-    return newest_changes([*(session for session in earlier if session.key != now.key), now])
+    known, models = _read(store, model.participant)
+    row = models[model.id]
+    now = replace(next(session for session in known if session.key == _key(row)), model=row)
+    return newest_changes(
+        [*(session for session in known if session.at_utc < now.at_utc and session.key != now.key), now]
+    )
 
 
 def sessions(store: Store, participant: str) -> list[Session]:
     """Return a participant's sessions, the oldest first."""
     return _read(store, participant)[0]
-
-
-def sessions_of_models(store: Store, participant: str, model_ids: Sequence[str]) -> list[Session]:
-    """Return for each model the session in which its recording was made, with this model for it."""
-    known, models = _read(store, participant)
-    by_key = {session.key: session for session in known}
-    return [replace(by_key[_key(models[model_id])], model=models[model_id]) for model_id in model_ids]
 
 
 def _read(store: Store, participant: str) -> tuple[list[Session], dict[str, Any]]:

@@ -18,7 +18,6 @@ from tests.api.browser import (
     WIDE,
     ZOOMED,
     chart,
-    look_closer,
     open_tab,
     participant,
     settled,
@@ -116,8 +115,7 @@ def test_a_model_and_what_is_made_of_it(tab: Any, service: Service, client: http
     tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
     for figure in ("comparison", "recruitment", "residual", "falling"):
         chart(tab, figure)
-    look_closer(tab, "step")
+    chart(tab, "step")
     examine(tab, "model, all open")
     visit(tab, service, f"/models/{first}/report", stop=False)
-    for path in (f"/compare?model={first}&model={added}", "/participants/X3/trend", f"/models/{first}/widths"):
-        visit(tab, service, path)
+    visit(tab, service, "/participants/X3/trend")

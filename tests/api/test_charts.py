@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import json
 import math
 import re
 import xml.etree.ElementTree as ElementTree
 from functools import cache
-from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -17,8 +16,7 @@ import pytest
 from stimrig import identify
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.charts import figure as fig
-from stimrig.api.charts.drawing import file, svg
-from stimrig.api.charts.figure import LIGHT, axis, curve, figure
+from stimrig.api.charts.figure import LIGHT, Axis, Figure, Line, Note
 from stimrig.api.charts.plot import plot
 from stimrig.api.jobs.curves import curves
 from stimrig.api.sessions import joint_plan
@@ -45,7 +43,7 @@ NAMES = ("recruitment", "comparison", "overview", "step", "residual", "signature
 
 
 @cache
-def figures() -> dict[str, Any]:
+def figures() -> dict[str, Figure]:
     """All figures of a made-up muscle's model page."""
     document, drawn = measured()
     rows = [{"label": label, "rms_nm": rms, "held_out_rms_nm": rms, "noise_sd_nm": 0.04, "current": label != "base"}
@@ -61,28 +59,24 @@ def figures() -> dict[str, Any]:
     }
 
 
-def axes(drawn: dict[str, Any]) -> dict[str, dict[str, Any]]:
-    return {name: value for name, value in drawn["layout"].items() if re.match("[xy]axis", name)}
-
-
 # ---- data ------------------------------------------------------------------------------------------------------------
 
 
 def test_the_measurement_is_torque_residual_and_pulse_width_on_one_axis() -> None:
     document, drawn = measured()
     large, overview = figures()["comparison"], figures()["overview"]
-    torque, predicted, left, width = large["data"]
-    assert torque["y"] == drawn["torque_nm"] and predicted["y"] == drawn["predicted_torque_nm"]
-    numbers = [np.array(trace["y"], dtype=float) for trace in (torque, predicted, left)]
-    assert np.allclose(numbers[0] - numbers[1], numbers[2], atol=1e-5) and width["y"] == drawn["pulse_width_us"]
-    assert [trace["yaxis"] for trace in large["data"]] == ["y", "y", "y2", "y3"] and width["line"]["shape"] == "hv"
-    noise = next(shape for shape in large["layout"]["shapes"] if shape["xref"] == "paper")
-    assert noise["yref"] == "y2" and noise["y1"] == pytest.approx(2 * document["fit"]["noise_sd_nm"])
-    assert overview["data"] == large["data"][:3] and overview["layout"]["height"] <= 320
-    assert large["layout"]["annotations"][-1]["text"].startswith("Check")
-    domains = [axes(large)[name]["domain"] for name in ("yaxis", "yaxis2", "yaxis3")]
-    assert domains[0][1] == 1.0 and domains[2][0] >= 0.0
-    assert all(above[0] > below[1] for above, below in pairwise(domains))
+    lines = large.lines()
+    torque, predicted, left, width = (
+        lines[name] for name in ("measured", "model, free run", "measured − model", "pulse width")
+    )
+    assert torque.y == drawn["torque_nm"] and predicted.y == drawn["predicted_torque_nm"]
+    numbers = [np.array(line.y, dtype=float) for line in (torque, predicted, left)]
+    assert np.allclose(numbers[0] - numbers[1], numbers[2], atol=1e-5) and width.y == drawn["pulse_width_us"]
+    assert [line.panel for line in (torque, predicted, left, width)] == [0, 0, 1, 2] and width.step
+    noise = next(mark for mark in large.marks if isinstance(mark, fig.Shade) and mark.panel == 1)
+    assert noise.end == pytest.approx(2 * document["fit"]["noise_sd_nm"])
+    assert [*overview.lines()] == [*lines][:3] and overview.height <= 320
+    assert [mark for mark in large.marks if isinstance(mark, fig.Note)][-1].words.startswith("Check")
 
 
 def test_no_line_goes_through_the_pause_between_two_recordings() -> None:
@@ -93,49 +87,25 @@ def test_no_line_goes_through_the_pause_between_two_recordings() -> None:
     assert model_charts.broken_at_pauses(slow) is slow, "slower sampling is no pause"
     paused = {**drawn, "time_s": [*first, *(moment_s + 600.0 for moment_s in second)]}
     broken = model_charts.measurement(paused, None)
-    for trace in broken["data"]:
-        assert len(trace["x"]) == len(trace["y"]) == len(drawn["time_s"]) + 1 and trace["y"][half] is None
-        assert trace["x"][half] == pytest.approx((paused["time_s"][half - 1] + paused["time_s"][half]) / 2)
-        assert len(trace.get("customdata", ())) in (0, len(trace["x"]))
-    assert "nan" not in svg(broken).lower()
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_every_axis_and_every_value_has_its_unit_and_every_colour_its_role(name: str) -> None:
-    drawn = figures()[name]
-    labels = [value["title"]["text"] for value in axes(drawn).values() if "ticktext" not in value]
-    assert all(re.search(r" \(.+\)$", label) for label in labels), labels
-    for trace in drawn["data"]:
-        unit = {"joint_g": "", "step": ""}.get(name, "µs" if trace["name"] == "pulse width" else "N·m")
-        end = f"}} {unit}".rstrip() + "<extra></extra>"
-        assert trace.get("hovertemplate", end).replace(" %{customdata}", "").endswith(end)
-        assert len(trace["x"]) == len(trace["y"])
-    assert set(re.findall(r"var\(--([\w-]+)\)", json.dumps(drawn))) <= set(LIGHT)
+    for line in broken.lines().values():
+        assert len(line.x) == len(line.y) == len(drawn["time_s"]) + 1 and line.y[half] is None
+        assert line.x[half] == pytest.approx((paused["time_s"][half - 1] + paused["time_s"][half]) / 2)
+    assert "nan" not in broken.svg().lower()
 
 
 def test_the_error_falls_to_the_noise() -> None:
     drawn = figures()["falling"]
-    fitted, _current, held_out, _ = drawn["data"]
-    assert (fitted["y"], held_out["y"]) == ([0.12, 0.05], [0.12, 0.05]) and drawn["layout"]["shapes"][0]["y0"] == 0.04
-    assert drawn["layout"]["xaxis"]["ticktext"] == ["1. base", "2. + fatigue"]
+    fitted, held_out = (drawn.lines()[name] for name in ("fitted pulses", "held-out pulses"))
+    assert fitted.y == held_out.y == [0.12, 0.05]
+    assert [mark.at for mark in drawn.marks if isinstance(mark, fig.Rule)] == [0.04]
+    assert [words for _at, words in drawn.x.ticks] == ["1. base", "2. + fatigue"]
 
 
 def test_the_band_of_a_curve_is_that_of_the_document() -> None:
-    document, _drawn = measured()
-    known = document["uncertainty"]["bands"]["recruitment"]
-    upper, lower, model = figures()["recruitment"]["data"]
-    assert (lower["x"], lower["y"], upper["y"]) == tuple(known[key] for key in
-                                                         ("pulse_width_us", "whole_lower", "whole_upper"))  # fmt: skip
-    assert lower["fill"] == "tonexty" and upper["line"]["width"] == 0
-    assert model["hovertemplate"] == "model %{y:.2f} N·m %{customdata}<extra></extra>"
-    halves = fig.half_widths(fig.band([0.0, 10.0], [1.0, 2.0], [1.2, 2.6]), [0.0, 5.0, 12.0])
-    assert halves == ["± 0.10", "± 0.20", "± 0.30"] and fig.half_widths([], [0.0]) == []
-
-
-def test_each_time_has_the_segment_it_lies_in() -> None:
-    segments = [{"name": name, "start_s": start} for name, start in (("a", 0.0), ("b", 1.0), ("c", 2.0))]
-    assert fig.segment_names([0.0, 0.9, 1.0, 2.0, 9.0], segments) == ["· a", "· a", "· b", "· c", "· c"]
-    assert fig.segment_names([0.0], []) == [""]
+    known = measured()[0]["uncertainty"]["bands"]["recruitment"]
+    band = figures()["recruitment"].marks[0]
+    assert (band.x, band.lower, band.upper) == tuple(known[key] for key in
+                                                     ("pulse_width_us", "whole_lower", "whole_upper"))  # fmt: skip
 
 
 # ---- g and h: the document's own numbers, bands where the joint was seen, dotted where it was not
@@ -156,26 +126,25 @@ def was_seen(name: str, angle_deg: float, velocity_rad_s: float) -> bool:
 
 @pytest.mark.parametrize("name", ["g", "h"])
 def test_lines_and_bands_are_the_documents_where_the_joint_was_seen_and_dotted_elsewhere(name: str) -> None:
-    law, traces = made_up_joint.g if name == "g" else made_up_joint.h_nm, figures()[f"joint_{name}"]["data"]
-    lines = {trace["name"]: trace for trace in traces if "hovertemplate" in trace}
+    law, drawn = made_up_joint.g if name == "g" else made_up_joint.h_nm, figures()[f"joint_{name}"]
+    lines = {words: line for words, line in drawn.lines().items() if line.dash == "solid"}
     assert set(lines) == set(SPEEDS) - ({"straightening 46°/s"} if name == "g" else set()), "never seen is left out"
-    for words, trace in lines.items():
-        assert trace["x"] == pytest.approx(ANGLES_DEG)
-        for angle_deg, value in zip(ANGLES_DEG, trace["y"], strict=True):
+    for words, line in lines.items():
+        assert line.x == pytest.approx(ANGLES_DEG)
+        for angle_deg, value in zip(ANGLES_DEG, line.y, strict=True):
             assert (value is not None) == was_seen(name, angle_deg, SPEEDS[words]), (words, angle_deg)
             assert value is None or value == pytest.approx(law(math.radians(angle_deg), SPEEDS[words]))
     count = 0
-    for upper, lower in pairwise(traces):
-        for angle_deg, low, high in zip(lower["x"], lower["y"], upper["y"], strict=True) if "fill" in lower else ():
+    for band in [mark for mark in drawn.marks if isinstance(mark, fig.Band)]:
+        for angle_deg, low, high in zip(band.x, band.lower, band.upper, strict=True):
             assert high - low == pytest.approx(2 * made_up_joint.half(math.radians(angle_deg)))
             row = round((angle_deg - ANGLES_DEG[0]) / 1.5)
-            assert any(trace["y"][row] == pytest.approx((low + high) / 2) for trace in lines.values())
+            assert any(line.y[row] == pytest.approx((low + high) / 2) for line in lines.values())
             count += 1
-    assert count == sum(value is not None for trace in lines.values() for value in trace["y"])
-    assert sum(trace["line"]["dash"] == "dot" for trace in traces) == sum(
-        None in trace["y"] for trace in lines.values()
-    )
-    listed = [trace["name"] for trace in traces if trace["showlegend"]]
+    assert count == sum(value is not None for line in lines.values() for value in line.y)
+    dotted = [mark for mark in drawn.marks if isinstance(mark, Line) and mark.dash == "dot"]
+    assert len(dotted) == sum(None in line.y for line in lines.values())
+    listed = [mark.label for mark in drawn.marks if isinstance(mark, Line | fig.Band) and mark.listed and mark.label]
     assert listed == ["95 % band", "dotted: not seen", *lines], "each once"
 
 
@@ -184,7 +153,7 @@ def test_all_seen_needs_no_dots_and_no_band_none_of_it() -> None:
     ones = [[1] * len(row) for row in joint["seen_g"]]
     bare = {key: value for key, value in joint.items() if "lower" not in key and "upper" not in key}
     for drawn in joint_charts.joint_figures({"joint": {**bare, "seen_g": ones, "seen_h": ones}}).values():
-        assert len(drawn["data"]) == 5 and all(trace["line"]["dash"] == "solid" for trace in drawn["data"])
+        assert len(drawn.marks) == 5 and {mark.dash for mark in drawn.marks} == {"solid"}
     for document in ({}, {"joint": {}}, {"joint": {"g": [[1.0]]}}):
         assert joint_charts.joint_figures(document) == {}
     assert (joint_charts.STILL_RAD_S, joint_charts.FAST_RAD_S) == (joint_plan.SLOW_RAD_S, joint_plan.FAST_RAD_S)
@@ -192,11 +161,10 @@ def test_all_seen_needs_no_dots_and_no_band_none_of_it() -> None:
 
 # ---- drawn -----------------------------------------------------------------------------------------------------------
 
-LINE = figure(
-    axis("Time (s)"), [axis("Torque (N·m)"), axis("Width (µs)")],
-    [curve([0.0, 10.0, 20.0], [0.0, 1.0, None], "<a> & $b$", "model"),
-     curve([0.0, 10.0], [1.0, 2.0], "var(--worst)", "width", panel=1)],
-    names=[fig.name(5.0, "<i>&"), fig.badge(6.0, "1", "worst")], shares=(1, 1),
+LINE = Figure(
+    Axis("Time (s)"), [Axis("Torque (N·m)"), Axis("Width (µs)")],
+    [Line([0.0, 10.0, 20.0], [0.0, 1.0, None], "<a href='x'> & $b$"), Line([0.0, 10.0], [1.0, 2.0], "_w", panel=1),
+     Note(5.0, "<i>&"), Note(6.0, "1", "worst")], shares=(1, 1),
 )  # fmt: skip
 
 
@@ -205,49 +173,53 @@ def words_of(picture: str) -> set[str | None]:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_still_is_whole_svg_with_its_axes_in_colours_of_the_page(name: str) -> None:
-    picture = str(svg(figures()[name], 760.0, label="<x> & more"))
+def test_a_still_is_whole_svg_with_units_in_colours_of_the_page(name: str) -> None:
+    drawn = figures()[name]
+    picture = str(drawn.svg(760.0, label="<x> & more"))
     root = ElementTree.fromstring(picture)
     assert root.attrib["aria-label"] == "<x> & more" and root.attrib["viewBox"].startswith("0 0 760 ")
+    labels = [axis.label for axis in (drawn.x, *drawn.panels) if not axis.ticks]
+    assert all(re.search(r" \(.+\)$", label) for label in labels), labels
     words = " ".join(filter(None, words_of(picture)))
-    labels = [value["title"]["text"] for value in axes(figures()[name]).values()]
     assert all(part in words for label in labels for part in label.split(" ("))
     assert "style=" not in picture and " id=" not in re.sub(r"<(clipPath|path) id=", "", picture)
-    assert not re.search(r"#[0-9a-f]{6}\b", picture) and "var(--" in picture, "a colour would stay light in the dark"
-    assert "var(--" not in svg(figures()[name], 760.0, light=True)
+    assert not re.search(r"#[0-9a-f]{6}\b", picture), "a colour would stay light in the dark"
+    assert set(re.findall(r"var\(--([\w-]+)\)", picture)) <= set(LIGHT)
+    assert "var(--" not in drawn.svg(760.0, light=True)
 
 
 def test_words_of_a_recording_are_words() -> None:
-    words = words_of(str(svg(LINE)))
-    assert {"‹i›&", "‹a› & $b$", "var( --worst)", "1"} <= words
-    assert "‹i›&" not in words_of(str(svg(LINE, 300.0))), "a narrow chart has no room for names"
-    assert fig.in_light(LINE)["data"][1]["name"] == "var( --worst)"
+    words = words_of(str(LINE.svg()))
+    assert {"<i>&", "<a href='x'> & $b$", "w", "1"} <= words
+    assert "<i>&" not in words_of(str(LINE.svg(300.0))), "a narrow chart has no room for names"
 
 
-def test_files_open() -> None:
-    assert [file(LINE, kind)[:4] for kind in ("svg", "pdf", "png")] == [b"<svg", b"%PDF", b"\x89PNG"]
+def test_files_open(tmp_path: Path) -> None:
+    for kind, begins in (("svg", b"<svg"), ("pdf", b"%PDF"), ("png", b"\x89PNG")):
+        LINE.save(tmp_path / f"line.{kind}")
+        assert (tmp_path / f"line.{kind}").read_bytes().startswith(begins)
+    with pytest.raises(ValueError, match=r"\.pdf"):
+        LINE.save(tmp_path / "line.exe")
 
 
 def test_a_still_is_small_and_loses_no_peak() -> None:
-    assert len(svg(figures()["overview"], 760.0)) < 45_000, "it stands in the page"
+    assert len(figures()["overview"].svg(760.0)) < 45_000, "it stands in the page"
     y = [math.sin(0.9 * k) for k in range(2000)]
     y[777] = 5.0
-    peaks = [float(at) for at in re.findall(r"[ML][-\d.]+ ([-\d.]+)", svg(figure(
-        axis("Time (s)"), [axis("Torque (N·m)", limits=(-2.0, 8.0))], [curve(range(2000), y, "", "model")]
-    )))]  # fmt: skip
+    drawn = Figure(Axis("Time (s)"), [Axis("Torque (N·m)", (-2.0, 8.0))], [Line(range(2000), y)]).svg()
+    peaks = [float(at) for at in re.findall(r"[ML][-\d.]+ ([-\d.]+)", drawn)]
     assert min(peaks) < min(sorted(peaks)[10:]) - 50, "the one at 5 of a range of 10 stands out"
 
 
-def test_a_notebook_draws_in_light_colours_and_a_free_effect_with_its_bands() -> None:
+def test_a_notebook_draws_a_free_effect_with_its_bands_in_light_colours() -> None:
     lines = {name: {"value": [0.0, one], "lower": [0.0, 0.9 * one], "upper": [0.0, 1.1 * one]}
              for name, one in (("opening", 1.0), ("speed", 0.5))}  # fmt: skip
     found = object.__new__(identify.Diagnosis)
-    entry = {"at": [0.0, 0.5], "lines": lines, "driver": "time (s)", "axis": "opening <a href='x'>"}
-    found.__dict__["free"] = (entry,)
-    drawn: Any = plot(found)
-    assert [trace.y for trace in drawn.data if trace.name in lines] == [(0.0, 1.0), (0.0, 0.5)]
-    assert [trace.y for trace in drawn.data if trace.fill] == [(0.0, 0.9), (0.0, 0.45)]
-    assert drawn.layout.yaxis.title.text == "opening ‹a href='x'›" and "var(" not in str(drawn)
+    found.__dict__["free"] = ({"at": [0.0, 0.5], "lines": lines, "driver": "time (s)", "axis": "opening"},)
+    drawn = plot(found)
+    assert [line.y for line in drawn.lines().values()] == [[0.0, 1.0], [0.0, 0.5]]
+    assert [mark.lower for mark in drawn.marks if isinstance(mark, fig.Band)] == [[0.0, 0.9], [0.0, 0.45]]
+    assert drawn._repr_html_().startswith("<svg") and "var(" not in drawn._repr_html_()
     found.__dict__["free"] = ()
     with pytest.raises(identify.BadRequest, match="free effect"):
         plot(found)
@@ -266,4 +238,4 @@ def test_reports_have_the_joint_and_pages_of_other_models_do_not(service: Servic
     for model, count in ((both.json()["id"], 2), (test["model_id"], 0)):
         page = client.get(f"/models/{model}").text
         assert page.count('data-figure="joint_') == count and ("joint_g.svg" in page) == bool(count)
-        assert client.get(f"/models/{model}/report").text.count("<svg") == 3 + count
+        assert client.get(f"/models/{model}/report").text.count('class="still"') == 4 + count

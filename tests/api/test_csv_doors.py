@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from stimrig import identify
 from stimrig.api import record_files
 from stimrig.api.cli import main
-from stimrig.api.models import inverted
+from stimrig.api.cli.files import inversion_table
 from stimrig.identify.records import cells
 from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.record import Record, Source
@@ -80,9 +80,12 @@ def test_an_export(tmp_path: Path) -> None:
     assert texts_of(tmp_path / "errors.csv", "address", "reason") == {"'=a", "'-c"}
 
 
+COLUMNS = ("pulse_width_us", "reference_torque_nm", "predicted_torque_nm")
+
+
 def test_numbers_only() -> None:
-    widths = {"pulse_rate_hz": 40.0, **{name: [-0.5, 1.0] for name in inverted.COLUMNS}}
-    assert all(is_number(cell) for row in inverted.table(widths).split()[1:] for cell in row.split(","))
+    widths = {"pulse_rate_hz": 40.0, **{name: [-0.5, 1.0] for name in COLUMNS}}
+    assert all(is_number(cell) for row in inversion_table(widths).split()[1:] for cell in row.split(","))
 
 
 def named() -> Record:

@@ -1,8 +1,7 @@
-"""Whatever is pressed in whatever chart, no request leaves: on pages, in report files, in notebooks."""
+"""No request leaves a report file, whatever its recording holds."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -10,20 +9,17 @@ from urllib.parse import urlsplit
 
 import pytest
 
-import stimrig
 from stimrig import identify
-from stimrig.api.charts.figure import CONFIG
 from stimrig.api.jobs.curves import curves, rounded
 from stimrig.api.models.explanation import step_versions
 from stimrig.api.models.story import story
 from stimrig.api.web.pages.report_file import comparison_html, story_html
-from tests.api.browser import look_closer, open_tab, settled
-from tests.api.conftest import Service, play_test, shared_service
+from tests.api.browser import open_tab
+from tests.api.conftest import Service, shared_service
 from tests.api.test_jobs import made_up_csv
 
 pytestmark = pytest.mark.browser
 LINK = '<a href="https://elsewhere.example/">here</a>'
-BUTTONS = ".js-plotly-plot :is(.modebar-btn, button, a, [role=button])"
 
 
 service = shared_service(speed=8.0)
@@ -37,8 +33,8 @@ def tab(browser: Any, service: Service) -> Iterator[Any]:
 
 
 def watch(page: Any) -> None:
-    """Take down what any tab of the browser's asks another machine for, and what is saved here."""
-    page.left, page.downloads, context = [], [], page.context
+    """Take down what any tab of the browser's asks another machine for."""
+    page.left, context = [], page.context
     own = urlsplit(page.url).netloc
 
     def stop(route: Any) -> None:
@@ -51,59 +47,11 @@ def watch(page: Any) -> None:
 
     context.route("**/*", stop)
     context.on("page", lambda other: page.left.append(f"a new window: {other.url}"))
-    page.on("download", lambda found: page.downloads.append(found))
-
-
-def press_everything(page: Any, figures: int) -> None:
-    """Every button and link of every chart, then the chart itself; the picture of each is made by the browser."""
-    page.locator(".js-plotly-plot .main-svg").first.wait_for()
-    page.wait_for_function("n => document.querySelectorAll('.js-plotly-plot .modebar').length >= n", arg=figures)
-    buttons, count = page.locator(BUTTONS), page.locator(BUTTONS).count()
-    assert count >= 4 * figures
-    for number in range(count):  # a press may draw a chart anew
-        buttons.nth(number).click(force=True, no_wait_after=True)
-    for chart in page.locator(".js-plotly-plot").all():
-        for entry in chart.locator(".legendtoggle").all():
-            entry.click(force=True)
-            entry.dblclick(force=True)
-        for plane in chart.locator(".nsewdrag").all():
-            plane.click(force=True, position={"x": 20, "y": 20})
-            plane.dblclick(force=True, position={"x": 30, "y": 20})
-    for _ in range(600):
-        if len(page.downloads) >= figures:
-            break
-        page.wait_for_timeout(100)
-    assert len(page.downloads) == figures
-    assert all(Path(download.path()).read_bytes().startswith(b"\x89PNG") for download in page.downloads)
-    assert buttons.count() == count, "no press brings up another button, as to upload it"
-    assert page.left == [] and page.errors == []
-
-
-@pytest.mark.campaign
-def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service) -> None:
-    with service.client() as http:
-        model = play_test(http, "N1")["model_id"]
-        added = http.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
-    added = added.get("id") or added["model"]["id"]
-    paths = (f"/models/{model}?diagnose=1", f"/models/{added}?diagnose=0")
-    seen: set[str] = set()
-    for path in paths:
-        tab.goto(service.url + path)
-        if path == paths[0]:
-            tab.locator("[data-figure=signature-fatigue]").first.wait_for(state="attached")
-        settled(tab)
-        tab.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
-        tab.downloads.clear()
-        names = [str(box.get_attribute("data-figure")) for box in tab.locator("[data-figure]").all()]
-        look_closer(tab, *names)
-        press_everything(tab, len(names))
-        seen |= set(names)
-    assert " ".join(sorted(seen)) == "comparison curve falling overview recruitment residual signature-fatigue step"
 
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report of each kind, and a notebook's figure, of a recording that tries to bring links into its charts."""
+    """A report of each kind, of a recording that tries to bring links into its charts."""
     folder = tmp_path_factory.mktemp("reports")
     record = made_up_csv(folder / "record.csv")
     record.write_text(record.read_text().replace(",prbs", ',"' + LINK.replace('"', '""') + '"'))
@@ -119,14 +67,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     measured = {"curves": drawn, "comparison": against}
     improved = story_html(told, measured, {**measured}, LINK)
     (folder / "improve.html").write_text(improved)
-    (folder / "notebook.html").write_text(f"<!doctype html><body>{stimrig.plot(model, read)._repr_html_()}")
     return folder
-
-
-def test_no_request_leaves_a_notebook_whatever_is_pressed(tab: Any, files: Path) -> None:
-    tab.goto((files / "notebook.html").as_uri())
-    press_everything(tab, 1)
-    assert tab.locator(".js-plotly-plot a[href]").count() == 0, "words of a recording are words, no links"
 
 
 @pytest.mark.parametrize(("name", "figures"), [("compare", 4), ("improve", 3)])
@@ -149,20 +90,3 @@ def test_a_report_is_one_small_file_without_scripts_that_lets_nothing_out(
           return [asked, picture]; }"""
     )
     assert tried == ["refused", "refused"] and tab.left == []
-
-
-def test_each_way_of_showing_a_notebooks_figure_is_without_the_upload() -> None:
-    import plotly.io as pio
-
-    step = {"added": None, "rms_nm": 1.0, "held_out_rms_nm": 2.0}
-    figure = stimrig.plot(identify.Improvement(0.1, "nothing_missing", steps=(step,), models=(), refused=()))
-    html = figure.to_html(include_plotlyjs=False, config={"showSendToCloud": True})
-    assert '"showSendToCloud": false' in html and '"modeBarButtons": [["toImage"]' in html
-    for renderer in ("colab", "plotly_mimetype"):
-        before, pio.renderers.default = pio.renderers.default, renderer
-        try:
-            shown = str(figure._repr_mimebundle_())
-        finally:
-            pio.renderers.default = before
-        assert re.search(r"showSendToCloud\W+false", shown, re.IGNORECASE), renderer
-    assert CONFIG["plotlyServerURL"] == "" and not CONFIG["showSendToCloud"]

@@ -118,7 +118,7 @@ def test_every_export_of_a_model_is_there(service: Service, pages: httpx.Client)
         answer = pages.get(links[name])
         assert "filename=" in answer.headers["content-disposition"] and answer.content.startswith(first), name
     report = pages.get(links["Report"]).text
-    assert "Muscle model of C3" in report and report.count('class="still"') == 3 and "<script" not in report
+    assert "Muscle model of C3" in report and report.count('class="still"') == 4 and "<script" not in report
     assert not list((service.data / "exports").iterdir()), "what was handed out is not kept twice"
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from stimrig import identify
-from stimrig.api.charts.drawing import Figures
+from stimrig.api.charts.figure import Figures
 from stimrig.api.charts.model_charts import free_effects
 from stimrig.api.cli.reports import report_test
 from stimrig.api.effect_words import library, parameter_words
@@ -51,8 +51,7 @@ def test_the_report_names_both_hashes_and_warnings_are_told_in_each_place(
     told_hash = {"data": {"sha256": "c0ffee" * 11}}
     monkeypatch.setattr(stored_model, "read", lambda row: json.loads(row.document) | told_hash)
     text = pages.get(f"/models/{sound['model_id']}/report").text
-    assert "SHA-256 of the file <span" in text and ", of its contents, as in MODEL.json <span" in text
-    assert ">c0ffeec0ffeec0ff…</span>" in text
+    assert "SHA-256 of the file " in text and ", of its contents, as in MODEL.json c0ffeec0ffeec0ff…" in text
 
 
 def test_the_story_begins_with_what_is_missing_and_ends_with_the_error(

@@ -51,7 +51,6 @@ GET    /v1/models/x/curves                                 read-model     404
 GET    /v1/models/x/diagnosis                              read-model     404
 POST   /v1/models/x/prediction                             read-model     422
 POST   /v1/models/x/widths                                 read-model     422
-GET    /models/x/widths                                    read-model     404
 GET    /v1/participants/x/model                            read-model     404
 GET    /v1/participants/x/models                           read-model     404
 GET    /v1/participants/x/tracking                         read-model     404
@@ -65,7 +64,6 @@ GET    /models/x/report                                    read-model     404
 GET    /models/x/figures/x                                 read-model     404
 GET    /models/x/story.html                                read-model     404
 GET    /participants/x/trend                               read-model     404
-GET    /compare                                            read-model     422
 GET    /jobs/x                                             read-model     404
 GET    /v1/participants                                    run-test       200
 POST   /v1/participants                                    run-test       422

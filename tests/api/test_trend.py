@@ -1,9 +1,8 @@
-"""The trend over sessions, models side by side: figures with uncertainty, what changed; JSON and pages."""
+"""The trend over sessions: figures with uncertainty, what changed; JSON and pages."""
 
 from __future__ import annotations
 
 import json
-import re
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +10,7 @@ import httpx
 import pytest
 
 from stimrig import identify
-from stimrig.api.charts.figure import axis
+from stimrig.api.charts.figure import Axis, Line, Rule
 from stimrig.api.charts.trend_charts import Point, history
 from stimrig.api.models import changes, stored_model
 from stimrig.api.models.changes import State
@@ -23,7 +22,7 @@ from tests.harness.sessions import Planned
 WEAKER = replace(Patient(), gain=0.82 * Patient().gain)
 DAYS = (
     Planned(Patient(), 0.0), Planned(Patient(), 3.0, approved=False), Planned(WEAKER, 7.0),
-    Planned(WEAKER, 9.0, current_ma=25.0), Planned(Patient(), 12.0), Planned(Patient(), 14.0), Planned(WEAKER, 16.0),
+    Planned(WEAKER, 9.0, current_ma=25.0),
 )  # fmt: skip
 service = shared_service()
 
@@ -132,16 +131,17 @@ def test_a_figure_shows_no_digits_that_nobody_knows(value: float, uncertainty: f
 def test_a_panel_breaks_its_line_at_another_current_and_marks_what_is_noted() -> None:
     values = [(1.0, 0.1, 20.0), (1.1, 0.1, 20.0), (None, None, 20.0), (1.2, 0.1, 20.0), (2.0, 9.0, 25.0)]
     points = [Point(float(k), value, half, k != 1, k == 2, ma) for k, (value, half, ma) in enumerate(values)]
-    drawn = history(points, "N·m", axis("", limits=(0.0, 4.0)), levels=[1.5, 99.0])
-    line, bars, dots, hollow, flags = drawn["data"]
-    assert line["y"] == [1.0, 1.1, None, 1.2, None, 2.0] and dots["y"] == [1.0, 1.1, 1.2, 2.0]
-    assert bars["y"][:3] == [0.9, 1.1, None] and (hollow["x"], flags["x"]) == ([1.0], [2.0])
-    assert [shape["y0"] for shape in drawn["layout"]["shapes"]] == [1.5]
-    low, high = drawn["layout"]["yaxis"]["range"]
+    drawn = history(points, "N·m", Axis("", (0.0, 4.0)), levels=[1.5, 99.0])
+    line, bars, dots, hollow, flags = (mark for mark in drawn.marks if isinstance(mark, Line))
+    assert line.y == [1.0, 1.1, None, 1.2, None, 2.0] and dots.y == [1.0, 1.1, 1.2, 2.0]
+    assert bars.y[:3] == [0.9, 1.1, None] and (hollow.x, flags.x) == ([1.0], [2.0])
+    assert [mark.at for mark in drawn.marks if isinstance(mark, Rule)] == [1.5]
+    assert drawn.panels[0].limits is not None
+    low, high = drawn.panels[0].limits
     assert low > -1.0 and high < 4.0, "one wide band does not dwarf the values"
 
 
-# ---- side by side, and what a model page says of the last approved session -------------------------------------------
+# ---- what a model page says of the last approved session -------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -149,47 +149,12 @@ def days(service: Service) -> list[str]:
     return made(service, "DAYS", list(DAYS))
 
 
-def cells(page: str, figure: str) -> list[tuple[str, str]]:
-    """Of each model what a figure's row shows: the value, and the difference with its mark."""
-    row = next(row for row in re.findall(r"<tr>.*?</tr>", page, re.S) if f'<th scope="row">{figure}' in row)
-    found = []
-    for cell in re.findall(r'<td class="num">(.*?)</td>', row, re.S):
-        value, _, more = cell.partition("<span")
-        found.append((value, re.sub(r"<[^>]+>|^[^>]*>", "", more)))
-    return found
-
-
-def compared(client: httpx.Client, days: list[str], **more: str) -> str:
-    answer = client.get("/compare", params={"model": days, **more})
-    assert answer.status_code == 200, answer.text
-    return answer.text
-
-
-def test_six_models_with_their_differences_to_the_oldest(client: httpx.Client, days: list[str]) -> None:
-    page = compared(client, days[5:0:-1] + days[:1])
-    found = cells(page, "Plateau")
-    assert len(found) == 6 and found[0][1] == ""
-    values = [float(value.split(" ±")[0]) for value, _ in found]
-    assert values[2] == pytest.approx(0.82 * values[0], rel=0.01)
-    assert [number for number, (_, difference) in enumerate(found) if difference[:1] in "▲▼" and difference] == [2]
-    assert found[2][1].startswith("▼ −1.2") and " ± 0.2" in found[2][1]
-    assert found[3][1] == "" and "threshold and plateau are not compared" in page  # at another current
-    assert cells(page, "Time constant")[3][1] != "" and "Dose of the day" in page
-    other = cells(compared(client, [days[0], days[2]], reference=days[2]), "Plateau")
-    assert other[1][1] == "" and other[0][1].startswith("▲ +1.2"), "another one is the reference"
-    assert page.count('class="sample"') == 6 and len(set(re.findall(r'stroke="(#\w+|var[^"]+)"', page))) >= 6
-
-
-def test_too_few_and_too_many(client: httpx.Client, days: list[str]) -> None:
-    for chosen in (days[:1], days[:7], [days[0], days[0]]):
-        answer = client.get("/compare", params={"model": chosen}, headers={"Accept": "text/html"})
-        assert answer.status_code == 422 and "choose 2 to 6 models" in answer.text
-
-
 def test_the_models_page_says_what_changed(client: httpx.Client, days: list[str]) -> None:
     weaker = client.get(f"/models/{days[2]}", params={"diagnose": 0}).text
     assert "Plateau 18\u00a0% lower than on 03 Aug 2026, more than twice its uncertainty." in weaker
     same = client.get(f"/models/{days[1]}", params={"diagnose": 0}).text
     assert "Nothing changed beyond its uncertainty since 03 Aug 2026." in same
+    stronger_current = client.get(f"/models/{days[3]}", params={"diagnose": 0}).text
+    assert "threshold and plateau are not compared" in stronger_current
     first = client.get(f"/models/{days[0]}", params={"diagnose": 0}).text
     assert 'class="changes' not in first

@@ -1,13 +1,11 @@
-"""A reference torque over HTTP, on the page and as a verb: widths by a real worker, refusals in words."""
+"""A reference torque over HTTP and as a verb: widths by a real worker, refusals in words."""
 
 from __future__ import annotations
 
 import csv
-import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -16,7 +14,6 @@ import pytest
 from stimrig import Client
 from stimrig.api.cli import main
 from stimrig.rig.messages import Bound
-from tests.api.browser import painted_soon
 from tests.api.conftest import PATIENCE_S, REAL, TOKEN, Service, run_service
 from tests.api.fake_rig import muscle
 from tests.api.test_jobs import made_up_csv
@@ -139,35 +136,6 @@ def test_a_table_says_the_same_as_its_numbers(client: httpx.Client, served: tupl
     asked = numbers, {"table": table().decode()}
     first, second = (client.post(f"/v1/models/{served[1]}/widths", json=body).json() for body in asked)
     assert first == second
-
-
-@pytest.mark.browser
-def test_the_page_shows_what_comes_of_a_reference_and_what_is_out_of_reach(
-    tab: Any, service: Service, served: tuple[Service, str], tmp_path: Path
-) -> None:
-    path = f"/models/{served[1]}/widths"
-    tab.goto(f"{service.url}/models/{served[1]}?diagnose=0")
-    assert tab.get_by_role("link", name="Widths for a torque").get_attribute("href") == path
-    tab.goto(service.url + path)
-    for name, torque_nm in (("reach.csv", WANTED_NM), ("beyond.csv", 20 * WANTED_NM)):
-        (tmp_path / name).write_bytes(table(torque_nm=torque_nm))
-        tab.locator("#reference").set_input_files(tmp_path / name)
-        tab.get_by_role("button", name="Find the pulse widths").click()
-        tab.locator("#result-title", has_text=name).wait_for()
-        assert painted_soon(tab, "torque-chart") and painted_soon(tab, "width-chart")
-        assert tab.locator("#lacking").is_visible() == (name == "beyond.csv")
-    assert "too high for the widest pulse" in tab.locator("#lacking").inner_text()
-    with tab.expect_download() as saved:
-        tab.get_by_role("button", name="Download the widths").click()
-    rows = list(csv.DictReader(io.StringIO(Path(saved.value.path()).read_text())))
-    assert list(rows[0]) == ["time_s", "pulse_width_us", "reference_torque_nm", "predicted_torque_nm"]
-    assert len(rows) == 240 and max(float(row["pulse_width_us"]) for row in rows) == 250.0
-    (tmp_path / "wrong.csv").write_text("time_s,torque_nm\n0,1\n0.1,x\n")
-    tab.locator("#reference").set_input_files(tmp_path / "wrong.csv")
-    tab.get_by_role("button", name="Find the pulse widths").click()
-    tab.get_by_text("line 3, column torque_nm").wait_for()
-    assert tab.locator("#result").is_hidden()
-    assert [error for error in tab.errors if "422" not in error] == []
 
 
 def test_the_verb_writes_the_same_table(

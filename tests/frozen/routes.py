@@ -304,8 +304,8 @@ def pages(day: Day) -> None:
         "/", "/?q=p2", "/?archived=1", "/participants/P1", "/participants/P2", "/participants/P1/next",
         "/participants/P1/calibration", "/participants/P1/trend", "/participants/P1/joint",
         "/models/{model_first}", "/models/{model_added}", "/models/{model_second}",
-        "/models/{model_first}/report", "/models/{model_first}/widths", "/tests/{test_first}", "/tests/{test_stopped}",
-        "/tests/{test_held}", "/tests/{test_trial}", "/compare?model={model_first}&model={model_second}", "/rig/angle",
+        "/models/{model_first}/report", "/tests/{test_first}", "/tests/{test_stopped}",
+        "/tests/{test_held}", "/tests/{test_trial}", "/rig/angle",
         "/rig/now", "/administration", "/sign-in", "/locked", "/models/none", "/nowhere", "/docs",
     )  # fmt: skip
     with day.service.client(None, headers=HTML, follow_redirects=False) as http:

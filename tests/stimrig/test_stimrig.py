@@ -34,7 +34,7 @@ NAMES = {
     "table1", "track",
 }  # fmt: skip
 HEAVY = {
-    "numpy", "scipy", "numba", "h5py", "plotly", "matplotlib", "httpx", "tqdm", "pydantic", "fastapi", "sqlalchemy",
+    "numpy", "scipy", "numba", "h5py", "matplotlib", "httpx", "tqdm", "pydantic", "fastapi", "sqlalchemy",
 }  # fmt: skip
 
 
@@ -81,26 +81,22 @@ def test_a_model_shows_itself_in_a_notebook(model: stimrig.Model) -> None:
 
 def test_a_model_draws_itself_beside_its_record(model: stimrig.Model, record: stimrig.Record) -> None:
     figure = model.plot(record)
-    names = [trace.name for trace in figure.data]
-    assert names[:3] == ["", "95 % band of the model", "measured"] and {"model, free run", "pulse width"} <= set(names)
-    measured = figure.data[2]
+    lines = figure.lines()
+    assert [*lines] == ["measured", "model, free run", "measured − model", "pulse width"]
+    measured = lines["measured"]
     assert measured.x[0] == record.time_s[0] and max(measured.y) == pytest.approx(record.torque_nm.max(), abs=1e-4)
-    curve = next(trace for trace in figure.data if trace.xaxis == "x2" and trace.name == "model")
-    assert list(curve.y) == pytest.approx(list(model.recruitment.table()[1]))
-    assert figure.layout.xaxis.domain[1] < figure.layout.xaxis2.domain[0]
+    assert list(model.plot().lines()["model"].y) == pytest.approx(list(model.recruitment.table()[1]))
 
 
 def test_a_comparison_draws_what_is_left(model: stimrig.Model, record: stimrig.Record) -> None:
     against = stimrig.compare(model, record)
-    (left,) = against.plot().data
-    assert left.name == "measured − model"
+    left = against.plot().lines()["measured − model"]
     assert max(left.y) == pytest.approx(max(record.torque_nm - model.predict(record)), abs=0.05)
 
 
-def test_what_cannot_be_drawn_says_what_can(model: stimrig.Model) -> None:
-    for draw in (model.plot, lambda: stimrig.plot({})):
-        with pytest.raises(BadRequest, match=r"plot\(model, record\)"):
-            draw()
+def test_what_cannot_be_drawn_says_what_can() -> None:
+    with pytest.raises(BadRequest, match=r"plot\(model, record\)"):
+        stimrig.plot({})
 
 
 def test_next_experiment_tells_two_rivals_apart(record: stimrig.Record) -> None:

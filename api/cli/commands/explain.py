@@ -36,12 +36,12 @@ def explain(
         write(html, html_report(explained, record, short(data)))
     if figures is not None:
         from stimrig.api.charts.diagnosis_charts import story_figures
-        from stimrig.api.charts.drawing import file
+        from stimrig.api.charts.figure import FILE_KINDS
 
         figures.mkdir(parents=True, exist_ok=True)
         narrative = story_of(record, explained)
         for name, figure in story_figures(narrative["story"], narrative["before"], narrative["after"]).items():
-            for kind in ("svg", "pdf", "png"):
-                write(figures / f"{name}.{kind}", file(figure, kind))
+            for kind in FILE_KINDS:
+                write(figures / f"{name}.{kind}", figure.file(kind))
     document = {"structure": structure, **explained.to_dict()}
     report(document, as_json, explained, *next_commands(explained.left), files=[output, html, figures])

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stimrig.api.cli.files import load_model, write
+from stimrig.api.cli.files import inversion_table, load_model, write
 from stimrig.api.cli.options import Json, ModelFile
 from stimrig.api.cli.terminal import report
 
@@ -28,12 +28,11 @@ def invert(
     as_json: Json = False,
 ) -> None:
     """Pulse widths whose predicted torque follows a reference best, and what of it is out of reach."""
-    from stimrig.api.models import inverted
     from stimrig.identify.inversion import invert as widths_for
     from stimrig.identify.inversion.reference import read_reference
 
     model = load_model(model_json)
     wanted = read_reference(reference.read_bytes(), str(reference), model.pulse_rate_hz)
     inversion = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us, shortest_us=shortest_us)
-    write(output, inverted.table(inversion.to_dict()))
+    write(output, inversion_table(inversion.to_dict()))
     report({"output": str(output), **inversion.to_dict()}, as_json, inversion, files=[output])

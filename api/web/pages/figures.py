@@ -1,29 +1,23 @@
-"""A model's charts, each by itself: a still for its page, a file to keep, and what plotly takes."""
+"""A model's charts, each by itself: a still for its page, and a file to keep."""
 
 from __future__ import annotations
 
 import asyncio
 import gzip
 import hashlib
-import json
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
-from stimrig.api.charts.drawing import svg
-from stimrig.api.charts.figure import CONFIG, TOOLBAR_PX
+from stimrig.api.charts.figure import Figures
 from stimrig.api.errors import NotFoundError
 from stimrig.api.web.dependencies import Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.pages import model_view
 
 router = APIRouter(include_in_schema=False)
-KINDS = {"html": "text/html; charset=utf-8", "json": "application/json", "svg": "image/svg+xml"}
-BUTTONS = {"Download plot as a PNG": "Save as a picture", "Download plot": "Save as a picture",
-           "Zoom": "Zoom: draw a box", "Pan": "Move", "Reset axes": "Show all again"}  # fmt: skip
-"""plotly's words for its buttons, and those of the page."""
-PAGE_CONFIG = {**CONFIG, "locale": "page", "locales": {"page": {"format": {}, "dictionary": BUTTONS}}}
+KINDS = {"html": "text/html; charset=utf-8", "svg": "image/svg+xml"}
 
 
 @router.get("/models/{model_id}/figures/{name}")
@@ -35,12 +29,8 @@ async def figure(
     figures, (stem, _dot, kind) = (await model_view.parts(context, row))["figures"], name.rpartition(".")
     if stem not in figures or kind not in KINDS:
         raise NotFoundError("chart", name)
-    if kind == "json":
-        picture = {"toImageButtonOptions": {"filename": f"{row.id}-{stem}", "scale": 2}}
-        body = json.dumps({**figures[stem], "config": PAGE_CONFIG | picture}).encode()
-    else:
-        style: dict[str, Any] = {"right": TOOLBAR_PX} if kind == "html" else {"light": True}
-        body = (await asyncio.to_thread(svg, figures[stem], width, **style)).encode()
+    style: dict[str, Any] = {"right": Figures.TOOLS_PX} if kind == "html" else {"light": True}
+    body = (await asyncio.to_thread(figures[stem].svg, width, **style)).encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
     headers = {"Cache-Control": "private, no-cache", "ETag": tag, "Vary": "Accept-Encoding"}
     if tag in entity_tags(request.headers.get("if-none-match", "")):

@@ -9,7 +9,7 @@ from fastapi import APIRouter, Request
 from fastapi.responses import RedirectResponse, Response
 
 from stimrig.api.charts import diagnosis_charts, model_charts
-from stimrig.api.charts.drawing import Figures
+from stimrig.api.charts.figure import Figures
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.job import FIT_TOGETHER, Job
 from stimrig.api.models import advice, explanation, stored_model, trend
@@ -23,7 +23,7 @@ from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
 from stimrig.api.web.pages import next_view
 from stimrig.api.web.pages.environment import environment
 from stimrig.api.web.pages.render import page
-from stimrig.api.web.pages.report_file import missing_parts
+from stimrig.api.web.pages.report_file import facts, missing_parts
 
 router = APIRouter(include_in_schema=False)
 environment.globals |= {"tracking_words": limits_words, "usual_tracking": Limits().model_dump()}  # type: ignore
@@ -114,11 +114,7 @@ async def parts(context: Context, row: Model) -> dict[str, Any]:
             "versions": rows,
             "earlier": earlier if earlier and earlier["id"] == row.parent_id else None,
             "added": {name: each["id"] for each in later for name in (each["added_effect"] or "").split(",")},
-            "held": explanation.held_free(document),
-            "recruitment": stored_model.recruitment(document),
-            "dynamics": stored_model.dynamics(document),
-            "repetition": stored_model.repetition(document),
-            "validity": stored_model.validity(document),
+            **facts(document),
             "warnings": context.runner.lifecycle.warnings(row.recording_id),
             "now_utc": context.clock.utc(),
             "figures": Figures(figures, f"/models/{row.id}/figures"),

@@ -1,4 +1,4 @@
-"""Reports as one HTML file that works offline: `comparison_html` and `story_html`."""
+"""Reports as one HTML file that works offline: of a model, and of the story of its improvement."""
 
 from __future__ import annotations
 
@@ -8,12 +8,18 @@ from typing import Any
 from markupsafe import Markup
 
 from stimrig.api.charts import diagnosis_charts, model_charts
-from stimrig.api.charts.drawing import Figures
+from stimrig.api.charts.figure import SHEET, Figures
 from stimrig.api.models import explanation, stored_model
-from stimrig.api.web.pages.environment import HERE, environment
+from stimrig.api.web.pages.environment import environment
 
 POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'none'; base-uri 'none'"
 """Nothing runs in a report, nothing is loaded, nothing leaves."""
+ABSENT: dict[str, Any] = {
+    "model": None, "story": None, "why": None, "session": None, "problem": None, "validity": None, "recording": None,
+    "summary": None, "warnings": (), "plain": (), "refused": (), "versions": (), "digest": "",
+    "footer": "Made by stimrig. This file needs no network.",
+}  # fmt: skip
+"""What a report need not have."""
 
 
 def comparison_html(
@@ -28,26 +34,32 @@ def comparison_html(
     `document`: a MODEL.json; `curves`: as `stimrig.api.jobs.curves.curves` gives them; `name`: of the file or the test;
     `test`: as the service shows it; `comparison`: as `identify.compare` gives it, cleaned and thinned.
     """
-    effects, compared = [effect["id"] for effect in document.get("effects") or []], comparison or {}
+    effects = [effect["id"] for effect in document.get("effects") or []]
     model = {**stored_model.figures(document), **stored_model.quality(document)}
     figures = model_charts.model_figures(document, curves, comparison)
     figures |= diagnosis_charts.diagnosis_figures(comparison, curves["segments"], None, {}, [])
-    return _write(
+    error = missing_parts(None, comparison)
+    return write(
         title=f"{name}: measurement against model",
         lead=f"with {', '.join(effects)}" if effects else "",
         model={**model, "id": document["model_id"], "method": document["method"]},
-        held=explanation.held_free(document),
-        recruitment=stored_model.recruitment(document),
-        dynamics=stored_model.dynamics(document),
-        repetition=stored_model.repetition(document),
-        test=test,
         figures=Figures(figures),
-        plain=compared.get("plain") or [],
-        places=diagnosis_charts.places_of(compared),
-        splits=explanation.splits(compared),
-        tests=(compared.get("tests") or {}).get("tests") or [],
-        story=None,
+        summary=test and test["summary"],
+        plain=(comparison or {}).get("plain") or [],
+        **facts(document),
+        **{**error, "tests": ((comparison or {}).get("tests") or {}).get("tests") or []},
     )
+
+
+def facts(document: dict[str, Any]) -> dict[str, Any]:
+    """Return what a model's page and its reports say of MODEL.json."""
+    return {
+        "held": explanation.held_free(document),
+        "recruitment": stored_model.recruitment(document),
+        "dynamics": stored_model.dynamics(document),
+        "repetition": stored_model.repetition(document),
+        "validity": stored_model.validity(document),
+    }
 
 
 def missing_parts(view: dict[str, Any] | None, comparison: dict[str, Any] | None) -> dict[str, Any]:
@@ -73,9 +85,10 @@ def story_html(
     begun = f" · begun with {structure}" if structure else ""
     lead = f"{name} · noise {story['noise_sd_nm'] or 0.0:.4f} N·m{begun}"
     figures = Figures(diagnosis_charts.story_figures(story, before, after))
-    return _write(title=story["title"], lead=lead, story=story, figures=figures, refused=refused, model=None)
+    return write(title=story["title"], lead=lead, story=story, figures=figures, refused=refused)
 
 
-def _write(**values: Any) -> str:
-    style = Markup((HERE / "static" / "page.css").read_text("utf-8"))
-    return environment.get_template("report.html").render(**values, style=style, policy=POLICY)
+def write(**values: Any) -> str:
+    """Write a report of what the template takes."""
+    style = Markup(SHEET.read_text("utf-8"))
+    return environment.get_template("report.html").render(**ABSENT | values, style=style, policy=POLICY)

@@ -9,7 +9,6 @@ from fastapi.responses import Response
 from markupsafe import Markup
 
 from stimrig.api.charts import model_charts
-from stimrig.api.charts.drawing import svg
 from stimrig.api.clinical_words import WORDS, missing_words
 from stimrig.api.errors import ApiError
 from stimrig.api.services import notes, tests
@@ -69,11 +68,11 @@ async def draw(context: Context, row: Test, plan_us: list[float]) -> Markup | No
             series = measured["comparison"].get("series")
             figure = model_charts.measurement(measured["curves"], model.fit.get("noise_sd_nm"), series)
             words = "Torque measured and predicted, what is left, and the pulse width, over time"
-            return await asyncio.to_thread(svg, figure, 1160.0, 520.0, words)
+            return await asyncio.to_thread(figure.svg, 1160.0, 520.0, words)
     if not row.recording_id:
         return None
     path = await asyncio.to_thread(context.analyses.path, row.recording_id)
     recorded = await context.pool.submit("recorded", urgent=True, data=path).result
     figure = model_charts.recorded(recorded, plan_us, row.plan.get("pulse_rate_hz", 40.0), row.state)
     words = "Torque that was measured and pulses that were sent, over time"
-    return await asyncio.to_thread(svg, figure, 1160.0, 460.0, words)
+    return await asyncio.to_thread(figure.svg, 1160.0, 460.0, words)
