@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -23,7 +22,6 @@ from stimrig.identify import effects
 from stimrig.identify.healing import healed_places, place_words
 from stimrig.identify.json_text import json_value
 from tests.api.conftest import Service, run_test
-from tests.api.test_free_shown import with_gate
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record, ramp
 
@@ -116,13 +114,14 @@ def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -
     assert set(library()) == set(effects.registry())
 
 
-def test_a_model_with_a_free_effect_shows_it_and_the_diagnosis_does_not_offer_it_again(tmp_path: Path) -> None:
+def test_a_model_with_a_free_effect_shows_it_and_the_diagnosis_does_not_offer_it_again() -> None:
     shape = {
         "enters": "rate of fall", "driven_by": "time since", "words": "Pulses open a gate.", "driver": "time (s)",
         "effect": "opening (1)", "at": [0.0, 0.5],
         "lines": {"opening": {"value": [0.0, 1.0], "lower": [0.0, 0.9], "upper": [0.0, 1.1]}},
     }  # fmt: skip
-    (card,) = explanation.held_free(json.loads(with_gate(tmp_path / "MODEL.json", shape=shape).read_text("utf-8")))
+    gate = {"id": "free_gate", "parameters": {"gate_s": {"value": 0.02, "sd": 0.001, "unit": "s"}}, "shape": shape}
+    (card,) = explanation.held_free({"effects": [gate, {"id": "fatigue"}]})
     drawn, templates = Figures(free_effects([card])), environment.get_template("model_parts.html")
     shown = templates.module.effect(card, drawn)
     assert "Pulses open a gate." in shown and 'data-figure="free-free_gate"' in shown
