@@ -16,6 +16,7 @@ from cantools.database import Database
 from cantools.database.can import Message
 from cantools.database.namedsignalvalue import NamedSignalValue
 
+from stimrig.rig.devices import DeviceSettings
 from stimrig.rig.errors import ConfigError, WireError
 from stimrig.rig.machine import Bus, Frame, Listener, Machine
 from stimrig.rig.signals import Block
@@ -128,8 +129,8 @@ class SampleFrame:
                 raise ConfigError(f"signal: {place}, {name}: a floating-point signal has no words; remove its VAL_")
         self._counter = _choose("counter", counter, names, place) if counter else None
         self._flag = _choose(flag_key, flag, names, place) if flag else None
-        has_fault = fault and (fault != CELL_FAULT or fault in names)
-        self._fault = _choose("fault", fault, names, place) if fault and has_fault else None
+        is_missing = not fault or (fault == CELL_FAULT and fault not in names)
+        self._fault = None if is_missing else _choose("fault", str(fault), names, place)
         self.counter_modulus = 0
         if self._counter:
             self.counter_modulus = 1 << message_format.get_signal_by_name(self._counter).length
@@ -137,16 +138,6 @@ class SampleFrame:
     @property
     def samples_per_frame(self) -> int:
         return len(self._signals)
-
-    def decode_all(self, frames: Iterable[Frame]) -> tuple[list[tuple[Frame, FrameSamples]], int]:
-        """The frames that can be read, each with its values, and how many cannot."""
-        readings, damaged = [], 0
-        for frame in frames:
-            try:
-                readings.append((frame, self.decode(frame.data)))
-            except WireError:
-                damaged += 1
-        return readings, damaged
 
     def decode(self, data: bytes) -> FrameSamples:
         """Values of one frame; NaN where the description has a word for a value (`VAL_`, as "no reading"), and in a
@@ -170,41 +161,53 @@ class SampleFrame:
             raise WireError(f"frame {data.hex(' ')} does not fit {self.message.name}: {error}") from None
 
 
+class CanSettings(DeviceSettings):
+    """Settings of every driver on a CAN bus."""
+
+    bus: dict[str, Any]
+    dbc: str
+    message: str | None
+    counter: str | None
+    sample_rate_hz: float
+
+
 class CanSensor:
     """Base of the drivers of sensors on a CAN bus; see `rig.devices.Sensor` for what the methods promise.
 
-    `table`: in the rig file; begins the words of a ConfigError. `frame`: makes the decoder of its frames.
+    `frame`: further arguments of the decoder of its frames, after the message.
     """
 
     name: ClassVar[str]
-    """For messages."""
+    """For messages; with `_` it is its table in the rig file."""
     dtype: ClassVar[np.dtype[Any]]
     gather_s: ClassVar[float]
     """Real seconds: a block is returned at most this long after its first sample arrived."""
 
-    def __init__(self, table: str, frame: Callable[[], SampleFrame], sample_rate_hz: float, machine: Machine) -> None:
+    def __init__(self, settings: CanSettings, machine: Machine, *frame: Any) -> None:
         try:
-            self._frame = frame()
+            self._frame = SampleFrame(settings.dbc, settings.message, *frame)
         except ConfigError as error:
-            raise ConfigError(f"{table}.{error}") from None
-        self._machine, self.sample_rate_hz = machine, sample_rate_hz
+            raise ConfigError(f"{self.name.replace(' ', '_')}.{error}") from None
+        self._device, self._machine, self.sample_rate_hz = settings.device, machine, settings.sample_rate_hz
         self.counter_modulus = self._frame.counter_modulus * self._frame.samples_per_frame
         self._bus: Bus | None = None
         self._listener: Listener | None = None
 
     def decode(self, frames: Sequence[Frame], damaged: int = 0, errors: int = 0) -> Block:
         """The samples of frames, in their order; damaged ones are counted. Pure."""
-        readable, unreadable = self._frame.decode_all(frames)
-        rows = [row for frame, samples in readable for row in self._rows(frame, samples)]
-        return Block(np.array(rows, dtype=self.dtype), damaged + unreadable, errors)
+        rows: list[tuple[float, ...]] = []
+        for frame in frames:
+            try:
+                rows += self._rows(frame, self._frame.decode(frame.data))
+            except WireError:
+                damaged += 1
+        return Block(np.array(rows, dtype=self.dtype), damaged, errors)
 
     def _rows(self, frame: Frame, samples: FrameSamples) -> Iterable[tuple[float, ...]]:
         """The samples of a frame."""
         raise NotImplementedError
 
-    def _listen(
-        self, device: str, bus: Bus, on_block: Callable[[Block], None], on_lost: Callable[[str], None]
-    ) -> dict[str, Any]:
+    def _listen(self, bus: Bus, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         """Take the bus's frames from now on; the identity to display."""
         message = self._frame.message
         self._bus = bus
@@ -213,7 +216,7 @@ class CanSensor:
         )
         bus.listen(self._listener)
         return {
-            "device": device,
+            "device": self._device,
             "bus": bus.place,
             "frame_id": f"0x{message.frame_id:X}",
             "message": message.name,

@@ -1,7 +1,4 @@
-"""Base of drivers of stimulators on a serial line: frames of ScienceMode 2 and 4, and commands with their acks.
-
-An ack has its command's number, and the command + 1.
-"""
+"""Base of drivers of stimulators on a serial line: frames of ScienceMode 2 and 4, and commands with their acks."""
 
 from __future__ import annotations
 
@@ -15,7 +12,7 @@ from typing import Any, ClassVar, Generic, TypeVar
 
 from stimrig.rig.devices import DeviceSettings
 from stimrig.rig.errors import DeviceError, WireError
-from stimrig.rig.machine import Machine, Port
+from stimrig.rig.machine import Machine
 from stimrig.rig.signals import Ack, LateError
 from stimrig.rig.tasks import Signal
 
@@ -156,23 +153,13 @@ class FrameReader:
         return bool(self._buffer)
 
 
-def _crc_table() -> bytes:
-    table = bytearray()
-    for byte in range(256):
-        for _ in range(8):
-            byte = (byte << 1 ^ 0x07 if byte & 0x80 else byte << 1) & 0xFF
-        table.append(byte)
-    return bytes(table)
-
-
-_CRC = _crc_table()
-
-
 def crc8(data: bytes) -> int:
     """CRC-8, polynomial 07, from 0, not reflected."""
     crc = 0
     for byte in data:
-        crc = _CRC[crc ^ byte]
+        crc ^= byte
+        for _ in range(8):
+            crc = (crc << 1 ^ 0x07 if crc & 0x80 else crc << 1) & 0xFF
     return crc
 
 
@@ -206,121 +193,6 @@ longer one, and the reader would then wait for that length and lose the frames i
 log = logging.getLogger("rig.line")
 
 
-class PacketLine:
-    """One serial port.
-
-    `port`: not opened yet; `name`: its path; `on_packet`: called with each packet and the time at which it was read
-    (rig clock).
-    """
-
-    def __init__(
-        self, machine: Machine, port: Port, name: str, framing: Framing, on_packet: Callable[[Packet, float], None]
-    ) -> None:
-        self.port = name
-        self.last_written_s = -1e9
-        self._tasks, self._clock, self._serial = machine.tasks, machine.tasks.clock, port
-        self._framing, self._number = framing, 0
-        self._frames = FrameReader(framing)
-        self._on_packet = on_packet
-        self._waiting: dict[int, tuple[Signal, list[Packet]]] = {}
-        self._open, self._lost = False, "not opened"
-        self.on_ack: Callable[[Ack], None] = lambda _: None
-        self._on_lost: Callable[[str], None] = lambda _: None
-
-    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
-        """Register callbacks: for the acks of pulses, which the driver finds among the packets, and for the loss."""
-        self.on_ack, self._on_lost = on_ack, on_lost
-
-    async def open(self) -> None:
-        """Open the port and start reading. Raises DeviceError, which names the port and says how to correct it."""
-        self._frames = FrameReader(self._framing)
-        await self._tasks.work(self._serial.open, self._read, self._lose)
-        self._open, self._lost = True, ""
-
-    def close(self) -> None:
-        """Close the port; never raises."""
-        self._open = False
-        self._end("not opened")
-        self._serial.close()
-
-    def discard(self) -> None:
-        """Discard bytes that were written but still wait in this computer, as on a stalled line.
-
-        A frame that is cut by this is damaged, and the device drops it because of its checksum.
-        """
-        self._serial.discard()
-
-    def send(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
-        """Write the frame that `make` returns for the next packet number; returns the number.
-
-        Raises LateError: the clock had passed `latest_s` right before the write: nothing was written. DeviceError: the
-        line accepts no bytes, or the frame cannot be encoded.
-        """
-        self._number = (self._number + 1) % self._framing.numbers
-        try:
-            frame = make(self._number)
-        except WireError as error:
-            raise DeviceError(f"stimulator {self.port}: the command cannot be encoded: {error}") from None
-        self._write(frame, latest_s)
-        return self._number
-
-    async def request(self, make: Callable[[int], bytes], name: str, answer: int, timeout_s: float) -> Packet:
-        """Write a command and wait so many real seconds for its ack, which has the command number `answer`.
-
-        Raises DeviceError: no ack in time, or an unexpected answer.
-        """
-        answered, packets = Signal(), list[Packet]()
-        number = self.send(make)
-        self._waiting[number] = answered, packets
-        await self._tasks.sleep(timeout_s, answered)
-        if self._waiting.get(number, (None,))[0] is answered:
-            del self._waiting[number]
-        if not packets:
-            why = self._lost or f"no answer in {timeout_s:g} s"
-            raise DeviceError(f"stimulator {self.port}: {name}: {why}; check its power")
-        if packets[0].command != answer:
-            raise DeviceError(f"stimulator {self.port}: {name}: answered with command {packets[0].command}")
-        return packets[0]
-
-    def _write(self, frame: bytes, latest_s: float | None) -> None:
-        if self._lost:
-            raise DeviceError(f"stimulator {self.port} is not connected: {self._lost}")
-        if latest_s is not None and not (self._clock.now_s() <= latest_s):
-            raise LateError
-        try:
-            written = self._serial.write(frame)
-        except OSError as error:
-            raise DeviceError(f"stimulator {self.port} accepted no bytes: {error}") from None
-        if written != len(frame):
-            raise DeviceError(f"stimulator {self.port} accepted {written} of {len(frame)} bytes; check its power")
-        self.last_written_s = self._clock.now_s()
-
-    def _read(self, data: bytes, time_s: float) -> None:
-        try:
-            for packet in self._frames.feed(data):
-                self._on_packet(packet, time_s)
-                if packet.number in self._waiting:
-                    answered, packets = self._waiting.pop(packet.number)
-                    packets.append(packet)
-                    answered.set()
-        except Exception as error:  # a bug in a driver: report it at once, not after a timeout
-            log.exception("the reader of %s failed", self.port)
-            self._lose(f"internal: {type(error).__name__}: {error}")
-
-    def _lose(self, reason: str) -> None:
-        if self._open:
-            self._open = False
-            self._end(reason)
-            self._on_lost(f"stimulator {self.port}: {reason}")
-
-    def _end(self, reason: str) -> None:
-        """Nothing more is written or answered."""
-        self._lost = reason
-        waiting, self._waiting = self._waiting, {}
-        for answered, _ in waiting.values():
-            answered.set()
-
-
 class LineSettings(DeviceSettings):
     """Settings of every driver on a serial line."""
 
@@ -333,20 +205,31 @@ S = TypeVar("S", bound=LineSettings)
 
 
 class LineStimulator(Generic[S]):
-    """Base of the drivers; see `rig.devices.Stimulator` for what the methods promise."""
+    """Base of the drivers, each with one port; see `rig.devices.Stimulator` for what the methods promise."""
 
     framing: ClassVar[Framing]
     serial: ClassVar[dict[str, Any]]
     """Arguments of `serial.Serial`."""
 
     def __init__(self, settings: S, machine: Machine) -> None:
-        self._settings = settings
-        port = machine.port(settings.port, **self.serial)
-        self._line = PacketLine(machine, port, settings.port, self.framing, self._handle)
-        self.listen = self._line.listen
+        self._settings, self._name = settings, f"stimulator {settings.port}"
+        self._tasks, self._clock = machine.tasks, machine.tasks.clock
+        self._port = machine.port(settings.port, **self.serial)
+        self._frames, self._number = FrameReader(self.framing), 0
+        self._waiting: dict[int, tuple[Signal, list[Packet]]] = {}
+        self._lost = "not opened"
+        """Why nothing can be written; empty: it can."""
+        self._last_written_s = -1e9
+        self._on_ack: Callable[[Ack], None] = lambda _: None
+        self._on_lost: Callable[[str], None] = lambda _: None
+
+    def listen(self, on_ack: Callable[[Ack], None], on_lost: Callable[[str], None]) -> None:
+        self._on_ack, self._on_lost = on_ack, on_lost
 
     async def open(self) -> dict[str, Any]:
-        await self._line.open()
+        self._frames = FrameReader(self.framing)
+        await self._tasks.work(self._port.open, self._read, self._lose)
+        self._lost = ""
         try:
             serial_number, firmware = await self._identity()
             _, state = await self.state()
@@ -367,20 +250,85 @@ class LineStimulator(Generic[S]):
         raise NotImplementedError
 
     def close(self) -> None:
-        self._line.close()
+        self._end("not opened")
+        self._port.close()
 
     async def _identity(self) -> tuple[str, str]:
+        """Serial number and firmware."""
         raise NotImplementedError
 
     def _handle(self, packet: Packet, time_s: float) -> None:
+        """Take a packet that was read at a time, rig clock: the acks of pulses are told from here."""
         raise NotImplementedError
 
     def _frame(self, command: IntEnum, data: bytes = b"") -> Callable[[int], bytes]:
         return lambda number: self.framing.encode(Packet(number, command, data))
 
+    def _send(self, make: Callable[[int], bytes], latest_s: float | None = None) -> int:
+        """Write the frame that `make` returns for the next packet number; returns the number.
+
+        Raises LateError: the clock had passed `latest_s` right before the write: nothing was written. DeviceError: the
+        line accepts no bytes, or the frame cannot be encoded.
+        """
+        self._number = (self._number + 1) % self.framing.numbers
+        try:
+            frame = make(self._number)
+        except WireError as error:
+            raise DeviceError(f"{self._name}: the command cannot be encoded: {error}") from None
+        if self._lost:
+            raise DeviceError(f"{self._name} is not connected: {self._lost}")
+        if latest_s is not None and not (self._clock.now_s() <= latest_s):
+            raise LateError
+        try:
+            written = self._port.write(frame)
+        except OSError as error:
+            raise DeviceError(f"{self._name} accepted no bytes: {error}") from None
+        if written != len(frame):
+            raise DeviceError(f"{self._name} accepted {written} of {len(frame)} bytes; check its power")
+        self._last_written_s = self._clock.now_s()
+        return self._number
+
     async def _request(self, command: IntEnum, data: bytes = b"") -> Packet:
-        frame, timeout_s = self._frame(command, data), self._settings.reply_timeout_s
-        return await self._line.request(frame, in_words(command), command + 1, timeout_s)
+        """Write a command and wait for its ack, which has its number, and the command + 1.
+
+        Raises DeviceError: no ack in time, or an unexpected answer.
+        """
+        answered, packets, timeout_s = Signal(), list[Packet](), self._settings.reply_timeout_s
+        number = self._send(self._frame(command, data))
+        self._waiting[number] = answered, packets
+        await self._tasks.sleep(timeout_s, answered)
+        if self._waiting.get(number, (None,))[0] is answered:
+            del self._waiting[number]
+        if not packets:
+            why = self._lost or f"no answer in {timeout_s:g} s"
+            raise DeviceError(f"{self._name}: {in_words(command)}: {why}; check its power")
+        if packets[0].command != command + 1:
+            raise DeviceError(f"{self._name}: {in_words(command)}: answered with command {packets[0].command}")
+        return packets[0]
+
+    def _read(self, data: bytes, time_s: float) -> None:
+        try:
+            for packet in self._frames.feed(data):
+                self._handle(packet, time_s)
+                if packet.number in self._waiting:
+                    answered, packets = self._waiting.pop(packet.number)
+                    packets.append(packet)
+                    answered.set()
+        except Exception as error:  # a bug in a driver: report it at once, not after a timeout
+            log.exception("the reader of %s failed", self._settings.port)
+            self._lose(f"internal: {type(error).__name__}: {error}")
+
+    def _lose(self, reason: str) -> None:
+        if not self._lost:
+            self._end(reason)
+            self._on_lost(f"{self._name}: {reason}")
+
+    def _end(self, reason: str) -> None:
+        """Nothing more is written or answered."""
+        self._lost = reason
+        waiting, self._waiting = self._waiting, {}
+        for answered, _ in waiting.values():
+            answered.set()
 
 
 def in_words(command: IntEnum) -> str:

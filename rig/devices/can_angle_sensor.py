@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any, Literal, Self
 
 from pydantic import Field
 
 from stimrig.rig.devices import DeviceSettings
-from stimrig.rig.devices._can import CanSensor, FrameSamples, SampleFrame
+from stimrig.rig.devices._can import CanSensor, CanSettings, FrameSamples
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Frame, Machine
 from stimrig.rig.signals import ANGLE_SAMPLE, AngleScale, Block
@@ -23,7 +22,7 @@ OF_THE_CELL = "dbc", "message", "counter", "sample_rate_hz"
 """Settings that the load cell's replace where the angle stands in its frame, unless the rig file gives them."""
 
 
-class Settings(DeviceSettings):
+class Settings(CanSettings):
     bus: dict[str, Any] = Field(default_factory=dict, description="as the load cell's, and by default the same")
     dbc: str = Field("angle_default", description="path of a DBC file, or angle_default")
     message: str | None = Field(None, description="message with the angle; default: the first one that has the signal")
@@ -57,10 +56,7 @@ class CanAngleSensor(CanSensor):
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
-        frame = partial(
-            SampleFrame, settings.dbc, settings.message, [settings.signal], settings.counter, settings.fault, "fault"
-        )
-        super().__init__(KIND, frame, settings.sample_rate_hz, machine)
+        super().__init__(settings, machine, [settings.signal], settings.counter, settings.fault, "fault")
         self.scale = AngleScale(settings.offset, settings.direction, settings.radians_per_unit)
         self.of_the_cell = settings.of_the_cell
         self.on_the_cells_bus = False
@@ -72,7 +68,7 @@ class CanAngleSensor(CanSensor):
             if self.of_the_cell:
                 raise DeviceError(f"{KIND}.of_the_cell: the load cell's bus is not open")
             bus = await self._machine.tasks.work(self._machine.open_bus, self._settings.bus, self.name)
-        return self._listen("can_angle_sensor", bus, on_block, on_lost)
+        return self._listen(bus, on_block, on_lost)
 
     async def close(self) -> None:
         bus, self._bus = self._bus, None

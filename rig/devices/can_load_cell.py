@@ -8,13 +8,11 @@ from __future__ import annotations
 import contextlib
 import re
 from collections.abc import Callable, Iterator
-from functools import partial
 from typing import Any
 
 from pydantic import Field, field_validator
 
-from stimrig.rig.devices import DeviceSettings
-from stimrig.rig.devices._can import CELL_FAULT, PACKAGED, CanSensor, FrameSamples, SampleFrame
+from stimrig.rig.devices._can import CELL_FAULT, PACKAGED, CanSensor, CanSettings, FrameSamples
 from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Frame, Machine
 from stimrig.rig.signals import SAMPLE, Block
@@ -24,7 +22,7 @@ KIND = "load_cell"
 _FRAME = re.compile(r"^([0-9A-Fa-f]{3}|[0-9A-Fa-f]{8})#((?:[0-9A-Fa-f]{2}){0,8})$")
 
 
-class Settings(DeviceSettings):
+class Settings(CanSettings):
     bus: dict[str, Any] = Field(description="keyword arguments of can.Bus: interface, channel, bitrate, host, port …")
     dbc: str = Field(PACKAGED, description="path of a DBC file, or torque_default")
     message: str | None = Field(None, description="message with the torque; default: the first one that has the signal")
@@ -71,15 +69,12 @@ class CanLoadCell(CanSensor):
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
         names = [settings.signal] if isinstance(settings.signal, str) else settings.signal
-        frame = partial(
-            SampleFrame, settings.dbc, settings.message, names, settings.counter, settings.sync, fault=settings.fault
-        )
-        super().__init__(KIND, frame, settings.sample_rate_hz, machine)
+        super().__init__(settings, machine, names, settings.counter, settings.sync, "sync", settings.fault)
 
     async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
         work = self._machine.tasks.work
         bus = await work(self._machine.open_bus, self._settings.bus, self.name)
-        identity = self._listen("can_load_cell", bus, on_block, on_lost)
+        identity = self._listen(bus, on_block, on_lost)
         try:
             await work(bus.send, [message_of(frame) for frame in self._settings.start_frames])
         except DeviceError:

@@ -86,25 +86,6 @@ def ll_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float, 
     return SCIENCEMODE_4.encode(Packet(number, Command.LL_CHANNEL_CONFIG, bytes((head,)) + body))
 
 
-def parse_status(data: bytes) -> tuple[int, int, int]:
-    """(result, level, high voltage code) of a status ack. Raises WireError: too short."""
-    if len(data) < 3:
-        raise WireError(f"status ack of {len(data)} bytes, expected 3")
-    return data[0], data[1], data[2]
-
-
-def parse_device_id(data: bytes) -> str:
-    """Serial number of a device id ack: ten characters after the result."""
-    return data[1:11].decode("ascii", "replace").strip("\0 ")
-
-
-def parse_version(data: bytes) -> str:
-    """`firmware (ScienceMode version)` of an extended version ack, '' where it is too short to tell."""
-    if len(data) < 7:
-        return ""
-    return f"{data[1]}.{data[2]}.{data[3]} (ScienceMode {data[4]}.{data[5]}.{data[6]})"
-
-
 class Settings(LineSettings):
     port: str = Field(description="serial port, e.g. /dev/serial/by-id/usb-HASOMED_P24-if00")
     channel: int = Field(1, ge=1, le=4, description="1 red, 2 blue, 3 black, 4 white")
@@ -122,15 +103,18 @@ class P24(LineStimulator[Settings]):
     serial = {"baudrate": 3_000_000, "stopbits": 2, "rtscts": True}  # noqa: RUF012
 
     async def _identity(self) -> tuple[str, str]:
-        serial_number = parse_device_id((await self._request(Command.DEVICE_ID)).data)
-        return serial_number, parse_version((await self._request(Command.EXTENDED_VERSION)).data)
+        serial_number = (await self._request(Command.DEVICE_ID)).data[1:11].decode("ascii", "replace").strip("\0 ")
+        firmware = (await self._request(Command.EXTENDED_VERSION)).data[1:7]
+        if len(firmware) < 6:  # too short to tell
+            return serial_number, ""
+        return serial_number, "{}.{}.{} (ScienceMode {}.{}.{})".format(*firmware)
 
     async def arm(self) -> None:
         await self._request(Command.LL_INIT, bytes((0,)))
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
         channel, connector = self._settings.channel - 1, self._settings.connector - 1
-        return self._line.send(
+        return self._send(
             lambda number: ll_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma, connector), latest_s
         )
 
@@ -138,32 +122,32 @@ class P24(LineStimulator[Settings]):
         pass  # the low level has no watchdog: the device does nothing by itself
 
     async def stop(self) -> None:
-        self._line.discard()
+        self._port.discard()
         # a device that is not initialised has already stopped
         await self._request(Command.LL_STOP, fine=(0, NOT_INITIALISED))
 
     async def state(self) -> tuple[bool, str]:
-        result, level, _ = parse_status((await self._request(Command.STIM_STATUS)).data)
-        if result != 0:
-            raise DeviceError(f"stimulator {self._settings.port} answered its state with {result_text(result)}")
-        return level == 0, LEVELS.get(level, f"level {level}")
+        data = (await self._request(Command.STIM_STATUS)).data
+        if len(data) < 3:
+            raise WireError(f"{self._name}: status ack of {len(data)} bytes, expected 3")
+        return data[1] == 0, LEVELS.get(data[1], f"level {data[1]}")
 
     async def _request(self, command: IntEnum, data: bytes = b"", fine: tuple[int, ...] = (0,)) -> Packet:
         packet = await super()._request(command, data)
         result = packet.data[0] if packet.data else 1  # an answer without a result is none
         if result not in fine:
-            raise DeviceError(f"stimulator {self._settings.port}: {in_words(command)}: {result_text(result)}")
+            raise DeviceError(f"{self._name}: {in_words(command)}: {result_text(result)}")
         return packet
 
     def _handle(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.LL_CHANNEL_CONFIG + 1:
             result = packet.data[0] if packet.data else 1
             words = result_text(result) if result else self._of_another_output(packet.data)
-            self._line.on_ack(Ack(packet.number, time_s, words))
+            self._on_ack(Ack(packet.number, time_s, words))
         elif packet.command in (Command.GENERAL_ERROR, Command.UNKNOWN_COMMAND):
             result = packet.data[0] if packet.data else 0
             words = result_text(result) if result else "unknown command"
-            self._line.on_ack(Ack(packet.number, time_s, words))
+            self._on_ack(Ack(packet.number, time_s, words))
 
     def _of_another_output(self, data: bytes) -> str | None:
         """Return the error of an ack that names another output than the rig file's; None where it is that one."""

@@ -113,7 +113,6 @@ class RehaStim2(LineStimulator[Settings]):
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         super().__init__(settings, machine)
-        self._tasks, self._clock = machine.tasks, machine.tasks.clock
         self._armed = False
         self._offered = Signal()
         self._offer: Packet | None = None
@@ -130,31 +129,31 @@ class RehaStim2(LineStimulator[Settings]):
         await self.stop()  # back to the start mode, whatever the mode was
         safe, state = await self.state()
         if not safe:
-            raise DeviceError(f"stimulator {self._settings.port}: cannot be armed, it is in {state}")
+            raise DeviceError(f"{self._name}: cannot be armed, it is in {state}")
         self._armed = True
 
     def send(self, pulse: Admitted, latest_s: float) -> int:
         channel = self._settings.channel - 1
-        return self._line.send(
+        return self._send(
             lambda number: single_pulse(number, channel, pulse.pulse_width_us, pulse.current_ma), latest_s
         )
 
     def feed(self) -> None:
-        if self._armed and self._clock.now_s() - self._line.last_written_s >= FEED_S:
-            self._line.send(self._frame(Command.WATCHDOG))
+        if self._armed and self._clock.now_s() - self._last_written_s >= FEED_S:
+            self._send(self._frame(Command.WATCHDOG))
 
     async def stop(self) -> None:
         self._armed = False
-        self._line.discard()
+        self._port.discard()
         result = result_of((await self._request(Command.STOP)).data)
         if result != 0:
-            raise DeviceError(f"stimulator {self._settings.port}: stop: {result_text(result)}")
+            raise DeviceError(f"{self._name}: stop: {result_text(result)}")
 
     async def state(self) -> tuple[bool, str]:
         data = (await self._request(Command.GET_MODE)).data
         result = result_of(data)
         if result != 0 or len(data) < 2:
-            raise DeviceError(f"stimulator {self._settings.port} answered its mode with {result_text(result)}")
+            raise DeviceError(f"{self._name} answered its mode with {result_text(result)}")
         return data[1] == START_MODE, MODES.get(data[1], f"mode {data[1]}")
 
     def close(self) -> None:
@@ -179,25 +178,25 @@ class RehaStim2(LineStimulator[Settings]):
             return False
         accepted = offer.data[:1] == bytes((VERSION,))
         result = 0 if accepted else -5
-        self._line.send(lambda _: SCIENCEMODE_2.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
+        self._send(lambda _: SCIENCEMODE_2.encode(Packet(offer.number, Command.INIT_ACK, bytes((result & 0xFF,)))))
         if not accepted:
-            raise DeviceError(f"stimulator {self._settings.port}: it uses protocol {offer.data.hex()}, this driver 1")
+            raise DeviceError(f"{self._name}: it uses protocol {offer.data.hex()}, this driver 1")
         return True
 
     def _handle(self, packet: Packet, time_s: float) -> None:
         if packet.command == Command.SINGLE_PULSE + 1:
             result = result_of(packet.data)
-            self._line.on_ack(Ack(packet.number, time_s, result_text(result) if result else None))
+            self._on_ack(Ack(packet.number, time_s, result_text(result) if result else None))
         elif packet.command == Command.STIMULATION_ERROR:
             error = result_of(packet.data)
-            self._line.on_ack(Ack(-1, time_s, ERRORS.get(error, f"stimulation error {error}")))
+            self._on_ack(Ack(-1, time_s, ERRORS.get(error, f"stimulation error {error}")))
         elif packet.command == Command.UNKNOWN:
-            self._line.on_ack(Ack(packet.number, time_s, "unknown command"))
+            self._on_ack(Ack(packet.number, time_s, "unknown command"))
         elif packet.command == Command.INIT:
             self._offer = packet
             self._offered.set()
             if self._armed:
-                self._line.on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
+                self._on_ack(Ack(-1, time_s, "it restarted during a test (reset, power failure, or its watchdog)"))
 
 
 create = RehaStim2

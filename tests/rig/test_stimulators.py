@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 from unittest.mock import Mock
 
@@ -20,7 +19,7 @@ from stimrig.rig.errors import DeviceError, WireError
 from stimrig.rig.limits import Admitted
 from stimrig.rig.machine import OnMessage
 from stimrig.rig.signals import Ack
-from tests.simulator.virtual_time import VirtualClock, VirtualMachine
+from tests.simulator.virtual_time import VirtualMachine
 
 
 @pytest.mark.parametrize(("number", "width_us", "current_ma"), [(5, 250, 20.0), (6, 300, 20.5), (15, 240, 20.0)])
@@ -46,30 +45,91 @@ def test_every_pulse_is_balanced(width_us: int, half_ma: int, channel: int):
     assert data[0] == 0x82 | channel << 5
 
 
-def test_status_and_identity():
-    assert p24.parse_status(b"\0\1\6") == (0, 1, 6)
-    with pytest.raises(WireError):
-        p24.parse_status(b"\0")
-    assert p24.parse_device_id(b"\0SN12345678") == "SN12345678"
-    assert p24.parse_version(bytes([0, 3, 2, 1, 4, 0, 1])) == "3.2.1 (ScienceMode 4.0.1)"
-    assert p24.parse_version(b"\0") == ""
+PORT = "/dev/serial/by-id/usb-wrong"
+DRIVERS = library("stimulator")
+
+
+class Wire(VirtualMachine):
+    """A machine with something at the end of its line, which keeps what it hears and answers as told."""
+
+    def __init__(self, answer: Callable[[bytes], bytes], greeting: bytes) -> None:
+        super().__init__()
+        self.heard, self._answer, self._greeting = b"", answer, greeting
+        self.acks, self.lost = list[Ack](), list[str]()
+
+    def port(self, *_: Any, **__: Any) -> Wire:
+        return self
+
+    def open(self, on_bytes: Callable[[bytes, float], None], _on_lost: OnMessage) -> None:
+        self.take = on_bytes
+        self._say(self._greeting)
+
+    def write(self, data: bytes) -> int:
+        self.heard += data
+        self._say(self._answer(data))
+        return len(data)
+
+    def discard(self) -> None: ...
+
+    def close(self) -> None: ...
+
+    def _say(self, data: bytes) -> None:
+        now_s = self.clock.now_s()
+        if data:
+            self.clock.call_at(now_s + 0.001, lambda: self.take(data, now_s + 0.001))
+
+
+def on_wire(
+    of: str, answer: Callable[[bytes], bytes] = lambda _: b"", greeting: bytes = b"", **settings: int
+) -> tuple[Any, Wire]:
+    """A driver that is not opened."""
+    wire, module = Wire(answer, greeting), DRIVERS[of]
+    made = module.create(module.Settings(device=of, port=PORT, **settings), wire)
+    made.listen(wire.acks.append, wire.lost.append)
+    return made, wire
+
+
+def opened(of: str, **settings: int) -> tuple[Any, Wire]:
+    """A driver whose port is open, on a line that says nothing by itself."""
+    made, wire = on_wire(of, **settings)
+    wire.open(made._read, made._lose)
+    made._lost = ""
+    return made, wire
+
+
+def answers_with(data: dict[int, bytes]) -> Callable[[bytes], bytes]:
+    """A P24 that acknowledges each command with these bytes, else with its result alone: fine."""
+
+    def answer(frame: bytes) -> bytes:
+        asked = SCIENCEMODE_4.decode(frame)
+        return SCIENCEMODE_4.encode(RigsPacket(asked.number, asked.command + 1, data.get(asked.command, b"\0")))
+
+    return answer
+
+
+IDENTITY = {52: b"\0SN12345678", 68: bytes([0, 3, 2, 1, 4, 0, 1]), 62: b"\0\1\6"}
+
+
+def test_status_and_identity_of_a_p24():
+    made, wire = on_wire("p24", answers_with(IDENTITY))
+    told = wire.run(made.open())
+    assert (told["id"], told["firmware"]) == ("SN12345678", "3.2.1 (ScienceMode 4.0.1)")
+    assert (told["state"], wire.run(made.state())[0]) == ("low level initialised", False)
+    made, wire = on_wire("p24", answers_with(IDENTITY | {68: b"\0"}))
+    assert wire.run(made.open())["firmware"] == ""
+    made, wire = on_wire("p24", answers_with(IDENTITY | {62: b"\0"}))
+    with pytest.raises(WireError, match="status ack of 1 bytes"):
+        wire.run(made.open())
 
 
 @pytest.mark.parametrize("data", [b"", b"\x01", b"\x08", b"\xff"])
-def test_every_answer_but_the_good_one_is_an_error(data: bytes, monkeypatch: pytest.MonkeyPatch):
+def test_every_answer_but_the_good_one_is_an_error(data: bytes):
     """Also one without a result: it confirms nothing."""
-    machine = VirtualMachine(VirtualClock())
-    monkeypatch.setattr(machine, "port", lambda *_, **__: SimpleNamespace())
-    device = p24.P24(p24.Settings(device="p24", port="/dev/p24"), machine)
-
-    async def ask(*_: object) -> RigsPacket:
-        return RigsPacket(0, 1, data)
-
-    monkeypatch.setattr(device._line, "request", ask)
-    monkeypatch.setattr(device._line, "discard", lambda: None)
-    for asked in (device.arm, device.stop):
+    made, wire = on_wire("p24", answers_with(IDENTITY | {0: data, 4: data}))
+    wire.run(made.open())
+    for asked in (made.arm, made.stop):
         with pytest.raises(DeviceError, match="error"):
-            machine.run(asked())
+            wire.run(asked())
 
 
 def test_results_are_signed():
@@ -91,39 +151,6 @@ def test_a_single_pulse_and_what_cannot_be_one():
 
 
 REHASTIM_OFFER = bytes.fromhex("f0814781560001010f")
-PORT = "/dev/serial/by-id/usb-wrong"
-
-
-class Other(VirtualMachine):
-    """A machine with something else at the end of its line, which keeps what it hears and answers as told."""
-
-    def __init__(self, answer: Callable[[bytes], bytes], greeting: bytes = b"") -> None:
-        super().__init__()
-        self.heard, self._answer, self._greeting = b"", answer, greeting
-
-    def port(self, path: str, **arguments: Any) -> Other:
-        self.asked = path, arguments
-        return self
-
-    def open(self, on_bytes: Callable[[bytes, float], None], on_lost: OnMessage) -> None:
-        self._on_bytes, self._on_lost = on_bytes, on_lost
-        self._say(self._greeting)
-
-    def write(self, data: bytes) -> int:
-        self.heard += data
-        self._say(self._answer(data))
-        return len(data)
-
-    def discard(self) -> None: ...
-
-    def close(self) -> None: ...
-
-    def _say(self, data: bytes) -> None:
-        now_s = self.clock.now_s()
-        if data:
-            self.clock.call_at(now_s + 0.001, lambda: self._on_bytes(data, now_s + 0.001))
-
-
 ANSWERS: dict[str, tuple[Callable[[bytes], bytes], bytes]] = {
     "silent": (lambda _: b"", b""),
     "rehastim2": (lambda _: REHASTIM_OFFER, REHASTIM_OFFER),
@@ -131,9 +158,6 @@ ANSWERS: dict[str, tuple[Callable[[bytes], bytes], bytes]] = {
     "an echo": (lambda data: data, b""),
     "a modem": (lambda _: b"\r\nERROR\r\n", b"RING\r\n"),
 }
-
-
-DRIVERS = library("stimulator")
 ASKING: dict[str, set[Any]] = {
     "p24": {p24.Command.DEVICE_ID, p24.Command.EXTENDED_VERSION, p24.Command.STIM_STATUS},
     "rehastim2": {rehastim2.Command.GET_MODE},
@@ -143,26 +167,22 @@ ASKING: dict[str, set[Any]] = {
 
 @pytest.mark.parametrize(("of", "what"), [(of, what) for of in DRIVERS for what in ANSWERS if what != of])
 def test_a_stimulator_that_is_another_is_only_asked_who_it_is(of: str, what: str):
-    line, driver = Other(*ANSWERS[what]), DRIVERS[of]
-    device = driver.create(driver.Settings(device=of, port=PORT), line)
-    device.listen(lambda _: None, lambda _: None)
+    made, wire = on_wire(of, *ANSWERS[what])
     with pytest.raises(DeviceError, match=PORT):
-        line.run(device.open())
-    commands = {packet.command for packet in FrameReader(driver.create.framing).feed(line.heard)}
+        wire.run(made.open())
+    commands = {packet.command for packet in FrameReader(made.framing).feed(wire.heard)}
     assert commands
     assert commands <= ASKING[of]
 
 
 def test_a_mistake_in_a_driver_is_told_at_once():
-    told, line = [], Other(lambda _: bytes.fromhex("f08155815a814381d514030000000f"))
-    device = p24.create(p24.Settings(device="p24", port=PORT), line)
-    device.listen(lambda _: None, told.append)
-    device._line._on_packet = Mock(side_effect=ZeroDivisionError("a mistake"))
-    asked_s = line.clock.now_s()
+    made, wire = on_wire("p24", answers_with(IDENTITY))
+    made._handle = Mock(side_effect=ZeroDivisionError("a mistake"))
+    asked_s = wire.clock.now_s()
     with pytest.raises(DeviceError, match="internal: ZeroDivisionError: a mistake"):
-        line.run(device.open())
-    assert line.clock.now_s() - asked_s < 0.01
-    assert "internal: ZeroDivisionError: a mistake" in told[0]
+        wire.run(made.open())
+    assert wire.clock.now_s() - asked_s < 0.01
+    assert "internal: ZeroDivisionError: a mistake" in wire.lost[0]
 
 
 FRAMES_2 = {
@@ -336,58 +356,29 @@ def test_a_body_longer_than_its_length_field_is_refused():
         rigs.encode(Packet(1, 36, bytes(254)))
 
 
-class Line:
-    def __init__(self) -> None:
-        self.written: list[bytes] = []
-
-    def open(self, on_bytes: Callable[[bytes, float], None], _on_lost: OnMessage) -> None:
-        self.take = on_bytes
-
-    def write(self, data: bytes) -> int:
-        self.written.append(data)
-        return len(data)
-
-    def discard(self) -> None: ...
-
-    def close(self) -> None: ...
-
-
-def driver(device: str, **settings: int) -> tuple[Any, Line, list[Ack]]:
-    machine, line, acks = VirtualMachine(VirtualClock()), Line(), list[Ack]()
-    machine.port = lambda *_, **__: line  # type: ignore[method-assign]
-    module = library("stimulator")[device]
-    made = module.create(module.Settings(device=device, port="/dev/x", **settings), machine)
-    made.listen(acks.append, lambda _: None)
-    machine.run(made._line.open())
-    return made, line, acks
-
-
-def test_a_p24_sends_to_the_output_of_the_rig_file():
-    made, line, _ = driver("p24", channel=4, connector=2)
+def test_each_driver_sends_to_the_output_of_the_rig_file():
+    made, wire = opened("p24", channel=4, connector=2)
     made.send(Admitted(250, 20.0), 1e9)
-    (head,) = [SCIENCEMODE_4.decode(frame).data[0] for frame in line.written]
+    head = SCIENCEMODE_4.decode(wire.heard).data[0]
     assert (head >> 7, head >> 5 & 3, head >> 4 & 1) == (1, 3, 1)
+    made, wire = opened("rehastim2", channel=8)
+    made.send(Admitted(250, 20.0), 1e9)
+    assert SCIENCEMODE_2.decode(wire.heard).data[0] == 7
 
 
 @pytest.mark.parametrize(("place", "ours"), [(0x00, False), (0x13, True), (0x10, False), (0x03, False)])
 def test_a_p24s_ack_of_another_output_is_an_error(place: int, ours: bool):
-    made, line, acks = driver("p24", channel=4, connector=2)
+    made, wire = opened("p24", channel=4, connector=2)
     number = made.send(Admitted(250, 20.0), 1e9)
-    line.take(SCIENCEMODE_4.encode(RigsPacket(number, 3, bytes((0, place, 0)))), 0.0)
-    (ack,) = acks
+    wire.take(SCIENCEMODE_4.encode(RigsPacket(number, 3, bytes((0, place, 0)))), 0.0)
+    (ack,) = wire.acks
     assert ack.number == number
     assert ack.error == (None if ours else "it acknowledged a pulse of an output that is not in use instead")
 
 
 def test_the_vendors_acks_are_of_the_first_output():
-    made, line, acks = driver("p24")
+    made, wire = opened("p24")
     for number in range(1, 6):
         assert made.send(Admitted(250, 20.0), 1e9) == number
-    line.take(bytes.fromhex("f0 81 55 81 5a 81 43 81 d5 14 03 00 00 00 0f"), 0.0)
-    assert [(ack.number, ack.error) for ack in acks] == [(5, None)]
-
-
-def test_a_rehastim_2_sends_to_the_output_of_the_rig_file():
-    made, line, _ = driver("rehastim2", channel=8)
-    made.send(Admitted(250, 20.0), 1e9)
-    assert [SCIENCEMODE_2.decode(frame).data[0] for frame in line.written] == [7]
+    wire.take(bytes.fromhex(FRAMES_4["LLConfigAck"][0]), 0.0)
+    assert [(ack.number, ack.error) for ack in wire.acks] == [(5, None)]
