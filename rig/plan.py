@@ -29,13 +29,12 @@ from stimrig.rig.messages import (
     Sequences,
     TestPlan,
 )
-from stimrig.rig.signals import Pulse, Segment
+from stimrig.rig.signals import LaidBy, Pulse, Segment
 
 USUAL_RATE_HZ = 40.0
 MAX_SEGMENTS = 200
 MAX_WIDTH_SETTING = "max_pulse_width_us"
 """If the plan does not give this setting of a sequence, it is the comfort maximum, or the request's limit if lower."""
-NOTHING = np.empty(0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +47,35 @@ class Piece:
     of: SegmentPlan
     pulse_width_us: NDArray[np.float64]
     jumps: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """Pieces one after the other: widths in µs and whether each may jump there, shape (n,), and the segments."""
+
+    pulse_width_us: NDArray[np.float64]
+    jumps: NDArray[np.bool_]
+    segments: tuple[Segment, ...]
+
+    def __len__(self) -> int:
+        return len(self.pulse_width_us)
+
+    def cut(self, end: int) -> Layout:
+        segments = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
+        return Layout(self.pulse_width_us[:end], self.jumps[:end], tuple(segments))
+
+    def add(self, pieces: Sequence[Piece], by: LaidBy) -> Layout:
+        """Return these pieces behind all others; an empty one makes no segment."""
+        widths_us, jumps, segments, end = [self.pulse_width_us], [self.jumps], [*self.segments], len(self)
+        for piece in pieces:
+            start, end = end, end + len(piece.pulse_width_us)
+            widths_us.append(piece.pulse_width_us)
+            jumps.append(np.full(end - start, piece.jumps))
+            segments += [Segment(piece.of.name, start, end, by)] if end > start else []
+        return Layout(np.concatenate(widths_us), np.concatenate(jumps), tuple(segments))
+
+
+NOTHING = Layout(np.empty(0), np.empty(0, bool), ())
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,17 +129,9 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
         raise PlanError(f"plan.segments: {len(chosen)} segments, at most {MAX_SEGMENTS}; combine some of them")
     built = build_pieces(chosen, plan, table["duration_s"])
     check_pieces(built, plan, table)
-    widths_us = np.concatenate([piece.pulse_width_us for piece in built])
-    longest_s = len(widths_us) / plan.pulse_rate_hz
-    if plan.adaptive is not None:
-        # it plays if nobody extends: it must fit into its bounds with its safe end
-        whole = len(widths_us) + safe_end(widths_us, plan.pulse_rate_hz)
-        refuse(table["duration_s"], whole / plan.pulse_rate_hz, "plan, with its safe end")
-        longest_s = table["duration_s"].hi
-    ends = np.cumsum([len(piece.pulse_width_us) for piece in built]).tolist()
-    places = zip(built, [0, *ends[:-1]], ends, strict=True)
-    segments = tuple(Segment(piece.of.name, start, end, "plan") for piece, start, end in places)
-    return PlannedTest(plan, widths_us, segments, built, longest_s)
+    layout = NOTHING.add(built, "plan")
+    longest_s = len(layout) / plan.pulse_rate_hz if plan.adaptive is None else table["duration_s"].hi
+    return PlannedTest(plan, layout.pulse_width_us, layout.segments, built, longest_s)
 
 
 def _check_angle(plan: TestPlan, table: dict[str, Limit]) -> None:
@@ -164,15 +184,13 @@ def _settings(segment: SegmentPlan, plan: TestPlan) -> dict[str, object]:
     return settings
 
 
-def check_pieces(
-    pieces: Sequence[Piece], plan: TestPlan, table: dict[str, Limit], before_us: NDArray[np.float64] = NOTHING
-) -> None:
-    """Check pieces against the limits, as a part of the whole that they make with the pulses before them.
+def check_pieces(pieces: Sequence[Piece], plan: TestPlan, table: dict[str, Limit], before: Layout = NOTHING) -> None:
+    """Check pieces against the limits, as a part of the whole that they make with what is laid before them.
 
-    `before_us`: widths of all pulses before them, µs, shape (n,), already checked. Raises RefusedError: names the
-    limit, the value and the excess.
+    `before`: already checked. In an adaptive test a safe end must be left. Raises RefusedError: names the limit, the
+    value and the excess.
     """
-    current_ma, rate_hz = plan.profile.current_ma, plan.pulse_rate_hz
+    current_ma, rate_hz, before_us = plan.profile.current_ma, plan.pulse_rate_hz, before.pulse_width_us
     added_us = np.concatenate([piece.pulse_width_us for piece in pieces])
     for width_us in np.unique(added_us):
         verdict = admit(Pulse(float(width_us), current_ma), table)
@@ -193,6 +211,9 @@ def check_pieces(
             first = int(np.argmax(rises_us))
             refuse(table["width_rise_us"], float(rises_us[first]), f"segment {piece.of.name}, pulse {first + 1}")
         last_us = float(piece.pulse_width_us[-1])
+    if plan.adaptive is not None:
+        whole += safe_end(np.concatenate([before_us, added_us]), rate_hz)
+        refuse(table["duration_s"], whole / rate_hz, "plan, with its safe end")
 
 
 def _place(pieces: Sequence[Piece], width_us: float) -> str:

@@ -26,73 +26,72 @@ LONGEST_LINE = 1_900_000
 """Bytes of a request. The rig refuses longer ones."""
 
 
-class StatusRequest(Message):
+class _Request(Message):
+    """Base of all requests, written with kind and id first."""
+
+    kind: str
+    id: int = 0
+
+
+class StatusRequest(_Request):
     kind: Literal["status"] = "status"
-    id: int = 0
 
 
-class SubscribeRequest(Message):
+class SubscribeRequest(_Request):
     kind: Literal["subscribe"] = "subscribe"
-    id: int = 0
 
 
-class PreviewRequest(Message):
+class PreviewRequest(_Request):
     """Ask for a plan's duration, dose and pulse widths; nothing is sent."""
 
     kind: Literal["preview"] = "preview"
-    id: int = 0
     plan: TestPlan
     recruitment: RecruitmentTable | None = Field(None, description="to estimate the torque-time")
 
 
-class SequencesRequest(Message):
+class SequencesRequest(_Request):
     """Ask for the library of sequences, and for the default test. Reply: `Sequences`."""
 
     kind: Literal["sequences"] = "sequences"
-    id: int = 0
 
 
-class StartRequest(Message):
+class StartRequest(_Request):
     kind: Literal["start"] = "start"
-    id: int = 0
     plan: TestPlan
     key: str = Field(
         default="", description="of an adaptive test: only who knows it may extend it; it is stored nowhere"
     )
 
 
-class ExtendRequest(Message):
+class ExtendRequest(_Request):
     """Add segments to the running adaptive test, behind everything that is laid. Reply: `Extended`.
 
     They pass the checks of a plan, as a part of the whole test. All are laid, or none.
     """
 
     kind: Literal["extend"] = "extend"
-    id: int = 0
     test_id: str
     key: str = Field(description="of the test's start")
     after: int = Field(description="`LiveEvent.laid` that the client saw; refused as late if more was laid since")
     segments: list[SegmentPlan] = Field(description="none: this client chooses no more, and the fixed plan plays on")
 
 
-class EnoughRequest(Message):
+class EnoughRequest(_Request):
     """End the running adaptive test well, with its safe end; anyone may ask, like for a stop. Reply: `Extended`."""
 
     kind: Literal["enough"] = "enough"
-    id: int = 0
     test_id: str
     by: str = ""
     at_once: bool = Field(default=False, description="at the next pulse; else where the segment that plays ends")
 
 
-class WithdrawRequest(Message):
+class WithdrawRequest(_Request):
     """Withdraw a test whose conditions have changed: it plays no pulse, and nothing latches. Reply: `Withdrawn`.
 
     It waits for nothing, and holds for a test that the rig has not heard of yet: its start is refused (`withdrawn`).
     """
 
     kind: Literal["withdraw"] = "withdraw"
-    id: int = 0
     test_id: str
     reason: str
     begun: bool = Field(
@@ -100,27 +99,24 @@ class WithdrawRequest(Message):
     )
 
 
-class StopRequest(Message):
+class StopRequest(_Request):
     kind: Literal["stop"] = "stop"
-    id: int = 0
     reason: str
     by: str = ""
 
 
-class RearmRequest(Message):
+class RearmRequest(_Request):
     """A person has looked. Refused with `latch-changed` unless `latch` is what the status tells now."""
 
     kind: Literal["rearm"] = "rearm"
-    id: int = 0
     by: str
     latch: str = Field(description="`Status.latch` that the person was shown")
 
 
-class CalibrateStartRequest(Message):
+class CalibrateStartRequest(_Request):
     """Open a guided calibration; nothing is sent yet. Reply: `Status` with `calibration`."""
 
     kind: Literal["calibrate-start"] = "calibrate-start"
-    id: int = 0
     calibration_id: str
     participant: str
     by: str
@@ -136,29 +132,27 @@ class CalibrateStartRequest(Message):
     max_torque_nm: float = Field(30.0, description="torque at which a train stops, N·m")
 
 
-class CalibrateStepRequest(Message):
+class CalibrateStepRequest(_Request):
     """Play one train: wider, narrower, or the same again. Reply: `Status`, at once (state arming).
 
     The train has ended when the state is `calibrating` again. A fault or a stop latches and ends the calibration.
     """
 
     kind: Literal["calibrate-step"] = "calibrate-step"
-    id: int = 0
     direction: Direction = "up"
     shown_us: float | None = Field(
         None, description="width that a person was shown; refused if another one would be sent. None: not shown"
     )
 
 
-class CalibrateMarkRequest(Message):
+class CalibrateMarkRequest(_Request):
     """Mark the width of the last train as a threshold; a new mark replaces the old one. Reply: `Status`."""
 
     kind: Literal["calibrate-mark"] = "calibrate-mark"
-    id: int = 0
     threshold: Threshold
 
 
-class CalibrateFinishRequest(Message):
+class CalibrateFinishRequest(_Request):
     """Close the calibration. Reply: `CalibrationResult`, with the profile unless `discard`.
 
     The result waits in `Status.calibrated` until it is stored (`CalibrateStoredRequest`), discarded, or its day ends.
@@ -166,21 +160,19 @@ class CalibrateFinishRequest(Message):
     """
 
     kind: Literal["calibrate-finish"] = "calibrate-finish"
-    id: int = 0
     by: str
     discard: bool = False
     calibration_id: str = Field(default="", description="refused if another one is open; empty: whichever is open")
 
 
-class CalibrateStoredRequest(Message):
+class CalibrateStoredRequest(_Request):
     """The result of a calibration is stored: the rig lets it go, if it still waits. Reply: `Status`."""
 
     kind: Literal["calibrate-stored"] = "calibrate-stored"
-    id: int = 0
     calibration_id: str
 
 
-class AnglePoseRequest(Message):
+class AnglePoseRequest(_Request):
     """Tell the angle that a goniometer shows while the joint is held still. Reply: `Status` with `angle`.
 
     The first pose begins a calibration of the angle sensor, the second, at least 0.5 rad away, completes it. The next
@@ -188,7 +180,6 @@ class AnglePoseRequest(Message):
     """
 
     kind: Literal["angle_pose"] = "angle_pose"
-    id: int = 0
     angle_rad: float = Field(description="elbow: 0 is straight, flexion positive, rad")
     by: str = Field(max_length=LONGEST_NAME, description="it stands in every status and recording from then on")
     first: bool = Field(False, description="begin anew: a first pose that waits for its second is forgotten")

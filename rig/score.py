@@ -12,17 +12,15 @@ from __future__ import annotations
 import contextlib
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from stimrig.rig import plan
 from stimrig.rig.errors import BusyError, PlanError, RefusedError, TooLateError
 from stimrig.rig.journal import Journal, Kind, LaidBlock
-from stimrig.rig.limits import Limit, refuse, tightened
+from stimrig.rig.limits import Limit, tightened
 from stimrig.rig.messages import AHEAD, Extended, SegmentPlan
-from stimrig.rig.plan import Piece, PlannedTest
+from stimrig.rig.plan import Layout, Piece, PlannedTest
 from stimrig.rig.signals import LaidBy, Segment
 from stimrig.rig.tasks import Tasks
 
@@ -34,31 +32,6 @@ MAX_NAME = 60
 SAFE_END = SegmentPlan(name="rest", sequence="rest", settings={})
 WAIT = SegmentPlan(name="wait", sequence="rest", settings={})
 WAIT_S = 0.25
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Everything that is laid: widths in µs and whether each may jump there, shape (n,), and the segments."""
-
-    pulse_width_us: NDArray[np.float64]
-    jumps: NDArray[np.bool_]
-    segments: tuple[Segment, ...]
-
-    def __len__(self) -> int:
-        return len(self.pulse_width_us)
-
-    def cut(self, end: int) -> Layout:
-        segments = (s._replace(end=min(s.end, end)) for s in self.segments if s.start < end)
-        return Layout(self.pulse_width_us[:end], self.jumps[:end], tuple(segments))
-
-    def add_piece(self, piece: Piece, by: LaidBy) -> Layout:
-        end = len(self) + len(piece.pulse_width_us)
-        added = Segment(piece.of.name, len(self), end, by)
-        return Layout(
-            np.concatenate([self.pulse_width_us, piece.pulse_width_us]),
-            np.concatenate([self.jumps, np.full(len(piece.pulse_width_us), piece.jumps)]),
-            (*self.segments, added),
-        )
 
 
 class Score:
@@ -78,9 +51,7 @@ class Score:
         self._patience_s = 0.0 if self.adaptive is None else self.adaptive.patience_s
         at_start = test.pieces[:1] if self.adaptive else test.pieces
         self._fixed = deque(test.pieces[len(at_start) :])
-        self.queue = Layout(plan.NOTHING, np.empty(0, bool), ())
-        for piece in at_start:
-            self.queue = self.queue.add_piece(piece, "plan")
+        self.queue = plan.NOTHING.add(at_start, "plan")
         self.decided = len(self.queue)
         """Pulses that are laid, without the rest behind them that only waits for a client."""
         self._reached = -1
@@ -206,17 +177,8 @@ class Score:
         longest_s = before / self.plan.pulse_rate_hz + MAX_EXTENSION_S
         table = tightened(self._table, "duration_s", longest_s, f"at most {MAX_EXTENSION_S:g} s an extension")
         built = plan.build_pieces(chosen, self.plan, table["duration_s"], before)
-        self._check(queue, built)
+        plan.check_pieces(built, self.plan, self._table, queue)
         return built
-
-    def _check(self, queue: Layout, added: Sequence[Piece]) -> None:
-        """Check pieces as a part of the whole, for which a safe end must be left. Raises RefusedError."""
-        before_us = queue.pulse_width_us
-        plan.check_pieces(added, self.plan, self._table, before_us)
-        whole_us = np.concatenate([before_us, *(piece.pulse_width_us for piece in added)])
-        rate_hz = self.plan.pulse_rate_hz
-        whole_s = (len(whole_us) + plan.safe_end(whole_us, rate_hz)) / rate_hz
-        refuse(self._table["duration_s"], whole_s, "plan, with its safe end")
 
     def _go_on(self) -> None:
         """Lay a rest where a client may still choose, else the fixed plan's next segment, or end."""
@@ -224,7 +186,7 @@ class Score:
             piece = Piece(WAIT, np.zeros(max(1, round(WAIT_S * self.plan.pulse_rate_hz))), jumps=False)
             self._patience_s -= len(piece.pulse_width_us) / self.plan.pulse_rate_hz
             with contextlib.suppress(RefusedError):  # no room for it: nor, perhaps, for the fixed plan's next segment
-                self._check(self.queue, [piece])
+                plan.check_pieces([piece], self.plan, self._table, self.queue)
                 self._append(piece, "wait")
                 return
         if not self._fixed:
@@ -232,7 +194,7 @@ class Score:
             return
         piece = self._fixed.popleft()
         try:
-            self._check(self.queue, [piece])
+            plan.check_pieces([piece], self.plan, self._table, self.queue)
         except RefusedError as error:
             self._end("limit", f"next of the fixed plan: {error}", len(self.queue))
         else:
@@ -253,7 +215,7 @@ class Score:
     def _append(self, piece: Piece, by: LaidBy, before: Layout | None = None) -> None:
         """Write a piece to the journal, then show it to the sender."""
         before = self.queue if before is None else before
-        following = before.add_piece(piece, by) if len(piece.pulse_width_us) else before
+        following = before.add([piece], by)
         block = LaidBlock(
             Segment(piece.of.name, len(before), len(following), by),
             piece.of.sequence,

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import logging
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from stimrig.rig.config import RigConfig
 from stimrig.rig.control.live import finite
 from stimrig.rig.control.memory import SmallFile
 from stimrig.rig.control.pair import Pair
-from stimrig.rig.devices import DeviceSettings
 from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError
 from stimrig.rig.limits import Limit, refuse
 from stimrig.rig.machine import Machine
@@ -45,33 +43,39 @@ SCALES = 0.7, 1.4
 """Bounds of the scale of two poses over the rig file's: beyond them a number was mistyped or the sensor slips."""
 SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
 """Settings that tell one sensor from another."""
-NO_SENSOR = "{}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)"
 ROUNDED = 1e-9
 """Share by which what a file says may differ from what its two poses make."""
 
 
-class AngleCalibrating:
-    """The calibration of a rig's angle sensor, and the first pose of the next one."""
+class Joint:
+    """The joint's angle as the rig's sensor gives it, the sensor's calibration, and the first pose of the next one."""
 
-    def __init__(self, folder: Path, sensor: DeviceSettings | None, machine: Machine) -> None:
-        self._file = SmallFile(folder / "angle-calibration.json", "angle_pose", machine)
-        self._clock = machine.tasks.clock
-        content = {} if sensor is None else sensor.model_dump(mode="json")
+    def __init__(self, config: RigConfig, machine: Machine, pair: Pair, bound: Limit) -> None:
+        self._file = SmallFile(config.data_dir / "angle-calibration.json", "angle_pose", machine)
+        self._present, self._needs_calibration = config.angle_sensor is not None, config.require_calibration
+        content = {} if config.angle_sensor is None else config.angle_sensor.model_dump(mode="json")
         self._sensor = {name: content[name] for name in SENSOR if name in content}
+        self._pair, self._bound, self._tasks, self._clock = pair, bound, machine.tasks, machine.tasks.clock
         self._first: tuple[AnglePose, float] | None = None
         self.calibration: AngleCalibration | None = None
 
     async def recall(self) -> None:
+        """Read the calibration that was kept, if it is this sensor's."""
         try:
-            content = await self._file.read() if self._sensor else None
+            content = await self._file.read() if self._present else None
             if content is None:
                 return
             if content["sensor"] == self._sensor:
                 self.calibration = _check_poses(AngleCalibration.model_validate(content["calibration"]))
+                self._rescale()
             else:
                 log.warning("%s: made with another sensor; take two poses again", self._file.path)
         except (OSError, ValueError, KeyError) as error:
             log.error("%s: not readable (%s); take two poses again", self._file.path, " ".join(str(error).split()))
+
+    def _rescale(self) -> None:
+        if (found := self.calibration) is not None:
+            self._pair.rescale(AngleScale(found.offset, found.direction, found.radians_per_unit))
 
     @property
     def first(self) -> AnglePose | None:
@@ -82,38 +86,84 @@ class AngleCalibrating:
         return pose if self._clock.now_s() - told_s <= FIRST_LASTS_S * self._clock.speed else None
 
     @property
-    def scale(self) -> AngleScale | None:
-        """By the two poses; None: there is no calibration."""
+    def set_at_utc(self) -> str | None:
+        """When the sensor was calibrated; None: it was not. May be called from another thread."""
         calibration = self.calibration
-        return (
-            None
-            if calibration is None
-            else AngleScale(calibration.offset, calibration.direction, calibration.radians_per_unit)
+        return None if calibration is None else calibration.set_at_utc
+
+    def status(self) -> AngleStatus:
+        if not self._present:
+            return AngleStatus()
+        angle = self._pair.angle
+        now: dict[str, Any] = {}
+        if angle is not None:
+            age_s = angle.age_s(self._clock.now_s())
+            status = {"angle_rad": angle.angle_rad, "velocity_rad_s": angle.velocity_rad_s, "age_s": age_s}
+            now = {"problem": angle.problem, **{name: finite(value) for name, value in status.items()}}
+        return AngleStatus(
+            present=True,
+            calibrated=self.calibration is not None,
+            range_rad=(self._bound.lo, self._bound.hi),
+            pose=self.first,
+            calibration=self.calibration,
+            **now,
         )
 
-    def described(self, rig_file: AngleScale) -> dict[str, Any]:
-        """Return the valid scale, for journals and recordings: the calibration, else the rig file's."""
-        if self.calibration is not None:
-            return self.calibration.model_dump(mode="json")
-        return {"poses": [], **asdict(rig_file), "by": "rig file", "set_at_utc": ""}
+    def described(self) -> dict[str, Any] | None:
+        """Return the entry of the sensor in a journal's header, with its scale; None: there is no sensor."""
+        if self._pair.angle is None:
+            return None
+        sensor, calibration = self._pair.angle.sensor, self.calibration
+        scale = {"poses": [], **asdict(sensor.scale), "by": "rig file", "set_at_utc": ""}
+        return {
+            "sample_rate_hz": sensor.sample_rate_hz,
+            "of_the_cell": sensor.of_the_cell,
+            "one_bus": sensor.on_the_cells_bus,
+            "calibration": scale if calibration is None else calibration.model_dump(mode="json"),
+        }
 
-    async def pose(self, angle_rad: float, by: str, receiver: AngleReceiver, bound: Limit, first: bool = False) -> bool:
-        """Take a pose; True if it completed a calibration. `first`: it begins anew, whichever one waits.
+    async def await_angle(self, plan: TestPlan) -> None:
+        """Wait a moment for the first angle, if a test asks for it. Raises DeviceError: the rig is disconnected."""
+        if plan.angle is not None and self._present:
+            await await_angle(self._receiver(), self._tasks)
 
-        Raises RefusedError: no angle of a joint, the joint moved, or the two poses do not fit each other. DeviceError:
-        the sensor gives no angle. RigError: the calibration could not be stored: the old one holds.
+    def check(self, plan: TestPlan, table: dict[str, Limit]) -> None:
+        """Refuse a test that asks for an angle that this rig cannot give, or where the joint is elsewhere.
+
+        Raises PlanError, RefusedError, DeviceError.
         """
-        refuse(bound, angle_rad, "angle_pose")
-        pose = AnglePose(angle_rad=angle_rad, raw=still_raw(receiver, self._clock.speed))
-        before = None if first else self.first
+        if plan.angle is None:
+            return
+        self._refuse_absent("plan.angle")
+        if self._needs_calibration and self.calibration is None:
+            raise RefusedError(
+                "plan.angle: the angle sensor is not calibrated; take two poses with a goniometer, "
+                f"{degrees(APART_RAD)} or more apart"
+            )
+        check_start(self._receiver(), plan, table, self._clock)
+
+    async def pose(self, request: AnglePoseRequest, phase: Phase) -> None:
+        """Take the goniometer's angle of a joint that is held still; the second one completes a calibration.
+
+        Raises PlanError: this rig has no angle sensor. BusyError: a test is in progress. RefusedError: no angle of a
+        joint, the joint moved, or the two poses do not fit each other. DeviceError: the sensor gives no angle.
+        RigError: the calibration could not be stored: the old one holds.
+        """
+        self._refuse_absent("angle_pose")
+        if phase.busy:
+            raise BusyError(f"test {phase.test_id} is {phase.state}; take the pose afterwards")
+        refuse(self._bound, request.angle_rad, "angle_pose")
+        receiver = self._receiver()
+        pose = AnglePose(angle_rad=request.angle_rad, raw=still_raw(receiver, self._clock.speed))
+        before = None if request.first else self.first
         if before is None:
             self._first = pose, self._clock.now_s()
-            return False
-        calibration = self._of_two(before, pose, by, receiver.sensor.scale)
+            return
+        calibration = self._of_two(before, pose, request.by, receiver.sensor.scale)
         await self._file.write({"sensor": self._sensor, "calibration": calibration.model_dump(mode="json")})
         self._first, self.calibration = None, calibration
         log.info("angle sensor calibrated: %s", calibration.model_dump_json(exclude={"by"}))
-        return True
+        self._rescale()
 
     def _of_two(self, first: AnglePose, second: AnglePose, by: str, rig_file: AngleScale) -> AngleCalibration:
         apart_rad = second.angle_rad - first.angle_rad
@@ -139,6 +189,15 @@ class AngleCalibrating:
             by=by,
             set_at_utc=utc_text(self._clock.unix_s()),
         )
+
+    def _refuse_absent(self, place: str) -> None:
+        if not self._present:
+            raise PlanError(f"{place}: this rig has no angle sensor; name one in its rig file (docs/rig-file.md)")
+
+    def _receiver(self) -> AngleReceiver:
+        if self._pair.angle is None:
+            raise DeviceError("angle sensor: the rig is disconnected; re-arm it first")
+        return self._pair.angle
 
 
 def _slope(first: AnglePose, second: AnglePose) -> float:
@@ -192,93 +251,3 @@ def _moved(samples: NDArray[Any], part_s: float) -> float:
     part = np.floor((samples["host_time_s"] - samples["host_time_s"][0]) / part_s).astype(int)
     means = [float(np.mean(samples["raw"][part == each])) for each in np.unique(part)]
     return max(means) - min(means)
-
-
-class Joint:
-    """The joint's angle as the rig's sensor gives it."""
-
-    def __init__(self, config: RigConfig, machine: Machine, pair: Pair, bound: Limit) -> None:
-        self.poses = AngleCalibrating(config.data_dir, config.angle_sensor, machine)
-        self._present, self._needs_calibration = config.angle_sensor is not None, config.require_calibration
-        self._pair, self._bound, self._tasks = pair, bound, machine.tasks
-
-    async def recall(self) -> None:
-        await self.poses.recall()
-        self._pair.rescale(self.poses.scale)
-
-    @property
-    def set_at_utc(self) -> str | None:
-        """When the sensor was calibrated; None: it was not. May be called from another thread."""
-        calibration = self.poses.calibration
-        return None if calibration is None else calibration.set_at_utc
-
-    def status(self) -> AngleStatus:
-        if not self._present:
-            return AngleStatus()
-        angle, poses = self._pair.angle, self.poses
-        now: dict[str, Any] = {}
-        if angle is not None:
-            age_s = angle.age_s(self._tasks.clock.now_s())
-            status = {"angle_rad": angle.angle_rad, "velocity_rad_s": angle.velocity_rad_s, "age_s": age_s}
-            now = {"problem": angle.problem, **{name: finite(value) for name, value in status.items()}}
-        return AngleStatus(
-            present=True,
-            calibrated=poses.calibration is not None,
-            range_rad=(self._bound.lo, self._bound.hi),
-            pose=poses.first,
-            calibration=poses.calibration,
-            **now,
-        )
-
-    def described(self) -> dict[str, Any] | None:
-        """Return the entry of the sensor in a journal's header; None: there is no sensor."""
-        if self._pair.angle is None:
-            return None
-        sensor = self._pair.angle.sensor
-        return {
-            "sample_rate_hz": sensor.sample_rate_hz,
-            "of_the_cell": sensor.of_the_cell,
-            "one_bus": sensor.on_the_cells_bus,
-            "calibration": self.poses.described(sensor.scale),
-        }
-
-    async def await_angle(self, plan: TestPlan) -> None:
-        """Wait a moment for the first angle, if a test asks for it. Raises DeviceError: the rig is disconnected."""
-        if plan.angle is not None and self._present:
-            await await_angle(self._receiver(), self._tasks)
-
-    def check(self, plan: TestPlan, table: dict[str, Limit]) -> None:
-        """Refuse a test that asks for an angle that this rig cannot give, or where the joint is elsewhere.
-
-        Raises PlanError, RefusedError, DeviceError.
-        """
-        if plan.angle is None:
-            return
-        self._refuse_absent("plan.angle")
-        if self._needs_calibration and self.poses.calibration is None:
-            raise RefusedError(
-                "plan.angle: the angle sensor is not calibrated; take two poses with a goniometer, "
-                f"{degrees(APART_RAD)} or more apart"
-            )
-        check_start(self._receiver(), plan, table, self._tasks.clock)
-
-    async def pose(self, request: AnglePoseRequest, phase: Phase) -> None:
-        """The goniometer's angle of a joint that is held still; the second one completes a calibration.
-
-        Raises PlanError: this rig has no angle sensor. BusyError: a test is in progress. DeviceError, RefusedError,
-        RigError: see `AngleCalibrating.pose`.
-        """
-        self._refuse_absent("angle_pose")
-        if phase.busy:
-            raise BusyError(f"test {phase.test_id} is {phase.state}; take the pose afterwards")
-        await self.poses.pose(request.angle_rad, request.by, self._receiver(), self._bound, request.first)
-        self._pair.rescale(self.poses.scale)
-
-    def _refuse_absent(self, place: str) -> None:
-        if not self._present:
-            raise PlanError(NO_SENSOR.format(place))
-
-    def _receiver(self) -> AngleReceiver:
-        if self._pair.angle is None:
-            raise DeviceError("angle sensor: the rig is disconnected; re-arm it first")
-        return self._pair.angle

@@ -6,21 +6,22 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
 
 from stimrig.rig import journal
 from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.control import angle_calibration
-from stimrig.rig.control.angle_calibration import AngleCalibrating
+from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibration import check_range
 from stimrig.rig.devices import can_angle_sensor
 from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, PlanError, RefusedError, RigError
 from stimrig.rig.journal import Kind
 from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.messages import AngleCalibration, AnglePlan, Profile, Status
+from stimrig.rig.phase import Phase
 from stimrig.rig.requests import AnglePoseRequest
 from tests.rig.fakes import FakeSensor, OpenedSensor, rest
 from tests.rig.live import SPEED, LiveRig
@@ -31,13 +32,15 @@ SETTINGS = can_angle_sensor.Settings(device="can_angle_sensor")
 
 
 class Posed:
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, settings: can_angle_sensor.Settings | None = SETTINGS) -> None:
         self.folder, self.machine, self.degrees = folder, VirtualMachine(), 20.0
         self.moving_deg_s = 0.0
         at = lambda t: math.radians(self.degrees + self.moving_deg_s * (t - 1000.0))  # noqa: E731
         self.sensor = FakeSensor(self.machine.clock, at)
         self.receiver = AngleReceiver(self.sensor, self.machine.tasks)
-        self.poses = AngleCalibrating(folder, SETTINGS, self.machine)
+        config: Any = SimpleNamespace(data_dir=folder, angle_sensor=settings, require_calibration=False)
+        pair: Any = SimpleNamespace(angle=self.receiver, rescale=self.receiver.rescale)
+        self.joint = Joint(config, self.machine, pair, BOUND)
 
     def hold(self, degrees: float, duration_s: float = 1.5) -> None:
         self.degrees = degrees
@@ -45,8 +48,10 @@ class Posed:
         self.machine.wait(duration_s)
 
     def pose(self, told_deg: float, first: bool = False) -> bool:
-        told_rad = math.radians(told_deg)
-        return self.machine.run(self.poses.pose(told_rad, "nurse", self.receiver, BOUND, first))
+        before = self.joint.calibration
+        request = AnglePoseRequest(angle_rad=math.radians(told_deg), by="nurse", first=first)
+        self.machine.run(self.joint.pose(request, Phase("ready")))
+        return self.joint.calibration is not before
 
     def take(self, degrees: float, told_deg: float | None = None, first: bool = False) -> bool:
         """Hold, and pose; whether that was the second pose."""
@@ -55,15 +60,18 @@ class Posed:
 
     def calibrate(self) -> AngleCalibration:
         assert not self.take(20.0) and self.take(90.0)
-        assert self.poses.calibration is not None
-        return self.poses.calibration
+        assert self.joint.calibration is not None
+        return self.joint.calibration
+
+    def shown_deg(self, raw: float) -> float:
+        """The angle that a value of the sensor stands for now."""
+        return math.degrees(self.receiver.scale.angle_rad(raw))
 
 
 def kept(folder: Path, settings: can_angle_sensor.Settings | None = SETTINGS) -> AngleCalibration | None:
-    machine = VirtualMachine()
-    again = AngleCalibrating(folder, settings, machine)
-    machine.run(again.recall())
-    return again.calibration
+    again = Posed(folder, settings)
+    again.machine.run(again.joint.recall())
+    return again.joint.calibration
 
 
 @pytest.fixture
@@ -73,14 +81,13 @@ def posed(tmp_path: Path) -> Posed:
 
 def test_two_poses_give_offset_direction_and_scale_kept_for_this_sensor_alone(posed: Posed):
     assert posed.take(20.0) is False
-    assert posed.poses.first is not None and posed.poses.calibration is None
+    assert posed.joint.first is not None and posed.joint.calibration is None
     assert posed.take(90.0) is True
-    found, scale = posed.poses.calibration, posed.poses.scale
+    found = posed.joint.calibration
     assert found is not None and found.direction == -1 and found.by == "nurse" and len(found.poses) == 2
     assert found.offset == pytest.approx(30.0, abs=0.05)
     assert found.radians_per_unit == pytest.approx(math.pi / 180, rel=1e-3)
-    assert posed.poses.first is None and scale is not None
-    assert np.degrees(scale.angle_rad(np.array([30.0 - 57.0]))) == pytest.approx(57.0, abs=0.1)
+    assert posed.joint.first is None and posed.shown_deg(30.0 - 57.0) == pytest.approx(57.0, abs=0.1)
     assert kept(posed.folder) == found
     assert kept(posed.folder, SETTINGS.model_copy(update={"signal": "Other_deg"})) is None
     assert kept(posed.folder, None) is None
@@ -120,28 +127,27 @@ def test_a_rig_comes_up_whatever_stands_in_the_file(tmp_path: Path, content: str
 
 def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_second(posed: Posed):
     old = posed.calibrate()
-    assert posed.take(40.0, told_deg=45.0) is False and posed.poses.calibration is old
-    assert posed.take(100.0, told_deg=105.0) is True and posed.poses.calibration is not old
-    assert posed.poses.scale is not None
-    assert np.degrees(posed.poses.scale.angle_rad(np.array([30.0 - 40.0]))) == pytest.approx(45.0, abs=0.1)
+    assert posed.take(40.0, told_deg=45.0) is False and posed.joint.calibration is old
+    assert posed.take(100.0, told_deg=105.0) is True and posed.joint.calibration is not old
+    assert posed.shown_deg(30.0 - 40.0) == pytest.approx(45.0, abs=0.1)
 
 
 def test_a_first_pose_of_long_ago_is_none(posed: Posed):
     posed.take(20.0)
     posed.machine.wait(angle_calibration.FIRST_LASTS_S + 1.0)
-    assert posed.poses.first is None
+    assert posed.joint.first is None
     assert posed.take(75.0, told_deg=90.0) is False, "the sensor sits elsewhere meanwhile"
     assert posed.take(5.0, told_deg=20.0) is True
-    assert posed.poses.calibration is not None
-    assert [pose.angle_rad for pose in posed.poses.calibration.poses] == [math.radians(90.0), math.radians(20.0)]
+    assert posed.joint.calibration is not None
+    assert [pose.angle_rad for pose in posed.joint.calibration.poses] == [math.radians(90.0), math.radians(20.0)]
 
 
 def test_a_wrong_first_pose_is_taken_once_more(posed: Posed):
     posed.take(20.0, told_deg=25.0)
     assert posed.take(90.0, first=True) is False
-    assert posed.poses.first is not None and posed.poses.first.angle_rad == pytest.approx(math.radians(90.0))
+    assert posed.joint.first is not None and posed.joint.first.angle_rad == pytest.approx(math.radians(90.0))
     assert posed.take(20.0) is True
-    assert posed.poses.calibration is not None and posed.poses.calibration.offset == pytest.approx(30.0, abs=0.05)
+    assert posed.joint.calibration is not None and posed.joint.calibration.offset == pytest.approx(30.0, abs=0.05)
 
 
 def test_a_pose_of_a_joint_that_moved_is_refused(posed: Posed):
@@ -172,7 +178,7 @@ def test_poses_that_give_another_scale_begin_again(posed: Posed, second_deg: flo
     posed.take(20.0)
     with pytest.raises(RefusedError, match=words):
         posed.take(second_deg, told_deg)
-    assert posed.poses.first is None and posed.poses.calibration is None
+    assert posed.joint.first is None and posed.joint.calibration is None
 
 
 @pytest.mark.parametrize("told_rad", [math.nan, math.inf, -1.0, 3.0])
@@ -199,10 +205,10 @@ def test_without_good_angles_there_is_no_pose(posed: Posed):
 def test_what_cannot_be_stored_does_not_hold(posed: Posed, monkeypatch: pytest.MonkeyPatch):
     posed.take(20.0)
     (posed.folder / "file").write_text("")
-    monkeypatch.setattr(posed.poses._file, "path", posed.folder / "file" / "x.json")
+    monkeypatch.setattr(posed.joint._file, "path", posed.folder / "file" / "x.json")
     with pytest.raises(RigError):
         posed.take(90.0)
-    assert posed.poses.calibration is None
+    assert posed.joint.calibration is None
 
 
 class AngledRig(LiveRig):
