@@ -21,6 +21,7 @@ import numpy as np
 from stimrig.rig import archive, assembly, journal
 from stimrig.rig.adapters.files import Files
 from stimrig.rig.errors import BusyError, RecordingError, RigError
+from stimrig.rig.signals import MAY_BE_FELT, PulseStatus
 
 UNKNOWN_END = "recovered by hand; the journal does not say how the test ended"
 
@@ -55,15 +56,14 @@ def recover(path: Path, folder: Path) -> dict[str, Any]:
         raise RecordingError(f"{target}: another recording of this test exists; give another folder with -o")
     if not known:
         archive.seal(recording, folder, Files())
-    columns, attributes = recording.columns, recording.attributes
-    may_be_felt = np.isin(columns["pulses/status"], (0, 4, 5))
+    status, attributes = recording.columns["pulses/status"], recording.attributes
     return {
         "recording": str(target),
         "was_there": known,
         **{name: attributes[name] for name in ("recording_id", "test_id", "participant", "outcome", "reason")},
-        "pulses": int(np.sum(may_be_felt)),
-        "unacknowledged": int(np.sum(columns["pulses/status"] == 4)),
-        "samples": len(columns["torque/time_s"]),
+        "pulses": int(np.sum(np.isin(status, MAY_BE_FELT))),
+        "unacknowledged": int(np.sum(status == PulseStatus.UNACKNOWLEDGED)),
+        "samples": len(recording.columns["torque/time_s"]),
         "damaged_bytes": attributes["journal_damaged_bytes"],
         "blocks_missing": attributes["journal_blocks_missing"],
         "note": attributes["journal_note"],

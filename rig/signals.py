@@ -21,6 +21,9 @@ class PulseStatus(IntEnum):
     DEVICE_ERROR = 5
 
 
+MAY_BE_FELT = PulseStatus.ACKNOWLEDGED, PulseStatus.UNACKNOWLEDGED, PulseStatus.DEVICE_ERROR
+
+
 @dataclass(frozen=True, slots=True)
 class Pulse:
     """One stimulation pulse as asked for: width of a phase in µs, current in mA. Width 0 is no pulse."""

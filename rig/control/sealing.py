@@ -25,9 +25,8 @@ from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.machine import Log, Machine
 from stimrig.rig.messages import FinishedEvent
 from stimrig.rig.plan import PlannedTest
-from stimrig.rig.signals import PulseStatus
+from stimrig.rig.signals import MAY_BE_FELT, PulseStatus
 
-MAY_BE_FELT = PulseStatus.ACKNOWLEDGED, PulseStatus.UNACKNOWLEDGED, PulseStatus.DEVICE_ERROR
 REST_S = 0.1
 """Before the first pulse: what torque is rest."""
 DOUBTFUL_ALIGNMENT_MS = 5.0
@@ -52,10 +51,7 @@ def recovered_dose(recording: Recording, contents: JournalContents, lost_s: floa
     columns, rate_hz = recording.columns, recording.attributes["pulse_rate_hz"]
     status, n = columns["pulses/status"], len(columns["pulses/status"])
     may_be_felt = np.isin(status, MAY_BE_FELT)
-    widths_us, currents_ma = (
-        columns["pulses/sent_pulse_width_us"][may_be_felt],
-        columns["pulses/current_ma"][may_be_felt],
-    )
+    widths_us, currents_ma = (columns[f"pulses/{name}"][may_be_felt] for name in ("sent_pulse_width_us", "current_ma"))
     widest_us = _largest(columns["pulses/pulse_width_us"], widths_us, HARD_LIMITS["pulse_width_us"].hi)
     highest_ma = _largest(np.array([recording.attributes["current_ma"]]), currents_ma, HARD_LIMITS["current_ma"].hi)
     widths_us = np.where(widths_us > 0, widths_us, widest_us)  # of a pulse whose width is lost
@@ -101,21 +97,22 @@ def _torque_dose(time_s: NDArray[Any], torque_nm: NDArray[Any], pulses_s: NDArra
 
 def summary_of(recording: Recording, counted: dict[str, Any]) -> dict[str, Any]:
     """Part of a finished test's summary; `counted`: what is known without the recording."""
-    alignment, dose = recording.alignment, []
+    alignment, texts = recording.alignment, warnings(recording)
     if counted.get("dose_is_bound"):
-        pulses = counted["doubtful_pulses"]
-        dose.append(
-            "dose: of 1 pulse it is not known whether it was felt; it is counted, so the true dose may be lower"
-            if pulses == 1
-            else f"dose: of {pulses} pulses it is not known whether they were felt; they are counted, so the true dose "
-            "may be lower"
+        texts.append(
+            _words(
+                counted["doubtful_pulses"],
+                "dose: of 1 pulse it is not known whether it was felt; it is counted, so the true dose may be lower",
+                "dose: of {} pulses it is not known whether they were felt; they are counted, so the true dose may be "
+                "lower",
+            )
         )
     return {
         **({"angle": counted.get("angle", {}) | _angle_summary(recording)} if recording.angle else {}),
         "samples": len(recording.columns["torque/time_s"]),
         "sample_rate_hz": recording.attributes["sample_rate_measured_hz"],
         "alignment": {**asdict(alignment), "error_ms": finite(alignment.error_ms)},
-        "warnings": [*warnings(recording), *dose],
+        "warnings": texts,
         "notes": notes(recording),
     }
 
@@ -130,26 +127,44 @@ def _angle_summary(recording: Recording) -> dict[str, Any]:
     }
 
 
+def _words(count: int, one: str, many: str) -> str:
+    return one if count == 1 else many.format(count)
+
+
+def _misaligned(error_ms: float) -> str:
+    """The error of an alignment in words; empty where it is small."""
+    if error_ms <= DOUBTFUL_ALIGNMENT_MS:
+        return ""
+    return "the error of their alignment is " + (f"{error_ms:.1f} ms" if finite(error_ms) else "unknown")
+
+
 def warnings(recording: Recording) -> list[str]:
     """Warnings before a model is fitted to it, one sentence each; empty if there are none."""
-    alignment, attributes = recording.alignment, recording.attributes
-    texts = [*_disturbed_line(recording), *_sensor_warnings(recording)]
+    columns, attributes = recording.columns, recording.attributes
+    texts = [
+        *_line_warnings(recording),
+        *(
+            f"{event['reason']}; the angle in this recording may be wrong or missing"
+            for event in _events(recording, "angle_trouble")
+        ),
+    ]
+    if recording.angle and len(columns["angle/time_s"]) and (error := _misaligned(recording.angle["error_ms"])):
+        texts.append(f"angle and torque: {error}; a model of a movement may be wrong")
     if attributes["journal_note"]:
         texts.append(f"journal: {attributes['journal_note']}")
-    nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
-    if not len(recording.columns["torque/time_s"]):
+    torque_nm = columns["torque/torque_nm"]
+    if not len(torque_nm):
         return texts
-    torque_nm = recording.columns["torque/torque_nm"]
     if np.all(torque_nm == torque_nm[0]):
         texts.append(
             f"load cell: its value stayed at exactly {torque_nm[0]:.3f} N·m in the whole test; it may be stuck"
         )
-    if not (alignment.error_ms <= DOUBTFUL_ALIGNMENT_MS):
-        error = "unknown" if alignment.error_ms != alignment.error_ms else f"{alignment.error_ms:.1f} ms"
+    if error := _misaligned(recording.alignment.error_ms):
         texts.append(
-            f"torque and pulses: the error of their alignment is {error} (usual: up to {DOUBTFUL_ALIGNMENT_MS:g} ms), "
-            "because the computer or the bus was blocked; delays in a model of this recording may be wrong"
+            f"torque and pulses: {error} (usual: up to {DOUBTFUL_ALIGNMENT_MS:g} ms), because the computer or the bus "
+            "was blocked; delays in a model of this recording may be wrong"
         )
+    nominal_hz, measured_hz = attributes["sample_rate_hz"], attributes["sample_rate_measured_hz"]
     if nominal_hz > 0 and not (abs(measured_hz / nominal_hz - 1) <= DOUBTFUL_RATE):
         texts.append(
             f"load cell: {measured_hz:.0f} samples/s arrived, the rig file says {nominal_hz:g}: times in this "
@@ -158,29 +173,13 @@ def warnings(recording: Recording) -> list[str]:
     return texts
 
 
-def _sensor_warnings(recording: Recording) -> list[str]:
-    """Warnings about an angle sensor that failed in a test that did not need it, or whose times are uncertain."""
-    texts = [
-        f"{event['reason']}; the angle in this recording may be wrong or missing"
-        for event in recording.events
-        if event.get("event") == "angle_trouble"
-    ]
-    if not recording.angle or not len(recording.columns["angle/time_s"]):
-        return texts
-    error_ms = recording.angle["error_ms"]
-    if not (error_ms <= DOUBTFUL_ALIGNMENT_MS):
-        error = "unknown" if error_ms != error_ms else f"{error_ms:.1f} ms"
-        texts.append(f"angle and torque: the error of their alignment is {error}; a model of a movement may be wrong")
-    return texts
-
-
-def _pauses(recording: Recording) -> list[dict[str, Any]]:
-    return [event for event in recording.events if event.get("event") == "pause"]
+def _events(recording: Recording, name: str) -> list[dict[str, Any]]:
+    return [event for event in recording.events if event.get("event") == name]
 
 
 def notes(recording: Recording) -> list[str]:
     """Return notes that put nothing in doubt: pauses of the computer, with their length and, if known, their cause."""
-    pauses = _pauses(recording)
+    pauses = _events(recording, "pause")
     if not pauses:
         return []
     count, whole_s = len(pauses), sum(pause["for_s"] for pause in pauses)
@@ -190,57 +189,48 @@ def notes(recording: Recording) -> list[str]:
     return [text, *sorted({pause["cause"] for pause in pauses} - {""})]
 
 
-def _disturbed_line(recording: Recording) -> list[str]:
-    """Warnings about late acknowledgements, acknowledgements of what was not sent, dropped pulses and what followed.
+def _line_warnings(recording: Recording) -> list[str]:
+    """Warnings about acknowledgements that came late or of what was not sent, dropped pulses and what followed.
 
     An acknowledgement that was read after a pause says nothing of the line.
     """
-    named = [event.get("event") for event in recording.events]
-    pauses = _pauses(recording)
-    spans_s = [(pause["time_s"] - pause["for_s"] - READ_S, pause["time_s"]) for pause in pauses]
-    late_s = [
-        event["delay_s"]
-        for event in recording.events
-        if event.get("event") == "late_ack" and not any(lo <= event["time_s"] <= hi for lo, hi in spans_s)
+    columns, pauses, texts = recording.columns, _events(recording, "pause"), list[str]()
+    if unasked := len(_events(recording, "unasked_ack")):
+        texts.append(
+            _words(
+                unasked,
+                "stimulator: it acknowledged 1 pulse that was not sent; it may have been felt and is not in this "
+                "recording",
+                "stimulator: it acknowledged {} pulses that were not sent; they may have been felt and are not in this "
+                "recording",
+            )
+        )
+    late_ms = [
+        1e3 * event["delay_s"]
+        for event in _events(recording, "late_ack")
+        if not any(pause["time_s"] - pause["for_s"] - READ_S <= event["time_s"] <= pause["time_s"] for pause in pauses)
     ]
-    texts = []
-    if unasked := named.count("unasked_ack"):
-        texts.append(
-            "stimulator: it acknowledged 1 pulse that was not sent; it may have been felt and is not in this recording"
-            if unasked == 1
-            else f"stimulator: it acknowledged {unasked} pulses that were not sent; they may have been felt and are "
-            "not in this recording"
-        )
-    if late_s:
-        dropped, most_ms = named.count("dropped"), f"{max(late_s) * 1e3:.0f}"
-        pulses = (
-            "1 pulse that came due meanwhile was" if dropped == 1 else f"{dropped} pulses that came due meanwhile were"
-        )
-        texts.append(
-            f"stimulator: 1 acknowledgement came late, {most_ms} ms after the pulse was sent; this pulse may have been "
-            f"felt that late; {pulses} dropped"
-            if len(late_s) == 1
-            else f"stimulator: {len(late_s)} acknowledgements came late, up to {most_ms} ms after the pulse was sent; "
-            f"these pulses may have been felt that late; {pulses} dropped"
-        )
-    planned_us, sent_us = (recording.columns[f"pulses/{name}_width_us"] for name in ("pulse", "sent_pulse"))
+    if late_ms:
+        late = _words(
+            len(late_ms),
+            "1 acknowledgement came late, {:.0f} ms after the pulse was sent; this pulse",
+            "{} acknowledgements came late, up to {{:.0f}} ms after the pulse was sent; these pulses",
+        ).format(max(late_ms))
+        dropped = int(np.count_nonzero(columns["pulses/status"] == PulseStatus.DROPPED))
+        lost = _words(dropped, "1 pulse of the test was dropped", "{} pulses of the test were dropped")
+        texts.append(f"stimulator: {late} may have been felt that late; {lost}")
+    planned_s, planned_us, sent_us = (
+        columns[f"pulses/{name}"] for name in ("planned_time_s", "pulse_width_us", "sent_pulse_width_us")
+    )
     narrower = (planned_us - sent_us > ROUNDED_US) & (sent_us > 0)  # one below the shortest pulse is not sent at all
-    if weaker := int(np.count_nonzero(narrower & ~_climbing(recording, pauses))):
-        pulses = "1 pulse was" if weaker == 1 else f"{weaker} pulses were"
+    for pause in pauses:  # which tells why those that follow soon are narrow
+        narrower &= (planned_s < pause["at_s"]) | (planned_s > pause["at_s"] + pause["for_s"] + CLIMB_S)
+    if weaker := int(np.count_nonzero(narrower)):
         texts.append(
-            f"stimulator: {pulses} narrower than planned, since after a pulse that was dropped, or too short to be "
-            "sent, the width climbs no faster than its limit"
+            f"stimulator: {_words(weaker, '1 pulse was', '{} pulses were')} narrower than planned, since after a pulse "
+            "that was dropped, or too short to be sent, the width climbs no faster than its limit"
         )
     return texts
-
-
-def _climbing(recording: Recording, pauses: list[dict[str, Any]]) -> NDArray[np.bool_]:
-    """Pulses that come so soon after a pause that it tells why they are narrow."""
-    planned_s = recording.columns["pulses/planned_time_s"]
-    climbing = np.zeros(len(planned_s), bool)
-    for pause in pauses:
-        climbing |= (planned_s >= pause["at_s"]) & (planned_s <= pause["at_s"] + pause["for_s"] + CLIMB_S)
-    return climbing
 
 
 log = logging.getLogger("rig.sealing")

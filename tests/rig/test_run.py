@@ -159,6 +159,20 @@ def test_pulses_too_short_to_be_sent_are_none_that_were_narrowed(tmp_path: Path)
     ]
 
 
+def test_late_acknowledgements_are_told_with_every_pulse_that_was_dropped(tmp_path: Path):
+    """Those that came due before an acknowledgement, and those that were late: as the summary counts them."""
+    rig = VirtualRig(tmp_path, [hold(on_s=2.0)])
+    for at_s, delay_s in ((0.99, 0.04), (1.02, 0.001)):
+        rig.at(at_s, lambda delay_s=delay_s: setattr(rig.stimulator, "ack_delay_s", delay_s))
+    rig.at(1.5, lambda: rig.clock.advance(0.06))
+    dropped = rig.execute().summary["dropped_pulses"]
+    (told,) = [line for line in warnings(rig.recording()) if "late" in line]
+    assert dropped > 2 and told == (
+        "stimulator: 1 acknowledgement came late, 40 ms after the pulse was sent; this pulse may have been felt that "
+        f"late; {dropped} pulses of the test were dropped"
+    )
+
+
 def test_after_a_rest_the_width_climbs_from_nothing(tmp_path: Path):
     """Also where pulses came before it, and those right after it were left out."""
     ramp = SegmentPlan(name="ramp", sequence="ramp", settings={"up_s": 0.5, "down_s": 0.5})
