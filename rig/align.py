@@ -8,7 +8,7 @@ early. This fit cannot see the shortest delay of the transport itself, which sta
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,35 +69,9 @@ def counted_rate_hz(samples: NDArray[Any]) -> float:
     return round(counted / max(float(last["host_time_s"] - first["host_time_s"]), 1e-9), 3)
 
 
-class Fit(NamedTuple):
-    """The line from the cell's clock to the test's, the points that it leads through, and the line below all of them.
-
-    `reliable`: the edges certainly belong to their pulses.
-    """
-
-    line: Line
-    cell_s: Array
-    host_s: Array
-    envelope: Line
-    method: Method
-    reliable: bool
-
-
-def fit(
-    cell_s: Array,
-    host_s: Array,
-    sync: NDArray[np.uint8],
-    written_s: Array,
-    sample_rate_hz: float,
-) -> Fit:
-    """See `align`."""
-    points = earliest(cell_s, host_s)
-    envelope = line_below(*points)
-    edge_s = rising_edges(cell_s, sync, sample_rate_hz)
-    pairs = paired(edge_s, written_s, envelope)
-    if pairs is None or len(pairs[0]) < MIN_EDGES:
-        return Fit(envelope, *points, envelope, "regression", True)
-    return Fit(robust_line(*pairs[:2]), *pairs[:2], envelope, "sync", pairs[2])
+def describe(method: Method, error_s: float, host_s: Array, time_s: Array, rate: float) -> Alignment:
+    """Return how `time_s` was obtained for samples that arrived at `host_s`, shape (N,) both."""
+    return Alignment(method, error_s * 1e3, float(np.median(host_s - time_s)) * 1e3, (rate - 1) * 1e6)
 
 
 def align(
@@ -122,19 +96,22 @@ def align(
     """
     if len(cell_s) < 2:
         return host_s.copy(), Alignment("regression", float("nan"), 0.0, 0.0)
-    fitted = fit(cell_s, host_s, sync, written_s, sample_rate_hz)
-    line, error_s = fitted.line, fitted.line.error_s
-    misfit_s = misfit(line, fitted.cell_s, fitted.host_s)
-    if fitted.method == "sync":
-        coarse_s = 0.0 if fitted.reliable else misfit(fitted.envelope, *earliest(cell_s, host_s))
-        if coarse_s > COARSE_MISFIT_S:  # then edges may have been matched to the wrong pulses
-            misfit_s = max(misfit_s, coarse_s)
-        # Pulses are often synchronous with the samples, so a pulse's position in its sample does not average out.
-        error_s = float(np.hypot(error_s, 1 / sample_rate_hz / np.sqrt(12)))
-    error_s = float(np.hypot(error_s, misfit_s))
+    points = earliest(cell_s, host_s)
+    envelope = line_below(*points)
+    pairs = paired(rising_edges(cell_s, sync, sample_rate_hz), written_s, envelope)
+    if pairs is None or len(pairs[0]) < MIN_EDGES:
+        error_s = float(np.hypot(envelope.error_s, misfit(envelope, *points)))
+        time_s = envelope.at(cell_s)
+        return time_s, describe("regression", error_s, host_s, time_s, envelope.rate)
+    *seen, reliable = pairs
+    line = robust_line(*seen)
+    misfit_s, coarse_s = misfit(line, *seen), 0.0 if reliable else misfit(envelope, *points)
+    if coarse_s > COARSE_MISFIT_S:  # then edges may have been matched to the wrong pulses
+        misfit_s = max(misfit_s, coarse_s)
+    # Pulses are often synchronous with the samples, so a pulse's position in its sample does not average out.
+    error_s = float(np.hypot(np.hypot(line.error_s, 1 / sample_rate_hz / np.sqrt(12)), misfit_s))
     time_s = line.at(cell_s)
-    delay_ms = float(np.median(host_s - time_s)) * 1e3
-    return time_s, Alignment(fitted.method, error_s * 1e3, delay_ms, (line.rate - 1) * 1e6)
+    return time_s, describe("sync", error_s, host_s, time_s, line.rate)
 
 
 def robust_line(cell_s: Array, host_s: Array) -> Line:

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig import align
-from stimrig.rig.align import Alignment, Array, Line, Method, counted_rate_hz
+from stimrig.rig.align import Alignment, Array, Line, Method, counted_rate_hz, describe
 from stimrig.rig.journal import JournalContents, Kind
 from stimrig.rig.signals import ANGLE_SAMPLE, TRUSTED
 
@@ -147,7 +147,7 @@ def align_angle(
         off_s = np.interp(sensor_s, sensor_s[which], known_s - line.at(sensor_s[which]))
         time_s = line.at(sensor_s) + off_s
         time_s[which] = known_s
-        return time_s, _attributes("cell", torque.error_ms, host_s, time_s, line.rate)
+        return time_s, describe("cell", torque.error_ms * 1e-3, host_s, time_s, line.rate)
     estimate, error_s, method = (one_bus and _align_order(samples, sensor_s, torque)) or _align_arrival(
         host_s, sensor_s
     )
@@ -157,12 +157,8 @@ def align_angle(
         if np.max(np.abs(line.at(ends_s) - estimate.at(ends_s))) <= max(ONE_CLOCK_S, error_s):
             estimate, error_s, method = line, stamps_error_s, "stamps"
     time_s = estimate.at(sensor_s)
-    error_ms = float(np.hypot(torque.error_ms, error_s * 1e3))
-    return time_s, _attributes(method, error_ms, host_s, time_s, estimate.rate)
-
-
-def _attributes(method: Method, error_ms: float, host_s: Array, time_s: Array, rate: float) -> Alignment:
-    return Alignment(method, error_ms, float(np.median(host_s - time_s)) * 1e3, (rate - 1) * 1e6)
+    error_s = float(np.hypot(torque.error_ms * 1e-3, error_s))
+    return time_s, describe(method, error_s, host_s, time_s, estimate.rate)
 
 
 def _match_frames(samples: NDArray[Any], torque: Reference) -> tuple[NDArray[np.bool_], Array] | None:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig.acquire.stream import Stream
-from stimrig.rig.align import RATE_TOLERANCE
 from stimrig.rig.align_angle import LiveSlope
 from stimrig.rig.devices import AngleSensor
 from stimrig.rig.errors import DeviceError
@@ -46,9 +45,6 @@ class AngleReceiver(Stream):
         """Columns: time of arrival (rig clock, s), angle (rad), velocity (rad/s)."""
         self.angle_rad: float | None = None
         self.velocity_rad_s: float | None = None
-        self.late_s = 0.0
-        """Delay of the newest sample against the promptest one, by its number, rig seconds."""
-        self._prompt: tuple[float, float] | None = None
         self._behind = 0
         self._restarted = False
         """True where the next sample is the first one since it was opened."""
@@ -63,7 +59,7 @@ class AngleReceiver(Stream):
 
     def data_age_s(self, now_s: float) -> float:
         """Return the age of the newest angle: the time since its arrival, and its delay."""
-        return self.age_s(now_s) + self.late_s
+        return self.age_s(now_s) + self.behind_s()
 
     def recent(self, duration_s: float) -> NDArray[Any]:
         """The samples of the last seconds, at most `RECENT_S`; dtype `ANGLE_SAMPLE`."""
@@ -100,10 +96,6 @@ class AngleReceiver(Stream):
         self._check(samples)
 
     def _remember(self, samples: NDArray[Any]) -> None:
-        now_s, _, delay_s = self._rate[-1]
-        best_s = delay_s if self._prompt is None else self._prompt[1] + RATE_TOLERANCE * (now_s - self._prompt[0])
-        self._prompt = now_s, min(delay_s, best_s)
-        self.late_s = delay_s - self._prompt[1]
         numbers = samples["counter"]
         if self._unwrapper is None:
             numbers = self._total - np.arange(len(samples))[::-1]
@@ -111,7 +103,7 @@ class AngleReceiver(Stream):
         self.angle_rad, self.velocity_rad_s = float(samples["angle_rad"][-1]), float(velocity_rad_s[-1])
         self.live.append(np.column_stack([samples["host_time_s"], samples["angle_rad"], velocity_rad_s]))
         self._recent.append(samples)
-        while self._recent[0]["host_time_s"][-1] < now_s - RECENT_S * self._clock.speed:
+        while self._recent[0]["host_time_s"][-1] < samples["host_time_s"][-1] - RECENT_S * self._clock.speed:
             self._recent.popleft()
 
     def start(self) -> None:
@@ -131,7 +123,8 @@ class AngleReceiver(Stream):
         await self._source.close()
 
     def _count_on(self, now_s: float) -> None:
-        self._prompt, self._behind = None, 0
+        self._behind = 0
+        self._rate.clear()
         if self._unwrapper is not None and self._previous is not None:
             passed_s = max(0.0, now_s - self._previous[1])
             self._unwrapper.resume(self._previous[0] + max(1, round(passed_s * self.nominal_rate_hz)))

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig.acquire.stream import LOOK_AT, SETTLE_S, SETTLING_S, Stream
-from stimrig.rig.devices import LoadCell
+from stimrig.rig.devices import Sensor
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.signals import Recorded
 from stimrig.rig.tasks import Tasks
@@ -79,7 +79,7 @@ RANGE_MEAN_S = 0.01
 class Receiver(Stream):
     """The load cell's."""
 
-    def __init__(self, cell: LoadCell, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
+    def __init__(self, cell: Sensor, tasks: Tasks, on_lost: Callable[[str], None]) -> None:
         super().__init__("load cell", cell, tasks, on_lost)
         self._limits_nm = (-np.inf, np.inf)
         self.last_torque_nm: float | None = None

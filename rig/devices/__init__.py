@@ -87,7 +87,7 @@ class Stimulator(Protocol):
 
 
 class Sensor(Protocol):
-    """Gives blocks of samples as they arrive."""
+    """Gives blocks of samples as they arrive: a load cell those of the torque."""
 
     sample_rate_hz: float
     counter_modulus: int
@@ -104,10 +104,6 @@ class Sensor(Protocol):
     async def close(self) -> None:
         """Stop the sensor and close the bus; never raises."""
         ...
-
-
-class LoadCell(Sensor, Protocol):
-    """Gives torque."""
 
 
 class AngleSensor(Sensor, Protocol):
