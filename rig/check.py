@@ -68,7 +68,7 @@ class Step(NamedTuple):
 
 
 class Fault(Exception):
-    """A step failed. Its arguments: one of `FAULTS`, what was measured, and what it must be where there is a bound."""
+    """A step failed, by one of `FAULTS`."""
 
 
 class NotDone(Exception):
@@ -158,15 +158,22 @@ class RigCheck:
                 await self.rig.close()
         return steps
 
-    async def _done(self, name: str, check: Callable[[], Awaitable[Step]]) -> Step:
+    async def _done(self, name: str, check: Callable[[], Awaitable[None]]) -> Step:
+        self.figure = self.bound = ""
         try:
-            return (await check())._replace(name=name)
+            await check()
+            return Step(name, "passed", self.figure, self.bound)
         except Fault as fault:
-            return Step(name, "failed", *fault.args[1:], fault=fault.args[0])
+            return Step(name, "failed", self.figure, self.bound, str(fault))
         except NotDone as why:
             return Step(name, "not done", str(why))
         except RigError as error:
             return Step(name, "failed", str(error), "", "refused")
+
+    def must(self, fault: str, holds: bool) -> None:
+        """Raise Fault unless it holds; `figure` and `bound` say what was measured, and what it must be."""
+        if not holds:
+            raise Fault(fault)
 
     async def confirm(self, question: str) -> None:
         """Raise NotDone where the person does not say yes."""
@@ -174,86 +181,82 @@ class RigCheck:
             raise NotDone("nobody said yes")
 
     async def listen(self, duration_s: float) -> NDArray[Any]:
-        """Return the load cell's samples from now on. Raises Fault: none come."""
+        """Return the load cell's torques from now on. Raises Fault: none come."""
         self.receiver.live.clear()
         await self.tasks.sleep(duration_s)
-        if not self.receiver.live:
-            raise Fault("cell_silent", self.rig.status().reason)
-        return np.concatenate(list(self.receiver.live))
+        self.figure = self.rig.status().reason
+        self.must("cell_silent", len(self.receiver.live) > 0)
+        return np.concatenate(list(self.receiver.live))["torque_nm"]
 
     # -- devices, rates, zero
 
-    async def check_devices(self) -> Step:
+    async def check_devices(self) -> None:
         await self.rig.open()
         status, receiver = self.rig.status(), self.rig.pair.receiver
+        self.figure, self.bound, stimulator = status.reason, "answers", status.stimulator
         if status.state != "ready" or receiver is None:
-            raise Fault("stimulator" if status.reason.startswith("stimulator") else "adapter", status.reason, "answers")
-        self.receiver, stimulator = receiver, status.stimulator
-        return passed(
-            " ".join(str(stimulator[key]) for key in ("device", "id", "firmware") if stimulator.get(key)), "answers"
-        )
+            raise Fault("stimulator" if status.reason.startswith("stimulator") else "adapter")
+        self.receiver = receiver
+        self.figure = " ".join(str(stimulator[key]) for key in ("device", "id", "firmware") if stimulator.get(key))
 
-    async def check_frames(self) -> Step:
+    async def check_frames(self) -> None:
         receiver, counts = self.receiver, self.receiver.counts
         await self.tasks.sleep(LISTEN_S)
         self.samples = np.concatenate([self.samples, *receiver.live])
-        count, bound = len(self.samples), f"at most {100 * self.most_lost:g} % lost, no errors of the bus"
-        figure = f"{count} samples, {counts.lost_samples} lost, {counts.error_frames} errors of the bus"
-        faults = {
-            "termination": counts.error_frames > max(1.0, self.most_lost * count),
-            "wrong_dbc": counts.malformed_frames > self.most_lost * count,
-            "frames_lost": not (counts.lost_samples <= self.most_lost * count),
-        }
+        count, self.bound = len(self.samples), f"at most {100 * self.most_lost:g} % lost, no errors of the bus"
+        self.figure = f"{count} samples, {counts.lost_samples} lost, {counts.error_frames} errors of the bus"
         if count < 10 or self.rig.status().state == "disconnected":
-            faults = {"bit_rate": counts.error_frames > 0, "wrong_dbc": counts.malformed_frames > 0}
-            faults |= {"counter_stuck": counts.duplicate_samples > 10, "cell_silent": True}
-        for fault in (fault for fault, present in faults.items() if present):
-            raise Fault(fault, figure, bound)
-        return passed(figure, bound)
+            self.must("bit_rate", counts.error_frames == 0)
+            self.must("wrong_dbc", counts.malformed_frames == 0)
+            self.must("counter_stuck", counts.duplicate_samples <= 10)
+            raise Fault("cell_silent")
+        self.must("termination", counts.error_frames <= max(1.0, self.most_lost * count))
+        self.must("wrong_dbc", counts.malformed_frames <= self.most_lost * count)
+        self.must("frames_lost", counts.lost_samples <= self.most_lost * count)
 
-    async def check_rate(self) -> Step:
+    async def check_rate(self) -> None:
         nominal_hz, rate_hz = self.receiver.nominal_rate_hz, measure_rate(self.samples, self.receiver.nominal_rate_hz)
-        figure, bound = f"{rate_hz:.1f} samples/s", f"{nominal_hz:g} samples/s within {100 * self.most_rate_off:g} %"
-        if not (abs(rate_hz / nominal_hz - 1) <= self.most_rate_off):
-            raise Fault("sample_rate", figure, bound)
-        return passed(figure, bound)
+        self.figure = f"{rate_hz:.1f} samples/s"
+        self.bound = f"{nominal_hz:g} samples/s within {100 * self.most_rate_off:g} %"
+        self.must("sample_rate", abs(rate_hz / nominal_hz - 1) <= self.most_rate_off)
 
-    async def check_zero(self) -> Step:
-        torque_nm = (await self.listen(1.0))["torque_nm"]
+    async def check_zero(self) -> None:
+        torque_nm = await self.listen(1.0)
         offset_nm, noise_nm = float(np.median(torque_nm)), float(np.std(torque_nm))
-        figure = f"{offset_nm:+.3f} N·m, noise {noise_nm:.3f} N·m"
-        bound = f"within {MOST_OFFSET_NM:g} N·m, noise {MOST_NOISE_NM:g} N·m"
-        if not np.isfinite(torque_nm).all():
-            raise Fault("no_number", figure, bound)
-        if not (noise_nm <= MOST_NOISE_NM):
-            raise Fault("noise", figure, bound)
-        if not (abs(offset_nm) <= MOST_OFFSET_NM):
-            raise Fault("offset", figure, bound)
+        self.figure = f"{offset_nm:+.3f} N·m, noise {noise_nm:.3f} N·m"
+        self.bound = f"within {MOST_OFFSET_NM:g} N·m, noise {MOST_NOISE_NM:g} N·m"
+        self.must("no_number", bool(np.isfinite(torque_nm).all()))
+        self.must("noise", noise_nm <= MOST_NOISE_NM)
+        self.must("offset", abs(offset_nm) <= MOST_OFFSET_NM)
         self.rest_nm = offset_nm
-        return passed(figure, bound)
 
     # -- signs, by a person's hand
 
-    async def check_sign(self) -> Step:
+    async def check_sign(self) -> None:
         await self.confirm("Pull the lever in the direction of flexion, and hold it. Is it held?")
-        pulled_nm = float(np.median((await self.listen(1.0))["torque_nm"])) - self.rest_nm
-        step = passed_if_positive("torque", pulled_nm, LEAST_PULL_NM, "N·m")
+        pulled_nm = float(np.median(await self.listen(1.0))) - self.rest_nm
+        self.must_be_positive("torque", pulled_nm, LEAST_PULL_NM, "N·m")
         await self.confirm("Let go of the lever. Is it free?")
-        return step
 
-    async def check_angle(self) -> Step:
+    async def check_angle(self) -> None:
         before = self.rig.joint.status()
-        if before.angle_rad is None or before.problem:
-            raise Fault("angle_silent", before.problem)
+        self.figure = before.problem
+        self.must("angle_silent", before.angle_rad is not None and not before.problem)
         await self.confirm("Bend the joint by 30° or more in the direction of flexion, and hold it. Is it bent?")
         await self.tasks.sleep(1.0)
-        after_rad = self.rig.joint.status().angle_rad
-        bent_rad = math.nan if after_rad is None else after_rad - before.angle_rad
-        return passed_if_positive("angle", bent_rad, LEAST_BEND_RAD, "rad")
+        angles_rad = before.angle_rad, self.rig.joint.status().angle_rad
+        was_rad, is_rad = (math.nan if rad is None else rad for rad in angles_rad)
+        self.must_be_positive("angle", is_rad - was_rad, LEAST_BEND_RAD, "rad")
+
+    def must_be_positive(self, what: str, value: float, minimum: float, unit: str) -> None:
+        """Raise Fault: the value is negative, or less than the minimum either way."""
+        self.figure, self.bound = f"{value:+.2f} {unit}", f"at least +{minimum:g} {unit}"
+        self.must(f"{what}_sign", not (value <= -minimum))
+        self.must(f"{what}_unmoved", value >= minimum)
 
     # -- one pulse, through the rig's own gate and limits
 
-    async def check_pulse(self) -> Step:
+    async def check_pulse(self) -> None:
         """Send one pulse and tell what became of it."""
         await self.confirm(
             "Connect nobody to the stimulator, and put a resistor of 500 Ω to 1 kΩ (2 W) on the cables alone. One "
@@ -269,15 +272,17 @@ class RigCheck:
         pulses = [pulse for pulse in gate.done if pulse.status != PulseStatus.REST]
         sync = np.concatenate([np.empty(0, "u1"), *(block["sync"] for block in receiver.live)])
         edges, reason = int(np.sum((sync[1:] == 1) & (sync[:-1] != 1))), rig.finished.reason
-        figure = f"one pulse: {reason or f'{edges} edges of the sync line'}"
+        self.figure = f"one pulse: {reason or f'{edges} edges of the sync line'}"
         if rig.finished.outcome != "completed":
-            raise Fault(next((fault for words, fault in ENDINGS.items() if words in reason), "refused"), figure)
+            raise Fault(next((fault for words, fault in ENDINGS.items() if words in reason), "refused"))
         if [pulse.status for pulse in pulses] != [PulseStatus.ACKNOWLEDGED]:
-            raise Fault("unanswered", f"{figure}; {', '.join(pulse.status.name for pulse in pulses)}")
-        if self.config.load_cell.model_dump().get("sync") and edges != 1:
-            raise Fault("sync", figure, "1 edge")
+            self.figure += f"; {', '.join(pulse.status.name for pulse in pulses)}"
+            raise Fault("unanswered")
+        self.bound = "1 edge"
+        self.must("sync", edges == 1 or not self.config.load_cell.model_dump().get("sync"))
         after_ms = 1e3 * (pulses[0].acknowledged_s - pulses[0].written_s)
-        return passed(f"{figure}, acknowledged after {after_ms:.1f} ms", "acknowledged, without an error")
+        self.figure += f", acknowledged after {after_ms:.1f} ms"
+        self.bound = "acknowledged, without an error"
 
     def plan(self) -> TestPlan:
         """One pulse between two rests."""
@@ -303,18 +308,6 @@ def measure_rate(samples: NDArray[Any], nominal_hz: float) -> float:
     lead_s, third = samples["host_time_s"] - number / nominal_hz, len(samples) // 3
     first, last = int(np.argmin(lead_s[:third])), len(samples) - third + int(np.argmin(lead_s[-third:]))
     return float((number[last] - number[first]) / (samples["host_time_s"][last] - samples["host_time_s"][first]))
-
-
-def passed_if_positive(what: str, value: float, minimum: float, unit: str) -> Step:
-    """Return the step of a sign. Raises Fault: the value is negative, or less than `least`."""
-    figure, bound = f"{value:+.2f} {unit}", f"at least +{minimum:g} {unit}"
-    if not (value >= minimum):
-        raise Fault(f"{what}_sign" if value <= -minimum else f"{what}_unmoved", figure, bound)
-    return passed(figure, bound)
-
-
-def passed(figure: str, bound: str = "") -> Step:
-    return Step("", "passed", figure, bound)
 
 
 def report(steps: list[Step], emulated: bool, devices: dict[str, Any]) -> dict[str, Any]:
