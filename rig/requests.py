@@ -7,7 +7,7 @@ accepts only `stop`, so that nothing on the first socket can delay a stop. A req
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
@@ -29,7 +29,7 @@ LONGEST_LINE = 1_900_000
 class _Request(Message):
     """Base of all requests, written with kind and id first."""
 
-    kind: str
+    kind: Any
     id: int = 0
 
 

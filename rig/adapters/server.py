@@ -1,7 +1,7 @@
 """The Unix socket: requests in, replies and events out, one JSON object per line. Also starts the stop socket.
 
-Requests are tasks of the rig, in its own thread; previews are built in another process. The numbers of
-connections, of waiting requests and of bytes in a request are limited; requests above a limit are refused at once.
+Requests are tasks of the rig, in its own thread. The numbers of connections, of waiting requests and of bytes in a
+request are limited; requests above a limit are refused at once.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 
 from pydantic import ValidationError
 
-from stimrig.rig.adapters.builders import Previews
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connections, StopServer
 from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
@@ -51,7 +50,6 @@ class Server:
         self._connections = Connections(MAX_SILENT, MAX_ACTIVE)
         self._server: asyncio.Server | None = None
         self._stop_server: StopServer | None = None
-        self._previews: Previews | None = None
 
     def publish(self, event: Event) -> None:
         """Send an event to all subscribers; may be called from any thread."""
@@ -65,7 +63,6 @@ class Server:
         """
         self._loop = asyncio.get_running_loop()
         self.rig, self._submit = rig, submit
-        self._previews = Previews(rig.table, rig.speed)
         if await _is_listening(path):
             raise ConfigError(f"socket: {path}: another rig is listening there; stop it or use another path")
         try:
@@ -80,7 +77,6 @@ class Server:
                 f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
             ) from None
         self._track(self._loop.create_task(self._live()))
-        await self._previews.warm()
 
     async def close(self) -> None:
         if self._server is not None:
@@ -90,8 +86,6 @@ class Server:
         for task in tuple(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        if self._previews is not None:
-            await self._previews.close()
 
     def _track(self, task: asyncio.Task[None]) -> None:
         self._tasks.add(task)
@@ -154,9 +148,6 @@ class Server:
         try:
             if crowded:
                 raise BusyError(f"{MAX_PENDING} requests of this connection are waiting; read their replies first")
-            if kind == "preview":
-                _write(writer, await self._preview(line, writer))
-                return
             self._refuse_long(line, kind)
             request = read_request(line)
         except RigError as error:
@@ -167,12 +158,6 @@ class Server:
             return
         await self._obey(request, writer)
 
-    async def _preview(self, line: bytes, writer: asyncio.StreamWriter) -> bytes:
-        """Previews are built in order of request; none for a client that has disconnected."""
-        if self._previews is None or writer.transport.is_closing():
-            return b""
-        return await self._previews.reply(line, self.rig.joint.set_at_utc)
-
     def _refuse_long(self, line: bytes, kind: str) -> None:
         if len(line) > LONG_LINE_BYTES and kind == "":
             raise PlanError(f"request: if over {LONG_LINE_BYTES // 1000} kB, it must begin with its kind and its id")
@@ -180,7 +165,7 @@ class Server:
             raise BusyError("a test is in progress; wait or stop it")
 
     async def _obey(self, request: Any, writer: asyncio.StreamWriter) -> None:
-        if request.kind in ("preview", "stop"):  # it does not begin with its kind and id
+        if request.kind == "stop":  # it does not begin with its kind and id
             await self._answer(to_line(request), writer, crowded=False)
             return
         rig = self.rig

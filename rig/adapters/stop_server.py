@@ -1,7 +1,7 @@
 """A second socket (`SOCKET.stop`) that accepts only stops, so that other requests cannot delay one.
 
-It has its own event loop in its own thread. It shares nothing with the requests, previews,
-subscribers and half-open connections of the first socket.
+It has its own event loop in its own thread. It shares nothing with the requests, subscribers and half-open connections
+of the first socket.
 """
 
 from __future__ import annotations

@@ -87,7 +87,7 @@ class Joint:
 
     @property
     def set_at_utc(self) -> str | None:
-        """When the sensor was calibrated; None: it was not. May be called from another thread."""
+        """When the sensor was calibrated; None: it was not."""
         calibration = self.calibration
         return None if calibration is None else calibration.set_at_utc
 

@@ -1,21 +1,16 @@
-"""Requests and replies as lines of JSON, for both sockets and the preview builder."""
+"""Requests and replies as lines of JSON, for both sockets."""
 
 from __future__ import annotations
 
 import contextlib
 import json
 import re
-import time
-from typing import Any, BinaryIO
+from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from stimrig.rig import limits, plan
-from stimrig.rig.control.calibration import check_profile, check_range
 from stimrig.rig.errors import RigError
-from stimrig.rig.limits import Limit
-from stimrig.rig.messages import Preview, Problem, Reply
-from stimrig.rig.requests import PreviewRequest
+from stimrig.rig.messages import Problem, Reply
 
 _HEAD = re.compile(rb'\s*\{\s*"kind"\s*:\s*"([a-z_-]{1,40})"\s*,\s*"id"\s*:\s*(\d{1,15})\s*[,}]')
 
@@ -56,46 +51,3 @@ def invalid_request(number: int, error: ValidationError) -> Reply:
 
 def to_line(message: BaseModel) -> bytes:
     return message.model_dump_json().encode() + b"\n"
-
-
-def previewed(
-    request: PreviewRequest,
-    table: dict[str, Limit],
-    unix_s: float,
-    speed: float = 1.0,
-    angle_set_at_utc: str | None = None,
-) -> Preview:
-    """Duration, dose and pulses of a plan. Raises PlanError, RefusedError."""
-    check_range(request.plan, angle_set_at_utc)
-    test = plan.build(request.plan, limits.for_plan(table, request.plan))
-    check_profile(request.plan.profile, unix_s, required=False, duration_s=test.longest_s / speed)
-    return plan.preview(test, request.recruitment)
-
-
-def answer(line: bytes, table: dict[str, Limit], unix_s: float, speed: float, angle_set_at_utc: str | None) -> Reply:
-    try:
-        request = PreviewRequest.model_validate_json(line)
-        body = previewed(request, table, unix_s, speed, angle_set_at_utc).model_dump(mode="json")
-        return Reply(id=request.id, ok=True, body=body)
-    except ValidationError as error:
-        return invalid_request(id_of(line), error)
-    except RigError as error:
-        return refusal(id_of(line), error)
-    except Exception as error:
-        return internal_error(id_of(line), error)
-
-
-def serve(requests: BinaryIO, replies: BinaryIO) -> None:
-    """Read the rig's limits from the first line, then answer requests until the end of input.
-
-    Before each request stands a line with the angle sensor's `set_at_utc`, which changes while the rig runs.
-    """
-    first = requests.readline()
-    if not first:
-        return
-    settings = json.loads(first)
-    table = {name: Limit(**row) for name, row in settings["table"].items()}
-    for of_angle in requests:
-        reply = answer(requests.readline(), table, time.time(), settings["speed"], json.loads(of_angle))
-        replies.write(to_line(reply))
-        replies.flush()

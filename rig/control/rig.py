@@ -21,13 +21,14 @@ from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
 from stimrig.rig.control.replies import internal_error, refusal
 from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
-from stimrig.rig.errors import ConfigError, DeviceError, LatchChangedError, PlanError, RigError
+from stimrig.rig.errors import BusyError, ConfigError, DeviceError, LatchChangedError, PlanError, RigError
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
     PASSIVE,
     Event,
     FinishedEvent,
     LiveEvent,
+    Preview,
     Reply,
     Sequences,
     StateEvent,
@@ -36,7 +37,7 @@ from stimrig.rig.messages import (
     TestPlan,
 )
 from stimrig.rig.phase import Phase
-from stimrig.rig.requests import AnglePoseRequest, Request
+from stimrig.rig.requests import AnglePoseRequest, PreviewRequest, Request
 
 log = logging.getLogger("rig")
 
@@ -45,6 +46,8 @@ STOP_TIMEOUT_S = 6.0
 """Real seconds to wait for the evidence of a stop, including the fall of the torque."""
 STORED_S = 7.0
 """Real seconds after which a stop is answered although the disk has not taken its latch."""
+MOST_PREVIEWS = 8
+"""That wait at once; each takes up to a third of a second."""
 SEALED_WITHIN_S = 30.0
 """Real seconds within which a test that was stopped is sealed."""
 
@@ -61,7 +64,7 @@ class Rig:
         self._publish, self.speed = publish, machine.tasks.clock.speed
         self.table = config.limits.table()
         """Hard limits, narrowed by the rig file."""
-        self._born_s = self._clock.now_s()
+        self._born_s, self._previews = self._clock.now_s(), 0
         self.state = State(
             LatchFile(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._publish_status
         )
@@ -218,6 +221,29 @@ class Rig:
             await self.player.launch(test, table, following, self.joint.described(), key)
         return self.status()
 
+    async def preview(self, request: PreviewRequest) -> Preview:
+        """Build a plan that a person looks at: one at a time, and none beside a test, whose sender it would hold up.
+
+        Raises BusyError: a test is in progress, or too many wait. PlanError, RefusedError: as `start`.
+        """
+        if self._previews >= MOST_PREVIEWS:
+            raise BusyError(f"previews: {self._previews} requests are waiting; try again in a moment")
+        self._previews += 1
+        try:
+            async with self.state.in_turn():
+                if self.state.phase.busy:
+                    raise BusyError(f"test {self.state.phase.test_id} is in progress; look at the plan afterwards")
+                check_range(request.plan, self.joint.set_at_utc)
+                return await self._tasks.work(self._previewed, request)
+        finally:
+            self._previews -= 1
+
+    def _previewed(self, request: PreviewRequest) -> Preview:
+        test = plan.build(request.plan, limits.for_plan(self.table, request.plan))
+        duration_s = test.longest_s / self._clock.speed
+        check_profile(request.plan.profile, self._clock.unix_s(), required=False, duration_s=duration_s)
+        return plan.preview(test, request.recruitment)
+
     async def angle_pose(self, request: AnglePoseRequest) -> Status:
         """A pose of the angle sensor's calibration; raises as `Joint.pose`."""
         async with self.state.in_turn():
@@ -319,6 +345,7 @@ _REQUEST: TypeAdapter[Any] = TypeAdapter(Request)
 
 _DO: dict[str, Callable[[Rig, Any], Awaitable[BaseModel | None]]] = {
     "start": lambda rig, request: rig.start(request.plan, request.key),
+    "preview": Rig.preview,
     "stop": lambda rig, request: rig.stop(request.reason, request.by),
     "withdraw": lambda rig, request: rig.player.withdraw(request),
     "extend": lambda rig, request: rig.player.extend(request),

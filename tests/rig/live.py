@@ -20,13 +20,14 @@ from stimrig.rig.messages import (
     Event,
     FinishedEvent,
     LiveEvent,
+    Preview,
     Profile,
     Status,
     StopEvidence,
     TestPlan,
     Threshold,
 )
-from stimrig.rig.requests import CalibrateMarkRequest, CalibrateStepRequest
+from stimrig.rig.requests import CalibrateMarkRequest, CalibrateStepRequest, PreviewRequest
 from stimrig.rig.signals import Block
 from stimrig.rig.tasks import Outcome, Task, Tasks
 from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, hold, rest
@@ -191,6 +192,9 @@ class LiveRig:
     def finished(self) -> FinishedEvent:
         assert self.rig.finished is not None
         return self.rig.finished
+
+    def preview(self, plan: TestPlan) -> Preview:
+        return self.ask(self.rig.preview(PreviewRequest(plan=plan)))
 
     def stop(self, reason: str, by: str = "nurse") -> StopEvidence:
         return self.ask(self.rig.stop(reason, by))

@@ -15,11 +15,10 @@ import pytest
 from stimrig.rig import archive, assembly, journal, limits
 from stimrig.rig.clock import utc_text
 from stimrig.rig.control.calibration import end_of_day_s
-from stimrig.rig.control.replies import previewed
 from stimrig.rig.errors import BusyError, JournalError, PlanError, RecordingError, RefusedError, RigError, TooLateError
 from stimrig.rig.journal import Kind, LaidBlock
 from stimrig.rig.messages import AHEAD, AdaptivePlan, Extended, LiveEvent, Profile, SegmentPlan, TestPlan
-from stimrig.rig.requests import EnoughRequest, ExtendRequest, PreviewRequest
+from stimrig.rig.requests import EnoughRequest, ExtendRequest
 from stimrig.rig.score import MAX_CHECKED, MAX_EXTENSION_S, MAX_EXTENSION_SEGMENTS
 from stimrig.rig.signals import PulseStatus
 from tests.rig.fakes import FIXED, PULSES_HZ, VirtualRig, adaptive, extend, hold, refusals, rest, slow_work, widths_sent
@@ -556,7 +555,7 @@ def test_the_day_must_last_as_long_as_the_bound(make: Callable[..., LiveRig]):
     with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
         live.start(late, KEY)
     with pytest.raises(RefusedError, match="before the end of this test of 15 s"):
-        previewed(PreviewRequest(plan=late), live.rig.table, midnight_s - 10.0, live.clock.speed)
+        live.preview(late)
     assert live.start(bounded(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
 
 

@@ -352,8 +352,11 @@ def test_a_range_that_was_said_under_another_calibration_is_refused(angled: Angl
     for wrong in (said, said.model_copy(update={"angle_set_at_utc": "2026-01-01T00:00:00Z"})):
         with pytest.raises(RefusedError, match=f"calibrated anew at {first.set_at_utc}; say the range again"):
             live.start(live.plan("one", profile=wrong, **HELD))
+        with pytest.raises(RefusedError, match="say the range again"):
+            live.preview(live.plan("one", profile=wrong, **HELD))
     right = said.model_copy(update={"angle_set_at_utc": first.set_at_utc})
     live.machine.wait(10.0)
+    assert live.preview(live.plan("one", profile=right, **HELD)).duration_s == 3.0
     live.play("one", profile=right, **HELD)
     live.machine.wait(10.0)
     live.start(live.plan("two", profile=said))  # it asks for no angle

@@ -16,14 +16,12 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from unittest.mock import AsyncMock
 
 import pytest
 
 from stimrig.rig import __main__ as program
 from stimrig.rig import config
 from stimrig.rig.__main__ import Notifier
-from stimrig.rig.adapters.builders import Previews
 from stimrig.rig.control import pair
 from stimrig.rig.control.rig import Rig
 from stimrig.rig.keys import StopKey, in_front
@@ -193,7 +191,6 @@ def test_the_process_tells_what_it_finds(
     monkeypatch.setattr(program.os, "sched_setscheduler", lambda *_: None)
     monkeypatch.setattr(program.os, "getppid", lambda: 0 if next(beats, None) is not None else 1)
     monkeypatch.setattr(program, "BEAT_PERIOD_S", 0.01)
-    monkeypatch.setattr(Previews, "warm", AsyncMock())  # these devices say nothing: after a while they count as gone
     monkeypatch.setenv("NOTIFY_SOCKET", manager.getsockname())
     monkeypatch.setenv("WATCHDOG_USEC", "30000000")
     if not well:

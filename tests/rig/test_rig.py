@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import NoneType
 
 import h5py
 import numpy as np
@@ -12,7 +13,8 @@ import pytest
 from stimrig.rig.config import LimitSettings
 from stimrig.rig.control import state
 from stimrig.rig.control.calibration import end_of_day_s
-from stimrig.rig.control.replies import previewed, refusal
+from stimrig.rig.control.replies import refusal
+from stimrig.rig.control.rig import MOST_PREVIEWS
 from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError, RestError, UncertainError
 from stimrig.rig.messages import Profile, SegmentPlan
 from stimrig.rig.requests import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest
@@ -56,8 +58,24 @@ def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
     ) as found:
         live.start(live.plan("two", profile=rested))
     assert refusal(2, found.value).problem.code == "rest-needed", "by this a program knows that it may ask again"
-    asked = PreviewRequest(plan=live.plan("p", profile=rested))
-    assert previewed(asked, live.rig.table, live.clock.unix_s()).duration_s == 3.0
+    assert live.preview(live.plan("p", profile=rested)).duration_s == 3.0
+
+
+def test_no_plan_is_previewed_beside_a_test_and_only_so_many_wait(make: Make):
+    """The next one is built once the one before is; a start waits for neither longer than that."""
+    live = make()
+    asked = [live.begin(live.rig.preview(PreviewRequest(plan=live.plan("p")))) for _ in range(2 * MOST_PREVIEWS)]
+    live.until(lambda: all(task.done.is_set() for task in asked))
+    assert [type(task.error) for task in asked] == [NoneType] * MOST_PREVIEWS + [BusyError] * MOST_PREVIEWS
+    waiting = live.begin(live.rig.preview(PreviewRequest(plan=live.plan("p"))))
+    live.start(live.plan("one"))
+    assert waiting.result.duration_s == 3.0
+    with pytest.raises(BusyError, match="test one is in progress; look at the plan afterwards"):
+        live.preview(live.plan("p"))
+    live.wait("ready")
+    with pytest.raises(PlanError, match="at least one segment"):
+        live.preview(live.plan("p", segments=[]))
+    assert live.preview(live.plan("p")).duration_s == 3.0
 
 
 def test_a_calibration_does_not_shorten_the_rest_after_a_test(make: Make):

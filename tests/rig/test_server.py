@@ -1,13 +1,10 @@
-"""The rig's sockets without a rig, and previews in a process of their own: bounded in time, memory and number."""
+"""The rig's sockets without a rig: whatever comes to them."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import socket
-import subprocess
-import sys
-from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,19 +13,16 @@ from typing import Any
 import pytest
 
 from stimrig.rig import __main__ as program
-from stimrig.rig.adapters import builders
-from stimrig.rig.adapters.builders import Previews
 from stimrig.rig.adapters.server import LONG_LINE_BYTES, Server
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
 from stimrig.rig.control.replies import internal_error, to_line
-from stimrig.rig.errors import BusyError
-from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.messages import Reply, StateEvent, Status, StopEvidence
 from stimrig.rig.phase import Phase
 from stimrig.rig.requests import LONGEST_LINE
 from tests.rig.live import LiveRig
 
 READY = Status(state="ready")
+PLAN = {"test_id": "t", "participant": "P", "profile": {"current_ma": 20.0}}
 
 
 @pytest.mark.parametrize("leaves", [True, False])
@@ -134,124 +128,3 @@ def test_a_rig_whose_thread_hangs_is_in_trouble(monkeypatch: pytest.MonkeyPatch)
     hangs: Any = lambda _: Future()  # noqa: E731
     found = asyncio.run(program._trouble(None, hangs))
     assert found == "the rig's thread hangs: no answer for 0.05 s"
-
-
-ROOT = Path(__file__).parents[2]
-PLAN = {"test_id": "t", "participant": "P", "profile": {"current_ma": 20.0}}
-REQUEST = json.dumps({"kind": "preview", "id": 3, "plan": PLAN}).encode() + b"\n"
-
-
-@pytest.fixture
-def previews(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Previews, Callable[[Any], Any]]]:
-    """Previews that are closed in the end, and what runs a coroutine on their loop."""
-    monkeypatch.chdir(ROOT)
-    with asyncio.Runner() as runner:
-        made = Previews(HARD_LIMITS, 1.0)
-        yield made, runner.run
-        runner.run(made.close())
-
-
-Asked = tuple[Previews, Callable[[Any], Any]]
-
-
-def test_one_that_takes_too_long_is_ended_and_the_next_is_built(previews: Asked, monkeypatch: pytest.MonkeyPatch):
-    asked, run = previews
-    run(asked.warm())
-    first = asked._process
-    monkeypatch.setattr(builders, "MAX_BUILD_S", 0.0)
-    with pytest.raises(BusyError, match="not built within"):
-        run(asked.reply(REQUEST))
-    assert first is not None and first.returncode is not None
-    monkeypatch.setattr(builders, "MAX_BUILD_S", 60.0)
-    reply = json.loads(run(asked.reply(REQUEST)))
-    assert (reply["id"], reply["ok"], reply["body"]["duration_s"]) == (3, True, pytest.approx(38.7))
-
-
-def test_a_slow_start_is_not_part_of_a_requests_time(previews: Asked, monkeypatch: pytest.MonkeyPatch):
-    asked, run = previews
-    code = "import sys, time; time.sleep(2); print(flush=True); sys.stdin.readline(); print(sys.stdin.readline())"
-    execute = asyncio.create_subprocess_exec
-    slow = lambda *_, **options: execute(sys.executable, "-c", code, **options)  # noqa: E731
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", slow)
-    monkeypatch.setattr(builders, "MAX_BUILD_S", 1.9)
-    asked._first = b""
-    assert run(asked.reply(REQUEST)) == REQUEST
-
-
-def test_a_request_that_is_cancelled_while_its_builder_starts_leaves_no_reply_to_the_next(
-    previews: Asked, monkeypatch: pytest.MonkeyPatch
-):
-    asked, run = previews
-    execute, begun = asyncio.create_subprocess_exec, list[asyncio.subprocess.Process]()
-
-    async def slow(*command: str, **options: Any) -> asyncio.subprocess.Process:
-        code = "import time; time.sleep(60)"
-        begun.append(await execute(*(command if begun else (sys.executable, "-c", code)), **options))
-        return begun[-1]
-
-    async def cancelled() -> None:
-        first = asyncio.create_task(asked.reply(REQUEST))
-        while not begun:
-            await asyncio.sleep(0.01)
-        first.cancel()
-        await asyncio.gather(first, return_exceptions=True)
-        assert first.cancelled()
-
-    monkeypatch.setattr(asyncio, "create_subprocess_exec", slow)
-    run(cancelled())
-    assert json.loads(run(asked.reply(REQUEST)))["ok"]
-    assert run(begun[0].wait()) < 0, "nobody waits for it any more"
-
-
-def test_a_builder_that_does_not_start_is_given_up_and_started_again_when_needed(
-    previews: Asked, monkeypatch: pytest.MonkeyPatch
-):
-    asked, run = previews
-    monkeypatch.setattr(builders, "MAX_START_S", 0.0)
-    run(asked.warm())
-    assert asked._process is None
-    monkeypatch.setattr(builders, "MAX_START_S", 60.0)
-    assert json.loads(run(asked.reply(REQUEST)))["ok"]
-
-
-def test_who_would_wait_for_too_long_is_refused_at_once(previews: Asked, monkeypatch: pytest.MonkeyPatch):
-    asked, run = previews
-    monkeypatch.setattr(builders, "MAX_BUILD_S", 60.0)
-
-    async def many() -> list[Any]:
-        return await asyncio.gather(*(asked.reply(REQUEST) for _ in range(40)), return_exceptions=True)
-
-    found = run(many())
-    assert [isinstance(one, bytes) for one in found[: builders.MAX_WAITING]] == [True] * builders.MAX_WAITING
-    assert all(isinstance(one, BusyError) for one in found[builders.MAX_WAITING :])
-    assert json.loads(run(asked.reply(REQUEST)))["ok"]
-
-
-def test_memory_is_bounded():
-    code = "import stimrig.rig.builder as b; b._modest(5); bytearray(2 << 30)"
-    ended = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
-    assert "MemoryError" in ended.stderr
-
-
-def test_what_is_wrong_is_told_and_the_builder_lives_on(previews: Asked):
-    asked, run = previews
-    too_long = {**PLAN, "segments": [{"name": "x", "sequence": "prbs", "settings": {"chips": 100_000}}]}
-    process = None
-    for line in (b"{}", b"[[", b"\xff\xfe", json.dumps({"kind": "preview", "id": 10, "plan": too_long}).encode()):
-        reply = json.loads(run(asked.reply(line + b"\n")))
-        assert not reply["ok"]
-        assert reply["problem"]["code"] in ("bad-plan", "refused")
-        process = process or asked._process
-    assert asked._process is process
-    assert json.loads(run(asked.reply(REQUEST)))["ok"]
-
-
-def test_a_range_is_judged_by_the_calibration_of_the_moment(previews: Asked):
-    asked, run = previews
-    asks = {"profile": {"angle_range_rad": [0.2, 2.0], "angle_set_at_utc": "first"}, "kind": "moving"}
-    plan = {**PLAN, **asks, "angle": {"range_rad": [0.2, 2.0], "still_s": 2.0}}
-    line = json.dumps({"kind": "preview", "id": 1, "plan": plan}).encode() + b"\n"
-    for now, fine in (("first", True), ("second", False), (None, False), ("first", True)):
-        reply = json.loads(run(asked.reply(line, now)))
-        assert reply["ok"] is fine, reply
-        assert fine or "say the range again" in reply["problem"]["detail"]
