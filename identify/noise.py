@@ -15,7 +15,7 @@ MEAN_OF_SLOW = 0.27
 SHORTEST = 0.006
 """1 - ar1 of the slowest noise (a memory of 4 s at 40 pulses/s); anything slower is a drift, which has a cause."""
 Stretches = tuple[np.ndarray, np.ndarray]
-
+"""Starts and ends of runs of intervals; noise is correlated only within a run."""
 LOWEST_HZ, HIGHEST_HZ = 2.8, 14.5
 
 
@@ -53,6 +53,13 @@ class NoiseLevel:
 
 WHITE = NoiseLevel(0.0, 0.0, 1.0, white_only=True)
 """White noise of any size."""
+UNKNOWN = NoiseLevel(0.5, 0.5, 1.0)
+"""Where a wide search begins."""
+SLOW_STEPS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]]) @ np.eye(2, 5)
+SLOW_GUESSES = np.array([[0.3, 0.9], [0.03, 0.3], [0.03, 1.0], [0.5, 0.02], [0.3, 1.7]]) @ np.eye(2, 5)
+"""Share that is forgotten in a step, and share of the slow part."""
+BAND_STEPS = np.repeat(np.eye(5), 2, axis=0) * np.tile([1.0, -1.0], 5)[:, None]
+"""Directions of the searches: log(1 - ar1), slow share of the rest, turn, log(1 - decay), band."""
 
 
 def profile(
@@ -63,13 +70,20 @@ def profile(
         fitted = np.concatenate([residual[start:stop] for start, stop in zip(*stretches, strict=True)])
         sd = max(float(np.sqrt(np.mean(fitted**2))), 1e-9)
         return replace(near, sd_nm=sd), -0.5 * fitted.size * (np.log(2 * np.pi * sd * sd) + 1.0)
-    if near.band <= 0.0:
-        ar1, share, sd, log_likelihood = profile_noise(residual, *stretches, near.ar1, near.share, wide)
-        return NoiseLevel(ar1, share, max(sd, 1e-9)), log_likelihood
-    slow, fading = np.log(1.0 - min(near.ar1, 1.0 - SHORTEST)), np.log(1.0 - min(near.decay, 0.9999))
-    share = min(near.share / max(1.0 - near.band, 1e-9), 1.0)
-    x = np.array([slow, share, near.turn, fading, near.band])
-    return _search(residual, stretches, x, 0.15, 0.03, (near.slowest, near.fastest))
+    slow = np.log(1.0 - min(near.ar1, 1.0 - SHORTEST))
+    if near.band > 0.0:
+        share = min(near.share / max(1.0 - near.band, 1e-9), 1.0)
+        x = np.array([slow, share, near.turn, np.log(1.0 - min(near.decay, 0.9999)), near.band])
+        return _profile_band(residual, stretches, x, 0.15, 0.03, (near.slowest, near.fastest))
+    bounds = np.array([[np.log(SHORTEST), 0.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0, 0.0]])
+    starts = np.array([[slow, near.share, 0.0, 0.0, 0.0]])
+    if wide:
+        guesses = SLOW_GUESSES.copy()
+        guesses[:, 0] = np.log(guesses[:, 0])
+        starts = np.concatenate([starts, guesses])
+    step = np.array([0.6, 0.2, 0.0, 0.0, 0.0]) * (1.0 if wide else 0.25)
+    x, sd, log_likelihood = _search(residual, *stretches, starts, bounds, step, SLOW_STEPS, 0.01 / step[0], 1e-9)
+    return NoiseLevel(float(1.0 - np.exp(x[0])), float(x[1]), max(float(sd), 1e-9)), log_likelihood
 
 
 def correlation(residual: np.ndarray, stretches: Stretches) -> float:
@@ -77,7 +91,7 @@ def correlation(residual: np.ndarray, stretches: Stretches) -> float:
     return profile(residual, stretches, NoiseLevel(0.0, 0.5, 1.0))[0].correlation
 
 
-def _search(
+def _profile_band(
     residual: np.ndarray,
     stretches: Stretches,
     x: np.ndarray,
@@ -85,22 +99,13 @@ def _search(
     smallest_step: float,
     turns: tuple[float, float],
 ) -> tuple[NoiseLevel, float]:
-    lower = np.array([np.log(SHORTEST), 0.0, turns[0], np.log(0.0008), 0.001])
-    upper = np.array([0.0, 1.0, turns[1], np.log(0.12), 0.999])
-    step = wide * np.array([1.5, 0.4, 0.12, 1.5, 0.4])
-    x = np.clip(x, lower, upper)
-    x, sd, log_likelihood = _profile_band(residual, *stretches, x, lower, upper, step, smallest_step)
-    noise = NoiseLevel(
-        ar1=float(1.0 - np.exp(x[0])),
-        share=float(x[1] * (1.0 - x[4])),
-        sd_nm=max(float(sd), 1e-9),
-        turn=float(x[2]),
-        decay=float(1.0 - np.exp(x[3])),
-        band=float(x[4]),
-        slowest=turns[0],
-        fastest=turns[1],
+    bounds = np.array(
+        [[np.log(SHORTEST), 0.0, turns[0], np.log(0.0008), 0.001], [0.0, 1.0, turns[1], np.log(0.12), 0.999]]
     )
-    return noise, log_likelihood
+    step = wide * np.array([1.5, 0.4, 0.12, 1.5, 0.4])
+    x, sd, log_likelihood = _search(residual, *stretches, x[None, :], bounds, step, BAND_STEPS, smallest_step, 1e-7)
+    ar1, share, decay = float(1.0 - np.exp(x[0])), float(x[1] * (1.0 - x[4])), float(1.0 - np.exp(x[3]))
+    return NoiseLevel(ar1, share, max(float(sd), 1e-9), float(x[2]), decay, float(x[4]), *turns), log_likelihood
 
 
 def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tuple[NoiseLevel, float]:
@@ -110,7 +115,7 @@ def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tupl
     for frequency_hz in _peaks(residual, stretches, step_s):
         for width_hz in (0.1, 0.7):
             x = np.array([np.log(0.3), 0.5, 2 * np.pi * frequency_hz * step_s, np.log(np.pi * width_hz * step_s), 0.5])
-            candidates.append(_search(residual, stretches, x, 1.0, 0.05, turns))
+            candidates.append(_profile_band(residual, stretches, x, 1.0, 0.05, turns))
     return max(candidates, key=lambda candidate: candidate[1])
 
 
@@ -134,300 +139,161 @@ def _peaks(residual: np.ndarray, stretches: Stretches, step_s: float) -> list[fl
 
 def whitened(rows: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> np.ndarray:
     """Rows on the grid, shape (M, K), whitened to unit variance; the fitted intervals in order, shape (M, F)."""
-    if noise.band <= 0.0:
-        return _whiten_rows(rows, *stretches, noise.ar1, noise.share) / noise.sd_nm
-    white, _ = _whiten_band(rows, *stretches, noise.ar1, noise.share, noise.turn, noise.decay, noise.band)
-    return white / noise.sd_nm
+    return _whiten(rows, *stretches, *_parts(noise))[0] / noise.sd_nm
 
 
 def band_part(residual: np.ndarray, stretches: Stretches, noise: NoiseLevel) -> np.ndarray:
     """The narrow band's part of a residual; zero in intervals that were not fitted."""
     if noise.band <= 0.0:
         return np.zeros(residual.size)
-    return _smooth_band(residual, *stretches, noise.ar1, noise.share, noise.turn, noise.decay, noise.band)
+    return _smooth_band(residual, *stretches, *_parts(noise))
 
 
-# ---- kernels: white plus slow, then with a band -------------------------------------------------------------------
+def _parts(noise: NoiseLevel) -> tuple[float, float, float, float, float]:
+    return noise.ar1, noise.share, noise.turn, noise.decay, noise.band
 
 
-@njit(cache=True, nogil=True)
-def _ratio(ar1, mean):  # pragma: no cover
-    """Variance of means of slow noise, divided by that of their innovations."""
-    return (1.0 + 2.0 * ar1 * mean + mean * mean) / (1.0 - ar1 * ar1)
-
-
-@njit(cache=True, nogil=True)
-def _whiten_means(rows, start, stop, ar1, mean, total):  # pragma: no cover
-    """Innovations of means of slow noise, x[k] = ar1 x[k-1] + e[k] + mean e[k-1], by the innovations algorithm."""
-    white = np.empty((rows.shape[0], total))
-    first = _ratio(ar1, mean)
-    for m in range(rows.shape[0]):
-        f = 0
-        for i in range(start.size):
-            r, x = first, 0.0
-            for k in range(start[i], stop[i]):
-                e = rows[m, k] - x
-                white[m, f] = e * np.sqrt(first / r)
-                x = ar1 * rows[m, k] + mean * e / r
-                r = 1.0 + mean * mean - mean * mean / r
-                f += 1
-    return white
-
-
-@njit(cache=True, nogil=True)
-def _whiten_rows(rows, start, stop, ar1, share):  # pragma: no cover
-    """Innovations of white plus AR(1) noise, scaled to equal variance, by an exact Kalman filter."""
-    total = np.sum(stop - start)
-    if share > 1.0:
-        return _whiten_means(rows, start, stop, ar1, (share - 1.0) * MEAN_OF_SLOW, total)
-    white, gain, scale = np.empty((rows.shape[0], total)), np.empty(total), np.empty(total)
-    f = 0
-    noise = (1.0 - ar1 * ar1) * share
-    for i in range(start.size):
-        p = share
-        for _ in range(stop[i] - start[i]):
-            s = max(p + 1.0 - share, 1e-12)
-            gain[f] = p / s
-            scale[f] = 1.0 / np.sqrt(s)
-            p = ar1 * ar1 * (p - p * p / s) + noise
-            f += 1
-    for m in range(rows.shape[0]):
-        f = 0
-        for i in range(start.size):
-            x = 0.0
-            for k in range(start[i], stop[i]):
-                e = rows[m, k] - x
-                white[m, f] = e * scale[f]
-                x = ar1 * (x + gain[f] * e)
-                f += 1
-    return white
-
-
-@njit(cache=True, nogil=True)
-def _squares(row, start, stop, ar1, share):  # pragma: no cover
-    """Sum of squared innovations, half the log determinant, count. The filter's gain converges within some steps."""
-    total, squares, logdet = 0, 0.0, 0.0
-    if share > 1.0:
-        mean = (share - 1.0) * MEAN_OF_SLOW
-        first = _ratio(ar1, mean)
-        for i in range(start.size):
-            r, x = first, 0.0
-            for k in range(start[i], stop[i]):
-                e = row[k] - x
-                squares += e * e * first / r
-                if r != 1.0:
-                    logdet += 0.5 * np.log(r / first)
-                else:
-                    logdet -= 0.5 * np.log(first)
-                x = ar1 * row[k] + mean * e / r
-                r = 1.0 + mean * mean - mean * mean / r
-                total += 1
-        return squares, logdet, total
-    noise = (1.0 - ar1 * ar1) * share
-    for i in range(start.size):
-        p, x, k, end = share, 0.0, start[i], stop[i]
-        total += end - k
-        s = 1.0
-        while k < end:
-            s = max(p + 1.0 - share, 1e-12)
-            e = row[k] - x
-            squares += e * e / s
-            logdet += 0.5 * np.log(s)
-            x = ar1 * (x + p / s * e)
-            fresh = ar1 * ar1 * (p - p * p / s) + noise
-            k += 1
-            if abs(fresh - p) < 1e-10 * (1e-6 + p):
-                break
-            p = fresh
-        if k < end:
-            gain, sum_e = p / s, 0.0
-            logdet += 0.5 * (end - k) * np.log(s)
-            for j in range(k, end):
-                e = row[j] - x
-                sum_e += e * e
-                x = ar1 * (x + gain * e)
-            squares += sum_e / s
-    return squares, logdet, total
-
-
-@njit(cache=True, nogil=True)
-def _minus_log_likelihood(row, start, stop, ar1, share):  # pragma: no cover
-    """Minus the profiled log-likelihood of one residual, up to a constant, and its variance."""
-    squares, logdet, total = _squares(row, start, stop, ar1, share)
-    variance = max(squares / max(total, 1), 1e-24)
-    return 0.5 * total * np.log(variance) + logdet, variance
-
-
-STEPS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0), (1.0, -1.0), (-1.0, 1.0), (-1.0, -1.0))
-"""Directions of the pattern search in log(1 - ar1) and share."""
-
-
-@njit(cache=True, nogil=True)
-def profile_noise(row, start, stop, ar1, share, wide):  # pragma: no cover
-    """The most likely correlation and slow share of a residual, by a pattern search from the given start.
-
-    ar1, share, sd and log_likelihood; `sd` is the total standard deviation, slow and white together.
-    """
-    total = np.sum(stop - start)
-    # a = log(1 - ar1), from log(SHORTEST) (long memory) to 0 (none).
-    low, high = np.log(SHORTEST), 0.0
-    a, b = min(max(np.log(1.0 - min(ar1, 1.0 - SHORTEST)), low), high), min(max(share, 0.0), 2.0)
-    best, variance = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(a), b)
-    for forgotten, guess_b in ((0.3, 0.9), (0.03, 0.3), (0.03, 1.0), (0.5, 0.02), (0.3, 1.7)):
-        if not wide:
-            break
-        guess_a = np.log(forgotten)
-        value, squares = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(guess_a), guess_b)
-        if value < best:
-            best, a, b, variance = value, guess_a, guess_b, squares
-    da, db = (0.6, 0.2) if wide else (0.15, 0.05)
-    while da > 0.01:
-        moved = False
-        for to_a, to_b in STEPS:
-            na, nb = min(max(a + da * to_a, low), high), min(max(b + db * to_b, 0.0), 2.0)
-            if na == a and nb == b:
-                continue
-            value, squares = _minus_log_likelihood(row, start, stop, 1.0 - np.exp(na), nb)
-            if value < best - 1e-9:
-                best, a, b, variance, moved = value, na, nb, squares, True
-        if not moved:
-            da, db = 0.5 * da, 0.5 * db
-    return 1.0 - np.exp(a), b, np.sqrt(variance), -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
-
-
-@njit(cache=True, nogil=True)
-def _system(ar1, slow, turn, decay, band):  # pragma: no cover
-    """Transition of (slow, cos, sin) over a step, the stationary covariance, and what each step adds to it."""
-    c, s = decay * np.cos(turn), decay * np.sin(turn)
-    f = np.array(((ar1, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
-    fresh = band * (1 - decay * decay)
-    return f, np.diag(np.array((slow, band, band))), np.array((slow * (1 - ar1 * ar1), fresh, fresh))
-
-
-@njit(cache=True, nogil=True)
-def _predict(f, p, gain, h, q):  # pragma: no cover
-    """Covariance a step later, after a measurement, whose covariance with the state is h; p is used up."""
-    fresh = np.zeros((3, 3))
-    for i in range(3):
-        for j in range(3):
-            p[i, j] -= gain[i] * h[j]
-    for i in range(3):
-        for j in range(3):
-            total = 0.0
-            for a in range(3):
-                for b in range(3):
-                    total += f[i, a] * p[a, b] * f[j, b]
-            fresh[i, j] = total
-        fresh[i, i] += q[i]
-    return fresh
+# ---- kernels ---------------------------------------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True)
 def _gains(length, ar1, slow, turn, decay, band):  # pragma: no cover
-    """Kalman gains of (slow, cos, sin) and innovation variances for a stretch of `length` from the stationary state."""
-    f, p, q = _system(ar1, slow, turn, decay, band)
-    white = max(1.0 - slow - band, 1e-9)
-    gains, variances, h = np.empty((length, 3)), np.empty(length), np.empty(3)
-    for k in range(length):
-        for i in range(3):
-            h[i] = p[i, 0] + p[i, 1]
-        variances[k] = h[0] + h[1] + white
-        for i in range(3):
-            gains[k, i] = h[i] / variances[k]
-        p = _predict(f, p, gains[k], h, q)
-        if k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11:  # settled
-            gains[k + 1 :], variances[k + 1 :] = gains[k], variances[k]
-            break
-    return gains, variances
+    """What an innovation adds to the next state (slow, cos, sin), (length, 3), its scale, and half its log variance.
+
+    Of an exact Kalman filter of `length` steps from the stationary state, total variance 1; of means of slow noise
+    (`slow` above 1) by the innovations algorithm. The last values hold once the filter has settled.
+    """
+    gains, variances, k = np.zeros((length, 3)), np.empty(length), 0
+    if band > 0.0:
+        k = _band_gains(gains, variances, ar1, slow, turn, decay, band)
+    elif slow > 1.0:  # x[k] = ar1 x[k-1] + e[k] + mean e[k-1]
+        mean = (slow - 1.0) * MEAN_OF_SLOW
+        first = (1.0 + 2.0 * ar1 * mean + mean * mean) / (1.0 - ar1 * ar1)
+        r, last = first, 0.0
+        while k < length and r != last:
+            gains[k, 0], variances[k], last = ar1 + mean / r, r / first, r
+            r = 1.0 + mean * mean - mean * mean / r
+            k += 1
+    else:
+        p, last, fresh = slow, -1.0, (1.0 - ar1 * ar1) * slow
+        while k < length and not abs(p - last) < 1e-10 * (1e-6 + last):
+            s = max(p + 1.0 - slow, 1e-12)
+            gains[k, 0], variances[k], last = ar1 * p / s, s, p
+            p = ar1 * ar1 * (p - p * p / s) + fresh
+            k += 1
+    gains[k:], variances[k:] = gains[k - 1], variances[k - 1]
+    half = np.empty(length)
+    for i in range(length):
+        half[i] = 0.5 * np.log(variances[i]) if i < k else half[k - 1]
+    return gains, 1.0 / np.sqrt(variances), half
 
 
 @njit(cache=True, nogil=True)
-def _whiten_band(rows, start, stop, ar1, slow, turn, decay, band):  # pragma: no cover
-    """As `_whiten_rows`, with an oscillator: `turn`, its angle per step, `decay` per step, and `band`, its share."""
-    gains, variances = _gains(np.max(stop - start), ar1, slow, turn, decay, band)
+def _band_gains(gains, variances, ar1, slow, turn, decay, band):  # pragma: no cover
+    """Gains and variances as in `_gains`, with an oscillator; the number of steps until they settle."""
     c, s = decay * np.cos(turn), decay * np.sin(turn)
-    white = np.empty((rows.shape[0], np.sum(stop - start)))
-    logdet = 0.0
-    for i in range(start.size):
-        for k in range(stop[i] - start[i]):
-            logdet += 0.5 * np.log(variances[k])
+    f = np.array(((ar1, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
+    p = np.diag(np.array((slow, band, band)))
+    q = np.array((slow * (1 - ar1 * ar1), band * (1 - decay * decay), band * (1 - decay * decay)))
+    h, after = np.empty(3), np.empty((3, 3))
+    for k in range(variances.size):
+        for i in range(3):
+            h[i] = p[i, 0] + p[i, 1]
+        variances[k] = h[0] + h[1] + max(1.0 - slow - band, 1e-9)
+        for i in range(3):
+            for j in range(3):
+                p[i, j] -= h[i] * h[j] / variances[k]
+                gains[k, i] += f[i, j] * h[j] / variances[k]
+        for i in range(3):
+            for j in range(3):
+                after[i, j] = q[i] if i == j else 0.0
+                for a in range(3):
+                    for b in range(3):
+                        after[i, j] += f[i, a] * p[a, b] * f[j, b]
+        p[:] = after
+        if k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11:
+            return k + 1
+    return variances.size
+
+
+@njit(cache=True, nogil=True)
+def _whiten(rows, start, stop, ar1, slow, turn, decay, band):  # pragma: no cover
+    """Innovations of rows, (M, K), scaled to equal variance, (M, F), and half the log determinant of a row."""
+    gains, scale, half = _gains(np.max(stop - start), ar1, slow, turn, decay, band)
+    c, s = decay * np.cos(turn), decay * np.sin(turn)
+    white, log_det = np.empty((rows.shape[0], np.sum(stop - start))), 0.0
     for m in range(rows.shape[0]):
         f = 0
         for i in range(start.size):
             x, u, v = 0.0, 0.0, 0.0
             for k in range(stop[i] - start[i]):
                 e = rows[m, start[i] + k] - x - u
-                white[m, f] = e / np.sqrt(variances[k])
-                x += gains[k, 0] * e
-                u += gains[k, 1] * e
-                v += gains[k, 2] * e
-                x, u, v = ar1 * x, c * u - s * v, s * u + c * v
+                white[m, f] = e * scale[k]
+                x = ar1 * x + gains[k, 0] * e
+                if band > 0.0:
+                    u, v = c * u - s * v + gains[k, 1] * e, s * u + c * v + gains[k, 2] * e
                 f += 1
-    return white, logdet
+    for i in range(start.size):
+        log_det += np.sum(half[: stop[i] - start[i]])
+    return white, log_det
 
 
 @njit(cache=True, nogil=True)
-def _band_cost(row, start, stop, x):  # pragma: no cover
-    """Minus the profiled log-likelihood, up to a constant, the variance, and the count.
-
-    At x = (log(1 - ar1), slow share of the rest, turn, log(1 - decay), band).
-    """
-    slow = x[1] * (1.0 - x[4])
-    white, logdet = _whiten_band(row, start, stop, 1.0 - np.exp(x[0]), slow, x[2], 1.0 - np.exp(x[3]), x[4])
+def _cost(row, start, stop, x):  # pragma: no cover
+    """Minus the profiled log-likelihood of a residual at x, up to a constant, and the variance."""
+    slow, decay = x[1] * (1.0 - x[4]), 1.0 - np.exp(x[3])
+    white, log_det = _whiten(row.reshape(1, row.size), start, stop, 1.0 - np.exp(x[0]), slow, x[2], decay, x[4])
     squares = 0.0
     for k in range(white.shape[1]):
         squares += white[0, k] * white[0, k]
-    size = white.shape[1]
-    variance = max(squares / size, 1e-24)
-    return 0.5 * size * np.log(variance) + logdet, variance, size
+    variance = max(squares / max(white.shape[1], 1), 1e-24)
+    return 0.5 * white.shape[1] * np.log(variance) + log_det, variance
 
 
 @njit(cache=True, nogil=True)
-def _profile_band(row, start, stop, x, lower, upper, step, smallest_step):  # pragma: no cover
-    """Coordinate search from x, halving its steps to `least`; returns x, sd and log-likelihood."""
-    rows = row.reshape(1, row.size)
-    best, variance, total = _band_cost(rows, start, stop, x)
+def _search(row, start, stop, starts, bounds, step, directions, smallest_step, smallest_gain):  # pragma: no cover
+    """Pattern search from the best of some starts, halving its steps; x, sd and log-likelihood."""
+    x = np.minimum(np.maximum(starts[0], bounds[0]), bounds[1])
+    best, variance = _cost(row, start, stop, x)
+    for guess in starts[1:]:
+        value, squares = _cost(row, start, stop, guess)
+        if value < best:
+            best, variance, x = value, squares, guess
     scale = 1.0
     while scale > smallest_step:
         moved = False
-        for i in range(x.size):
-            for sign in (1.0, -1.0):
-                trial = x.copy()
-                trial[i] = min(max(x[i] + sign * scale * step[i], lower[i]), upper[i])
-                if trial[i] == x[i]:
-                    continue
-                value, squares, _ = _band_cost(rows, start, stop, trial)
-                if value < best - 1e-7:
-                    best, variance, moved = value, squares, True
-                    x = trial
-                    break
+        for direction in directions:
+            trial = np.minimum(np.maximum(x + scale * step * direction, bounds[0]), bounds[1])
+            if np.all(trial == x):
+                continue
+            value, squares = _cost(row, start, stop, trial)
+            if value < best - smallest_gain:
+                best, variance, x, moved = value, squares, trial, True
         if not moved:
             scale *= 0.5
+    total = np.sum(stop - start)
     return x, np.sqrt(variance), -best - 0.5 * total * (np.log(2 * np.pi) + 1.0)
 
 
 @njit(cache=True, nogil=True)
 def _smooth_band(row, start, stop, ar1, slow, turn, decay, band):  # pragma: no cover
-    """The oscillator's part of a residual, given all of it (fixed-interval smoother); zero outside the stretches."""
+    """The oscillator's part of a residual y, given all of it: its covariance times the inverse one of y times y."""
+    gains, scale, _ = _gains(np.max(stop - start), ar1, slow, turn, decay, band)
+    white, _ = _whiten(row.reshape(1, row.size), start, stop, ar1, slow, turn, decay, band)
+    c, s, last = decay * np.cos(turn), decay * np.sin(turn), white.shape[1]
     out = np.zeros(row.size)
-    for i in range(start.size):
-        f, p, q = _system(ar1, slow, turn, decay, band)
-        c, s = f[1, 1], f[2, 1]
+    for i in range(start.size - 1, -1, -1):
         length = stop[i] - start[i]
-        gains, variances = _gains(length, ar1, slow, turn, decay, band)
-        errors, waves, covariances = np.empty(length), np.empty(length), np.empty((length, 3, 3))
-        x, u, v = 0.0, 0.0, 0.0
+        last -= length
+        weights = np.empty(length)
+        x, u, v, ahead, turned = 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(length - 1, -1, -1):  # the adjoint of the filter gives the inverse covariance times y
+            weights[k] = white[0, last + k] * scale[k] - gains[k, 0] * x - gains[k, 1] * u - gains[k, 2] * v
+            x, u, v = ar1 * x + weights[k], c * u + s * v + weights[k], c * v - s * u
+            out[start[i] + k] = band * ahead
+            ahead, turned = c * (ahead + weights[k]) - s * turned, s * (ahead + weights[k]) + c * turned
+        ahead, turned = 0.0, 0.0
         for k in range(length):
-            errors[k], waves[k], covariances[k] = row[start[i] + k] - x - u, u, p
-            x, u, v = x + gains[k, 0] * errors[k], u + gains[k, 1] * errors[k], v + gains[k, 2] * errors[k]
-            x, u, v = ar1 * x, c * u - s * v, s * u + c * v
-            p = _predict(f, p, gains[k], p[0] + p[1], q)
-        # Backward pass on the adjoint r: x_hat = x + P r, with P h = gain * variance; only the oscillator is wanted.
-        r = np.zeros(3)
-        for k in range(length - 1, -1, -1):
-            r[0], r[1], r[2] = ar1 * r[0], c * r[1] + s * r[2], c * r[2] - s * r[1]
-            h = errors[k] / variances[k] - (gains[k, 0] * r[0] + gains[k, 1] * r[1] + gains[k, 2] * r[2])
-            r[0], r[1] = r[0] + h, r[1] + h
-            cov = covariances[k, 1]
-            out[start[i] + k] = waves[k] + cov[0] * r[0] + cov[1] * r[1] + cov[2] * r[2]
+            ahead, turned = c * ahead - s * turned + weights[k], s * ahead + c * turned
+            out[start[i] + k] += band * ahead
     return out

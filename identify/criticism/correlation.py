@@ -13,7 +13,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.estimation.samples import block_means
-from stimrig.identify.noise import profile_noise
+from stimrig.identify.noise import UNKNOWN, profile
 
 LAGS = 25
 DRAWS = 1500
@@ -68,11 +68,11 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
 
 def _innovations(residual: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, float]:
     """The residual without slow noise: cross-correlations of coloured noise become large by chance."""
-    ar1, share, _, _ = profile_noise(residual, *ends_of(runs(known)), 0.5, 0.5, True)
-    lag_one = ar1 * share
+    noise, _ = profile(residual, ends_of(runs(known)), UNKNOWN)
+    lag_one = noise.ar1 * noise.share
     if abs(lag_one) < 0.08:
         return residual, 0.0
-    return _filtered(residual, ar1 * share, known), lag_one
+    return _filtered(residual, lag_one, known), lag_one
 
 
 def _filtered(signal: np.ndarray, ar1: float, known: np.ndarray) -> np.ndarray:

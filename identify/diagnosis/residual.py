@@ -12,7 +12,7 @@ from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.left_out import difference, hold_out
-from stimrig.identify.noise import band_part, profile_noise
+from stimrig.identify.noise import UNKNOWN, band_part, profile
 
 MEDIAN = 0.6745
 """Median of the size of normal errors over their standard deviation."""
@@ -72,7 +72,8 @@ def _long(flags: np.ndarray, min_rows: int) -> list[slice]:
 def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, float, float]:
     if not parts:
         return (0.0, 0.0, 0.0, 0.0)
-    return profile_noise(residual, *ends_of(parts), 0.5, 0.5, True)
+    noise, log_likelihood = profile(residual, ends_of(parts), UNKNOWN)
+    return noise.ar1, noise.share, noise.sd_nm, log_likelihood
 
 
 def _rms(residual: np.ndarray, parts: list[slice]) -> float:
