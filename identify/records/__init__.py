@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -38,8 +39,10 @@ def read(
     BadRecord
         With file, line and column, and what to do.
     """
-    from stimrig.identify.records import bounds, columns
-    from stimrig.identify.records.mat import is_mat, read_mat
+    from stimrig.identify.records import bounds, columns, csv, join
+    from stimrig.identify.records.clock import regular
+    from stimrig.identify.records.segments import with_segments
+    from stimrig.identify.records.table import checked
 
     path = Path(path)
     if pulse_rate_hz is not None:
@@ -52,12 +55,12 @@ def read(
         if column_map:
             raise BadRecord("a sealed recording has its own columns", place=str(path), fix="Leave --map out.")
         return read_recording(content, path, pulse_rate_hz)
-    if is_mat(content) or path.suffix.lower() == ".mat":
-        return read_mat(content, path, pulse_rate_hz, column_map)
-    if content.startswith(PARQUET_MAGIC) or path.suffix.lower() == ".parquet":
-        from stimrig.identify.records.parquet import read_parquet
-
-        return read_parquet(content, path, pulse_rate_hz, column_map)
-    from stimrig.identify.records.csv import read_csv
-
-    return read_csv(content, path, pulse_rate_hz, column_map)
+    if (content.startswith(b"MATLAB") and content[126:128] in (b"IM", b"MI")) or path.suffix.lower() == ".mat":
+        from stimrig.identify.records.mat import read_mat as read_table
+    elif content.startswith(PARQUET_MAGIC) or path.suffix.lower() == ".parquet":
+        from stimrig.identify.records.parquet import read_parquet as read_table
+    else:
+        read_table = csv.read_csv
+    table = read_table(content, path, column_map)
+    table = checked(table if pulse_rate_hz is None else replace(table, pulse_rate_hz=pulse_rate_hz))
+    return join.record_of_parts(table) if table.part_cells else with_segments(regular(table)).record()

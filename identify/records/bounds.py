@@ -28,11 +28,6 @@ LARGEST = {
 }
 MAY_LACK = ("time_s", "pulse_width_us", "torque_nm", "angle_rad", "velocity_rad_s")
 """Columns in which a number may be missing: a row without one is left out."""
-UNITS = {
-    "angle_rad": "No joint turns so far. If these are degrees, say so: --map angle_rad=angle_rad:deg, and the same "
-    "for a velocity."
-}
-"""Likely cause where all numbers of a column are finite, and one is too large."""
 LARGEST_CALENDAR_S = 1e11
 """Times as they are read may be counted from 1970, or from 1904."""
 LONGEST_NAME = 100
@@ -51,34 +46,17 @@ def content_of(path: Path) -> bytes:
             pieces = [file.read(PIECE_BYTES)]
             while pieces[-1] and len(pieces) * PIECE_BYTES <= LARGEST_FILE_BYTES:
                 pieces.append(file.read(PIECE_BYTES))
-    except FileNotFoundError as error:
-        raise BadRecord("no such file", place=str(path), fix="Check the path.") from error
+    except (FileNotFoundError, ValueError) as error:  # a ValueError: a NUL in the name
+        raise BadRecord("no such file", place=str(path).replace("\0", "\\0"), fix="Check the path.") from error
     except IsADirectoryError as error:
         raise BadRecord("a directory, not a record", place=str(path), fix="Name the file in it.") from error
     except OSError as error:
         reason = error.strerror or str(error)
         raise BadRecord(f"can't be read ({reason})", place=str(path), fix="Check its rights.") from error
-    except ValueError as error:  # a NUL in the name
-        raise BadRecord("no such file", place=repr(str(path)), fix="Check the path.") from error
     if sum(map(len, pieces)) > LARGEST_FILE_BYTES:
         fix = "Cut the record, or give the sealed recording."
         raise BadRecord(f"more than {LARGEST_FILE_BYTES // 2**20} MB", place=str(path), fix=fix)
     return b"".join(pieces)
-
-
-def wrong_rows(column: str, values: np.ndarray) -> np.ndarray:
-    """Rows of a column as it was read, in its own unit, with a number that no measurement gives.
-
-    NaN stands where there is none, which columns of `MAY_LACK` may have.
-    """
-    largest = LARGEST_CALENDAR_S if column == "time_s" else LARGEST[column]
-    wrong = ~(np.abs(values) <= largest)
-    return np.flatnonzero(wrong & ~np.isnan(values) if column in MAY_LACK else wrong)
-
-
-def fix_of(column: str, wrong: np.ndarray, otherwise: str) -> str:
-    """Advice on numbers of a column that are too large, or missing."""
-    return UNITS.get(column, otherwise) if np.isfinite(wrong).all() else otherwise
 
 
 def check_size(size: int, place: str) -> None:
@@ -100,24 +78,32 @@ def check_sampling(rate_hz: float, place: str) -> None:
     Raises BadRecord: below 40 Hz or above 2 kHz, by more than rounding.
     """
     if not (LOWEST_HZ <= rate_hz <= HIGHEST_HZ):
-        fix = "40 Hz to 2 kHz can be used."
-        if LOWEST_HZ <= 1000 * rate_hz <= HIGHEST_HZ:
-            fix = "40 Hz to 2 kHz can be used; if time is in milliseconds, give --map time_s=time_s:ms."
+        units = {"ms": 1e-3, "µs": 1e-6, "ns": 1e-9, "d": 86400.0}
+        fitting = [unit for unit, unit_s in units.items() if LOWEST_HZ <= rate_hz / unit_s <= HIGHEST_HZ]
+        fix = (
+            "40 Hz to 2 kHz can be used"
+            + "".join(f"; for time in {u}, give --map time_s=time_s:{u}" for u in fitting)
+            + "."
+        )
         raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, fix=fix)
 
 
-def check_name(name: str, place: str) -> None:
-    """Refuse a segment's name that is no name.
+def check_names(names: list[str], place: str) -> None:
+    """Refuse segments' names that are none.
 
-    Raises BadRecord: empty, too long, or with signs that cannot be printed.
+    Raises BadRecord: too many; one is empty, too long, or with signs that cannot be printed.
     """
-    if not name.strip():
-        raise BadRecord("empty", place=place, fix="Name it: rest, prbs, ramp, validate…")
-    if len(name) > LONGEST_NAME:
-        fix = f"A segment's name has at most {LONGEST_NAME}."
-        raise BadRecord(f"a name of {len(name)} characters", place=place, fix=fix)
-    if not name.isprintable():
-        raise BadRecord("a name that cannot be printed", place=place, fix="Use letters, digits, - and _.")
+    if len(names) > MOST_SEGMENTS:
+        fix = "Name segments by what they are (rest, prbs…), not each row."
+        raise BadRecord(f"more than {MOST_SEGMENTS} names", place=place, fix=fix)
+    for name in names:
+        if not name.strip():
+            raise BadRecord("empty", place=place, fix="Name it: rest, prbs, ramp, validate…")
+        if len(name) > LONGEST_NAME:
+            fix = f"A segment's name has at most {LONGEST_NAME}."
+            raise BadRecord(f"a name of {len(name)} characters", place=place, fix=fix)
+        if not name.isprintable():
+            raise BadRecord("a name that cannot be printed", place=place, fix="Use letters, digits, - and _.")
 
 
 def check_span(time_s: np.ndarray, place: str) -> None:

@@ -1,6 +1,7 @@
-"""A record from a table of text, as the rig or another tool wrote it (docs/recording.md).
+"""A table of text, as the rig or another tool wrote it (docs/recording.md).
 
-It is read in blocks of rows, so that memory follows the numbers it holds and not what else is in the file."""
+Numbers are read by `numpy.loadtxt`, line by line, so that memory follows the numbers and not what else is in the file;
+the layout is found, and each cell that cannot be taken is named, here."""
 
 from __future__ import annotations
 
@@ -9,20 +10,18 @@ import csv
 import io
 import re
 from array import array
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
-from itertools import chain, islice
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds, columns, join
-from stimrig.identify.records.assemble import record_of
 from stimrig.identify.records.cells import as_written, is_number
 from stimrig.identify.records.columns import Column, ColumnMap
-from stimrig.identify.records.file_content import PULSE_RATE_HZ, FileContent, file_source
-from stimrig.identify.records.record import Record
+from stimrig.identify.records.table import Table
 
 LONGEST_LINE = 10_000
 """Characters; no row of numbers has as many."""
@@ -31,13 +30,18 @@ MOST_BEFORE = 100
 BLANKS = " "
 SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs", "|": "bars", BLANKS: "blanks"}
 COMMENTS = ("#", "%", "//")
+PLAIN = "0123456789+-."
+"""With what a row of numbers begins."""
 PACKED = {
     b"\x1f\x8b": ("packed with gzip", "Unpack it with gunzip first."),
     b"PK\x03\x04": ("an Excel workbook or a ZIP archive", "Save the sheet as CSV text, or unpack the archive."),
     b"\xd0\xcf\x11\xe0": ("an old Excel workbook", "Save the sheet as CSV text."),
 }
 """First bytes of tables that are not text, with the kind of file and the fix."""
-Row = tuple[int, list[str]]
+MISSING = {"", "nan", "na", "n/a", "n.a.", "#n/a", "#nv", "null", "none", "-", "--"}
+"""Texts that tools write where they have no number."""
+CLOCK = re.compile(r"\d+[-/.:]\d+[-/.:]\d+")
+CUT = "Every row needs every column; was the file cut off?"
 
 
 def encoding_of(content: bytes, name: str) -> tuple[str, str]:
@@ -57,19 +61,12 @@ def encoding_of(content: bytes, name: str) -> tuple[str, str]:
                 return codec, "read as UTF-16 text"
         place = f"{name}, line {content.count(10, 0, content.index(0)) + 1}"
         raise BadRecord("not text (a zero byte)", place=place, fix="Save the file as CSV text.")
-    if content.isascii() or _is_utf8(content):
-        return "utf-8-sig", ""
-    return "cp1252", "not UTF-8: read as Windows-1252 (Latin-1) text"
-
-
-def _is_utf8(content: bytes) -> bool:
-    pieces = (content[start : start + bounds.PIECE_BYTES] for start in range(0, len(content), bounds.PIECE_BYTES))
     try:
-        for _ in codecs.iterdecode(pieces, "utf-8"):
+        for _ in codecs.iterdecode(iter(partial(io.BytesIO(content).read, bounds.PIECE_BYTES), b""), "utf-8"):
             pass
     except UnicodeDecodeError:
-        return False
-    return True
+        return "cp1252", "not UTF-8: read as Windows-1252 (Latin-1) text"
+    return "utf-8-sig", ""
 
 
 def text_lines(content: bytes, encoding: str, name: str) -> Iterator[str]:
@@ -92,51 +89,186 @@ def text_lines(content: bytes, encoding: str, name: str) -> Iterator[str]:
         raise BadRecord("not text", place=f"{name}, line {number + 1}", fix="Save the file as UTF-8 CSV.") from None
 
 
-@dataclass
-class Layout:
-    """Separator and header of a table, and its rows from the first one with numbers."""
+class _Text:
+    """A table of text. Making it finds encoding, separator, header and row of units; then its rows are read.
 
-    separator: str
-    header: list[str]
-    line: int
-    rows: Iterator[Row]
-    units: list[str] = field(default_factory=list)
-
-
-def find_layout(content: bytes, encoding: str, column_map: ColumnMap, name: str) -> Layout:
-    """Find header and separator among the first lines.
-
-    Raises BadRecord: no line names the columns that a record needs, or the rows do not stand under it.
+    Raises BadRecord: no text, or no line among the first names the columns that a record needs.
     """
-    source = text_lines(content, encoding, name)
-    before: list[str] = []
-    closest: tuple[float, int, list[str]] = (0.0, 1, [])
-    for number, line in enumerate(islice(source, MOST_BEFORE + 1), start=1):
-        before.append(line)
-        for separator in SEPARATORS:
-            cells = _cells(line, separator)
-            indices_of = columns.places(cells, column_map)
-            if number <= MOST_BEFORE and len(cells) >= len(columns.NEEDED) and columns.complete(indices_of):
-                if not _numbered(column_map):
-                    rows = _rows(source, separator, number + 1, name)
-                    return _below(Layout(separator, cells, number, rows), content, name)
-                if all(is_number(cells[indices_of[target][0]].replace(",", ".")) for target in columns.NEEDED):
-                    return Layout(separator, cells, 0, _rows(chain([line], source), separator, number, name))
-            score = len(indices_of) + (0.5 if sum(map(_is_word, cells)) >= 3 else 0)
-            if score > closest[0]:
-                closest = (score, number, cells)
-    raise _no_header(before, closest[1], closest[2], column_map, name)
+
+    def __init__(self, content: bytes, name: str, column_map: ColumnMap) -> None:
+        self.content, self.name = content, name
+        self.encoding, self.encoded = encoding_of(content, name)
+        self.lines = array("L")
+        """The line of each row, once it is read."""
+        self.segment_names: list[str] = []
+        self.segment_codes: dict[str, int] = {}
+        """The code of each segment's name, by the cells that hold it."""
+        self.decimal = ""
+        """The decimal sign, once one was met in a number that is not written plainly."""
+        self.separator, self.header, self.line, self.skipped = self._find_header(column_map)
+        self.units: list[str] = []
+        first = self.cells(next(self.rows(), ""))
+        known = {unit for units in columns.UNITS.values() for unit in units}
+        if any(columns.plain_unit(cell) in known for cell in first) and not any(map(is_number, first)):
+            self.units, self.skipped = first, self.lines[0]
+
+    def _find_header(self, column_map: ColumnMap) -> tuple[str, list[str], int, int]:
+        """Separator, names, their line (0 where columns are chosen by number), and the lines before the rows."""
+        before: list[str] = []
+        best: tuple[float, int, list[str]] = (0.0, 1, [])
+        by_number = all(column_map.get(target, "").startswith("#") for target in columns.NEEDED)
+        for number, line in islice(self._numbered_lines(), MOST_BEFORE):
+            before.append(line)
+            for separator in SEPARATORS:
+                cells = _header_cells(line, separator)
+                indices_of = columns.places(cells, column_map)
+                if len(cells) >= len(columns.NEEDED) and columns.complete(indices_of):
+                    if not by_number:
+                        return separator, cells, number, number
+                    if all(_looks_like_number(cells[indices_of[target][0]]) for target in columns.NEEDED):
+                        return separator, cells, 0, number - 1
+                words = sum(bool(cell) and not _looks_like_number(cell) for cell in cells)
+                if (score := len(indices_of) + 0.5 * (words >= 3)) > best[0]:
+                    best = score, number, cells
+        _, number, cells = best
+        if cells:
+            columns.columns(cells, column_map, [], f"{self.name}, line {number}")  # says which column is missing
+            fix = "Put one line with the columns' names before the numbers, or name each column with --map."
+            raise self.bad("no numbers follow the header", fix, number)
+        fix = "The first line must be time_s,pulse_width_us,torque_nm,segment, or name your columns with --map."
+        is_filled = any(line.strip("\ufeff \t\r\n") for line in before)
+        if is_filled and is_number(re.split(r"[,;|\s]+", before[0].strip())[0]):
+            fix = "Say which column is which: --map time_s=#1:s --map pulse_width_us=#2:µs --map torque_nm=#3:Nm."
+        raise self.bad("no header" if is_filled else "empty", fix, 1)
+
+    def _numbered_lines(self) -> Iterator[tuple[int, str]]:
+        return enumerate(text_lines(self.content, self.encoding, self.name), start=1)
+
+    def bad(self, message: str, fix: str, line: int = 0, column: str = "") -> BadRecord:
+        """The error at a line; without one at the row that was read last."""
+        place = f"{self.name}, line {line or self.lines[-1]}" + (f", column {column}" if column else "")
+        return BadRecord(message, place=place, fix=fix)
+
+    def cells(self, row: str) -> list[str]:
+        """The cells of a row."""
+        return row.split() if self.separator == BLANKS else next(csv.reader([row], delimiter=self.separator), [])
+
+    def rows(self) -> Iterator[str]:
+        """Rows with numbers, and their lines into `lines`; comments and empty rows are passed over.
+
+        Raises BadRecord: a row has more cells than the header has names, so it is not known which cell is which.
+        """
+        self.lines = array("L")
+        source, nothing, width = self._numbered_lines(), f"{self.separator} \t\r\n", len(self.header)
+        for number, row in islice(source, self.skipped, None):
+            if row[0] not in PLAIN or '"' in row or row.count(self.separator) >= width:
+                while row.count('"') % 2 and (more := next(source, None)):  # a cell of several lines
+                    row += more[1]
+                    if len(row) > LONGEST_LINE:
+                        raise self.bad(f"more than {LONGEST_LINE} characters", "Is a quote not closed?", number)
+                if not row.strip(nothing) or row.lstrip().startswith(COMMENTS):
+                    continue
+                self._check_width(row, number, least=1)
+            self.lines.append(number)
+            yield row
+
+    def _check_width(self, row: str, number: int, least: int) -> None:
+        used = max((index for index, cell in enumerate(self.cells(row), start=1) if cell.strip()), default=0)
+        width = len(self.header)
+        if least <= used <= width:
+            return
+        fix = "Name every column."
+        if used < width:
+            fix = f"The header is separated by {SEPARATORS[self.separator]}: separate the rows alike."
+        elif self.separator == ",":
+            fix = "Name every column; with decimal commas, separate the cells with semicolons."
+        raise self.bad(f"{used} {'cell' if used == 1 else 'cells'} under a header of {width}", fix, number)
+
+    def numbers(self, known: Mapping[str, Column]) -> dict[str, np.ndarray]:
+        """The known columns, each in its own unit, NaN where there is no number; the code of each row's segment.
+
+        Numbers are read as they are. Only where that fails they are read cell by cell: decimal commas, signs for no
+        number, and the cell that is neither. Raises BadRecord: with line and column.
+        """
+        first = next(self.rows(), None)
+        if first is None:
+            raise self.bad("no row under the header", "Give a few seconds of data.", self.skipped + 1)
+        self._check_width(first, self.lines[0], least=len(self.header) if self.separator == BLANKS else 2)
+        try:
+            return self._load(known, by_cell=("segment", "pulse_rate_hz"))
+        except ValueError:
+            pass
+        try:
+            return self._load(known, by_cell=tuple(known))
+        except ValueError as error:
+            if isinstance(error.__cause__, BadRecord):
+                raise error.__cause__ from None
+            last = next(row for number, row in self._numbered_lines() if number == self.lines[-1])
+            width = len(self.cells(last))
+            short = next((target for target, column in known.items() if column.index >= width), "")
+            raise self.bad(f"only {width} cells", CUT, column=short) from error
+
+    def _load(self, known: Mapping[str, Column], by_cell: tuple[str, ...]) -> dict[str, np.ndarray]:
+        self.segment_names, self.segment_codes = [], {}
+        converters: dict[int | str, Callable[[str], float]] = {
+            known[target].index: self._code if target == "segment" else partial(self._number, target)
+            for target in by_cell
+            if target in known
+        }
+        values = np.loadtxt(
+            self.rows(),
+            delimiter=None if self.separator == BLANKS else self.separator,
+            comments=None,
+            quotechar='"',
+            usecols=[column.index for column in known.values()],
+            converters=converters,
+            ndmin=2,
+        )
+        return dict(zip(known, values.T.copy(), strict=True))
+
+    def _code(self, cell: str) -> int:
+        """The code of a segment's name."""
+        code = self.segment_codes.get(cell)
+        if code is None:
+            name = as_written(cell.strip())
+            if name not in self.segment_names:
+                self.segment_names.append(name)
+                bounds.check_names(self.segment_names, f"{self.name}, line {self.lines[-1]}, column segment")
+            code = self.segment_codes[cell] = self.segment_names.index(name)
+        return code
+
+    def _number(self, column: str, cell: str) -> float:
+        """The number in a cell."""
+        text = cell.strip()
+        if text.lower() in MISSING:
+            return np.nan
+        fix = "Write all numbers with a decimal point, without signs between thousands."
+        for sign in (sign for sign in ",." if sign in text):
+            if sign == self.separator or self.decimal not in ("", sign):
+                after = f"after numbers with a decimal {'comma' if sign == '.' else 'point'}"
+                message = f"{columns.short(text)!r} {after if self.decimal else 'between separating commas'}"
+                raise self.bad(message, fix, column=column)
+            self.decimal = sign
+        if is_number(text := text.replace(",", ".")):
+            return float(text)
+        if CLOCK.search(text):
+            fix = "Times of a calendar or of a clock are not read: give seconds in a column."
+        raise self.bad(f"{columns.short(cell.strip())!r} is no number", fix, column=column)
+
+    def part_cells(self, part: np.ndarray) -> dict[int, dict[str, str]]:
+        """Of a joined record: the cells that describe each part, by the row that it begins with."""
+        firsts = np.flatnonzero(np.diff(part, prepend=np.nan))
+        if firsts.size > bounds.MOST_PARTS:
+            raise self.bad("too many parts", f"At most {bounds.MOST_PARTS} in one record.", self.lines[firsts[-1]])
+        row_of = {self.lines[row]: row for row in firsts.tolist()}
+        lines = ((row_of[number], self.cells(line)) for number, line in self._numbered_lines() if number in row_of)
+        return {row: dict(zip(self.header, map(as_written, cells), strict=False)) for row, cells in lines}
 
 
-def _numbered(column_map: ColumnMap) -> bool:
-    """Return true if all needed columns are chosen by number, so that no header is needed."""
-    return all(target in column_map and column_map[target].name.startswith("#") for target in columns.NEEDED)
-
-
-def _cells(line: str, separator: str) -> list[str]:
+def _header_cells(line: str, separator: str) -> list[str]:
     text = line.strip().lstrip("#%").strip() if line.lstrip()[:1] in ("#", "%") else line.strip("\r\n")
     if separator == BLANKS:
-        return re.sub(r"[ \t]+([\[(][^\[\]()]{0,40}[\])])", r"\1", text[:LONGEST_LINE]).split()
+        return re.sub(r"[ \t]+([\[(][^\[\]()]{0,40}[\])])", r"\1", text).split()
     if separator not in text:
         return []
     try:
@@ -145,268 +277,32 @@ def _cells(line: str, separator: str) -> list[str]:
         return []
 
 
-def _rows(source: Iterable[str], separator: str, first_line: int, name: str) -> Iterator[Row]:
-    """Rows with the number of their line; empty lines are passed over."""
-    if separator == BLANKS:
-        yield from ((number, cells) for number, line in enumerate(source, first_line) if (cells := line.split()))
-        return
-    reader = csv.reader(source, delimiter=separator)
-    before = first_line - 1
-    try:
-        for row in reader:
-            if row:
-                yield before + reader.line_num, row
-    except csv.Error as error:
-        place = f"{name}, line {before + reader.line_num}"
-        raise BadRecord(f"not CSV ({error})", place=place, fix="Save the file as comma-separated text.") from error
+def _looks_like_number(cell: str) -> bool:
+    return is_number(cell.replace(",", "."))
 
 
-def _below(layout: Layout, content: bytes, name: str) -> Layout:
-    """With the row of units below the header, if there is one, taken off the rows, and comments left out."""
-    double = 2 * layout.separator
-    if any(f"\n{sign}".encode() in content for sign in (*COMMENTS, double)) or b"\0" in content:
-        layout.rows = ((line, row) for line, row in layout.rows if not _is_aside(row))
-    layout.rows = _no_wider(layout, layout.rows, name)
-    first = next(layout.rows, None)
-    if first is None:
-        return layout
-    line, row = first
-    filled = [cell.strip() for cell in row if cell.strip()]
-    known = {unit for target in columns.UNITS for unit in columns.UNITS[target]}
-    if any(columns.plain_unit(cell) in known for cell in filled) and not any(is_number(cell) for cell in filled):
-        layout.units = row
-        return layout
-    _check_width(layout, line, row, name)
-    layout.rows = chain([first], layout.rows)
-    return layout
+def read_csv(content: bytes, path: Path, column_map: ColumnMap) -> Table:
+    """Read a table of text from its bytes; `path` names it in messages, `column_map` is the parsed `--map`.
 
-
-def _is_aside(row: list[str]) -> bool:
-    """Return true for a comment or an empty row."""
-    return row[0].lstrip().startswith(COMMENTS) or not any(cell.strip() for cell in row)
-
-
-def _no_wider(layout: Layout, rows: Iterator[Row], name: str) -> Iterator[Row]:
-    """The rows; one further down with more cells than the header is refused as the first one is."""
-    width = len(layout.header)
-    for line, row in rows:
-        if len(row) > width and any(cell.strip() for cell in row[width:]):
-            _check_width(layout, line, row, name)
-        yield line, row
-
-
-def _check_width(layout: Layout, line: int, row: list[str], name: str) -> None:
-    """Refuse rows that have more cells than the header has names: it is not known which cell is which."""
-    used = max((index for index, cell in enumerate(row, start=1) if cell.strip()), default=0)
-    if used == len(layout.header) or (used < len(layout.header) and used > 1 and layout.separator != BLANKS):
-        return
-    fix = "Name every column."
-    if used < len(layout.header):
-        fix = f"The header is separated by {SEPARATORS[layout.separator]}: separate the rows alike."
-    elif layout.separator == ",":
-        fix = "Name every column; with decimal commas, separate the cells with semicolons."
-    message = f"{used} {'cell' if used == 1 else 'cells'} under a header of {len(layout.header)}"
-    raise BadRecord(message, place=f"{name}, line {line}", fix=fix)
-
-
-def _no_header(before: list[str], number: int, cells: list[str], column_map: ColumnMap, name: str) -> BadRecord:
-    """Describe what the line that is most like a header lacks."""
-    fix = "The first line must be time_s,pulse_width_us,torque_nm,segment, or name your columns with --map."
-    if not cells:
-        filled = any(line.strip("\ufeff \t\r\n") for line in before)
-        if filled and any(is_number(cell) for cell in re.split(r"[,;|\s]+", before[0].strip())[:1]):
-            fix = "Say which column is which: --map time_s=#1:s --map pulse_width_us=#2:µs --map torque_nm=#3:Nm."
-        return BadRecord("no header" if filled else "empty", place=f"{name}, line 1", fix=fix)
-    try:
-        columns.columns(cells, column_map, [], f"{name}, line {number}")
-    except BadRecord as error:
-        return error
-    fix = "Put one line with the columns' names before the numbers, or name each column with --map."
-    return BadRecord("no numbers follow the header", place=f"{name}, line {number}", fix=fix)
-
-
-def _is_word(cell: str) -> bool:
-    return bool(cell) and not is_number(cell.replace(",", "."))
-
-
-BLOCK = 4096
-CUT = "Every row needs every column; was the file cut off?"
-MISSING = {"", "nan", "na", "n/a", "n.a.", "#n/a", "#nv", "null", "none", "-", "--"}
-"""Texts that tools write where they have no number."""
-
-
-class Table:
-    """Contents of the rows: numbers by column, segments by name, and each row's line.
-
-    `name`: how messages call the file. `columns`: where each column stands, and its factor; a `segment` may be missing.
-    `cells`: where the cells stand that describe a part; empty where the file has none. `commas`: whether numbers may
-    have decimal commas: not where commas separate the cells.
+    Raises BadRecord: with file, line, column and fix.
     """
-
-    def __init__(self, name: str, columns: Mapping[str, Column], cells: Mapping[str, int], commas: bool) -> None:
-        self.name, self.columns, self.cells, self.commas = name, columns, cells, commas
-        self.lines = array("L")
-        self.segment = array("L")
-        self.names: dict[str, int] = {}
-        self.numbers = {column: array("d") for column in columns if column != "segment"}
-        self.parts: dict[int, dict[str, str]] = {}
-        """Cells that describe a part, by the row that it begins with."""
-        self.decimal = ""
-        """The decimal sign, once one was met."""
-
-    def fill(self, rows: Iterable[Row]) -> None:
-        """Take all rows in. Raises BadRecord: with file, line and column."""
-        source = iter(rows)
-        while block := list(islice(source, BLOCK)):
-            for column, values in self.numbers.items():
-                values.extend(self._column(block, column))
-            if self.cells:
-                self._take_parts(block)
-            if "segment" in self.columns:
-                self._take_segments(block)
-            self.lines.extend(line for line, _ in block)
-
-    def _take_segments(self, rows: list[Row]) -> None:
-        at = self.columns["segment"].index
-        for line, row in rows:
-            if len(row) <= at:
-                raise self._short(row, line, "segment")
-            text = as_written(row[at].strip())
-            code = self.names.get(text)
-            self.segment.append(self._new_name(text, line) if code is None else code)
-
-    def _take_parts(self, rows: list[Row]) -> None:
-        """Keep the cells of each row with which a part begins."""
-        before = len(self.lines)
-        number = np.array(self.numbers["part"][max(before - 1, 0) :])
-        firsts = np.flatnonzero(np.diff(number)) + (0 if before else 1)
-        for index in firsts.tolist() if before else [0, *firsts.tolist()]:
-            line, row = rows[index]
-            if len(row) <= max(self.cells.values()):
-                raise self._short(row, line, "pause_s")
-            self.parts[before + index] = {column: as_written(row[at].strip()) for column, at in self.cells.items()}
-            if len(self.parts) > bounds.MOST_PARTS:
-                fix = f"At most {bounds.MOST_PARTS} in one record."
-                raise BadRecord("too many parts", place=self.at(line, "part"), fix=fix)
-
-    def _column(self, rows: list[Row], column: str) -> np.ndarray:
-        """The numbers of a column in its own unit; NaN where the file has none."""
-        source = self.columns[column]
-        try:
-            cells = [row[source.index] for _, row in rows]
-        except IndexError:
-            line, row = next((line, row) for line, row in rows if len(row) <= source.index)
-            raise self._short(row, line, column) from None
-        text = "".join(cells)
-        lines = [line for line, _ in rows]
-        self._settle_decimal(text, cells, column, lines)
-        if self.decimal == ",":
-            cells, text = [cell.replace(",", ".") for cell in cells], text.replace(",", ".")
-        try:
-            values = np.array([float(cell) for cell in cells])
-        except ValueError:
-            values = np.array([self._number(cell, column, line) for cell, line in zip(cells, lines, strict=True)])
-        # Python's float also takes digits of other scripts and underscores, which no measuring tool writes.
-        if not text.isascii() or "_" in text:
-            for cell, line in zip(cells, lines, strict=True):
-                self._number(cell, column, line)
-        if source.factor != 1.0:
-            values *= source.factor
-        if (bad := bounds.wrong_rows(column, values)).size:
-            cell_text = columns.short(cells[bad[0]].strip())
-            fix = "Remove the row's cause, or cut the record before it; values must be finite."
-            fix = bounds.fix_of(column, values[bad], fix)
-            message = f"{cell_text} is no measurement" if cell_text else "empty"
-            raise BadRecord(message, place=self.at(lines[bad[0]], column), fix=fix)
-        return values
-
-    def _settle_decimal(self, text: str, cells: list[str], column: str, lines: list[int]) -> None:
-        """One decimal sign for the whole file."""
-        for sign in ",.":
-            if sign not in text:
-                continue
-            if (self.commas or sign == ".") and self.decimal in ("", sign):
-                self.decimal = sign
-                continue
-            cell, line = next(pair for pair in zip(cells, lines, strict=True) if sign in pair[0])
-            other = f"after numbers with a decimal {'comma' if sign == '.' else 'point'}"
-            message = f"{columns.short(cell)!r} {other if self.decimal else 'between separating commas'}"
-            fix = "Write all numbers with a decimal point, without signs between thousands."
-            raise BadRecord(message, place=self.at(line, column), fix=fix)
-
-    def _number(self, cell: str, column: str, line: int) -> float:
-        """One number; NaN where the tool says that it has none."""
-        if cell.strip().lower() in MISSING:
-            return np.nan
-        if is_number(cell):
-            return float(cell)
-        fix = "Give a number with a decimal point, without signs between thousands."
-        raise BadRecord(f"{columns.short(cell)!r} is no number", place=self.at(line, column), fix=fix)
-
-    def _new_name(self, text: str, line: int) -> int:
-        bounds.check_name(text, self.at(line, "segment"))
-        if len(self.names) == bounds.MOST_SEGMENTS:
-            fix = "Name segments by what they are (rest, prbs…), not each row."
-            raise BadRecord(f"more than {bounds.MOST_SEGMENTS} names", place=self.at(line, "segment"), fix=fix)
-        return self.names.setdefault(text, len(self.names))
-
-    def _short(self, row: list[str], line: int, column: str) -> BadRecord:
-        return BadRecord(f"only {len(row)} cells", place=self.at(line, column), fix=CUT)
-
-    def at(self, line: int, column: str) -> str:
-        """Name a cell in messages."""
-        return f"{self.name}, line {line}, column {column}"
-
-
-def read_csv(content: bytes, path: Path, pulse_rate_hz: float | None, column_map: ColumnMap) -> Record:
-    """Read a record from the bytes of a table; `path` names it in messages, `column_map` is the parsed `--map`.
-
-    The pulse rate is 40 Hz unless the file or the caller gives another. Raises BadRecord: with file, line, column
-    and fix.
-    """
-    name = str(path)
-    encoding, encoded = encoding_of(content, name)
-    layout = find_layout(content, encoding, column_map, name)
-    known = columns.columns(layout.header, column_map, layout.units, f"{name}, line {layout.line}")
-    cells = _cells_of_parts(layout.header, known, f"{name}, line {layout.line}")
-    table = Table(name, known, cells, commas=layout.separator != ",")
-    table.fill(layout.rows)
-    if not table.lines:
-        place = f"{name}, line {layout.line + 1}"
-        raise BadRecord("no row under the header", place=place, fix="Give a few seconds of data.")
-    numbers = {column: np.array(values) for column, values in table.numbers.items()}
-    if "segment" in known:
-        numbers["segment"] = np.array(table.segment)
-    file = FileContent(
-        columns=numbers,
-        names=list(table.names),
-        name=name,
-        cell=lambda row, column: f"line {table.lines[row]}, column {column}",
-        source=file_source(content, path, known, encoded, _written(layout, table)),
-        pulse_rate_hz=pulse_rate_hz or PULSE_RATE_HZ,
+    text = _Text(content, str(path), column_map)
+    known = columns.columns(text.header, column_map, text.units, f"{path}, line {text.line}")
+    is_joined = {"part", "segment", *join.CELLS} <= set(text.header)
+    if is_joined:
+        known["part"] = Column(text.header.index("part"))
+    numbers = text.numbers(known)
+    written = [f"{SEPARATORS[text.separator]} between cells"] if text.separator != "," else []
+    written += ["decimal commas"] if text.decimal == "," else []
+    if text.line != 1:
+        written.append(f"header in line {text.line}" if text.line else "no header")
+    return Table.of(
+        content,
+        path,
+        known,
+        numbers,
+        segment_names=text.segment_names,
+        cell=lambda row, column: f"line {text.lines[row]}, column {column}",
+        notes=(text.encoded, ", ".join(written)),
+        part_cells=text.part_cells(numbers["part"]) if is_joined else {},
     )
-    return join.read_joined(file, table.parts, pulse_rate_hz) if cells else record_of(file)
-
-
-def _written(layout: Layout, table: Table) -> str:
-    """Describe the assumptions on how the table is written."""
-    written = []
-    if layout.separator != ",":
-        written.append(f"{SEPARATORS[layout.separator]} between cells")
-    if table.decimal == ",":
-        written.append("decimal commas")
-    if layout.line != 1:
-        written.append(f"header in line {layout.line}" if layout.line else "no header")
-    return ", ".join(written)
-
-
-def _cells_of_parts(header: list[str], known: dict[str, Column], place: str) -> dict[str, int]:
-    """Where a joined record describes its parts; `part` joins the known columns then."""
-    header = [cell.strip() for cell in header]
-    # One of them alone is a column of somebody else's.
-    if not {"part", "pause_s", "segment"} <= set(header):
-        return {}
-    if twice := [column for column in ("part", *join.CELLS) if header.count(column) > 1]:
-        raise BadRecord(f"column {twice[0]} is there twice", place=place, fix="Keep one of them.")
-    known["part"] = Column(header.index("part"))
-    return {column: header.index(column) for column in join.CELLS if column in header}

@@ -138,8 +138,7 @@ def _segments(file: StrictFile, time_s: np.ndarray) -> tuple[np.ndarray, list[st
         raise file.bad("names, starts and ends differ in number", "/segments")
     if not ((np.diff(starts) >= 0).all() and (ends >= starts).all()):
         raise file.bad("segments do not follow one another", "/segments")
-    for index, text in enumerate(names):
-        bounds.check_name(text, f"{file.name}, /segments/name, segment {index}")
+    bounds.check_names(names, f"{file.name}, /segments/name")
     if not names:
         return np.full(time_s.size, -1), names
     order = np.searchsorted(starts, time_s, side="right") - 1

@@ -271,11 +271,11 @@ def csv_of(path: Path, changes: dict[int, tuple[str, str]] | None = None) -> Pat
 @pytest.mark.parametrize(
     ("cells", "says"),
     [
-        (("soon", "0"), r"line 7, column late_s: 'soon' is no number\. Give"),
+        (("soon", "0"), r"line 7, column late_s: 'soon' is no number\. Write"),
         (("12", "0"), r"line 7, column late_s: 12 is no measurement"),
-        (("nan", "0"), r"line 7, column late_s: nan is no measurement"),
+        (("nan", "0"), r"line 7, column late_s: no number"),
         (("0", "0.5"), r"line 7, column doubted: 0\.5 is neither 0 nor 1\. 1 is"),
-        (("0", ""), r"line 7, column doubted: empty"),
+        (("0", ""), r"line 7, column doubted: no number"),
     ],
 )
 def test_bad_csv_columns_are_one_line(tmp_path, cells, says):

@@ -292,14 +292,14 @@ def test_column_part_of_somebody_else_is_passed_over(tmp_path):
     ("column", "value", "says"),
     [
         ("part", "2", "part 1 begins"),
-        ("pause_s", "", "empty"),
+        ("pause_s", "", "'' is not 0 to 86400"),
         ("pause_s", "nan", "is not 0 to 86400"),
         ("folded_s", "4000", "is not 0 to"),
         ("folded_s", "29", "longer than the jump"),
         ("begun_s", "yesterday", "is not 0 to"),
         ("pulse_rate_hz", "30", "different pulse rates"),
         ("recording_id", "x" * 400, "cannot be"),
-        ("time_s", "0", "does not rise"),
+        ("time_s", "0", "time runs backwards"),
     ],
 )
 def test_file_with_wrong_parts_is_refused(tmp_path, column, value, says):

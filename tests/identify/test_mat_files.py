@@ -66,10 +66,14 @@ def ways(record: Record) -> dict[str, tuple[dict[str, Any], dict[str, str] | Non
             {"d": own | {"part": rows}},
             {"time_s": "d.t:ms", "pulse_width_us": "pw:s", "torque_nm": "d.M:mNm", "segment": "d.part"}, {},
         ),
+        "fields of any depth": (
+            {"d": {"t": own["t"], "stim": {"pw": own["pw"]}}, "M": own["M"], "part": rows},
+            {"time_s": "d.t:ms", "pulse_width_us": "d.stim.pw:s", "torque_nm": "M:mNm", "segment": "part"}, {},
+        ),
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("way", range(5))
+@pytest.mark.parametrize("way", range(6))
 def test_the_same_data_give_the_same_record(tmp_path: Path, record: Record, way: int) -> None:
     content, given, how = list(ways(record).values())[way]
     found = identify.read(saved(tmp_path / "data.mat", content, **how), map=given)
@@ -124,7 +128,7 @@ def test_a_model_and_its_prediction_open_in_other_tools(tmp_path: Path, record: 
     ("change", "says"),
     [
         ({"torque_nm": np.ones((40, 40))}, r"torque_nm: 40×40 numbers\. Give one row or column"),
-        ({"torque_nm": np.ones(7)}, r"torque_nm: 7 numbers, and time_s has 1600\. Give one for each sample"),
+        ({"torque_nm": np.ones(7)}, r"torque_nm: 7 numbers for 1600 samples\. Give one for each sample"),
         ({"torque_nm": np.ones(1600) * 1j}, r"torque_nm: complex numbers"),
         ({"torque_nm": "strong"}, r"torque_nm: no numbers\. Turn it into plain numbers"),
         ({"segment": np.array(["a", 3.0], object)}, r"segment: a cell array with something in it\. Give texts only"),

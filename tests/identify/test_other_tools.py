@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
@@ -332,7 +333,7 @@ HEAD = "time_s,pulse_width_us,torque_nm"
     ("header", "given", "says"),
     [
         ("Time,PW,Torque", (), "line 1: column 'Time' is taken for time_s, but its unit is not said. "
-         r"Give --map time_s=Time:s \(or ms, µs\)\.$"),
+         r"Give --map time_s=Time:s \(or ms, µs, ns, d\)\.$"),
         ("time_s,PW [V],torque_nm", (), r"'PW \[V\]' is taken for pulse_width_us, but its unit 'V' is not known"),
         ("time_s,pulse_width_us,Kraft", (), r"no column torque_nm\. Say which it is, for instance "
          "--map torque_nm=NAME:Nm; it has: time_s, pulse_width_us, Kraft"),
@@ -354,6 +355,63 @@ def test_what_is_not_known_is_asked_for_in_one_line(tmp_path: Path, header: str,
     with pytest.raises(BadRecord, match=says) as caught:
         read(path, map=given)
     assert "\n" not in str(caught.value)
+
+
+ALL = cells()
+UNSAID = {
+    "a pulse rate in a column": (table([[*row, "25"] for row in ALL], (*HEADER, "pulse_rate_hz")), (), ""),
+    "days": (
+        table([[f"{46158.5 + at / 86400:.12f}", *row[1:]] for at, row in zip(TIME_S, ALL, strict=True)]),
+        ("time_s=time_s:d",),
+        "",
+    ),
+    "a clock": (
+        table([[f"20:56:{row[0]}", *row[1:]] for row in ALL]),
+        (),
+        "line 2, column time_s: '20:56:0.0000' is no number. Times of a calendar or of a clock are not read",
+    ),
+    "two pulse rates": (
+        table([[*row, str(25 + k // 300)] for k, row in enumerate(ALL)], (*HEADER, "pulse_rate_hz")),
+        (),
+        "pulse_rate_hz: different pulse rates",
+    ),
+    "a name against its unit": (
+        table([["s", "us", "mNm", ""], *ALL], ("Time (s)", "PW (us)", "Torque (Nm)", "segment")),
+        (),
+        "says 'Nm', the row below it 'mNm'",
+    ),
+    "widths where they change": (
+        table([[row[0], "" if k % 4 else row[1], *row[2:]] for k, row in enumerate(ALL)]),
+        (),
+        "Fill the width down",
+    ),
+    "widths at the pulses": (
+        table([[f"{k / 200:.3f}", "0" if k % 5 else ALL[k // 20][1], "1", "prbs"] for k in range(1500)]),
+        (),
+        "only in the samples of the pulses. Hold each width",
+    ),
+    "points between thousands": (
+        table(
+            [[f"{10 * k}", "9", f"{991 + k % 5 * 5:,}".replace(",", ".")] for k in range(99)], (*MS[:2], "M [mNm]"), ";"
+        ),
+        ("torque_nm=M",),
+        "line 4, column torque_nm: 1.001 among whole",
+    ),
+}
+"""What files leave unsaid or say strangely; `--map`; and what is wrong, empty for what is read."""
+
+
+@pytest.mark.parametrize("what", UNSAID)
+def test_what_files_leave_unsaid_is_read_or_refused_with_a_way_out(tmp_path: Path, what: str) -> None:
+    content, given, says = UNSAID[what]
+    path = saved(tmp_path, content)
+    if says:
+        with pytest.raises(BadRecord, match=re.escape(says)):
+            read(path, map=given)
+        return
+    record = read(path, map=given)
+    np.testing.assert_allclose(record.time_s - record.time_s[0], TIME_S, atol=2e-6)
+    assert record.pulse_rate_hz == (25.0 if "rate" in what else 40.0)
 
 
 def test_a_unit_that_contradicts_the_header_is_said(tmp_path: Path) -> None:

@@ -52,6 +52,12 @@ def test_another_tools_table_is_read_by_names_units_and_map(tmp_path: Path) -> N
     assert any("mNm" in note for note in record.notes) and any("no segment column" in note for note in record.notes)
 
 
+def test_timestamps_are_read(tmp_path: Path) -> None:
+    stamps = pa.array((1_700_000_000_000 + 10 * np.arange(N)).tolist(), pa.timestamp("ms"))
+    record = identify.read(written(tmp_path, OURS | {"time_s": stamps}))
+    assert record.time_s == pytest.approx(TIME_S, abs=1e-6)
+
+
 def cut(length: int) -> Callable[[Path], None]:
     return lambda path: path.write_bytes(path.read_bytes()[:length])
 
