@@ -9,11 +9,12 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim import options as command_line
+from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.emulator import Emulator
 from stimrig.hardware_sim.errors import FaultError, HardwareSimError
 from stimrig.hardware_sim.factory import HIDDEN, make_devices
@@ -34,51 +35,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
             return 0
         patient = options.patient if options.hidden is None else f"{HIDDEN}{options.hidden}"
         settings = command_line.settings(options, patient)
-        emulator = Emulator(make_devices(settings, options.arm, options.arm_law, epoch_us=time.time_ns() // 1000))
+        _run(make_devices(settings, options.arm, options.arm_law, epoch_us=time.time_ns() // 1000), options)
     except HardwareSimError as error:
         print(f"{PROG}: {error}", file=sys.stderr)
         return 2
-    try:
-        for text in options.fault:
-            emulator.devices.faults.on(*_fault(text))
-        return _run(emulator, options)
-    except FaultError as error:
-        print(f"{PROG}: {error}", file=sys.stderr)
-        return 2
-    finally:
-        emulator.close()
-
-
-def _run(emulator: Emulator, options: argparse.Namespace) -> int:
-    signals: list[int] = []
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda caught, _frame: signals.append(caught))
-    # before the ready line, since a parent may die as soon as it has read it
-    orphaned = _orphan_watch() if options.die_with_parent else lambda: False
-    ready = emulator.ready()
-    if options.no_json:
-        print(*(f"{key}: {value}" for key, value in ready.items()), sep="\n", flush=True)
-    else:
-        print(json.dumps(ready), flush=True)
-    if options.speed <= FASTEST_AT_PRIORITY:
-        _take_priority()
-    emulator.run(lambda: bool(signals) or orphaned())
     return 0
 
 
-def _take_priority() -> None:
-    """Real-time priority if the system allows it: a real device does not slow down under the host's load."""
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
-
-
-def _orphan_watch() -> Callable[[], bool]:
-    """A function that says whether the parent has ended.
-
-    It asks the kernel each time. A death signal would depend on the thread that started this process.
-    """
-    parent = os.getppid()
-    return lambda: os.getppid() != parent
+def _run(devices: Devices, options: argparse.Namespace) -> None:
+    emulator = Emulator(devices)
+    signals: list[int] = []
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda caught, _frame: signals.append(caught))
+    # before the ready line, since a parent may die as soon as it has read it; the kernel is asked each time, since a
+    # death signal would depend on the thread that started this process
+    parent = os.getppid() if options.die_with_parent else None
+    try:
+        for text in options.fault:
+            devices.faults.on(*_fault(text))
+        print(json.dumps(emulator.ready()), flush=True)
+        if options.speed <= FASTEST_AT_PRIORITY:
+            with contextlib.suppress(OSError):  # where allowed: a real device does not slow down under the host's load
+                os.sched_setscheduler(0, os.SCHED_RR, os.sched_param(1))
+        emulator.run(lambda: bool(signals) or (parent is not None and os.getppid() != parent))
+    finally:
+        emulator.close()
 
 
 def _fault(text: str) -> tuple[str, dict[str, Any]]:

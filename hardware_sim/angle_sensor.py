@@ -42,7 +42,7 @@ class Encoder:
         """The reading at an emulated time that never runs backwards."""
         settings = self.settings
         from_zero_deg = settings.angle_direction * self._angle_deg(time_s) / settings.angle_scale
-        raw_deg = settings.angle_offset_deg + from_zero_deg + self._noise.next()
+        raw_deg = settings.angle_offset_deg + from_zero_deg + self._noise.draw()[0]
         raw_deg = self._step_deg * round(raw_deg / self._step_deg)
         for hook in self.hooks:
             raw_deg = hook(raw_deg, time_s)

@@ -16,14 +16,13 @@ from typing import Any
 
 from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.errors import ArmError, FaultError, HardwareSimError
-from stimrig.hardware_sim.ports import Reactor
+from stimrig.hardware_sim.ports import Client, Reactor, Server
 from stimrig.hardware_sim.timeline import WallClock
 
 LONGEST_LINE = 65536
-SEND_TIMEOUT_S = 1.0
 
 
-class Control:
+class Control(Server):
     """Answers any number of clients, in the emulator's own thread; `catch_up` simulates up to the present first."""
 
     def __init__(
@@ -36,13 +35,11 @@ class Control:
         state: Callable[[], dict[str, Any]],
     ) -> None:
         self.path = path
-        self._reactor, self._devices, self._clock, self._catch_up = reactor, devices, clock, catch_up
-        self._clients: dict[socket.socket, bytes] = {}
-        self._listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        self._listener.bind(str(path))
-        self._listener.listen()
-        self._listener.setblocking(False)
-        reactor.add(self._listener, self._accept)
+        self._devices, self._clock, self._catch_up = devices, clock, catch_up
+        listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        listener.bind(str(path))
+        listener.listen()
+        super().__init__(reactor, listener, self._obey)
         self._commands: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
             "state": lambda _request: state(),
             "pulses": self._pulses,
@@ -50,13 +47,6 @@ class Control:
             "fault": self._fault,
             "arm": self._arm,
         }
-
-    def close(self) -> None:
-        """Close the socket and every connection."""
-        for client in list(self._clients):
-            self._drop(client)
-        self._reactor.remove(self._listener)
-        self._listener.close()
 
     def answer(self, line: bytes) -> dict[str, Any]:
         """The answer to one line."""
@@ -74,6 +64,17 @@ class Control:
         except HardwareSimError as error:
             return {"ok": False, "error": str(error)}
 
+    def _obey(self, client: Client) -> None:
+        *lines, rest = client.received.split(b"\n")
+        client.received = rest[-LONGEST_LINE:]
+        for line in lines:
+            client.backlog += json.dumps(self.answer(line)).encode() + b"\n"
+
+    def _now(self) -> dict[str, float]:
+        """The emulated time, and the machine's monotonic time then."""
+        time_s = self._devices.timeline.now_s
+        return {"time_s": time_s, "monotonic_s": self._clock.monotonic_s(time_s)}
+
     def _pulses(self, request: dict[str, Any]) -> dict[str, Any]:
         since = request.get("since", 0)
         pulses = self._devices.electrodes.pulses(since if isinstance(since, int) and since >= 0 else 0)
@@ -82,50 +83,19 @@ class Control:
         return {"pulses": pulses}
 
     def _fault(self, request: dict[str, Any]) -> dict[str, Any]:
-        name, on, for_s = request.pop("name", ""), request.pop("on", True), request.pop("for_s", None)
+        name, on, for_s = str(request.pop("name", "")), request.pop("on", True), request.pop("for_s", None)
         if for_s is not None and not (isinstance(for_s, int | float) and 0 <= for_s < math.inf):
             raise FaultError(f"'for_s' must be a number of seconds, not {for_s!r}")
+        faults = self._devices.faults
         if on:
-            self._devices.faults.on(str(name), request, for_s)
+            faults.on(name, request, for_s)
         else:
-            self._devices.faults.off(str(name))
-        time_s = self._devices.timeline.now_s
-        return {
-            "time_s": time_s,
-            "monotonic_s": self._clock.monotonic_s(time_s),
-            "active": self._devices.faults.active(),
-            "pulses_received": len(self._devices.electrodes.log),
-        }
+            faults.off(name)
+        return {**self._now(), "active": faults.active(), "pulses_received": len(self._devices.electrodes.log)}
 
     def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
-        limb, time_s = self._devices.limb, self._devices.timeline.now_s
+        limb = self._devices.limb
         if limb is None:
             raise ArmError("this rig has no arm; start it with --arm")
-        limb.move(str(request.pop("mode", "")), request, time_s)
-        return {"time_s": time_s, "monotonic_s": self._clock.monotonic_s(time_s), **limb.state()}
-
-    def _accept(self) -> None:
-        try:
-            client, _ = self._listener.accept()
-        except OSError:
-            return
-        client.settimeout(SEND_TIMEOUT_S)
-        self._clients[client] = b""
-        self._reactor.add(client, lambda: self._read(client))
-
-    def _read(self, client: socket.socket) -> None:
-        try:
-            data = client.recv(LONGEST_LINE)
-            *lines, rest = (self._clients[client] + data).split(b"\n")
-            self._clients[client] = rest[-LONGEST_LINE:]
-            for line in lines:
-                client.sendall(json.dumps(self.answer(line)).encode() + b"\n")
-        except OSError:  # the client has gone or does not read; it must not block the emulator
-            data = b""
-        if not data:
-            self._drop(client)
-
-    def _drop(self, client: socket.socket) -> None:
-        if self._clients.pop(client, None) is not None:
-            self._reactor.remove(client)
-            client.close()
+        limb.move(str(request.pop("mode", "")), request, self._devices.timeline.now_s)
+        return {**self._now(), **limb.state()}

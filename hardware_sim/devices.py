@@ -58,15 +58,11 @@ class Devices:
         self.limb = Limb(muscle, arm, settings.noise_seed) if arm else None
         muscle = self.limb or muscle
         self.encoder = Encoder(self.limb.angle_deg, settings) if self.limb else None
-        own_bus = settings.angle == "own"
-        self.load_cell = LoadCell(
-            muscle, settings, epoch_us, self.encoder.read if self.encoder and not own_bus else None
-        )
-        self.angle_sensor = (
-            AngleSensor(self.encoder, self.load_cell.add_frame, settings, epoch_us)
-            if self.encoder and own_bus
-            else None
-        )
+        in_cell = self.encoder.read if self.encoder and settings.angle == "in-cell" else None
+        self.load_cell = LoadCell(muscle, settings, epoch_us, in_cell)
+        self.angle_sensor: AngleSensor | None = None
+        if self.encoder and not in_cell:
+            self.angle_sensor = AngleSensor(self.encoder, self.load_cell.add_frame, settings, epoch_us)
         self.timeline.followers.append(self._sample_until)
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
         self.stimulator_plugged = self.cell_plugged = True

@@ -76,10 +76,14 @@ class Emulator:
             self.catch_up()
             self._deliver()
             self.port.flush()
+            self._control.flush()
             self.port.forget_speed()
             now_s = time.monotonic()
             next_tick_s = max(next_tick_s + tick_s, now_s)
-            while (left_s := self._wait_s(next_tick_s)) > 0 and not stopping():
+            while (left_s := next_tick_s - time.monotonic()) > 0 and not stopping():
+                event_s = self.devices.next_s()  # the next tick or event, whichever comes first
+                if event_s is not None:
+                    left_s = min(left_s, max(self.clock.monotonic_s(event_s) - time.monotonic(), 1e-5))
                 self._reactor.poll(left_s)
                 self.catch_up()
 
@@ -116,7 +120,7 @@ class Emulator:
         else:
             self._write()
             if self.port.is_open:
-                self._reactor.remove(self.port)
+                self._reactor.unregister(self.port)
                 self.port.close()
         self._link.unlink(missing_ok=True)
         if plugged:
@@ -133,15 +137,6 @@ class Emulator:
     @property
     def _link(self) -> Path:
         return self._folder / "stimulator"
-
-    def _wait_s(self, next_tick_s: float) -> float:
-        """Real time until the next tick or event, whichever comes first; zero when a tick is due."""
-        now_s = time.monotonic()
-        left_s = next_tick_s - now_s
-        event_s = self.devices.next_s()
-        if event_s is None:
-            return left_s
-        return min(left_s, max(self.clock.monotonic_s(event_s) - now_s, 1e-5))
 
     def _read(self) -> None:
         data = self.port.read()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import secrets
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import fields
 from typing import NoReturn
 
@@ -37,53 +37,23 @@ def parse(arguments: Sequence[str] | None = None, prog: str = "stimrig emulate")
         description="The emulated rig: a stimulator on a serial line, a CAN load cell, and a muscle between "
         "them. Prints one JSON line once its devices answer, then runs until SIGTERM or Ctrl-C.",
     )
-    _patient(parser.add_argument_group("the muscle"))
-    devices = parser.add_argument_group("the devices")
-    _devices(devices)
-    _add(devices, lambda name: name != "speed" and not name.startswith("angle"))
-    _arm(parser.add_argument_group("the arm and the sensor of its angle (only with --arm)"))
-    _process(parser.add_argument_group("the process"))
-    return parser.parse_args(arguments)
-
-
-def settings(options: argparse.Namespace, patient: str) -> Settings:
-    """The checked settings of these options. Raises SettingsError: a number is out of its range."""
-    values = {field.name: getattr(options, field.name) for field in fields(Settings) if hasattr(options, field.name)}
-    if options.noise_seed is None:
-        values["noise_seed"] = secrets.randbelow(2**31)
-    values |= {"patient": patient, "cell": _cell_kind(options), "sync": not options.no_sync}
-    return Settings(**values)
-
-
-def _cell_kind(options: argparse.Namespace) -> str:
-    """The cell as asked for; the one with an angle is there where, and only where, the angle is in its frame."""
-    in_cell = options.arm is not None and options.angle == "in-cell"
-    kind = options.cell or (WithAngle.name if in_cell else DEFAULTS.cell)
-    if in_cell != (kind == WithAngle.name):
-        raise SettingsError(f"--cell {WithAngle.name} goes with --arm and --angle in-cell, and no other cell does")
-    return kind
-
-
-def _patient(group: argparse._ArgumentGroup) -> None:
-    exclusive = group.add_mutually_exclusive_group()
-    exclusive.add_argument(
+    muscle = parser.add_argument_group("the muscle").add_mutually_exclusive_group()
+    muscle.add_argument(
         "--patient",
         default=DEFAULTS.patient,
         metavar="NAME|FILE",
         help=f"{', '.join(PATIENTS)}, or a TOML file with 'patient' and a table 'parameters' (default: %(default)s)",
     )
-    exclusive.add_argument(
+    muscle.add_argument(
         "--hidden",
         type=int,
         metavar="SEED",
         help="a patient with a hidden effect, drawn by SEED; with --arm another one, whose joint matters",
     )
-    exclusive.add_argument("--reveal", type=int, metavar="SEED", help="print what --hidden SEED hides, and exit")
-
-
-def _devices(group: argparse._ArgumentGroup) -> None:
-    group.add_argument("--stimulator", default=DEFAULTS.stimulator, choices=STIMULATORS)
-    group.add_argument(
+    muscle.add_argument("--reveal", type=int, metavar="SEED", help="print what --hidden SEED hides, and exit")
+    devices = parser.add_argument_group("the devices")
+    devices.add_argument("--stimulator", default=DEFAULTS.stimulator, choices=STIMULATORS)
+    devices.add_argument(
         "--load-cell",
         dest="transport",
         default=DEFAULTS.transport,
@@ -91,36 +61,27 @@ def _devices(group: argparse._ArgumentGroup) -> None:
         help="what carries the cell's frames: a server on 127.0.0.1, or an adapter on a pseudo-terminal "
         "(default: %(default)s)",
     )
-    group.add_argument(
+    devices.add_argument(
         "--cell",
         choices=CELLS,
         help=f"the cell's frames (default: {DEFAULTS.cell}: id 0x181, float32 N·m, counter, status)",
     )
-    group.add_argument("--no-sync", action="store_true", help="no sync line from the stimulator to the cell")
-    group.add_argument(
+    devices.add_argument("--no-sync", action="store_true", help="no sync line from the stimulator to the cell")
+    devices.add_argument(
         "--fault",
         action="append",
         default=[],
         metavar="NAME[,SETTING=NUMBER…]",
         help="switch a fault on from the start; may be repeated",
     )
-
-
-def _add(group: argparse._ArgumentGroup, names: Callable[[str], bool]) -> None:
-    """The options that the settings of these names have."""
-    for each in fields(Settings):
-        if "option" in each.metadata and names(each.name):
-            group.add_argument("--" + each.name.replace("_", "-"), **each.metadata["option"])
-
-
-def _arm(group: argparse._ArgumentGroup) -> None:
-    group.add_argument(
+    arm = parser.add_argument_group("the arm and the sensor of its angle (only with --arm)")
+    arm.add_argument(
         "--arm",
         metavar="MODE[,SETTING=NUMBER…]",
         help=f"what holds or moves the elbow: {', '.join(MOVERS)}; with --hidden also "
         "'design', the movement that its effect was sized on (default: no arm, the joint is still and has no sensor)",
     )
-    group.add_argument(
+    arm.add_argument(
         "--arm-law",
         action="append",
         default=[],
@@ -128,10 +89,25 @@ def _arm(group: argparse._ArgumentGroup) -> None:
         help=f"another law of its tissue, or other numbers, at {', '.join(PLACES)}; may be repeated (default: "
         f"{', '.join(f'{place}={name}' for place, name in DEFAULT_LAWS.items())}; 'none' for no law)",
     )
-    _add(group, lambda name: name.startswith("angle"))
+    process = parser.add_argument_group("the process")
+    for each in fields(Settings):
+        if "option" in each.metadata:
+            group = process if each.name == "speed" else arm if each.name.startswith("angle") else devices
+            group.add_argument("--" + each.name.replace("_", "-"), **each.metadata["option"])
+    process.add_argument("--die-with-parent", action="store_true", help="end when the process that started it does")
+    return parser.parse_args(arguments)
 
 
-def _process(group: argparse._ArgumentGroup) -> None:
-    _add(group, lambda name: name == "speed")
-    group.add_argument("--no-json", action="store_true", help="print readable lines instead of the JSON line")
-    group.add_argument("--die-with-parent", action="store_true", help="end when the process that started it does")
+def settings(options: argparse.Namespace, patient: str) -> Settings:
+    """The checked settings of these options. Raises SettingsError: a number is out of its range.
+
+    The cell with an angle is there where, and only where, the angle is in its frame.
+    """
+    values = {field.name: getattr(options, field.name) for field in fields(Settings) if hasattr(options, field.name)}
+    if options.noise_seed is None:
+        values["noise_seed"] = secrets.randbelow(2**31)
+    in_cell = options.arm is not None and options.angle == "in-cell"
+    cell = options.cell or (WithAngle.name if in_cell else DEFAULTS.cell)
+    if in_cell != (cell == WithAngle.name):
+        raise SettingsError(f"--cell {WithAngle.name} goes with --arm and --angle in-cell, and no other cell does")
+    return Settings(**values | {"patient": patient, "cell": cell, "sync": not options.no_sync})

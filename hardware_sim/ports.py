@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import fcntl
 import os
-import select
+import selectors
+import socket
 import struct
 import termios
 import tty
@@ -98,27 +99,85 @@ class PseudoTerminal:
             os.close(self._master)
 
 
-class Reactor:
-    """Calls a function for each socket or port that has something to read.
-
-    Its time limit is finer than epoll's millisecond.
-    """
-
-    def __init__(self) -> None:
-        self._readers: dict[int, Callable[[], None]] = {}
+class Reactor(selectors.SelectSelector):
+    """Calls a function for each socket or port that has something to read; its time limit is finer than epoll's."""
 
     def add(self, source: Any, on_readable: Callable[[], None]) -> None:
-        """Call `on_readable` whenever `source` has something to read."""
-        self._readers[source.fileno()] = on_readable
-
-    def remove(self, source: Any) -> None:
-        """Forget `source`; to be called before it is closed."""
-        self._readers.pop(source.fileno(), None)
+        """Call `on_readable` whenever `source` has something to read; to be unregistered before it is closed."""
+        self.register(source, selectors.EVENT_READ, on_readable)
 
     def poll(self, timeout_s: float) -> None:
         """Wait up to `timeout_s` for something to read, and serve all that have."""
-        readable, _, _ = select.select(list(self._readers), (), (), max(0.0, timeout_s))
-        for descriptor in readable:
-            on_readable = self._readers.get(descriptor)
-            if on_readable is not None:  # an earlier callback may have closed it
-                on_readable()
+        for key, _ in self.select(max(0.0, timeout_s)):
+            if key.fd in self.get_map():  # an earlier callback may have closed it
+                key.data()
+
+
+class Client:
+    """One connection: what was received and not yet taken, and what was not yet sent."""
+
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.received, self.backlog = b"", bytearray()
+        self.state: Any = None
+        """Its server's own."""
+
+
+class Server:
+    """Any number of clients of a listening socket; nothing blocks. `on_data` is called when a client has sent some."""
+
+    def __init__(self, reactor: Reactor, listener: socket.socket, on_data: Callable[[Client], None]) -> None:
+        self.clients: list[Client] = []
+        self._reactor, self._listener, self._on_data = reactor, listener, on_data
+        listener.setblocking(False)
+        reactor.add(listener, self._accept)
+
+    def connected(self, client: Client) -> None:
+        """A client has come."""
+
+    def flush(self) -> None:
+        """Send each client what fits of what it has not got."""
+        for client in [client for client in self.clients if client.backlog]:
+            try:
+                del client.backlog[: client.connection.send(client.backlog)]
+            except BlockingIOError:
+                continue
+            except OSError:
+                self._drop(client)
+
+    def close(self) -> None:
+        """Close the socket and every connection."""
+        for client in list(self.clients):
+            self._drop(client)
+        if self._listener.fileno() >= 0:
+            self._reactor.unregister(self._listener)
+            self._listener.close()
+
+    def _accept(self) -> None:
+        try:
+            connection, _ = self._listener.accept()
+        except OSError:  # the client has already disconnected
+            return
+        connection.setblocking(False)
+        self.clients.append(client := Client(connection))
+        self._reactor.add(connection, lambda: self._read(client))
+        self.connected(client)
+
+    def _read(self, client: Client) -> None:
+        try:
+            data = client.connection.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            data = b""
+        if not data:
+            self._drop(client)
+            return
+        client.received += data
+        self._on_data(client)
+        self.flush()
+
+    def _drop(self, client: Client) -> None:
+        self.clients.remove(client)
+        self._reactor.unregister(client.connection)
+        client.connection.close()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Protocol
+from typing import Any
 
 import numpy as np
 
@@ -20,14 +20,8 @@ class Noise:
         self._random = np.random.default_rng(seed)
         self._block: list[float] = []
 
-    def next(self) -> float:
-        """Noise of the next sample, in the unit of its standard deviation."""
-        if not self._block:
-            self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist()
-        return self._block.pop()
-
-    def draw(self, count: int) -> list[float]:
-        """Noise of the next `count` samples, at least one."""
+    def draw(self, count: int = 1) -> list[float]:
+        """Noise of the next `count` samples, at least one, in the unit of its standard deviation."""
         while len(self._block) < count:
             self._block = (self._sd * self._random.standard_normal(NOISE_BLOCK))[::-1].tolist() + self._block
         values = self._block[: -count - 1 : -1]
@@ -58,7 +52,7 @@ class SampleClock:
         """Go on to the next sample."""
         self.samples += 1
         largest_s = LARGEST_JITTER_PERIODS * self._period_s
-        self._off_s = min(max(self._jitter.next(), -largest_s), largest_s) if self._jitter else 0.0
+        self._off_s = min(max(self._jitter.draw()[0], -largest_s), largest_s) if self._jitter else 0.0
         self._due_s = self._anchor_s + (self.samples - self._anchor_sample) * self._period_s + self._off_s
 
     def advance_until(self, until_s: float) -> list[float]:
@@ -84,20 +78,10 @@ class SampleClock:
         return self._epoch_us + round(time_s * self._rate * 1e6)
 
 
-class Sampler(Protocol):
-    """A sensor whose samples are taken one by one, by its clock."""
-
-    clock: SampleClock
-
-    def sample(self) -> None:
-        """Take the next sample."""
-        ...
-
-
-def take_in_order(samplers: Sequence[Sampler], until_s: float) -> None:
+def take_in_order(sensors: Sequence[Any], until_s: float) -> None:
     """Take all samples due before `until_s`, of all sensors in the order of their time: a limb's time only advances."""
     while True:
-        first = min(samplers, key=lambda sampler: sampler.clock.next_s())
+        first = min(sensors, key=lambda sensor: sensor.clock.next_s())
         if first.clock.next_s() >= until_s:
             return
         first.sample()

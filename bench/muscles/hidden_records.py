@@ -23,7 +23,6 @@ from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.design import UNRECORDED, Design, make_design
 from stimrig.hardware_sim.hidden.kernels import Floats
 from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS
-from stimrig.hardware_sim.hidden.live import Staged
 from stimrig.hardware_sim.hidden.scenario import draw_pair, draw_scenario, rng_of
 
 SLOWEST_SIMULATION_HZ = 1600
@@ -157,7 +156,7 @@ def patient_record(seed: int) -> dict[str, Any]:
     return sampled(scenario, scenario.design, 400.0, noise_nm) | {"truth": hidden.reveal(seed, False)}
 
 
-def sampled(muscle: Staged, design: Design, rate_hz: float, noise_nm: Callable[[int], Floats]) -> dict[str, Any]:
+def sampled(muscle: Any, design: Design, rate_hz: float, noise_nm: Callable[[int], Floats]) -> dict[str, Any]:
     """Simulate a record of this design: its columns without the unrecorded rows."""
     every = math.ceil(SLOWEST_SIMULATION_HZ / rate_hz)
     step_s = 1.0 / (rate_hz * every)

@@ -11,8 +11,6 @@ from numpy.random import Generator
 
 from stimrig.hardware_sim.hidden import recruitment
 from stimrig.hardware_sim.hidden.kernels import (
-    ACTIVATION,
-    FORCE,
     LARGEST_NM,
     PULSE,
     SPEED,
@@ -43,9 +41,7 @@ def look_up(table: Any, width_us: float) -> float:
 @kernel("recruitment")
 def recruit(x, p, s, c):
     """p[0:512]: torque at every µs."""
-    w = look_up(p, x)
-    c[ACTIVATION] = w / c[LARGEST_NM]
-    return w
+    return look_up(p, x)
 
 
 @helper
@@ -73,6 +69,13 @@ def lag_after(before, after, state, tau_s, step_s):
 
 
 @helper
+def force_after(before, s, tau_s, c):
+    """The force s[1], N·m, a lag behind calcium, which went from `before` to s[0] over the step."""
+    s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], tau_s, c[STEP_S])
+    return s[1]
+
+
+@helper
 def delayed(x, late, s, first, size):
     """`x` of `late` steps ago, linear between steps, by a ring s[first : first + size] whose place is s[0]."""
     i = int(s[0])
@@ -87,9 +90,7 @@ def delayed(x, late, s, first, size):
 @kernel("dynamics")
 def second_order(x, p, s, c):
     """p: 1/Tω, ζ."""
-    y = second_order_step(x, p[0] * c[SPEED], p[1], s, 0, c[STEP_S])
-    c[FORCE] = y / c[LARGEST_NM]
-    return y
+    return second_order_step(x, p[0] * c[SPEED], p[1], s, 0, c[STEP_S])
 
 
 @kernel("delay")

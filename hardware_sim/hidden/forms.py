@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partialmethod
 from typing import Any, Literal
 
 from numpy.random import Generator
@@ -70,11 +71,6 @@ def second_order(_rng: Generator, base: Base) -> tuple[float, float]:
     return 1.0 / base.t_omega_s, base.zeta
 
 
-def largest_width_us(_rng: Generator, base: Base) -> float:
-    """The largest pulse width that the base is sent."""
-    return float(base.largest_width_us)
-
-
 def recruitment_table(_rng: Generator, base: Base) -> tuple[float, ...]:
     """The base's torque at every µs, N·m."""
     return tuple(base.table_nm)
@@ -84,8 +80,8 @@ def recruitment_table(_rng: Generator, base: Base) -> tuple[float, ...]:
 class Formulation:
     """A form whose numbers are drawn.
 
-    `build(magnitude)` gives its stages. At magnitude 0 they leave the base muscle as it is. A stage in the slot
-    `recruitment` or `dynamics` replaces the base's own. `magnitude_name` says what the magnitude is, with its unit.
+    `build(magnitude)` gives its stages. A stage in the slot `recruitment` or `dynamics` replaces the base's own.
+    `magnitude_name` says what the magnitude is, with its unit.
     """
 
     name: str
@@ -93,7 +89,7 @@ class Formulation:
     build: Callable[[float], list[Stage]]
     largest_magnitude: float
     magnitude_name: str
-    parameters: dict[str, Any] = field(default_factory=dict)
+    parameters: dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -102,11 +98,11 @@ class Form:
 
     `build(magnitude, *numbers, state=…)` gives its stages. A name in `draws` that begins with `_` is not revealed. A
     `Sign` is no number: the magnitude is multiplied by it. `seed_at` is the place of a random generator's seed in the
-    stage's state; it is drawn last. Name and largest magnitude may be functions of what is revealed.
+    stage's state; it is drawn last. The name may be a function of what is revealed.
     """
 
     build: Callable[..., list[Stage]]
-    largest_magnitude: float | Callable[[dict[str, Any]], float]
+    largest_magnitude: float
     magnitude_name: str
     draws: Mapping[str, Draw]
     seed_at: int | None = None
@@ -121,7 +117,10 @@ class Form:
                 sign = draw.draw(rng)
                 revealed[name] = draw.positive if sign > 0 else draw.negative
                 continue
-            value = _draw(draw, rng, base)
+            if isinstance(draw, tuple | list):
+                value = float(rng.uniform(*draw) if isinstance(draw, tuple) else rng.choice(draw))
+            else:
+                value = draw(rng, base) if callable(draw) else draw
             if isinstance(value, Numbers):
                 numbers += value.numbers
                 revealed |= value.revealed
@@ -134,27 +133,15 @@ class Form:
             self.name(revealed) if callable(self.name) else self.name,
             self.source,
             lambda magnitude: self.build(sign * magnitude, *numbers, state=state),
-            self.largest_magnitude(revealed) if callable(self.largest_magnitude) else self.largest_magnitude,
+            self.largest_magnitude,
             self.magnitude_name,
             revealed,
         )
 
-    def drawing(self, **draws: Draw) -> Form:
-        """The same stage with other numbers."""
-        return replace(self, draws=draws)
-
-
-def _draw(draw: Draw, rng: Generator, base: Base) -> Any:
-    if callable(draw):
-        return draw(rng, base)
-    if isinstance(draw, tuple):
-        return float(rng.uniform(*draw))
-    return float(rng.choice(draw)) if isinstance(draw, list) else draw
-
 
 def draws(
     slot: str,
-    largest_magnitude: float | Callable[[dict[str, Any]], float],
+    largest_magnitude: float,
     magnitude_name: str,
     *,
     arrange: Callable[..., Iterable[float]] = lambda *numbers: numbers,
@@ -190,15 +177,16 @@ class Effect:
     forms: list[Form] = field(default_factory=list)
     held_back_forms: list[Form] = field(default_factory=list)
 
-    def form(self, name: str | Callable[[dict[str, Any]], str], source: str) -> Callable[[Form], Form]:
-        """Decorate a form with what it is and whose it is; gives the form unnamed, for another name and other draws."""
-        return lambda form: _added(self.forms, form, name, source)
+    def form(
+        self, name: str | Callable[[dict[str, Any]], str], source: str, held_back: bool = False, **draws: Draw
+    ) -> Callable[[Form], Form]:
+        """Decorate a form with what it is and whose it is; `draws` take the place of its own."""
 
-    def held_back(self, name: str, source: str) -> Callable[[Form], Form]:
-        """The same of a form that is held back."""
-        return lambda form: _added(self.held_back_forms, form, name, source)
+        def add(form: Form) -> Form:
+            forms = self.held_back_forms if held_back else self.forms
+            forms.append(replace(form, name=name, source=source, draws=draws or form.draws))
+            return form
 
+        return add
 
-def _added(forms: list[Form], form: Form, name: str | Callable[[dict[str, Any]], str], source: str) -> Form:
-    forms.append(replace(form, name=name, source=source))
-    return form
+    held_back = partialmethod(form, held_back=True)

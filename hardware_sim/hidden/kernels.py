@@ -135,11 +135,6 @@ class Stage:
     parameters: Any = ()
     state: Any = ()
 
-    @property
-    def slot(self) -> str:
-        """Where in the muscle it stands."""
-        return self.kernel.slot
-
     def rows(self) -> tuple[Floats, Floats]:
         """Parameters and starting state, padded to full rows."""
         parameters, state = np.zeros(ROW), np.zeros(ROW)

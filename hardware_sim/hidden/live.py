@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from typing import Protocol
+from typing import Any
 
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.chain import TRAIN_GAP_S, Chain, split
-from stimrig.hardware_sim.hidden.kernels import Floats, Stage
+from stimrig.hardware_sim.hidden.scenario import Scenario
 
 STEPS_PER_S = 1600.0
 PERIOD_STEPS = 0.025 * STEPS_PER_S
@@ -15,21 +14,6 @@ LATE_STEPS = 0.005 * STEPS_PER_S
 NOMINAL_CURRENT_MA = 20.0
 REMEMBERED_STEPS = 64
 """More than the latest pulse can go back: 5 ms and a delivery."""
-
-_Saved = tuple[Floats, Floats, float]
-
-
-class Staged(Protocol):
-    """Muscle made of stages: a scenario, or another one."""
-
-    @property
-    def base(self) -> Base:
-        """The muscle without effects; its largest torque is what shares are of."""
-        ...
-
-    def stages(self) -> list[Stage]:
-        """All stages of the muscle."""
-        ...
 
 
 class HiddenMuscle:
@@ -40,9 +24,9 @@ class HiddenMuscle:
     two twitches add up. Another current than 20 mA scales the width by charge.
     """
 
-    def __init__(self, staged: Staged) -> None:
-        before, after = split(staged.stages())
-        largest_nm = staged.base.largest_nm
+    def __init__(self, scenario: Scenario) -> None:
+        before, after = split(scenario.stages())
+        largest_nm = scenario.base.largest_nm
         self._muscle = Chain(before, largest_nm, 1.0 / STEPS_PER_S)
         self._converter = Chain(after, largest_nm, 1.0 / STEPS_PER_S) if after else None
         self._done = 0  # steps simulated; the state is that at `_done` / STEPS_PER_S
@@ -53,7 +37,7 @@ class HiddenMuscle:
         self._hold_end = -math.inf
         self._late = 0.0  # of the last pulse, in steps, where a gap before it stays open
         self._lingering: list[tuple[float, float, float]] = []  # begin and end in steps, what a late pulse recruits
-        self._at_hold_end: tuple[_Saved, int, tuple[float, float], float] | None = None
+        self._at_hold_end: tuple[Any, int, tuple[float, float], float] | None = None
         self._joint = (0.0, 0.0)
         self._joints = [self._joint] * REMEMBERED_STEPS  # by step, for going back; known up to and with `_joints_known`
         self._joints_known = 0

@@ -124,7 +124,7 @@ def _play(x, p, s, c):
     half = p[0] * c[LARGEST_NM]
     s[0] = min(max(s[0], x - half), x + half)
     s[1] += (s[0] - s[1]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
-    return s[1] if p[0] > 0.0 else x
+    return s[1]
 
 
 # Jumps of gain: an electrode shifts at an instant and with it the share of the nerve it reaches.
@@ -301,8 +301,6 @@ SLOW_CONVERTER = OUTSIDERS["slow_converter"] = Effect()
 @draws("converter", 1.2, "held_s")
 def _sample_and_hold(x, p, s, c):
     """p: how long a reading is held, s. s: reading, time of the next."""
-    if p[0] <= 0.0:
-        return x
     if c[TIME_S] >= s[1]:
         s[0] = x
         s[1] += p[0]
@@ -313,8 +311,6 @@ def _sample_and_hold(x, p, s, c):
 @draws("converter", 0.6, "step_share")
 def _coarse(x, p, s, c):
     """p: step as a share of the largest torque."""
-    if p[0] <= 0.0:
-        return x
     step = p[0] * c[LARGEST_NM]
     return round(x / step) * step
 
@@ -334,7 +330,7 @@ def _stick_slip(x, p, s, c):
         s[0] += (x - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[2]))
         if abs(x - s[0]) < p[1] * gap:
             s[1] = 0.0
-    return s[0] if p[0] > 0.0 else x
+    return s[0]
 
 
 # Delay that depends on the pulse width: weak pulses answer later (or earlier) than strong ones.
@@ -363,4 +359,4 @@ def _variable_line(x, p, s, c):
         s[1 + (i + k) % size] = x
     out = s[1 + i % size]
     s[0] = (i + 1) % size
-    return out if p[0] > 0.0 else x
+    return out

@@ -47,22 +47,22 @@ class Scenario:
 
     def truth(self, noise_sd_nm: float) -> dict[str, Any]:
         """Return the hidden effects and their parameters as plain values."""
-        return {
-            "effects": [effect.effect for effect in self.hidden],
-            "formulation": [effect.formulation.name for effect in self.hidden],
-            "source": [effect.formulation.source for effect in self.hidden],
-            "strength": self.hidden[0].strength if self.hidden else "none",
-            "parameters": {
-                effect.effect: jsonable(
-                    {effect.formulation.magnitude_name: effect.magnitude, **effect.formulation.parameters}
-                )
-                for effect in self.hidden
-            },
-            "outside_library": any(effect.effect not in EFFECTS for effect in self.hidden),
-            "excess": {effect.effect: jsonable(effect.excess) for effect in self.hidden},
-            "excess_over_noise": [round(effect.excess["counted_nm"] / noise_sd_nm, 3) for effect in self.hidden],
-            "base": jsonable(self.base.describe()),
-        }
+        forms = [(effect, effect.formulation) for effect in self.hidden]
+        return jsonable(
+            {
+                "effects": [effect.effect for effect in self.hidden],
+                "formulation": [form.name for _, form in forms],
+                "source": [form.source for _, form in forms],
+                "strength": self.hidden[0].strength if self.hidden else "none",
+                "parameters": {
+                    effect.effect: {form.magnitude_name: effect.magnitude, **form.parameters} for effect, form in forms
+                },
+                "outside_library": any(effect.effect not in EFFECTS for effect in self.hidden),
+                "excess": {effect.effect: effect.excess for effect in self.hidden},
+                "excess_over_noise": [round(effect.excess["counted_nm"] / noise_sd_nm, 3) for effect in self.hidden],
+                "base": self.base.describe(),
+            }
+        )
 
 
 def rng_of(seed: int, *labels: str) -> Generator:
@@ -91,42 +91,31 @@ def draw_scenario(
     if strength not in BANDS:
         raise ValueError(f"strength {strength!r}: one of {', '.join(BANDS)}")
     effects = [(name, find_effect(name)) for name in names]
-    moving = moving or bool(MOVING & set(names))
+    low, high = BANDS[strength]
+
+    def hide(name: str, effect: Effect) -> HiddenEffect:
+        """The effect with this strength on this base, in one of the forms that the seed allows."""
+        forms = find_forms(effect, seed)
+        formulation = forms[int(rng.integers(len(forms)))](rng, base)
+        target_nm = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
+        band_nm = noise_sd_nm * low, noise_sd_nm * high
+        magnitude, excess = find_magnitude(effect.counted, formulation, base, sequence, target_nm, band_nm)
+        return HiddenEffect(name, formulation, magnitude, strength, excess)
+
     for attempt in range(ATTEMPTS):
         rng = rng_of(seed, *names, strength, str(attempt))
         base = draw_base(rng, steep)
         if pulsed:
             base = replace(base, burst_s=float(rng.uniform(0.003, 0.012)))
-        sequence = make_design(design, rng, float(base.largest_width_us), moving=moving, **design_settings)
+        moves = moving or bool(MOVING & set(names))
+        sequence = make_design(design, rng, float(base.largest_width_us), moving=moves, **design_settings)
         try:
-            hidden = tuple(
-                _draw_effect(rng, name, effect, strength, noise_sd_nm, base, sequence, seed) for name, effect in effects
-            )
-            combine(base, [(effect.formulation, effect.magnitude) for effect in hidden])
+            scenario = Scenario(base, tuple(hide(name, effect) for name, effect in effects), sequence)
+            scenario.stages()  # two effects may replace the same stage
         except NotSuited:
             continue
-        return Scenario(base, hidden, sequence)
+        return scenario
     raise ValueError(f"{' and '.join(names)}, {strength}: no muscle found that shows it this strongly")
-
-
-def _draw_effect(
-    rng: Generator,
-    name: str,
-    effect: Effect,
-    strength: str,
-    noise_sd_nm: float,
-    base: Base,
-    design: Design,
-    seed: int,
-) -> HiddenEffect:
-    """Draw the effect with this strength on this base, in one of the forms that the seed allows."""
-    low, high = BANDS[strength]
-    forms = find_forms(effect, seed)
-    formulation = forms[int(rng.integers(len(forms)))](rng, base)
-    target_nm = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
-    band_nm = noise_sd_nm * low, noise_sd_nm * high
-    magnitude, excess = find_magnitude(effect.counted, formulation, base, design, target_nm, band_nm)
-    return HiddenEffect(name, formulation, magnitude, strength, excess)
 
 
 def draw_pair(rng: Generator) -> tuple[str, str]:
@@ -143,6 +132,4 @@ def jsonable(value: Any) -> Any:
         return [jsonable(v) for v in value]
     if isinstance(value, bool | str) or value is None:
         return value
-    if isinstance(value, int | np.integer):
-        return int(value)
-    return round(float(value), 6)
+    return int(value) if isinstance(value, int | np.integer) else round(float(value), 6)

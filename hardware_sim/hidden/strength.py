@@ -8,8 +8,6 @@ are not fitted. This only sets the magnitude of a hidden effect; no verdict depe
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.interpolate import BSpline
 from scipy.linalg import cho_factor, cho_solve
@@ -58,8 +56,8 @@ def _filter(t_omega_s: float, zeta: float, step_s: float) -> tuple[Floats, Float
 
 # Loops instead of a linear-algebra library, whose threads wait for one another if several processes share few cores.
 @helper
-def _normal_equations(basis, b, a, y, held_out):
-    """Filter each column (second order, no feed-through); Gram matrix and moments over the rows to fit."""
+def _normal_equations(basis, b, a, y, fitted):
+    """Filter each column (second order, no feed-through); lower Gram matrix and moments over the rows to fit."""
     n, m = basis.shape
     x = np.zeros((n, m))
     gram = np.zeros((m, m))
@@ -70,15 +68,12 @@ def _normal_equations(basis, b, a, y, held_out):
             if k > 1:
                 value += b[2] * basis[k - 2, j] - a[2] * x[k - 2, j]
             x[k, j] = value
-        if not held_out[k]:
+        if fitted[k]:
             for i in range(m):
                 xi = x[k, i]
                 moment[i] += xi * y[k]
                 for j in range(i + 1):
                     gram[i, j] += xi * x[k, j]
-    for i in range(m):
-        for j in range(i):
-            gram[j, i] = gram[i, j]
     return x, gram, moment
 
 
@@ -92,29 +87,23 @@ def _product(x, coefficients):
     return out
 
 
-@dataclass
 class EffectFreeFit:
-    """The effect-free fit for one design at the pulse rate, with knots and starting values from a base.
+    """The effect-free fit for one design at the pulse rate, with knots and starting values from a base."""
 
-    `held_out`: rows of the held-out segment, bool, shape (n,).
-    """
-
-    base: Base
-    width_us: Floats
-    held_out: np.ndarray
-
-    def __post_init__(self) -> None:
-        knots = _knots(self.base)
-        u = np.clip(self.width_us, 0.0, knots[-1])
+    def __init__(self, base: Base, design: Design) -> None:
+        self._fitted = ~design.held_out
+        knots = _knots(base)
+        u = np.clip(design.width_us, 0.0, knots[-1])
         basis = BSpline.design_matrix(u, knots, 3).toarray()[:, 1:]  # f(0) = 0
-        self._basis = np.ascontiguousarray(basis[:, basis[~self.held_out].any(axis=0)])
+        self._basis = np.ascontiguousarray(basis[:, basis[self._fitted].any(axis=0)])
         bend = np.diff(np.eye(self._basis.shape[1] + 1), 2, axis=0)[:, 1:]  # the coefficient left out is zero
         self._bend = bend.T @ bend
-        self._start = np.log([self.base.t_omega_s, self.base.zeta])
+        self._starts = [np.log([base.t_omega_s, base.zeta])] * 2
 
     def _predict(self, theta: Floats, torque_nm: Floats) -> Floats:
         b, a = _filter(float(np.exp(theta[0])), float(np.exp(theta[1])), 1.0 / PULSE_RATE_HZ)
-        x, gram, moment = _normal_equations(self._basis, b, a, torque_nm, self.held_out)
+        x, gram, moment = _normal_equations(self._basis, b, a, torque_nm, self._fitted)
+        gram += np.tril(gram, -1).T
         weight = np.trace(gram) / len(gram)
         gram += STIFFNESS * weight * self._bend
         gram[np.diag_indices_from(gram)] += 1e-9 * weight
@@ -122,12 +111,10 @@ class EffectFreeFit:
 
     def fit(self, torque_nm: Floats) -> Floats:
         """Residual of the best effect-free model over all rows, free run, N·m."""
-        train = ~self.held_out
-        start = np.log([self.base.t_omega_s, self.base.zeta])
-        starts = [start] if np.array_equal(start, self._start) else [self._start, start]
+        of_base, of_last = self._starts  # the last fit's end may be a local minimum for the next
         results = [
             least_squares(
-                lambda theta: (torque_nm - self._predict(theta, torque_nm))[train],
+                lambda theta: (torque_nm - self._predict(theta, torque_nm))[self._fitted],
                 start,
                 bounds=(np.log([0.004, 0.08]), np.log([4.0, 12.0])),
                 x_scale=(0.3, 0.3),
@@ -136,10 +123,10 @@ class EffectFreeFit:
                 xtol=1e-4,
                 ftol=1e-5,
             )
-            for start in starts  # the last fit's end may be a local minimum for the next
+            for start in ([of_base] if np.array_equal(of_base, of_last) else [of_last, of_base])
         ]
         best = min(results, key=lambda result: result.cost)
-        self._start = best.x
+        self._starts[1] = best.x
         return torque_nm - self._predict(best.x, torque_nm)
 
 
@@ -152,36 +139,6 @@ def excess_nm(counted: Counted, residual_nm: Floats, held_out: np.ndarray) -> di
     else:
         counts = {"training": training, "larger": max(training, held_out_rms)}.get(counted, held_out_rms)
     return {"training_nm": training, "held_out_nm": held_out_rms, "all_nm": everywhere, "counted_nm": counts}
-
-
-@dataclass
-class _Excess:
-    """The error that the effect-free fit leaves, by the effect's magnitude, on one base and one design."""
-
-    counted: Counted
-    formulation: Formulation
-    base: Base
-    design: Design
-
-    def __post_init__(self) -> None:
-        self._effect_free_fit = EffectFreeFit(self.base, self.design.width_us, self.design.held_out)
-        self._without, fit = self._residual(self.base.stages())
-        self.own_nm = fit["counted_nm"]  # what the fit leaves without any effect
-
-    def _residual(self, stages: list[Stage]) -> tuple[Floats, dict[str, float]]:
-        torque = simulate(self.base, stages, self.design, STEP_S)
-        if not np.all(np.isfinite(torque)):
-            raise NotSuited("the simulation diverged")
-        every = round(1.0 / PULSE_RATE_HZ / STEP_S)
-        return torque, excess_nm(self.counted, self._effect_free_fit.fit(torque[::every]), self.design.held_out)
-
-    def at(self, magnitude: float) -> dict[str, float]:
-        """Excess in N·m; the error without the effect is taken out of `counted_nm`."""
-        torque, fit = self._residual(combine(self.base, [(self.formulation, magnitude)]))
-        counted = float(np.sqrt(max(fit["counted_nm"] ** 2 - self.own_nm**2, 1e-18)))
-        if self.counted == "added":
-            counted = float(np.std(torque - self._without))
-        return fit | {"counted_nm": counted}
 
 
 def find_magnitude(
@@ -198,21 +155,37 @@ def find_magnitude(
 
     Raises NotSuited: the excess of the largest magnitude is too small, or the fit without the effect too poor.
     """
-    excess = _Excess(counted, formulation, base, design)
-    if excess.own_nm > 0.5 * target_nm:
+    effect_free = EffectFreeFit(base, design)
+
+    def residual(stages: list[Stage]) -> tuple[Floats, dict[str, float]]:
+        torque = simulate(base, stages, design, STEP_S)
+        if not np.all(np.isfinite(torque)):
+            raise NotSuited("the simulation diverged")
+        every = round(1.0 / PULSE_RATE_HZ / STEP_S)
+        return torque, excess_nm(counted, effect_free.fit(torque[::every]), design.held_out)
+
+    def excess_at(magnitude: float) -> dict[str, float]:
+        """Excess in N·m; the error without the effect is taken out of `counted_nm`."""
+        torque, fit = residual(combine(base, [(formulation, magnitude)]))
+        left_nm = float(np.sqrt(max(fit["counted_nm"] ** 2 - own_nm**2, 1e-18)))
+        return fit | {"counted_nm": float(np.std(torque - without)) if counted == "added" else left_nm}
+
+    without, fit = residual(base.stages())
+    own_nm = fit["counted_nm"]  # what the fit leaves without any effect
+    if own_nm > 0.5 * target_nm:
         raise NotSuited("the effect-free fit follows this base too poorly")
     high = formulation.largest_magnitude
-    at_high = excess.at(high)["counted_nm"]
+    at_high = excess_at(high)["counted_nm"]
     if at_high < target_nm:
         raise NotSuited("too small even at its largest magnitude")
     low, at_low = high * 1e-3, target_nm * 1e-3
     magnitude = high * target_nm / at_high
     for tries in range(12):
-        excess_now = excess.at(magnitude)
-        shown_nm = excess_now["counted_nm"]
+        excess = excess_at(magnitude)
+        shown_nm = excess["counted_nm"]
         close = abs(np.log(shown_nm / target_nm)) < (0.1 if tries < 6 else 1.0)
         if close and band_nm[0] * 1.03 < shown_nm < band_nm[1] * 0.97:
-            return magnitude, excess_now
+            return magnitude, excess
         if shown_nm > target_nm:
             high, at_high = magnitude, shown_nm
         else:

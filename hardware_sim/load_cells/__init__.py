@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from stimrig.hardware_sim.load_cells.cells import CELLS
-from stimrig.hardware_sim.load_cells.frames import FrameHandler, TransportProtocol
 from stimrig.hardware_sim.load_cells.slcan import Slcan
 from stimrig.hardware_sim.load_cells.socketcand import Socketcand
-from stimrig.hardware_sim.ports import Reactor
 
 __all__ = ["CELLS", "TRANSPORTS"]
 
-TRANSPORTS: dict[str, Callable[[Reactor, FrameHandler], TransportProtocol]] = {"slcan": Slcan, "socketcand": Socketcand}
-"""By name, in alphabetical order."""
+TRANSPORTS: dict[str, type[Slcan | Socketcand]] = {"slcan": Slcan, "socketcand": Socketcand}
+"""Connections of the CAN bus to the host by name, in alphabetical order."""

@@ -11,9 +11,8 @@ import struct
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
-from stimrig.hardware_sim.load_cells.frames import Frame, Sample
+from stimrig.hardware_sim.load_cells.frames import AngleReading, Frame, Sample
 
-SYNC_BIT, ANGLE_FAULT_BIT = 0x01, 0x02
 TORQUE = struct.Struct("<fHBB")
 """Little endian: torque in N·m, counter, status, spare."""
 
@@ -54,48 +53,37 @@ class Plain(Cell):
     With three samples per frame: three int16 counts of 2 mN·m and a 16-bit counter of frames, without the sync line.
     """
 
-    PACKED = struct.Struct("<hhhH")
-    COUNTS_PER_NM = 500
-
     name, can_id, layouts = "plain", 0x181, {1: {}, 3: _packed("torque_packed3", 3, "Counter")}
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
-        """Values are limited to full scale; NaN is the lowest count."""
         last = samples[-1]
         if len(samples) == 1:
-            return TORQUE.pack(last.torque_nm, last.counter & 0xFFFF, SYNC_BIT if last.sync else 0, 0)
-        counts = (_counts(sample.torque_nm, self.COUNTS_PER_NM, nothing=-32767) for sample in samples)
-        return self.PACKED.pack(*counts, last.counter // self.samples_per_frame & 0xFFFF)
+            return TORQUE.pack(last.torque_nm, last.counter & 0xFFFF, int(last.sync), 0)
+        counts = (_counts(sample.torque_nm, per_unit=500, nothing=-32767) for sample in samples)
+        return struct.pack("<hhhH", *counts, last.counter // self.samples_per_frame & 0xFFFF)
 
 
 class Counts(Cell):
     """Like ME's GSV-4: id 610, big endian, no counter and no sync line; several samples of a frame follow one another.
 
-    16-bit counts in offset binary: 32768 is zero, full scale 50 N·m.
+    16-bit counts in offset binary, limited to full scale: 32768 is zero, full scale 50 N·m, NaN the lowest count.
     """
-
-    ZERO_COUNTS = 32768
-    COUNTS_PER_NM = 32767 / 50.0
 
     name, can_id, layouts = "counts", 610, {count: _packed("counts_be16", count, "") for count in (1, 2, 3, 4)}
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
-        """Values are limited to full scale; NaN is the lowest count."""
-        return b"".join(self._count(sample.torque_nm).to_bytes(2, "big") for sample in samples)
-
-    def _count(self, torque_nm: float) -> int:
-        counts = self.ZERO_COUNTS + round(torque_nm * self.COUNTS_PER_NM) if math.isfinite(torque_nm) else 0
-        return min(max(counts, 0), 0xFFFF)
+        values = (sample.torque_nm for sample in samples)
+        counts = (32768 + round(nm * (32767 / 50.0)) if math.isfinite(nm) else 0 for nm in values)
+        return struct.pack(f">{len(samples)}H", *(min(max(count, 0), 0xFFFF) for count in counts))
 
 
-class CanOpen(Cell):
+class CanOpen(Plain):
     """A CANopen cell, node 1: the default's layout in TPDO1 (0x181), sent only after NMT start (000#0100 or 000#0101).
 
     NMT: 01 start, 02 stop, 80 pre-operational, 81 and 82 reset; node 0 means all (CiA 301).
     """
 
-    NMT_ID, NODE = 0x000, 1
-    START, STOP_COMMANDS = 0x01, (0x02, 0x80, 0x81, 0x82)
+    NODE, START, STOP_COMMANDS = 1, 0x01, (0x02, 0x80, 0x81, 0x82)
 
     name, can_id, layouts = "canopen", 0x180 + NODE, {1: {"start_frames": ["000#0101"], "stop_frames": ["000#0201"]}}
 
@@ -103,40 +91,27 @@ class CanOpen(Cell):
         super().__init__(samples_per_frame)
         self.running = False
 
-    def pack(self, samples: Sequence[Sample]) -> bytes:
-        """Pack one sample."""
-        sample = samples[0]
-        return TORQUE.pack(sample.torque_nm, sample.counter & 0xFFFF, int(sample.sync), 0)
-
     def received(self, can_id: int, data: bytes) -> None:
         """NMT commands for this node or for all."""
-        if can_id == self.NMT_ID and len(data) == 2 and data[1] in (0, self.NODE):
-            if data[0] == self.START:
-                self.running = True
-            elif data[0] in self.STOP_COMMANDS:
-                self.running = False
+        if can_id == 0 and len(data) == 2 and data[1] in (0, self.NODE):
+            self.running = data[0] == self.START or (self.running and data[0] not in self.STOP_COMMANDS)
 
 
 class WithAngle(Cell):
     """Its electronics read the joint's angle too: id 0x181, both in one frame and by one clock.
 
-    Little endian: float32 torque in N·m, int16 raw angle in 0.01 degrees, 8-bit counter, status (bit 0 sync, bit 1
-    fault of the angle). The default cell's frame has one free byte only, so that one could not carry the angle.
+    Little endian: float32 torque in N·m, int16 raw angle in 0.01 degrees (an angle that is no number is the lowest
+    count), 8-bit counter, status (bit 0 sync, bit 1 fault of the angle). The default cell's frame has one free byte
+    only, so that one could not carry the angle.
     """
-
-    LAYOUT = struct.Struct("<fhBB")
-    COUNTS_PER_DEG = 100
-    NO_ANGLE = -32768
 
     name, can_id, layouts = "with_angle", 0x181, {1: {"dbc": "torque_with_angle"}}
 
     def pack(self, samples: Sequence[Sample]) -> bytes:
-        """Pack one sample; an angle that is no number is the lowest count."""
         sample = samples[0]
-        status = (SYNC_BIT if sample.sync else 0) | (ANGLE_FAULT_BIT if sample.angle and sample.angle.fault else 0)
-        angle_deg = sample.angle.angle_deg if sample.angle else math.nan
-        counts = _counts(angle_deg, self.COUNTS_PER_DEG, nothing=self.NO_ANGLE)
-        return self.LAYOUT.pack(sample.torque_nm, counts, sample.counter & 0xFF, status)
+        angle = sample.angle or AngleReading(math.nan, fault=False)
+        counts, status = _counts(angle.angle_deg, per_unit=100, nothing=-32768), int(sample.sync) | 2 * angle.fault
+        return struct.pack("<fhBB", sample.torque_nm, counts, sample.counter & 0xFF, status)
 
 
 def _counts(value: float, per_unit: float, nothing: int) -> int:
@@ -144,5 +119,7 @@ def _counts(value: float, per_unit: float, nothing: int) -> int:
     return min(max(round(value * per_unit), -32767), 32767) if math.isfinite(value) else nothing
 
 
-CELLS: dict[str, type[Cell]] = {cell.name: cell for cell in sorted(Cell.__subclasses__(), key=lambda cell: cell.name)}
+CELLS: dict[str, type[Cell]] = {
+    cell.name: cell for cell in sorted([*Cell.__subclasses__(), *Plain.__subclasses__()], key=lambda cell: cell.name)
+}
 """By name, in alphabetical order."""

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 LARGEST_STANDARD_ID = 0x7FF
 
@@ -46,23 +46,3 @@ class Frame(NamedTuple):
 
 FrameHandler = Callable[[int, bytes], None]
 """Called with the id and data of each frame from the host."""
-
-
-class TransportProtocol(Protocol):
-    """Connection of the CAN bus to the host."""
-
-    can: dict[str, Any]
-    """Arguments of `can.Bus`."""
-
-    @property
-    def overruns(self) -> int:
-        """Frames dropped because the host did not read."""
-        ...
-
-    def send(self, frames: Sequence[Frame]) -> None:
-        """Frames to every client that listens; never blocks."""
-        ...
-
-    def close(self) -> None:
-        """Unplug."""
-        ...

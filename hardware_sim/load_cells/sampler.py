@@ -23,7 +23,7 @@ class LoadCell:
     Faults act on `torque_hooks` and `frame_hooks`. A torque hook changes a reading at a time; a frame hook takes a
     frame and returns those that are sent instead. A muscle may have a method `converted_nm(reading_nm, time_s)`: the
     last stage of its cell, which comes after noise and offset (a converter that clips). `read_angle(time_s)` is there
-    where the cell's electronics read a joint angle too; it is read after the torque.
+    where the cell's electronics read a joint angle too, after the torque.
     """
 
     def __init__(
@@ -41,9 +41,9 @@ class LoadCell:
         self.clock = SampleClock(settings.rate_hz, settings.clock_ppm, jitter_s, JITTER_SEED, epoch_us)
         self.cell = _make_cell(settings)
         self._muscle, self._settings, self._noise = muscle, settings, Noise(settings.noise_nm, settings.noise_seed)
-        self._converted_nm: Callable[[float, float], float] | None = getattr(muscle, "converted_nm", None)
+        converted_nm: TorqueHook | None = getattr(muscle, "converted_nm", None)
+        self._converter = [converted_nm] if converted_nm else []
         self._read_angle = read_angle
-        self._one_by_one = self._converted_nm is not None or read_angle is not None
         self._sync = False
         self._unsent: list[Sample] = []
         self._frames: list[Frame] = []
@@ -54,7 +54,7 @@ class LoadCell:
 
     def produce(self, until_s: float) -> None:
         """Take all samples that are due before `until_s`, in emulated seconds."""
-        if self._one_by_one or self.torque_hooks or self.frame_hooks:
+        if self._converter or self._read_angle or self.torque_hooks or self.frame_hooks:
             while self.clock.next_s() < until_s:
                 self.sample()
         elif times_s := self.clock.advance_until(until_s):
@@ -88,10 +88,8 @@ class LoadCell:
         noise_nm = self._noise.draw(len(times_s))
         offset_nm = self._settings.torque_offset_nm
         readings_nm = [nm + offset_nm + more for nm, more in zip(torques_nm, noise_nm, strict=True)]
-        if self._converted_nm is not None:
-            readings_nm = [self._converted_nm(readings_nm[0], times_s[0])]
-        for hook in self.torque_hooks:
-            readings_nm = [hook(readings_nm[0], times_s[0])]
+        for change in (*self._converter, *self.torque_hooks):
+            readings_nm = [change(readings_nm[0], times_s[0])]
         angle = self._read_angle(times_s[0]) if self._read_angle else None
         counters = range(self.counter, self.counter + len(times_s))
         syncs = chain((self._sync,), repeat(False))

@@ -42,7 +42,7 @@ class Slcan:
     def close(self) -> None:
         """Pull the adapter out."""
         if self._port.is_open:
-            self._reactor.remove(self._port)
+            self._reactor.unregister(self._port)
             self._port.close()
 
     def _read(self) -> None:

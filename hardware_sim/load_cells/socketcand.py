@@ -6,139 +6,77 @@ packet takes the handshake as failed, and nothing on the wire shows when it has 
 
 from __future__ import annotations
 
+import math
 import socket
 import time
 from collections.abc import Sequence
 from typing import Any
 
 from stimrig.hardware_sim.load_cells.frames import LARGEST_STANDARD_ID, Frame, FrameHandler
-from stimrig.hardware_sim.ports import Reactor
+from stimrig.hardware_sim.ports import Client, Reactor, Server
 
 CHANNEL = "can0"
 QUIET_S = 0.05
 LARGEST_BACKLOG_BYTES = 1 << 20
+UNOPENED, OPENED = math.inf, math.nan
+"""States of a client before it is in raw mode; then its state is the time from which frames are sent to it."""
 
 
-class Socketcand:
+class Socketcand(Server):
     """Serves any number of clients, each with the same frames."""
 
     def __init__(self, reactor: Reactor, on_frame: FrameHandler) -> None:
-        self._reactor, self._on_frame = reactor, on_frame
-        self._clients: list[_Client] = []
+        listener = socket.create_server(("127.0.0.1", 0))
+        super().__init__(reactor, listener, self._obey)
+        self._on_frame = on_frame
         self.overruns = 0
-        self._listener = socket.create_server(("127.0.0.1", 0))
-        self._listener.setblocking(False)
-        reactor.add(self._listener, self._accept)
-        host, port = self._listener.getsockname()
+        host, port = listener.getsockname()
         self.can: dict[str, Any] = {"interface": "socketcand", "host": host, "port": port, "channel": CHANNEL}
+
+    def connected(self, client: Client) -> None:
+        """Greet it."""
+        client.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.state = UNOPENED
+        client.backlog += b"< hi >"
+        self.flush()
 
     def send(self, frames: Sequence[Frame]) -> None:
         """Frames to every client in raw mode."""
-        message = b"".join(map(_text, frames)) if self._clients else b""
+        message = b"".join(map(_text, frames)) if self.clients else b""
         now_s = time.monotonic()
-        for client in list(self._clients):
-            if not client.listens(now_s):
-                continue
-            if len(client.backlog) > LARGEST_BACKLOG_BYTES:
-                self.overruns += len(frames)
-            else:
-                client.backlog += message
-            self._flush(client)
+        for client in self.clients:
+            if client.state <= now_s:
+                if len(client.backlog) > LARGEST_BACKLOG_BYTES:
+                    self.overruns += len(frames)
+                else:
+                    client.backlog += message
+        self.flush()
 
-    def close(self) -> None:
-        """Close the bus for everybody."""
-        for client in list(self._clients):
-            self._drop(client)
-        if self._listener.fileno() >= 0:
-            self._reactor.remove(self._listener)
-            self._listener.close()
+    def _obey(self, client: Client) -> None:
+        *messages, rest = client.received.split(b">")
+        client.received = rest[-4096:]
+        for message in messages:
+            words = message.decode("ascii", errors="replace").replace("<", " ").split()
+            client.backlog += self._answer(client, words)
 
-    def _accept(self) -> None:
-        try:
-            connection, _ = self._listener.accept()
-        except OSError:  # the client has already disconnected
-            return
-        connection.setblocking(False)
-        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        client = _Client(connection)
-        self._clients.append(client)
-        self._reactor.add(connection, lambda: self._read(client))
-        self._answer(client, b"< hi >")
-
-    def _read(self, client: _Client) -> None:
-        try:
-            data = client.connection.recv(65536)
-        except BlockingIOError:
-            return
-        except OSError:
-            data = b""
-        if not data:
-            self._drop(client)
-            return
-        client.text += data.decode("ascii", errors="replace")
-        while client in self._clients and ">" in client.text:
-            message, client.text = client.text.split(">", 1)
-            self._obey(client, message.replace("<", " ").split())
-        client.text = client.text[-4096:]
-
-    def _obey(self, client: _Client, words: list[str]) -> None:
+    def _answer(self, client: Client, words: list[str]) -> bytes:
+        opened = client.state != UNOPENED
         match words:
             case ["open", name]:
-                client.opened = name == CHANNEL
-                self._answer(client, b"< ok >" if client.opened else b"< error could not open bus >")
-            case ["rawmode"] if client.opened:
-                self._answer(client, b"< ok >")
-                client.raw_from_s = time.monotonic() + QUIET_S
-            case ["send", can_id, length, *data] if client.opened:
-                self._receive_frame(client, can_id, length, data)
-            case ["echo"]:
-                self._answer(client, b"< echo >")
-            case _:
-                self._answer(client, b"< error unknown command >")
-
-    def _receive_frame(self, client: _Client, can_id: str, length: str, data: list[str]) -> None:
-        try:
-            payload = bytes(int(byte, 16) for byte in data)
-            if len(payload) != int(length, 16):
-                raise ValueError
-            self._on_frame(int(can_id, 16), payload)
-        except ValueError:
-            self._answer(client, b"< error unknown command >")
-
-    def _answer(self, client: _Client, message: bytes) -> None:
-        client.backlog += message
-        self._flush(client)
-
-    def _flush(self, client: _Client) -> None:
-        try:
-            sent = client.connection.send(client.backlog)
-        except BlockingIOError:
-            return
-        except OSError:
-            self._drop(client)
-            return
-        del client.backlog[:sent]
-
-    def _drop(self, client: _Client) -> None:
-        if client in self._clients:
-            self._clients.remove(client)
-            self._reactor.remove(client.connection)
-            client.connection.close()
-
-
-class _Client:
-    """One connection: text received and not yet parsed, bytes not yet sent."""
-
-    def __init__(self, connection: socket.socket) -> None:
-        self.connection = connection
-        self.text = ""
-        self.backlog = bytearray()
-        self.opened = False
-        self.raw_from_s: float | None = None
-
-    def listens(self, now_s: float) -> bool:
-        """Return whether frames may be sent to it."""
-        return self.raw_from_s is not None and now_s >= self.raw_from_s
+                client.state = OPENED if name == CHANNEL else UNOPENED
+                return b"< ok >" if name == CHANNEL else b"< error could not open bus >"
+            case ["rawmode"] if opened:
+                client.state = time.monotonic() + QUIET_S
+                return b"< ok >"
+            case ["send", can_id, length, *data] if opened:
+                try:
+                    payload = bytes(int(byte, 16) for byte in data)
+                    if len(payload) == int(length, 16):
+                        self._on_frame(int(can_id, 16), payload)
+                        return b""
+                except ValueError:
+                    pass
+        return b"< error unknown command >"
 
 
 def _text(frame: Frame) -> bytes:

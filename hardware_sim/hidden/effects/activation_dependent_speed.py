@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from stimrig.hardware_sim.hidden.base import lag_after
+from stimrig.hardware_sim.hidden.base import force_after
 from stimrig.hardware_sim.hidden.forms import Effect, Sign, draws, even, two_lags
 from stimrig.hardware_sim.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, SPEED, STEP_S
 
@@ -40,9 +40,7 @@ def _calcium_pump(x, p, s, c):
     slope = rate * (release - before / (1.0 + sigma * before))
     guess = max(before + c[STEP_S] * slope, 0.0)
     s[0] += 0.5 * c[STEP_S] * (slope + rate * (release - guess / (1.0 + sigma * guess)))
-    s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], p[1], c[STEP_S])
-    c[FORCE] = s[1] / c[LARGEST_NM]
-    return s[1]
+    return force_after(before, s, p[1], c)
 
 
 @EFFECT.form(
@@ -55,9 +53,7 @@ def _bound_calcium(x, p, s, c):
     s[0] += (x / c[LARGEST_NM] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
     bound = max(s[0], 0.0)
     tau = p[2] * (1.0 + p[0] * bound) / (1.0 + 0.4 * p[0])
-    s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], tau, c[STEP_S])
-    c[FORCE] = s[1] / c[LARGEST_NM]
-    return s[1]
+    return force_after(before, s, tau, c)
 
 
 @EFFECT.form("cooperative attachment, faster when strong", "Campbell 1997")
@@ -68,9 +64,7 @@ def _cooperative(x, p, s, c):
     s[0] += (x / c[LARGEST_NM] - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
     share = min(max(s[1] / c[LARGEST_NM], 0.0), 1.2)
     rate = (1.0 + p[0] * share) / (1.0 + 0.4 * p[0]) / p[2]
-    s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], 1.0 / rate, c[STEP_S])
-    c[FORCE] = s[1] / c[LARGEST_NM]
-    return s[1]
+    return force_after(before, s, 1.0 / rate, c)
 
 
 @EFFECT.held_back(

@@ -6,9 +6,9 @@ import math
 
 from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base, lag_after, second_order_step
+from stimrig.hardware_sim.hidden.base import Base, force_after, lag_after, second_order_step
 from stimrig.hardware_sim.hidden.forms import Effect, Sign, draws, mostly, second_order, two_lags
-from stimrig.hardware_sim.hidden.kernels import FORCE, LARGEST_NM, STEP_S
+from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, STEP_S
 
 EFFECT = Effect()
 
@@ -40,9 +40,7 @@ def _thelen(x, p, s, c):
     tau = p[0] / math.sqrt(p[2]) * factor if e > a else p[0] * math.sqrt(p[2]) / factor
     before = s[0]
     s[0] += (e - s[0]) * (1.0 - math.exp(-c[STEP_S] / tau))
-    s[1] = lag_after(before * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], p[1], c[STEP_S])
-    c[FORCE] = s[1] / c[LARGEST_NM]
-    return s[1]
+    return force_after(before, s, p[1], c)
 
 
 @EFFECT.form("tanh-smoothed activation dynamics", "De Groote, Kinney, Rao and Fregly 2016")
@@ -65,9 +63,7 @@ def _de_groote(x, p, s, c):
     up = math.exp(0.5 * p[2]) / (p[0] * factor)
     down = math.exp(-0.5 * p[2]) * factor / p[0]
     s[0] += (e - a) * (1.0 - math.exp(-c[STEP_S] * ((f + 0.5) * up + (0.5 - f) * down)))
-    s[1] = lag_after(a * c[LARGEST_NM], s[0] * c[LARGEST_NM], s[1], p[1], c[STEP_S])
-    c[FORCE] = s[1] / c[LARGEST_NM]
-    return s[1]
+    return force_after(a, s, p[1], c)
 
 
 @EFFECT.form(
@@ -79,9 +75,7 @@ def _cross_bridges(x, p, s, c):
     """p: log ratio, 1/Tω, ζ, smoothing. Second order; the rate depends on whether force is being made or lost."""
     attached = math.tanh((x - s[0]) / (p[3] * c[LARGEST_NM]))
     rate = p[1] * math.exp(0.25 * p[0] * attached)
-    y = second_order_step(x, rate, p[2], s, 0, c[STEP_S])
-    c[FORCE] = y / c[LARGEST_NM]
-    return y
+    return second_order_step(x, rate, p[2], s, 0, c[STEP_S])
 
 
 @EFFECT.held_back(
@@ -94,10 +88,7 @@ def _limited_fall(x, p, s, c):
     before = s[0]
     s[0] += (x - s[0]) * (1.0 - math.exp(-c[STEP_S] / p[1]))
     goal = lag_after(before, s[0], s[1], p[2], c[STEP_S])
-    if p[0] > 0.0:
-        fastest = c[STEP_S] * c[LARGEST_NM] / p[0]
-        change = goal - s[1]
-        goal = s[1] + (change if change > 0.0 else -fastest * math.tanh(-change / fastest))
-    s[1] = goal
-    c[FORCE] = s[1] / c[LARGEST_NM]
+    fastest = c[STEP_S] * c[LARGEST_NM] / p[0]
+    change = goal - s[1]
+    s[1] += change if change > 0.0 else -fastest * math.tanh(-change / fastest)
     return s[1]

@@ -25,8 +25,6 @@ def _line(x, p, s, c):
 @draws("delay", 0.14, "delay_s", lags=lambda rng, _base: int(rng.integers(5, 13)))
 def _lags(x, p, s, c):
     """p: delay s, number of lags (a gamma-shaped delay), each integrated in closed form."""
-    if p[0] <= 0.0:
-        return x
     n = int(p[1])
     decay = np.exp(-c[STEP_S] * n / p[0])
     for i in range(n):
@@ -69,7 +67,5 @@ def _spread(x, p, s, c):
 def _onset(x, p, s, c):
     """p: delay s, share of it that is a lag. s[0]: place in the ring, s[1]: the lag's state."""
     x = delayed(x, min(p[0] * (1.0 - p[1]) / c[STEP_S], 690.0), s, 10, 700)
-    if p[0] > 0.0:
-        s[1] += (x - s[1]) * (1.0 - math.exp(-c[STEP_S] / (p[0] * p[1])))
-        return s[1]
-    return x
+    s[1] += (x - s[1]) * (1.0 - math.exp(-c[STEP_S] / (p[0] * p[1])))
+    return s[1]

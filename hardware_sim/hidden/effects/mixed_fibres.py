@@ -9,7 +9,7 @@ from numpy.random import Generator
 
 from stimrig.hardware_sim.hidden.base import Base, second_order_step
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws, second_order
-from stimrig.hardware_sim.hidden.kernels import FORCE, LARGEST_NM, STEP_S
+from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, STEP_S
 
 EFFECT = Effect()
 
@@ -27,14 +27,16 @@ def _two_branches(x, p, s, c):
         slow = x - fast
     else:
         fast, slow = p[3] * x, (1.0 - p[3]) * x
-    y = second_order_step(fast, p[0], p[2], s, 0, c[STEP_S]) + second_order_step(slow, p[1], p[2], s, 2, c[STEP_S])
-    c[FORCE] = y / c[LARGEST_NM]
-    return y
+    return second_order_step(fast, p[0], p[2], s, 0, c[STEP_S]) + second_order_step(slow, p[1], p[2], s, 2, c[STEP_S])
 
 
 EFFECT.form(
-    "fast fibres recruited before the slow ones", "reversed order: Trimble and Enoka 1991; Gregory and Bickel 2005"
-)(_two_branches.drawing(_base=second_order, fast_share=(0.3, 0.7), _ordered=1.0))
+    "fast fibres recruited before the slow ones",
+    "reversed order: Trimble and Enoka 1991; Gregory and Bickel 2005",
+    _base=second_order,
+    fast_share=(0.3, 0.7),
+    _ordered=1.0,
+)(_two_branches)
 
 
 SPREAD = 7
@@ -57,7 +59,6 @@ def _spectrum(x, p, s, c):
     y = 0.0
     for i in range(7):
         y += second_order_step(p[1 + i] * x, p[8 + i], p[0], s, 2 * i, c[STEP_S])
-    c[FORCE] = y / c[LARGEST_NM]
     return y
 
 
@@ -73,9 +74,7 @@ def _slow_tail(x, p, s, c):
     """p: slow share, 1/Tω, ζ, time constant of the slow first-order fibres s."""
     fast = second_order_step(x, p[1], p[2], s, 0, c[STEP_S])
     s[2] += (x - s[2]) * (1.0 - math.exp(-c[STEP_S] / p[3]))
-    y = (1.0 - p[0]) * fast + p[0] * s[2]
-    c[FORCE] = y / c[LARGEST_NM]
-    return y
+    return (1.0 - p[0]) * fast + p[0] * s[2]
 
 
 @EFFECT.held_back("slow fibres of third order", "sim")
@@ -94,6 +93,4 @@ def _third_order(x, p, s, c):
     for i in range(3):
         s[2 + i] = signal + (s[2 + i] - signal) * decay
         signal = s[2 + i]
-    y = (1.0 - p[0]) * fast + p[0] * signal
-    c[FORCE] = y / c[LARGEST_NM]
-    return y
+    return (1.0 - p[0]) * fast + p[0] * signal

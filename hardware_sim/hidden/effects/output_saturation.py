@@ -14,8 +14,6 @@ EFFECT = Effect()
 @draws("structure", 4.0, "largest_over_knee")
 def _tanh(x, p, s, c):
     """p: largest torque over the knee."""
-    if p[0] <= 0.0:
-        return x
     knee = c[LARGEST_NM] / p[0]
     return knee * math.tanh(x / knee)
 
@@ -24,8 +22,6 @@ def _tanh(x, p, s, c):
 @draws("structure", 4.0, "largest_over_limit", exponent=(1.5, 6.0))
 def _power(x, p, s, c):
     """p: largest torque over the limit, exponent. x / (1 + (x/limit)^p)^(1/p)."""
-    if p[0] <= 0.0:
-        return x
     limit = c[LARGEST_NM] / p[0]
     return x / (1.0 + (abs(x) / limit) ** p[1]) ** (1.0 / p[1])
 
@@ -34,8 +30,6 @@ def _power(x, p, s, c):
 @draws("structure", 4.0, "exponent")
 def _tendon(x, p, s, c):
     """p: exponent at the largest torque. Torque lost where the tendon stretches: (1 - exp(-k x)) / k."""
-    if p[0] < 1e-9:
-        return x
     k = p[0] / c[LARGEST_NM]
     return (1.0 - math.exp(-k * x)) / k
 
@@ -64,7 +58,5 @@ def _hyperbola(x, p, s, c):
 @draws("structure", 5.0, "largest_over_knee")
 def _arctangent(x, p, s, c):
     """p: largest torque over the knee."""
-    if p[0] <= 0.0:
-        return x
     knee = c[LARGEST_NM] / p[0]
     return knee * math.atan(x / knee)

@@ -7,7 +7,6 @@ from numpy.random import Generator
 
 from stimrig.hardware_sim.hidden.base import Base, look_up
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws, recruitment_table
-from stimrig.hardware_sim.hidden.kernels import ACTIVATION, LARGEST_NM
 
 EFFECT = Effect()
 
@@ -97,7 +96,6 @@ def _unit_thresholds(x, p, s, c):
             elif x + half < s[i]:
                 s[i] = x + half
             w += step * min(max(s[i] - i, 0.0), 1.0)
-    c[ACTIVATION] = w / c[LARGEST_NM]
     return w
 
 
@@ -119,6 +117,4 @@ def _two_curves(x, p, s, c):
     s[1] = x
     q = s[0] * (1.5 - 0.5 * s[0] * s[0])
     up, down = look_up(p, x * (1.0 - p[512])), look_up(p, x * (1.0 + p[512]))
-    w = 0.5 * (1.0 + q) * up + 0.5 * (1.0 - q) * down
-    c[ACTIVATION] = w / c[LARGEST_NM]
-    return w
+    return 0.5 * (1.0 + q) * up + 0.5 * (1.0 - q) * down

@@ -12,8 +12,6 @@ EFFECT = Effect()
 @draws("converter", 0.8, "share_cut_off")
 def _rail(x, p, s, c):
     """p: share of the largest torque that is cut off."""
-    if p[0] <= 0.0:
-        return x
     return min(x, (1.0 - p[0]) * c[LARGEST_NM])
 
 
@@ -21,8 +19,6 @@ def _rail(x, p, s, c):
 @draws("converter", 0.8, "share_cut_off", lower_rail_share=(0.05, 0.3))
 def _both_rails(x, p, s, c):
     """p: share cut off, lower rail as a share of the largest torque."""
-    if p[0] <= 0.0:
-        return x
     return max(min(x, (1.0 - p[0]) * c[LARGEST_NM]), -p[1] * c[LARGEST_NM])
 
 
@@ -30,8 +26,6 @@ def _both_rails(x, p, s, c):
 @draws("converter", 0.8, "share_cut_off", counts=lambda rng, _base: int(rng.choice([2047, 4095, 8191])))
 def _converter(x, p, s, c):
     """p: share cut off, counts up to the rail. A coarse-ish converter whose code stops at its end."""
-    if p[0] <= 0.0:
-        return x
     rail = (1.0 - p[0]) * c[LARGEST_NM]
     count = rail / p[1]
     return min(float(round(x / count)), p[1]) * count
@@ -41,8 +35,6 @@ def _converter(x, p, s, c):
 @draws("converter", 0.8, "share_cut_off", stays_s=(0.005, 0.03))
 def _overload(x, p, s, c):
     """p: share of the largest torque cut off, s the amplifier stays at the rail. s[0]: until when."""
-    if p[0] <= 0.0:
-        return x
     rail = (1.0 - p[0]) * c[LARGEST_NM]
     if x >= rail:
         s[0] = c[TIME_S] + p[1]

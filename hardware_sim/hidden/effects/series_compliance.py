@@ -41,13 +41,11 @@ def _resonate(x, omega, damping, stiffening, s, step_s):
 )
 def _in_series(x, p, s, c):
     """p: 1/ω² s², ζ, stiffening at the largest torque."""
-    if p[0] < 1e-8:
-        return x
     return _resonate(x, 1.0 / math.sqrt(p[0]), p[1], p[2] / (c[LARGEST_NM] * c[LARGEST_NM]), s, c[STEP_S])
 
 
-EFFECT.form("mass on a spring that stiffens", "tendon toe region, Zajac 1989")(
-    _in_series.drawing(zeta=(0.04, 0.3), stiffening=(0.3, 2.5))
+EFFECT.form("mass on a spring that stiffens", "tendon toe region, Zajac 1989", zeta=(0.04, 0.3), stiffening=(0.3, 2.5))(
+    _in_series
 )
 
 
@@ -75,8 +73,6 @@ def _chain(x, p, s, c):
 
     Muscle pulls the first mass against the second, the load cell holds the second: x -> m1 -> spring -> m2 -> cell.
     """
-    if p[0] < 1e-8:
-        return x
     omega = 1.0 / math.sqrt(p[0])
     second = omega * p[2]
     pieces = int(second * c[STEP_S] / 0.05) + 1

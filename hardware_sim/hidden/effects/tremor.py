@@ -47,9 +47,7 @@ def _wandering(x, p, s, c):
     return x + size * (math.sin(s[0]) + p[3] * math.sin(2.0 * s[0] + 0.7))
 
 
-EFFECT.form("action tremor, grows with force", "McAuley and Marsden 2000")(
-    _wandering.drawing(**OSCILLATOR, _with_force=1.0)
-)
+EFFECT.form("action tremor, grows with force", "McAuley and Marsden 2000", **OSCILLATOR, _with_force=1.0)(_wandering)
 
 
 def _lines(rng: Generator, _base: Base) -> Numbers:
