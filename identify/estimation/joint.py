@@ -84,7 +84,7 @@ class Fitted:
     @property
     def effects(self) -> list[tuple[str, Form]]:
         """Effects and their forms."""
-        return [(chosen.effect, chosen.form) for chosen in self.problem.chosen]
+        return self.problem.effects
 
     @property
     def physical(self) -> np.ndarray:

@@ -123,9 +123,9 @@ def fit_from(setup: Setup, starts_s: tuple[float, ...], roughness: np.ndarray, d
 def start_at(setup: Setup, linear: SecondOrder, roughness: np.ndarray) -> tuple[Problem, np.ndarray, NoiseLevel]:
     """The problem with the smoothness of the curve, its parameters, and the white noise, at given dynamics.
 
-    All but the dynamics is linear: it is solved for.
+    All but the dynamics is linear: it is solved for. `setup`: of `plain_setup`, without a penalty.
     """
-    problem = Problem(setup.with_(roughness=np.zeros_like(roughness)), [])
+    problem = Problem(setup, [])
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
     theta = np.clip(problem.from_physical(values), problem.lower, problem.upper)
@@ -134,15 +134,16 @@ def start_at(setup: Setup, linear: SecondOrder, roughness: np.ndarray) -> tuple[
     assert slopes is not None
     noise = NoiseLevel(0.0, 0.0, USUAL_NOISE * setup.scale_nm)
     others = np.arange(problem.baselines.start, problem.coefficients.start)
-    smoothness = _smoothness(problem, setup.target_nm - mean, slopes, theta, others, noise, roughness)
-    problem = Problem(setup.with_(roughness=smoothness.weight / smoothness.variance * roughness), [])
-    noise = NoiseLevel(0.0, 0.0, noise.sd_nm * float(np.sqrt(smoothness.variance)))
-    free = np.arange(problem.baselines.start, problem.coefficients.stop)
+    curve = np.arange(problem.coefficients.start, problem.coefficients.stop)
+    free = np.r_[curve, others]
     products = gram(setup.whitened(np.vstack([setup.target_nm - mean, slopes[free]]), noise))
     prior_mean, precision = problem.prior
-    part = precision[np.ix_(free, free)]
+    smoothness = _smoothness(products, precision[np.ix_(others, others)], roughness, int(setup.fitted.sum()))
+    problem = _smoothed(problem, roughness, smoothness)
+    part = problem.prior[1][np.ix_(free, free)]
+    products = products / smoothness.variance
     theta[free] = np.linalg.solve(products[1:, 1:] + part, products[0, 1:] + part @ prior_mean[free])
-    return problem, theta, noise
+    return problem, theta, NoiseLevel(0.0, 0.0, noise.sd_nm * float(np.sqrt(smoothness.variance)))
 
 
 def plain_setup(
@@ -189,7 +190,7 @@ def _with_knots(first: Fitted, count: int, noise: NoiseLevel | None) -> Fitted:
     delay_s = setup.delay_bounds_s[0] if np.ptp(setup.delay_bounds_s) == 0.0 else None
     setup = plain_setup(setup.grid, setup.fitted, setup.basis, zeros_nm, sign, delay_s)
     basis, roughness = final_spline(setup, linear, curve, count)
-    problem, theta, white = start_at(setup.with_(basis=basis), linear, roughness)
+    problem, theta, white = start_at(setup.without_penalty(basis), linear, roughness)
     fitted = solve(problem, theta, noise or NoiseLevel(0.0, 0.5, white.sd_nm))
     for _ in range(REWEIGHTED):
         smoothed = with_smoothness(fitted, roughness)
@@ -202,38 +203,35 @@ def _with_knots(first: Fitted, count: int, noise: NoiseLevel | None) -> Fitted:
 
 def with_smoothness(fitted: Fitted, roughness: np.ndarray) -> Problem:
     """The problem with the smoothness of its curve that the solution asks for; all else is linear there, too."""
-    problem = fitted.problem
-    others = np.delete(np.arange(problem.size), problem.coefficients)
-    smoothness = _smoothness(problem, fitted.residual_nm, fitted.slopes, fitted.theta, others, fitted.noise, roughness)
-    return Problem(problem.setup.with_(roughness=smoothness.weight / smoothness.variance * roughness), fitted.effects)
-
-
-def _smoothness(
-    problem: Problem,
-    residual_nm: np.ndarray,
-    slopes: np.ndarray,
-    theta: np.ndarray,
-    others: np.ndarray,
-    noise: NoiseLevel,
-    roughness: np.ndarray,
-) -> Choice:
-    """The weight of the roughness that the data ask for (REML), with the `others` among the parameters projected out.
-
-    Its variance is relative to that of `noise`.
-    """
-    setup, place = problem.setup, problem.coefficients
-    curve = np.arange(place.start, place.stop)
+    problem, setup, place = fitted.problem, fitted.problem.setup, fitted.problem.coefficients
+    others = np.delete(np.arange(problem.size), place)
     # what the curve and the others' changes have to explain: the residual, and the curve itself
-    target = residual_nm + theta[place] @ slopes[place]
-    products = gram(setup.whitened(np.vstack([target, slopes[curve], slopes[others]]), noise))
-    inner, rows = 1 + curve.size, int(setup.fitted.sum())
-    bound = products[inner:, inner:] + problem.prior[1][np.ix_(others, others)]
+    target = fitted.residual_nm + fitted.theta[place] @ fitted.slopes[place]
+    rows = np.vstack([target, fitted.slopes[place], fitted.slopes[others]])
+    products = gram(setup.whitened(rows, fitted.noise))
+    precision = problem.prior[1][np.ix_(others, others)]
+    return _smoothed(problem, roughness, _smoothness(products, precision, roughness, int(setup.fitted.sum())))
+
+
+def _smoothed(problem: Problem, roughness: np.ndarray, choice: Choice) -> Problem:
+    """The problem with the prior that a choice makes of the roughness."""
+    return Problem(problem.setup.with_(roughness=choice.weight / choice.variance * roughness), problem.effects)
+
+
+def _smoothness(products: np.ndarray, precision: np.ndarray, roughness: np.ndarray, rows: int) -> Choice:
+    """The weight of the roughness that the data ask for (REML), with all parameters but the curve's projected out.
+
+    `products`: of the target, the slopes by the curve's coefficients and those by the others, whitened, `rows` of each;
+    `precision`: prior of the others. Its variance is relative to that of the noise they were whitened with.
+    """
+    inner, others = len(products) - len(precision), len(precision)
+    bound = products[inner:, inner:] + precision
     projected = products[:inner, :inner] - products[:inner, inner:] @ np.linalg.solve(bound, products[inner:, :inner])
     design, moment = ((projected + projected.T) / 2)[1:, 1:].copy(), projected[1:, 0].copy()
     if np.any(roughness):
-        return choose_weight(design, moment, float(projected[0, 0]), rows, roughness, others.size)
+        return choose_weight(design, moment, float(projected[0, 0]), rows, roughness, others)
     explained = float(moment @ np.linalg.lstsq(design, moment, rcond=None)[0])
-    return Choice(0.0, max(float(projected[0, 0]) - explained, 1e-14) / max(rows - inner - others.size, 1))
+    return Choice(0.0, max(float(projected[0, 0]) - explained, 1e-14) / max(rows - inner - others, 1))
 
 
 def _on_rows(fitted: Fitted, rows: np.ndarray) -> Fitted:
@@ -262,7 +260,8 @@ def final_spline(setup: Setup, linear: SecondOrder, pilot: Curve, count: int) ->
     largest_us, widths_us = pilot.basis.largest_us, setup.grid.pulse_width_us[setup.fitted]
     basis, roughness = fitting_spline(_points(pilot), largest_us, count, widths_us)
     for _ in range(2):
-        curve = curve_at(setup.with_(basis=basis), linear, roughness)
+        setup = setup.without_penalty(basis)
+        curve = curve_at(setup, linear, roughness)
         known = basis, curve.coefficients_nm
         basis, roughness = fitting_spline(_points(curve), largest_us, count, widths_us, known)
     return basis, roughness

@@ -32,8 +32,8 @@ HIGHEST_POWER = 9
 
 def with_basis(first: Fitted, basis: Basis) -> Fitted:
     """Joint estimate with a curve of another basis and white noise, from the dynamics of a first one."""
-    setup = first.problem.setup.with_(basis=basis)
-    problem, theta, _ = start_at(setup, first.linear, np.zeros((basis.size, basis.size)))
+    none = np.zeros((basis.size, basis.size))
+    problem, theta, _ = start_at(first.problem.setup.without_penalty(basis), first.linear, none)
     return solve(problem, theta, WHITE, tolerance=1e-6)
 
 

@@ -256,12 +256,12 @@ def physical(
     both = plain_setup(grid, near_rest(grid, prbs) | rows, straight.basis)
     curve, roughness = _recruitment(grid, rows, linear, knots)
     for _ in range(iterations):
-        problem, theta, _ = start_at(both.with_(basis=FixedShape(curve)), linear, none)
+        problem, theta, _ = start_at(both.without_penalty(FixedShape(curve)), linear, none)
         linear = solve(problem, theta, WHITE).linear
         curve, roughness = _recruitment(grid, rows, linear, knots)
     reasons.append(f"after stage two: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}")
     # The last curve and the last dynamics; baseline and noise are estimated from both segments.
-    problem, theta, white = start_at(both.with_(basis=curve.basis), linear, roughness)
+    problem, theta, white = start_at(both.without_penalty(curve.basis), linear, roughness)
     return solve(problem, theta, NoiseLevel(0.0, 0.5, white.sd_nm), max_steps=0), reasons
 
 
@@ -271,7 +271,7 @@ def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) 
     setup = plain_setup(grid, rows, basis)
     coarse = curve_at(setup, linear, spline_roughness(basis))
     basis, roughness = final_spline(setup, linear, coarse, knots)
-    return curve_at(setup.with_(basis=basis), linear, roughness), roughness
+    return curve_at(setup.without_penalty(basis), linear, roughness), roughness
 
 
 def general(

@@ -59,7 +59,7 @@ class Problem:
     """
 
     def __init__(self, setup: Setup, effects: list[tuple[str, Form]]) -> None:
-        self.setup = setup
+        self.setup, self.effects = setup, effects
         parts, span = setup.grid.begins.size, 6.0 * setup.scale_nm
         table = [
             Parameter("time_constant_s", "s", *TIME_CONSTANT_BOUNDS_S, 0.3, (0.2,), "log"),
@@ -204,7 +204,7 @@ class _StagePass:
     def grown(self, rows: np.ndarray) -> np.ndarray:
         """An array of an earlier stage, with the rows that have come since then."""
         since = len(self.owners) + 1 - len(rows)
-        return rows[np.r_[np.arange(len(rows)), np.zeros(since, np.int64)]] if since else rows
+        return np.concatenate([rows, np.broadcast_to(rows[:1], (since, *rows.shape[1:]))]) if since else rows
 
     def forms(self, stage: str) -> list[Chosen]:
         return [chosen for chosen in self.problem.chosen if chosen.form.stage == stage]
@@ -380,7 +380,6 @@ class _StagePass:
 
     def add(self, value: np.ndarray, scene=None, skip: frozenset[str] = frozenset()) -> np.ndarray:
         part = self.setup.part_of(scene is not None)
-        scene = scene or self.setup.scene
         values = self.join(self.problem.baselines)
         value = self.grown(value) + (values if part is None else values[:, part])
         for chosen in self.forms("additive"):
@@ -390,7 +389,7 @@ class _StagePass:
                 continue
             # An added torque does not depend on the signal: rows with the same parameters share one evaluation.
             distinct = np.r_[0, np.arange(present, len(value))]
-            added = np.asarray(chosen.form.call(None, self.named(chosen, values[distinct]), scene))
+            added = np.asarray(chosen.form.call(None, self.named(chosen, values[distinct]), scene or self.setup.scene))
             value[:present] += added[:1]
             value[present:] += added[1:]
         return value

@@ -164,8 +164,17 @@ class Setup:
         return self.zero_nm + self.sign * torque_nm
 
     def with_(self, **changes: object) -> Setup:
-        """The set-up with some fields changed; other arrays than the curve's are computed again."""
+        """The set-up with some fields changed; derived arrays that do not depend on them are kept."""
         changed = replace(self, **changes)  # type: ignore
-        if changed.basis is self.basis and changed.grid is self.grid and "design" in self.__dict__:
-            changed.__dict__["design"] = self.design
+        if set(changes) <= set(_STALE) and changed.basis.largest_us == self.basis.largest_us:
+            own, stale = {*self.__dataclass_fields__}, set().union(*(_STALE[name] for name in changes))
+            changed.__dict__.update({n: v for n, v in self.__dict__.items() if n not in own and n not in stale})
         return changed
+
+    def without_penalty(self, basis: Basis) -> Setup:
+        """The set-up with another basis of the curve, and no penalty on its coefficients."""
+        return self.with_(basis=basis, roughness=np.zeros((basis.size, basis.size)))
+
+
+_STALE = {"roughness": {"penalty"}, "curve_nm": set(), "basis": {"penalty", "design"}, "fitted": {"stretches", "scene"}}
+"""Derived arrays of a `Setup` that depend on a field; on fields that are not listed they may all depend."""
