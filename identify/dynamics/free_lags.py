@@ -12,7 +12,7 @@ from enum import IntEnum
 import numpy as np
 from numba import njit
 
-from stimrig.identify.dynamics.states import step_matrix
+from stimrig.identify.dynamics.second_order import step_matrix
 
 PARTS = 3
 """Steps within a pulse interval in which the rates are evaluated."""

@@ -13,8 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from stimrig.identify.dynamics.repeats import find_repeats
-from stimrig.identify.dynamics.second_order import CUBIC, Core, curve_weights
-from stimrig.identify.dynamics.states import boundary_states, mean_weights, read_at, read_means
+from stimrig.identify.dynamics.second_order import CUBIC, Core, curve_weights, mean_weights, read_at
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
 from stimrig.identify.records.clock import pulse_phase_s
@@ -177,13 +176,6 @@ class Grid:
         rows = np.flatnonzero(late + early)
         at = np.stack([moved + whole, moved + whole + 1])
         return rows, late[rows], early[rows], moved, at, np.stack([1.0 - rest, rest])
-
-    def response(self, core: Core, delay_s: float, drive_nm: np.ndarray) -> np.ndarray:
-        """Interval means of the delayed response from rest to a drive on even slots, shape (K,) or (K, M), N·m."""
-        states = boundary_states(*core, self.step_s, self.interval_means(drive_nm))
-        torque, rate = (np.ascontiguousarray(np.atleast_2d(state.T)) for state in states)
-        mean = read_means(torque, rate, *self.mean_weights(delay_s, self.curve(core)))
-        return mean[0] if drive_nm.ndim == 1 else mean.T
 
     def at_samples(
         self, torque_nm: np.ndarray, rate_nm_s: np.ndarray, lag: float, core: Core | None = None

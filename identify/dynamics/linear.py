@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.second_order import Core, transition
+from stimrig.identify.dynamics.second_order import Core, boundary_states, read_means, recursion, transition
 
 if TYPE_CHECKING:
     from stimrig.identify.dynamics.grid import Grid
@@ -44,7 +44,10 @@ class SecondOrder:
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
         """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
-        return grid.response(self.core, self.delay_s, drive_nm)
+        drive = grid.interval_means(np.atleast_2d(drive_nm.T), axis=1)
+        weights = grid.mean_weights(self.delay_s, grid.curve(self.core))
+        mean = read_means(*boundary_states(self.core, grid.step_s, drive), *weights)
+        return mean[0] if drive_nm.ndim == 1 else mean.T
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:
         """(b, a, d) of equations (1) to (3) at a sampling rate, exact for an input held between samples.
@@ -96,7 +99,7 @@ class Discrete:
     @property
     def poles(self) -> np.ndarray:
         """Roots of A."""
-        return np.roots(self.a) if len(self.a) > 1 else np.zeros(0)
+        return np.roots(self.a)
 
     @property
     def stable(self) -> bool:
@@ -111,23 +114,22 @@ class Discrete:
         return self.step_s * (self.delay_samples + len(self.b) + decay)
 
     def on_grid(self, grid: Grid, drive_nm: np.ndarray) -> np.ndarray:
-        """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
+        """Interval means of the response from rest to a drive given on even slots, shape (K,), N·m."""
         mean_nm = grid.interval_means(drive_nm)
         if abs(grid.step_s - self.step_s) <= 1e-9:
             return self.filter(mean_nm)
         # On a grid with another pulse interval it runs at its own, and is then interpolated.
         time_s = np.arange(int(np.ceil(grid.size * grid.step_s / self.step_s))) * self.step_s
         source = np.clip(np.floor((time_s + 1e-9) / grid.step_s).astype(np.int64), 0, grid.size - 1)
-        response = self.filter(mean_nm[source])
         at = (np.arange(grid.size) + self.centre) * grid.step_s
-        columns = [np.interp(at, time_s + self.centre * self.step_s, column) for column in np.atleast_2d(response.T)]
-        return columns[0] if response.ndim == 1 else np.stack(columns, axis=1)
+        return np.interp(at, time_s + self.centre * self.step_s, self.filter(mean_nm[source]))
 
     def filter(self, drive_nm: np.ndarray) -> np.ndarray:
         """B(q)/A(q) applied along the first axis, from rest."""
-        from scipy.signal import lfilter
-
-        return np.asarray(lfilter(np.r_[np.zeros(self.delay_samples), self.b], self.a, drive_nm, axis=0))
+        forced = np.zeros(drive_nm.shape, order="F")
+        for lag, b in enumerate(self.b, start=self.delay_samples):
+            forced[lag:] += b * drive_nm[: max(len(drive_nm) - lag, 0)]
+        return recursion(np.array(self.a), forced)
 
     def between(self, grid: Grid, mean: np.ndarray) -> np.ndarray:
         """Interval means interpolated to the record's samples by a cubic through their centres, shape (N,)."""
@@ -145,8 +147,7 @@ class Discrete:
         """Response to a unit step at zero, linear between pulses."""
         time_s = np.asarray(time_s, float)
         size = int(np.ceil(max(float(np.max(time_s, initial=0.0)) / self.step_s, 1.0))) + 2
-        response = self.filter(np.ones(size))
-        return np.interp(time_s / self.step_s, np.arange(size) + self.centre, response)
+        return np.interp(time_s / self.step_s, np.arange(size) + self.centre, self.filter(np.ones(size)))
 
     def to_dict(self) -> dict:
         return {"kind": "discrete", "step_s": self.step_s, "centre": self.centre}

@@ -11,7 +11,7 @@ from enum import IntEnum
 import numpy as np
 from numba import njit
 
-from stimrig.identify.dynamics.states import step_matrix, through
+from stimrig.identify.dynamics.second_order import step_matrix, through
 
 PARTS, LEVEL_PARTS = 3, 5
 """Number of steps within a pulse interval in which a speed law, or the level of an activation, is evaluated."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.states import boundary_states
+from stimrig.identify.dynamics.second_order import boundary_states
 from stimrig.identify.errors import BadRequest, IdentifyError
 from stimrig.identify.estimation.averaged import averaged
 from stimrig.identify.estimation.disturbance import disturbed, unsure
@@ -310,7 +310,7 @@ def _play(linear: SecondOrder, curve: Curve, goal: AdaptiveGoal) -> Reach:
         if record is None and dose > goal.left_nm_s:
             return _reached(Decision("spent"), target, 0.0, 0.0)
         drive = np.repeat(curve(widths), SAMPLES)
-        torque = boundary_states(*linear.core, 1.0 / (rate * SAMPLES), drive)[0][:-1]
+        torque = boundary_states(linear.core, 1.0 / (rate * SAMPLES), drive[None, :])[0][0, :-1]
         # Always the same noise: the same question has one answer, and what was measured stays.
         measured = torque + NOISE_NM * np.random.default_rng(1).standard_normal(torque.size)
         time_s = np.arange(torque.size) / (rate * SAMPLES)

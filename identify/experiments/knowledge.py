@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from stimrig.identify.dynamics.linear import step_responses
-from stimrig.identify.dynamics.states import FROM_START, held_states, step_matrix
+from stimrig.identify.dynamics.second_order import FROM_START, held_states, step_matrix
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.short_record import Short
 from stimrig.identify.experiments.designs import Piece

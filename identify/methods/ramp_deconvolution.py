@@ -13,7 +13,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.states import boundary_states
+from stimrig.identify.dynamics.second_order import boundary_states
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import completed
 from stimrig.identify.methods import Method
@@ -82,10 +82,10 @@ def deconvolved(grid: Grid, ramp: np.ndarray, linear: SecondOrder) -> tuple[np.n
     columns = basis.design(np.clip((np.arange(grid.size) - first) * grid.step_s, 0.0, span))
     columns[last + 1 :] = 0.0
     # The torque that is left from earlier stimulation at the start of the ramp decays by the same dynamics.
-    decaying, idle = np.zeros((grid.size, 2)), np.zeros(grid.size - first)
+    decaying, idle = np.zeros((grid.size, 2)), np.zeros((1, grid.size - first))
     for column, state in enumerate(np.eye(2)):
-        states = boundary_states(linear.time_constant_s, linear.damping, grid.step_s, idle, (state[0], state[1]))
-        decaying[first:, column] = states[0][:-1]
+        states = boundary_states(linear.core, grid.step_s, idle, (state[0], state[1]))
+        decaying[first:, column] = states[0][0, :-1]
     baseline = quiet_level(grid)
     design = np.c_[linear.on_grid(grid, columns), decaying][rows]
     target = grid.torque_nm[rows] - baseline

@@ -15,8 +15,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
-from stimrig.identify.dynamics.second_order import Core
-from stimrig.identify.dynamics.states import read_means
+from stimrig.identify.dynamics.second_order import Core, read_means
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw, run_core
 from stimrig.identify.effects.base import Form, Parameter, Values
 from stimrig.identify.recruitment import Basis

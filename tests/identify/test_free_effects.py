@@ -18,7 +18,7 @@ from stimrig.identify.diagnosis.search import resembles_earlier, search_effects,
 from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
-from stimrig.identify.dynamics.states import boundary_states
+from stimrig.identify.dynamics.second_order import boundary_states
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.errors import BadModel, BadRequest
@@ -58,8 +58,8 @@ def run(drives: np.ndarray, core: tuple[float, float], **laws: float) -> tuple[n
 @pytest.mark.parametrize("swapped", [0.0, 1.0])
 def test_without_anything_free_two_lags_are_the_second_order(damping: float, swapped: float):
     own = run(drive()[None, :], (0.15, damping), SWAPPED=swapped)
-    for found, asked in zip(own, boundary_states(0.15, damping, STEP_S, drive()), strict=True):
-        np.testing.assert_allclose(found[0], asked, atol=1e-9)
+    for found, asked in zip(own, boundary_states((0.15, damping), STEP_S, drive()[None, :]), strict=True):
+        np.testing.assert_allclose(found, asked, atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from stimrig.identify.dynamics import grid as pulse_grid
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.states import boundary_states
+from stimrig.identify.dynamics.second_order import boundary_states
 from stimrig.identify.noise import NoiseLevel, whitened
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient
@@ -85,7 +85,8 @@ def test_the_curve_is_exact_however_short_a_lag_is(time_constant_s: float, dampi
     linear = SecondOrder(time_constant_s, damping)
     drive = patient.recruitment(grid.pulse_width_us)
     assert np.abs(linear.on_grid(grid, drive) - grid.torque_nm).max() < 1e-6
-    at_samples = grid.at_samples(*boundary_states(*linear.core, grid.step_s, drive), 0.0, grid.curve(linear.core))
+    torque_nm, rate_nm_s = boundary_states(linear.core, grid.step_s, drive[None, :])
+    at_samples = grid.at_samples(torque_nm[0], rate_nm_s[0], 0.0, grid.curve(linear.core))
     assert np.abs(at_samples - torque[skipped:]).max() < 1e-6
 
 
