@@ -120,7 +120,7 @@ def curve_weights(fraction: np.ndarray, step_s: float, time_constant_s: float, d
         p11, p12, p21, p22 = step_matrix(time_constant_s, damping, step_s)
         last = p12 / step_s, p22
         ends = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 0.0, 1.0, -step_s * p21 / (1.0 - p11)], [0.0, 1.0, *last]])
-        partial = step_matrix.py_func(time_constant_s, damping, s * step_s)
+        partial = step_matrix.py_func(time_constant_s, damping, s * step_s)  # type: ignore
         short = np.stack([np.ones_like(s), (1.0 - partial[0]) / (1.0 - p11), partial[1] / step_s], axis=1)
         weights += (short - weights @ ends.T) @ np.linalg.solve(ends @ ends.T, ends)
     weights[:, 1::2] *= step_s

@@ -26,13 +26,6 @@ class Curve:
         """Pulse widths, µs, and torques, N·m, dense enough for linear interpolation.
 
         The spacing is halved until the error at the midpoints is below `tolerance` times the curve's range.
-
-        Parameters
-        ----------
-        tolerance : float
-            Largest error, as a share of the curve's range.
-        most : int
-            So many points at most.
         """
         size = 151
         while True:
@@ -80,15 +73,7 @@ class FixedShape:
         return self.curve.basis.largest_us
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
-        """Shape (..., 1).
-
-        Parameters
-        ----------
-        pulse_width_us : ndarray
-            µs.
-        derivative : int
-            0: the values; 1: their slope.
-        """
+        """Values at pulse widths, µs, or a derivative; shape (..., 1)."""
         return self.curve(pulse_width_us, derivative)[..., None]
 
     def to_dict(self) -> dict:
@@ -101,13 +86,7 @@ Basis = SplineBasis | PowerBasis | SigmoidBasis | FixedShape
 
 
 def basis_from_dict(data: dict[str, Any]) -> Basis:
-    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to.
-
-    Parameters
-    ----------
-    data : dict
-        What `to_dict` of a basis gave.
-    """
+    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to."""
     match data["kind"]:
         case "cubic-spline":
             return SplineBasis(np.asarray(data["knots_us"], float))
@@ -124,14 +103,8 @@ THRESHOLD_SHARE = 0.05
 def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[str, dict[str, Any]]:
     """The landmarks by name, each with `value`, `sd` and `unit`.
 
-    A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients.
-
-    Parameters
-    ----------
-    curve : Curve
-        f(u); where it falls, its plateau is below zero.
-    covariance_nm2 : ndarray, optional
-        Of the coefficients, N²·m², shape (basis.size, basis.size).
+    A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients, N²·m².
+    Where the curve falls, its plateau is below zero.
     """
     width_us, torque_nm = curve.table()
     top = int(np.argmax(np.abs(torque_nm)))
@@ -139,9 +112,12 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
     at_top = curve.basis.design(width_us[top : top + 1])[0]
 
     def crossing(share: float) -> dict[str, Any]:
-        at_us = _crossing(width_us, torque_nm, share * plateau_nm)
-        if at_us is None:
+        level = share * abs(plateau_nm)
+        reached = np.flatnonzero(np.sign(plateau_nm) * torque_nm[1:] >= level)
+        if reached.size == 0 or level == 0.0:
             return {"value": None, "sd": None, "unit": "µs"}
+        pair = slice(reached[0], reached[0] + 2)
+        at_us = float(np.interp(level, np.sign(plateau_nm) * torque_nm[pair], width_us[pair]))
         place = np.array([at_us])
         # The width at which f(u) = share · plateau moves by the change of that difference over the curve's slope.
         moved = _sd(curve.basis.design(place)[0] - share * at_top, covariance_nm2)
@@ -156,34 +132,12 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
     }
 
 
-def _crossing(width_us: np.ndarray, torque_nm: np.ndarray, level_nm: float) -> float | None:
-    """The first width at which the curve reaches a torque, linear between the table's rows."""
-    sign = 1.0 if level_nm >= 0 else -1.0
-    reached = np.flatnonzero(sign * torque_nm[1:] >= sign * level_nm)
-    if reached.size == 0 or level_nm == 0.0:
-        return None
-    first = int(reached[0])
-    low, high = torque_nm[first], torque_nm[first + 1]
-    share = (level_nm - low) / (high - low)
-    return float(width_us[first] + share * (width_us[first + 1] - width_us[first]))
-
-
 def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:
     return None if covariance is None else float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
 
 
 def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:
-    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search.
-
-    Parameters
-    ----------
-    steepness_log : float
-        Log of the steepness.
-    middle_us : float
-        Of the sigmoid, µs.
-    largest_us : float
-        Largest pulse width, µs.
-    """
+    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search."""
     a2 = float(np.exp(steepness_log))
     return SigmoidBasis(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
 
@@ -193,52 +147,36 @@ def fit_shape(
 ) -> SigmoidBasis:
     """Least-squares estimate of the two shape parameters: a coarse scan, then a bounded trust-region search.
 
-    Parameters
-    ----------
-    residual_of : callable
-        Gives the residual for a shape, with all linear parameters solved for.
-    largest_us : float
-        Largest pulse width, µs.
-    seen_us : ndarray
-        Widths that were applied, µs; they bound the middle.
+    `residual_of` gives the residual for a shape, with all linear parameters solved for. The widths that were applied,
+    `seen_us`, bound the middle.
     """
     from scipy.optimize import least_squares
 
     top = max(float(np.max(seen_us)), 1e-6)
-    scan = [
-        (float(np.log(steep / top)), share * top)
-        for steep in (3.0, 6.0, 12.0, 25.0, 60.0)
-        for share in (0.15, 0.3, 0.45, 0.6, 0.8)
-    ]
 
     def residual(x: np.ndarray) -> np.ndarray:
         return residual_of(basis_at(x[0], x[1] * top, largest_us))
 
-    costs = [float(np.sum(residual(np.array([s, m / top])) ** 2)) for s, m in scan]
-    best = scan[int(np.argmin(costs))]
+    scan = [
+        np.array([np.log(steep / top), share])
+        for steep in (3.0, 6.0, 12.0, 25.0, 60.0)
+        for share in (0.15, 0.3, 0.45, 0.6, 0.8)
+    ]
+    best = scan[int(np.argmin([float(np.sum(residual(x) ** 2)) for x in scan]))]
     bounds = ([np.log(0.5 / top), 0.0], [np.log(2000.0 / top), 1.2])
-    solution = least_squares(
-        residual, [best[0], best[1] / top], bounds=bounds, x_scale=[0.3, 0.05], xtol=1e-12, ftol=1e-14, gtol=1e-14
-    )
-    return basis_at(solution.x[0], solution.x[1] * top, largest_us)
+    x = least_squares(residual, best, bounds=bounds, x_scale=[0.3, 0.05], xtol=1e-12, ftol=1e-14, gtol=1e-14).x
+    return basis_at(x[0], x[1] * top, largest_us)
 
 
 def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:
-    """The sigmoid fitted to points, with its gain.
+    """The sigmoid fitted to points of a curve, µs and N·m, with its gain."""
 
-    Parameters
-    ----------
-    width_us : ndarray
-        µs, shape (K,).
-    torque_nm : ndarray
-        N·m, shape (K,).
-    """
-    largest = float(np.max(width_us))
-
-    def gain_and_residual(basis: SigmoidBasis) -> tuple[float, np.ndarray]:
+    def gain(basis: SigmoidBasis) -> float:
         column = basis.design(width_us)[:, 0]
-        gain = float(column @ torque_nm / max(float(column @ column), 1e-300))
-        return gain, torque_nm - gain * column
+        return float(column @ torque_nm / max(float(column @ column), 1e-300))
 
-    basis = fit_shape(lambda b: gain_and_residual(b)[1], largest, width_us)
-    return Curve(basis, np.array([gain_and_residual(basis)[0]]))
+    def residual(basis: SigmoidBasis) -> np.ndarray:
+        return torque_nm - gain(basis) * basis.design(width_us)[:, 0]
+
+    basis = fit_shape(residual, float(np.max(width_us)), width_us)
+    return Curve(basis, np.array([gain(basis)]))

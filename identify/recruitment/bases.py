@@ -125,17 +125,14 @@ class SigmoidBasis:
 
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Shape (..., 1); derivatives by the closed form, up to the second."""
-        u = np.asarray(pulse_width_us, float)
-        decay = np.exp(-self.a2_per_us * np.maximum(u, 0.0))
+        decay = np.exp(-self.a2_per_us * np.maximum(np.asarray(pulse_width_us, float), 0.0))
         bottom = 1.0 + self.a3 * decay
-        if derivative == 0:
-            value = (1.0 - decay) / bottom
-        elif derivative == 1:
-            value = self.a2_per_us * (1.0 + self.a3) * decay / bottom**2
-        elif derivative == 2:
-            value = self.a2_per_us**2 * (1.0 + self.a3) * decay * (self.a3 * decay - 1.0) / bottom**3
-        else:
-            raise ValueError("derivatives up to the second")
+        steep = (1.0 + self.a3) * decay
+        value = (
+            (1.0 - decay) / bottom,
+            self.a2_per_us * steep / bottom**2,
+            self.a2_per_us**2 * steep * (self.a3 * decay - 1.0) / bottom**3,
+        )[derivative]
         return value[..., None]
 
     def to_dict(self) -> dict:

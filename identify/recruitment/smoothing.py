@@ -109,19 +109,13 @@ class Choice:
 
 
 def straight_lines(roughness: np.ndarray) -> int:
-    """Dimension of the shapes that are not penalised."""
+    """Dimension of the shapes that are not penalised; from the penalty, as the data do not cover all shapes."""
     size = np.sqrt(np.maximum(np.diag(roughness), 1e-300))  # of close knots much larger than of others
     return int(np.sum(np.linalg.eigvalsh(roughness / size / size[:, None]) <= 1e-13))
 
 
 def choose_weight(
-    gram: np.ndarray,
-    moment: np.ndarray,
-    energy: float,
-    rows: int,
-    roughness: np.ndarray,
-    free: int = 0,
-    null: int | None = None,
+    gram: np.ndarray, moment: np.ndarray, energy: float, rows: int, roughness: np.ndarray, free: int = 0
 ) -> Choice:
     """The weight of the penalty in min ||y - Z c||² + weight c'Rc that makes the data most likely (REML).
 
@@ -129,20 +123,10 @@ def choose_weight(
     1985; Wood 2011). One eigendecomposition serves all weights.
 
     `gram`, `moment`, `energy`: Z'Z, Z'y and y'y of `rows` whitened rows; `free` columns without a penalty are already
-    projected out. `roughness`: R. `null`: `straight_lines(roughness)`, if it is known already.
+    projected out. `roughness`: R.
     """
-    # This dimension is computed from the penalty, not from the data, which do not cover all shapes.
-    straight = straight_lines(roughness) if null is None else null
+    size, straight = len(gram), straight_lines(roughness)
     freedom_left = max(rows - free - straight, 1)
-    weight, squares = _weighed(gram, moment, energy, freedom_left, roughness, straight)
-    return Choice(weight, squares / freedom_left)
-
-
-def _weighed(
-    gram: np.ndarray, moment: np.ndarray, energy: float, freedom_left: int, roughness: np.ndarray, straight: int
-) -> tuple[float, float]:
-    """The weight, and the squares that it leaves."""
-    size = len(gram)
     balance = np.trace(gram) / max(np.trace(roughness), 1e-300)
     floor = 1e-11 * balance
     root = np.linalg.cholesky(gram + floor * roughness + 1e-13 * np.trace(gram) / size * np.eye(size))
@@ -151,15 +135,20 @@ def _weighed(
     bent, turn = np.linalg.eigh((half + half.T) / 2)
     bent[:straight] = 0.0  # else rounding would decide among the weights of a curve that is not bent at all
     part = (turn.T @ (inverse @ moment)) ** 2
+    smallest = 1e-14 * energy
+
+    def bottom(weight: np.ndarray) -> np.ndarray:
+        return np.maximum(1.0 + (weight - floor)[:, None] * bent, 1e-12)
+
     weight = balance * np.exp(np.linspace(np.log(LOWEST), np.log(HIGHEST), 73))
-    bottom = np.maximum(1.0 + (weight - floor)[:, None] * bent, 1e-12)
-    squares = np.maximum(energy - (part / bottom).sum(axis=1), 1e-14 * energy + 1e-300)
-    score = -freedom_left * np.log(squares) - np.log(bottom).sum(axis=1) + (size - straight - TILT) * np.log(weight)
+    squares = np.maximum(energy - (part / bottom(weight)).sum(axis=1), smallest + 1e-300)
+    score = -freedom_left * np.log(squares) - np.log(bottom(weight)).sum(axis=1)
+    score += (size - straight - TILT) * np.log(weight)
     best = int(np.argmax(score))
     chosen = float(weight[best])
     if 0 < best < weight.size - 1:  # the top of the parabola through three points
-        below, here, above = score[best - 1], score[best], score[best + 1]
+        below, here, above = score[best - 1 : best + 2]
         shift = 0.5 * (below - above) / min(below - 2 * here + above, -1e-12)
-        chosen = weight[best] * (weight[1] / weight[0]) ** shift
-    bottom = np.maximum(1.0 + (chosen - floor) * bent, 1e-12)
-    return float(chosen), max(energy - float((part / bottom).sum()), 1e-14 * energy)
+        chosen = float(chosen * (weight[1] / weight[0]) ** shift)
+    left = max(energy - float((part / bottom(np.array([chosen]))).sum()), smallest)
+    return Choice(chosen, left / freedom_left)

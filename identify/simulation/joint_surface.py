@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -56,6 +55,10 @@ class JointEffect:
     def adds(self) -> bool:
         return self.form.stage == "additive"
 
+    def apply(self, x: np.ndarray | None, scene: Scene) -> np.ndarray:
+        """The form with its values, shape (1, K)."""
+        return np.asarray(self.form.call(x, {name: np.array([[v]]) for name, v in self.values.items()}, scene))
+
 
 @dataclass(frozen=True)
 class Surfaces:
@@ -88,18 +91,17 @@ class Surfaces:
         """Torque at the load cell per acceleration, N·m per rad/s², with the record's sign."""
         return self._sign * sum(joint_effect.values.get(INERTIA, 0.0) for joint_effect in self.acting)
 
-    @cached_property
+    @property
     def _sign(self) -> float:
         return float(self.settings.get("sign", 1.0))
 
     def g(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
         """Share of the torque at the reference angle that is there, at rest 1 at that angle; of the inputs' shape."""
         scene = self._scene(angle_rad, velocity_rad_s)
-        large = np.full((1, scene.time_s.size), float(self.settings.get("scale_nm", 1.0)))
-        torque = large
+        torque = large = np.full((1, scene.time_s.size), scene.scale_nm)
         for joint_effect in self.acting:
             if not joint_effect.adds:
-                torque = np.asarray(joint_effect.form.call(torque, _rows(joint_effect.values), scene))
+                torque = joint_effect.apply(torque, scene)
         return (torque / large).reshape(np.shape(angle_rad))
 
     def h_nm(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
@@ -108,11 +110,8 @@ class Surfaces:
         Of tissue that has been there for long: what of it relaxes is not in it.
         """
         scene = self._scene(angle_rad, velocity_rad_s)
-        total = np.zeros((1, scene.time_s.size))
-        for joint_effect in self.acting:
-            if joint_effect.adds:
-                total = total + np.asarray(joint_effect.form.call(None, _rows(joint_effect.values), scene))
-        return self._sign * total.reshape(np.shape(angle_rad))
+        added = (joint_effect.apply(None, scene) for joint_effect in self.acting if joint_effect.adds)
+        return self._sign * sum(added, np.zeros((1, scene.time_s.size))).reshape(np.shape(angle_rad))
 
     def _scene(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> Scene:
         angle, velocity = (np.ravel(np.asarray(values, float)) for values in (angle_rad, velocity_rad_s))
@@ -129,37 +128,21 @@ class Surfaces:
             begins=np.ones(angle.size, bool),
         )
 
-    def _with(self, name: str, value: float) -> Surfaces:
-        """With one parameter, by its name in the covariance, changed."""
-        effect, _, parameter = name.partition(".")
-        acting = [
-            replace(joint_effect, values=joint_effect.values | {parameter: value})
-            if joint_effect.effect.id == effect
-            else joint_effect
-            for joint_effect in self.acting
-        ]
-        return Surfaces(tuple(acting), self.settings)
-
-    def slopes(
-        self, names: Sequence[str], angle_rad: np.ndarray, velocity_rad_s: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Derivatives of g and of h by named parameters of the model, each of shape (len(names), *inputs' shape)."""
-        values = {
-            f"{joint_effect.effect.id}.{name}": value
-            for joint_effect in self.acting
-            for name, value in joint_effect.values.items()
-        }
-        derivatives = np.zeros((2, len(names), *np.shape(angle_rad)))
-        for place, name in enumerate(names):
-            if name not in values:
-                continue
-            step = STEP * max(abs(values[name]), 0.01)
-            up, down = self._with(name, values[name] + step), self._with(name, values[name] - step)
-            derivatives[0, place] = (up.g(angle_rad, velocity_rad_s) - down.g(angle_rad, velocity_rad_s)) / (2 * step)
-            derivatives[1, place] = (up.h_nm(angle_rad, velocity_rad_s) - down.h_nm(angle_rad, velocity_rad_s)) / (
-                2 * step
-            )
-        return derivatives[0], derivatives[1]
+    def slopes(self, names: Sequence[str], angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
+        """Derivatives of g and of h by named parameters of the model, shape (2, len(names), *inputs' shape)."""
+        at, derivatives = (angle_rad, velocity_rad_s), np.zeros((2, len(names), *np.shape(angle_rad)))
+        places = {name: place for place, name in enumerate(names)}
+        for number, moved in enumerate(self.acting):
+            for name, value in moved.values.items():
+                place = places.get(f"{moved.effect.id}.{name}")
+                if place is None:
+                    continue
+                step = STEP * max(abs(value), 0.01)
+                for sign in (1.0, -1.0):
+                    other = replace(moved, values=moved.values | {name: value + sign * step})
+                    surfaces = Surfaces((*self.acting[:number], other, *self.acting[number + 1 :]), self.settings)
+                    derivatives[:, place] += sign * np.stack([surfaces.g(*at), surfaces.h_nm(*at)]) / (2 * step)
+        return derivatives
 
 
 def joint_tables(
@@ -183,55 +166,40 @@ def joint_tables(
         return {}
     low, high = surfaces.settings.get("angle_range_rad", (float(angle_rad.min()), float(angle_rad.max())))
     angles = np.unique(np.r_[np.linspace(low, high, ANGLES), np.clip(surfaces.reference_rad, low, high)])
-    fastest = max(float(np.max(np.abs(velocity_rad_s))), 1e-3)
     shares = np.array(SPEEDS)
-    velocities = fastest * np.r_[-shares[:0:-1], shares]
+    velocities = max(float(np.max(np.abs(velocity_rad_s))), 1e-3) * np.r_[-shares[:0:-1], shares]
     x, v = np.meshgrid(angles, velocities, indexing="ij")
-    tables = {
+    edges = [np.r_[-np.inf, 0.5 * (axis[1:] + axis[:-1]), np.inf] for axis in (angles, velocities)]
+
+    def nearest(rows: np.ndarray | slice) -> np.ndarray:
+        return np.histogram2d(angle_rad[rows], velocity_rad_s[rows], bins=edges)[0].astype(int)
+
+    tables: dict[str, Any] = {
         "reference_angle_rad": surfaces.reference_rad,
         "angle_rad": angles,
         "velocity_rad_s": velocities,
-        "g": surfaces.g(x, v).round(6),
-        "h_nm": surfaces.h_nm(x, v).round(6),
         "inertia_nm_s2_per_rad": surfaces.inertia_nm_s2_per_rad,
         "formula": {
             "torque": FORMULA,
             "g": [joint_effect.form.equation for joint_effect in surfaces.acting if not joint_effect.adds],
             "h": [joint_effect.form.equation for joint_effect in surfaces.acting if joint_effect.adds],
         },
-        "seen_g": _cell_counts(angles, velocities, angle_rad[at_work], velocity_rad_s[at_work]),
-        "seen_h": _cell_counts(angles, velocities, angle_rad, velocity_rad_s),
+        "seen_g": nearest(at_work),
+        "seen_h": nearest(slice(None)),
+        "level_percent": 95,
     }
-    return tables | _bands(surfaces, names, matrix, x, v, tables["g"], tables["h_nm"])
-
-
-def _bands(
-    surfaces: Surfaces, names: Sequence[str], matrix: np.ndarray, x: np.ndarray, v: np.ndarray, g: Any, h_nm: Any
-) -> dict[str, Any]:
     rows = [place for place, name in enumerate(names) if "." in name]
-    matrix = matrix[np.ix_(rows, rows)]
     slopes = surfaces.slopes([names[row] for row in rows], x, v)
-    bands: dict[str, Any] = {"level_percent": 95}
-    for name, unit, value, slope in (("g", "", g, slopes[0]), ("h", "_nm", h_nm, slopes[1])):
-        variance = np.einsum("iab,ij,jab->ab", slope, matrix, slope, optimize=True)
+    values = surfaces.g(x, v).round(6), surfaces.h_nm(x, v).round(6)
+    for name, unit, value, slope in zip("gh", ("", "_nm"), values, slopes, strict=True):
+        variance = np.einsum("iab,ij,jab->ab", slope, matrix[np.ix_(rows, rows)], slope, optimize=True)
         half = WIDER[name] * POINTWISE * np.sqrt(np.maximum(variance, 0.0))
-        bands |= {f"{name}_lower{unit}": (value - half).round(6), f"{name}_upper{unit}": (value + half).round(6)}
-    return bands
-
-
-def _cell_counts(
-    angles: np.ndarray, velocities: np.ndarray, angle_rad: np.ndarray, velocity_rad_s: np.ndarray
-) -> np.ndarray:
-    """Number of the given points nearest to each cell of the table, shape (len(angles), len(velocities))."""
-    edges = [np.r_[-np.inf, 0.5 * (axis[1:] + axis[:-1]), np.inf] for axis in (angles, velocities)]
-    return np.histogram2d(angle_rad, velocity_rad_s, bins=edges)[0].astype(int)
+        bounds = {"lower": (value - half).round(6), "upper": (value + half).round(6)}
+        tables |= {f"{name}{unit}": value} | {f"{name}_{side}{unit}": bound for side, bound in bounds.items()}
+    return tables
 
 
 def angle_range(settings: Mapping[str, Any]) -> tuple[float, float] | None:
     """Smallest and largest angle that a model was fitted on, rad; None if it does not say."""
     known = settings.get("angle_range_rad")
     return None if known is None else (float(known[0]), float(known[1]))
-
-
-def _rows(values: Mapping[str, float]) -> dict[str, np.ndarray]:
-    return {name: np.array([[value]]) for name, value in values.items()}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
@@ -69,15 +69,6 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, the record lacks a column
     it needs, or the torque grows without limit. Raises BadRequest: in the earlier trial no joint moves, or it is
     several recordings.
-
-    Parameters
-    ----------
-    model : Muscle
-        Of one muscle.
-    record : Record
-        Whose pulse widths, and angle, are used.
-    earlier_trial : Record, optional
-        A record of the same movement.
     """
     refuse_rate(model, record)
     grid = make_grid(record)
@@ -143,17 +134,14 @@ def unpredictable_torque(model: Muscle) -> dict[str, tuple[float, float]]:
 
     Both are taken over the fitted rows of the model's own record. The mean stays as a zero.
     """
-    entries = {e["id"]: e.get("unforeseen", {}) for e in model.effects if not find_effect(e["id"]).predictable}
+    unpredictable = [entry for entry in model.effects if not find_effect(entry["id"]).predictable]
     return {
-        effect: (statistics.get("mean_nm", 0.0), statistics.get("rms_nm", 0.0))
-        for effect, statistics in entries.items()
+        e["id"]: tuple(e.get("unforeseen", {}).get(key, 0.0) for key in ("mean_nm", "rms_nm")) for e in unpredictable
     }
 
 
 def problem_of(
-    model: Muscle,
-    grid: Grid,
-    further: Sequence[tuple[Form, Sequence[float]]] = (),
+    model: Muscle, grid: Grid, further: Sequence[tuple[Form, Sequence[float]]] = ()
 ) -> tuple[Problem, np.ndarray]:
     """The model as a `Problem` on a record, and its parameters there; on another record than its own without effects
     that cannot be foreseen.
@@ -166,6 +154,9 @@ def problem_of(
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
     settings = model.effects[0].get("settings", {}) if model.effects else {}
+    if "reference_rad" not in settings and depend_on_joint(entry["id"] for entry in model.effects):
+        message = "the model does not say at which angle its curve holds"
+        raise BadModel(message, place="effects.0.settings.reference_rad", fix="Fit its record again with this version.")
     own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     setup = Setup(
         grid=grid,
@@ -180,7 +171,8 @@ def problem_of(
         sign=float(settings.get("sign", 1.0)),
         reference_s=float(settings.get("reference_s", 0.0)),
         angle_late_s=float(settings.get("angle_late_s", 0.0)),
-        **_own_angles(model, settings),
+        reference_rad=settings.get("reference_rad"),
+        angle_range_rad=angle_range(settings),
         states={} if own_record else states_of(model),
     )
     acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]
@@ -228,19 +220,6 @@ def sensor_cost_nm(problem: Problem, theta: np.ndarray) -> float:
         motion = record.motion.read_again(record.time_s, [part.first for part in record.parts])
         difference_nm = (_moved(problem, motion).run(theta)[0] - problem.run(theta)[0])[grid.comparable]
     return float(np.sqrt(np.mean(np.square(difference_nm))))
-
-
-def _own_angles(model: Muscle, settings: Mapping[str, Any]) -> dict[str, Any]:
-    """The reference angle and the range of fitted angles.
-
-    Raises BadModel: the model depends on the joint and does not say at which angle its curve holds.
-    """
-    if "reference_rad" in settings:
-        return {"reference_rad": settings["reference_rad"], "angle_range_rad": angle_range(settings)}
-    if depend_on_joint(entry["id"] for entry in model.effects):
-        message = "the model does not say at which angle its curve holds"
-        raise BadModel(message, place="effects.0.settings.reference_rad", fix="Fit its record again with this version.")
-    return {}
 
 
 def states_of(model: Muscle) -> dict[str, float]:
