@@ -1,8 +1,7 @@
-"""Forms of a page without a browser: found, read and sent as `act.js` does."""
+"""Forms of a page without a browser: found, and sent on the version that they show."""
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass, field
 from html.parser import HTMLParser
@@ -10,18 +9,13 @@ from typing import Any
 
 import httpx
 
-Text = str | tuple[str, ...]
-"""What a person typed in a field, or in each field of one name."""
-VOID = {"input", "br", "img", "link", "meta", "hr"}
-
 
 @dataclass
 class Control:
-    """A field or a button, with its attributes; a list's value is the chosen option's."""
+    """A field or a button, with its attributes."""
 
     tag: str
     attributes: dict[str, str]
-    text: str = ""
 
     @property
     def name(self) -> str:
@@ -32,12 +26,13 @@ class Control:
         return "disabled" in self.attributes
 
     @property
-    def value(self) -> str:
-        return self.attributes.get("value", self.text)
-
-    @property
     def kind(self) -> str:
         return self.attributes.get("type", "text")
+
+    @property
+    def value(self) -> Any:
+        text, kind = self.attributes.get("value", ""), self.attributes.get("data-type")
+        return text == "true" if kind == "flag" else float(text) if kind == "number" and text else text
 
 
 @dataclass
@@ -61,14 +56,8 @@ class Page(HTMLParser):
         super().__init__()
         self.forms: list[Form] = []
         self.meta = ""
-        self._open: list[Control] = []
-        self._orphans: list[Control] = []
         self._form: Form | None = None
         self.feed(html)
-        for control in self._orphans:
-            for form in self.forms:
-                if form.attributes.get("id") == control.attributes["form"]:
-                    _add(form, control)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         given = {name: value or "" for name, value in attrs}
@@ -77,29 +66,12 @@ class Page(HTMLParser):
         elif tag == "form":
             self._form = Form(given)
             self.forms.append(self._form)
-        elif tag == "option" and self._open and ("selected" in given or "value" not in self._open[-1].attributes):
-            self._open[-1].attributes["value"] = given.get("value", "")
-        elif tag in ("input", "select", "button"):
-            control = Control(tag, given)
-            self._open = [] if tag in VOID else [control]
-            if "form" in given:
-                self._orphans.append(control)
-            elif self._form is not None:
-                _add(self._form, control)
+        elif tag in ("input", "select", "button") and self._form is not None and "form" not in given:
+            (self._form.buttons if tag == "button" else self._form.fields).append(Control(tag, given))
 
     def handle_endtag(self, tag: str) -> None:
         if tag == "form":
             self._form = None
-        if self._open and tag == self._open[-1].tag:
-            self._open = []
-
-    def handle_data(self, data: str) -> None:
-        if self._open and self._open[-1].tag == "button":
-            self._open[-1].text += data
-
-
-def _add(form: Form, control: Control) -> None:
-    (form.buttons if control.tag == "button" else form.fields).append(control)
 
 
 def find(html: str, call: str) -> tuple[Form, dict[str, str], Control | None]:
@@ -109,48 +81,16 @@ def find(html: str, call: str) -> tuple[Form, dict[str, str], Control | None]:
     return next(each for each in calls if way.fullmatch(each[1]["data-call"]))
 
 
-def body_of(form: Form, button: Control | None, texts: dict[str, Text]) -> dict[str, Any]:
-    """Return the body, as `act.js` makes it."""
-    body: dict[str, Any] = {}
-    groups: dict[str, list[Control]] = {}
-    for control in [*form.fields, *([button] if button else [])]:
-        skipped = {"data-confirm", "data-query", "disabled"} & set(control.attributes) or control.kind == "file"
-        if control.name and not skipped and (control.kind != "checkbox" or "checked" in control.attributes):
-            groups.setdefault(control.name, []).append(control)
-    for name, controls in groups.items():
-        given, (*_, types) = texts.get(name), [control.attributes.get("data-type", "").split() for control in controls]
-        typed = list(given) if isinstance(given, tuple) else [c.value if given is None else given for c in controls]
-        unchanged = all(a == b.value and b.kind != "hidden" for a, b in zip(typed, controls, strict=True))
-        null = controls[-1].attributes.get("data-empty") == "null"
-        if ("data-changed" in form.attributes and unchanged) or not (null or any(typed)):
-            continue
-        values: Any = [_value(text.strip(), types) for text in typed] if any(typed) else None
-        *path, last = name.split(".")
-        part = body
-        for key in path:
-            part = part.setdefault(key, {})
-        part[last] = values if "list" in types or values is None else values[-1]
-    return body
-
-
-def _value(text: str, types: list[str]) -> Any:
-    if "flag" in types:
-        return text == "true"
-    if not {"int", "number", "degrees"} & set(types):
-        return text
-    number = float(text.replace(",", ".").replace("−", "-"))
-    return math.radians(number) if "degrees" in types else int(number) if "int" in types else number
-
-
 def press(
-    client: httpx.Client, page: str, call: str, *, html: str = "", confirm: str = "", **texts: Text
+    client: httpx.Client, page: str, call: str, *, html: str = "", confirm: str = "", **typed: Any
 ) -> httpx.Response:
-    """Send the form of a page that makes this call; `html`: the page as it was shown before."""
+    """Send the form of a page that makes this call, with its hidden fields; `html`: the page as it was shown before."""
     html = html or client.get(page, headers={"Accept": "text/html"}).text
     form, given, button = find(html, call)
+    hidden = [each for each in form.fields if each.kind == "hidden" and each.value != ""] + ([button] if button else [])
     method, _, address = given["data-call"].partition(" ")
     headers = {"Accept": "application/json", "X-CSRF-Token": Page(html).meta}
     if version := given.get("data-if-match"):
         headers["If-Match"] = f'"{version}"'
-    url = httpx.URL(address).copy_merge_params({"confirm": confirm} if confirm else {})
-    return client.request(method, url, json=body_of(form, button, texts), headers=headers)
+    body = {each.name: each.value for each in hidden if each.name} | typed
+    return client.request(method, address, params={"confirm": confirm} if confirm else {}, json=body, headers=headers)

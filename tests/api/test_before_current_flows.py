@@ -50,7 +50,7 @@ def test_the_page_shows_who_and_how_much_and_plays_nothing(tab: httpx.Client, cl
 def test_start_sends_limits_that_were_typed_and_leads_on(tab: httpx.Client, client: httpx.Client) -> None:
     html = tab.get(PAGE).text
     assert re.search(rf'<button class="stimulate" data-next="{WHERE}"', html)
-    assert press(tab, PAGE, f"PUT /v1{PAGE}/profile", html=html, current_ma="19,5").status_code == 200
+    assert press(tab, PAGE, f"PUT /v1{PAGE}/profile", html=html, current_ma=19.5).status_code == 200
     assert client.get("/v1" + PAGE).json()["profile"]["current_ma"] == 19.5
     assert rows(tab.get(WHERE).text)["Current of every pulse"] == "19.5 mA"
 

@@ -63,37 +63,30 @@ def test_each_key_sends_its_train_and_marks(page: Any, service: Service) -> None
     assert not page.errors
 
 
-def test_a_key_that_is_held_sends_one_train(page: Any, service: Service) -> None:
+def test_a_press_is_one_train_and_nothing_is_kept_for_later(page: Any, service: Service) -> None:
+    """Neither of a held key nor of presses while a train is asked for or played; Enter marks wherever the focus is."""
     page.keyboard.down("ArrowUp")
     for _ in range(5):
         page.keyboard.down("ArrowUp")  # what a held key sends: keydown with repeat
         page.wait_for_timeout(60)
     page.keyboard.up("ArrowUp")
     settled(page, 1)
-    assert widths(service) == [10]
-
-
-def test_nothing_is_kept_for_later(page: Any, service: Service) -> None:
-    """Presses while a train is asked for or played are forgotten."""
     page.evaluate("""() => { for (const key of ['ArrowUp', 'r', 'ArrowUp', 'm'])
         document.body.dispatchEvent(new KeyboardEvent('keydown', { key, bubbles: true })); }""")
-    settled(page, 1)
+    settled(page, 2)
     page.wait_for_timeout(600)
-    assert widths(service) == [10] and not service.rig.calibration.marks_us
-
-
-def test_the_focus_stays_and_enter_marks_wherever_it_is(page: Any, service: Service) -> None:
-    page.locator("#step-up").click()
-    settled(page, 1)
-    assert page.evaluate("document.activeElement.id") == "step-up"
+    assert widths(service) == [10, 20] and not service.rig.calibration.marks_us
+    page.locator("#step-repeat").click()
+    settled(page, 3)
+    assert page.evaluate("document.activeElement.id") == "step-repeat"
     page.keyboard.press("Enter")  # never a second train by the button that has the focus
     page.locator("#mark-motor.primary").wait_for()
-    assert widths(service) == [10] and page.evaluate("document.activeElement.id") == "step-up"
-    press(page, "ArrowUp", 2)
-    assert page.evaluate("document.activeElement.id") == "step-up"
+    assert len(widths(service)) == 3 and page.evaluate("document.activeElement.id") == "step-repeat"
+    press(page, "ArrowUp", 4)
+    assert page.evaluate("document.activeElement.id") == "step-repeat"
 
 
-def test_a_key_in_a_field_sends_nothing(page: Any, service: Service) -> None:
+def test_a_key_in_a_field_sends_nothing_and_space_stops_once_also_on_a_button(page: Any, service: Service) -> None:
     page.evaluate("document.querySelector('main').insertAdjacentHTML('beforeend', '<input id=note>')")
     page.locator("#note").focus()
     page.keyboard.type("r m")
@@ -101,13 +94,6 @@ def test_a_key_in_a_field_sends_nothing(page: Any, service: Service) -> None:
     page.wait_for_timeout(300)
     assert widths(service) == [] and page.locator("#note").input_value() == "r m"
     assert service.rig.state == "calibrating"
-    page.keyboard.press("Escape")
-    page.wait_for_url("**/stopped/**")
-    assert service.rig.state == "latched"
-
-
-def test_space_stops_once_also_on_a_button(page: Any, service: Service) -> None:
-    press(page, "ArrowUp", 1)
     page.locator("#step-up").focus()
     sent: list[str] = []
     page.on("request", lambda request: sent.append(request.url) if request.method == "POST" else None)
@@ -116,7 +102,9 @@ def test_space_stops_once_also_on_a_button(page: Any, service: Service) -> None:
     assert [url.rsplit("/", 1)[1] for url in sent] == ["stop"] and service.rig.state == "latched"
 
 
-def test_a_stale_page_sends_nothing_and_says_so_in_place(page: Any, service: Service, client: httpx.Client) -> None:
+def test_a_stale_page_and_one_without_an_answer_send_nothing_and_say_so(
+    page: Any, service: Service, client: httpx.Client
+) -> None:
     client.post("/v1/participants/K1/calibration/step", json={"direction": "up"})
     page.keyboard.press("ArrowUp")
     page.get_by_text("This page is out of date").wait_for()
@@ -124,17 +112,13 @@ def test_a_stale_page_sends_nothing_and_says_so_in_place(page: Any, service: Ser
     settled(page, 1)
     press(page, "ArrowUp", 2)
     assert widths(service) == [10, 20] and page.get_by_text("This page is out of date").count() == 0
-
-
-def test_a_service_that_does_not_answer_is_told_and_no_button_works(page: Any, service: Service) -> None:
     page.route("**/calibration**", lambda route: route.abort())
     page.keyboard.press("ArrowUp")
     page.get_by_text("It is not known whether the train was sent").wait_for()
     assert page.locator("#calibration button:not([disabled])").count() == 0
     page.unroute("**/calibration**")
-    settled(page, 0)
-    press(page, "ArrowUp", 1)
-    assert widths(service) == [10]
+    settled(page, 2)
+    press(page, "ArrowUp", 3)
 
 
 def test_another_calibration_that_comes_under_the_hand_is_read_first(page: Any, service: Service) -> None:

@@ -20,7 +20,7 @@ TEXT = [
 SEEN = [
     *((part, surface) for part in ("edge", "stop", "stimulate", "accent") for surface in ("card", "paper")),
     *((part, "card") for part in ("good", "warn", "cursor")),
-    *((f"series-{k}", "chart") for k in range(1, 7)),
+    *((f"series-{k}", "chart") for k in (1, 2, 3, 4, 6)),
     *((role, "chart") for role in ("measured", "model", "residual", "width", "limit", "worst")),
 ]  # fmt: skip
 """Parts whose shape has to be seen (WCAG 1.4.11)."""

@@ -28,8 +28,8 @@ def tab(service: Service, participant: str) -> Iterator[httpx.Client]:
         yield browser
 
 
-def send(tab: httpx.Client, html: str = "", confirm: str = "", **texts: str) -> httpx.Response:
-    return press(tab, PAGE, LIMITS, html=html, confirm=confirm, **texts)
+def send(tab: httpx.Client, html: str = "", confirm: str = "", **limits: float) -> httpx.Response:
+    return press(tab, PAGE, LIMITS, html=html, confirm=confirm, **limits)
 
 
 # ---- numbers ------------------------------------------------------------------------------------------------
@@ -87,41 +87,41 @@ def test_every_button_that_stimulates_looks_like_it() -> None:
 def test_only_what_was_typed_is_set(tab: httpx.Client, client: httpx.Client) -> None:
     client.put("/v1/participants/P017/profile", json={"current_ma": 9.1234567})
     form, _, _ = find(tab.get(PAGE).text, LIMITS)
-    assert {field.name: field.value for field in form.fields}["current_ma"] == "9.1234567"
-    assert send(tab, max_torque_nm="25").status_code == 200
+    assert next(field.value for field in form.fields if field.name == "current_ma") == 9.1234567
+    assert send(tab, max_torque_nm=25).status_code == 200
     assert limits(client) == {"current_ma": 9.1234567, "max_pulse_width_us": 300, "max_torque_nm": 25}
 
 
 def test_bounds_are_this_rigs_own_and_said_at_the_field(tab: httpx.Client, client: httpx.Client) -> None:
     page = tab.get(PAGE).text
     assert "at most 60 mA (rig file)" in page and "at most 500 µs (hard limit)" in page
-    for texts, field, words in (
-        ({"current_ma": "60,5"}, "current_ma", "at most 60 mA, as this rig asks (rig file)"),
-        ({"max_pulse_width_us": "5000"}, "max_pulse_width_us", "less than or equal to 500"),
-        ({"current_ma": "60", "max_pulse_width_us": "400"}, "max_pulse_width_us", "20 µC that this rig takes"),
+    for sent, field, words in (
+        ({"current_ma": 60.5}, "current_ma", "at most 60 mA, as this rig asks (rig file)"),
+        ({"max_pulse_width_us": 5000}, "max_pulse_width_us", "less than or equal to 500"),
+        ({"current_ma": 60, "max_pulse_width_us": 400}, "max_pulse_width_us", "20 µC that this rig takes"),
     ):
-        (error,) = problem(send(tab, **texts), 422)["errors"]
+        (error,) = problem(send(tab, **sent), 422)["errors"]
         assert error["field"] == field and words in error["detail"]
     assert limits(client)["current_ma"] == 20
 
 
 def test_a_jump_is_asked_about_and_the_answer_holds_for_exactly_that(tab: httpx.Client, client: httpx.Client) -> None:
-    asked = problem(send(tab, current_ma="25,5"), 409)["confirm"]
+    asked = problem(send(tab, current_ma=25.5), 409)["confirm"]
     assert asked["warnings"] == ["The current rises from 20 to 25.5 mA, 1.27 times as much."]
     assert asked["button"] == "Yes, set 25.5 mA, 300 µs, 30 N·m" and asked["rows"][0]["before"] == "20 mA"
     assert limits(client)["current_ma"] == 20, "nothing yet"
-    assert send(tab, current_ma="59", confirm=asked["token"]).status_code == 409, "another question"
-    assert send(tab, current_ma="25,5", confirm=asked["token"]).status_code == 200
+    assert send(tab, current_ma=59, confirm=asked["token"]).status_code == 409, "another question"
+    assert send(tab, current_ma=25.5, confirm=asked["token"]).status_code == 200
     assert limits(client) == {"current_ma": 25.5, "max_pulse_width_us": 300, "max_torque_nm": 30}
-    assert send(tab, current_ma="31").status_code == 200, "not more than a quarter"
+    assert send(tab, current_ma=31).status_code == 200, "not more than a quarter"
 
 
 def test_a_yes_to_old_limits_changes_nothing(tab: httpx.Client, client: httpx.Client) -> None:
     html = tab.get(PAGE).text
-    token = problem(send(tab, html=html, current_ma="40"), 409)["confirm"]["token"]
+    token = problem(send(tab, html=html, current_ma=40), 409)["confirm"]["token"]
     client.put("/v1/participants/P017/profile", json={"current_ma": 10})
-    assert send(tab, html=html, current_ma="40", confirm=token).status_code == 412
-    assert send(tab, current_ma="40", confirm=token).status_code == 409, "it is asked about 10 to 40 mA now"
+    assert send(tab, html=html, current_ma=40, confirm=token).status_code == 412
+    assert send(tab, current_ma=40, confirm=token).status_code == 409, "it is asked about 10 to 40 mA now"
     assert limits(client)["current_ma"] == 10
 
 
@@ -130,8 +130,8 @@ def test_a_yes_to_old_limits_changes_nothing(tab: httpx.Client, client: httpx.Cl
 
 def test_a_calibration_far_above_the_participants_current_is_asked_about(tab: httpx.Client, service: Service) -> None:
     page = f"{PAGE}/calibration"
-    assert problem(press(tab, page, CALIBRATE, step_us="26"), 422)["errors"][0]["field"] == "step_us"
-    asked = problem(press(tab, page, CALIBRATE, current_ma="45"), 409)["confirm"]
+    assert problem(press(tab, page, CALIBRATE, step_us=26), 422)["errors"][0]["field"] == "step_us"
+    asked = problem(press(tab, page, CALIBRATE, current_ma=45), 409)["confirm"]
     assert "rises from 20 to 45 mA" in asked["warnings"][0] and service.rig.calibration is None
-    assert press(tab, page, CALIBRATE, current_ma="45", confirm=asked["token"]).status_code == 201
+    assert press(tab, page, CALIBRATE, current_ma=45, confirm=asked["token"]).status_code == 201
     assert service.rig.calibration is not None and service.rig.calibration.current_ma == 45

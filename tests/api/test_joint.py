@@ -73,14 +73,14 @@ def test_two_poses_calibrate_and_are_written_down(service: Service, client: http
 def test_two_poses_on_the_page_and_the_first_once_more(service: Service, pages: httpx.Client, ready: str) -> None:
     service.rig.arm.way = still(math.radians(15))
 
-    def pose(degrees: str, query: str = "") -> httpx.Response:
-        return press(pages, "/rig/angle" + query, "/pose", angle_rad=degrees)
+    def pose(degrees: float, query: str = "") -> httpx.Response:
+        return press(pages, "/rig/angle" + query, "/pose", angle_rad=math.radians(degrees))
 
-    (error,) = problem(pose("200"), 422)["errors"]
+    (error,) = problem(pose(200), 422)["errors"]
     assert error == {"field": "angle_rad", "detail": "200° is not within −6° … 138°, as this rig asks"}
-    assert pose("51").status_code == 200 and "Second pose" in pages.get("/rig/angle").text, "a slip"
-    assert pose("15", "?again=1").status_code == 200 and "The first pose is taken: 15°" in pages.get("/rig/angle").text
-    assert pose("100,4").status_code == 200 and "at 15° and 100°" in pages.get("/rig/angle").text
+    assert pose(51).status_code == 200 and "Second pose" in pages.get("/rig/angle").text, "a slip"
+    assert pose(15, "?again=1").status_code == 200 and "The first pose is taken: 15°" in pages.get("/rig/angle").text
+    assert pose(100.4).status_code == 200 and "at 15° and 100°" in pages.get("/rig/angle").text
 
 
 # ---- what is asked for ----------------------------------------------------------------------------------------

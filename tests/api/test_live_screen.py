@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +22,6 @@ from tests.api.test_stop_right import stops_noted
 service = shared_service(speed=0.5)
 
 
-@pytest.fixture
-def running(tab: Any, service: Service) -> Any:
-    """The page of a test that runs for a while."""
-    participant(tab, service, f"V{time.time_ns() % 10**9}")
-    start(tab)
-    tab.locator("#age", has_text="ms").wait_for()
-    return tab
-
-
 LIMIT_PIXELS = """(id) => { const c = document.getElementById(id), pen = c.getContext('2d');
   const probe = document.createElement('canvas').getContext('2d');
   probe.fillStyle = colourOf('limit'); probe.fillRect(0, 0, 1, 1);
@@ -42,17 +32,25 @@ LIMIT_PIXELS = """(id) => { const c = document.getElementById(id), pen = c.getCo
 
 
 @pytest.mark.browser
-def test_what_flows_is_told_in_numbers_and_a_clinicians_words(running: Any, service: Service) -> None:
-    running.locator("#segment", has_text="Random pulses").wait_for()
-    assert running.locator("#segment").get_attribute("title") == "prbs"
-    assert running.locator("#current").inner_text() == "20.0 mA"
-    expected(running.locator("#dose")).not_to_have_text(re.compile("^0.00 mC"))
-    charge_mc, pulses = map(float, re.findall(r"([\d.]+) mC · pulses: (\d+)", running.locator("#dose").inner_text())[0])
+def test_what_flows_is_told_and_esc_stops_also_where_a_space_is_a_space(tab: Any, service: Service) -> None:
+    participant(tab, service, "V1")
+    start(tab)
+    tab.locator("#segment", has_text="Random pulses").wait_for()
+    assert tab.locator("#segment").get_attribute("title") == "prbs"
+    assert tab.locator("#current").inner_text() == "20.0 mA"
+    expected(tab.locator("#dose")).not_to_have_text(re.compile("^0.00 mC"))
+    charge_mc, pulses = map(float, re.findall(r"([\d.]+) mC · pulses: (\d+)", tab.locator("#dose").inner_text())[0])
     assert charge_mc == pytest.approx(0.006 * pulses, abs=0.005), "300 µs at 20 mA are 6 µC"
-    assert "Check (not used for fitting)" in running.locator("#track").inner_text()
+    assert "Check (not used for fitting)" in tab.locator("#track").inner_text()
     for chart in ("torque-chart", "width-chart"):
-        assert running.evaluate(LIMIT_PIXELS, chart) > 300, "the limits are lines in the charts"
-    assert running.errors == []
+        assert tab.evaluate(LIMIT_PIXELS, chart) > 300, "the limits are lines in the charts"
+    assert tab.errors == []
+    tab.evaluate("document.querySelector('#live').insertAdjacentHTML('afterend', '<textarea id=remark></textarea>')")
+    tab.locator("#remark").focus()
+    tab.keyboard.type("arm moved ")
+    assert tab.locator("#remark").input_value() == "arm moved " and service.rig.state == "running"
+    tab.keyboard.press("Escape")
+    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
 
 def test_the_tightest_torque_limit_is_the_one_shown() -> None:
@@ -62,28 +60,6 @@ def test_the_tightest_torque_limit_is_the_one_shown() -> None:
     assert limits_of(row, rig) == {"current_ma": 20.0, "torque_nm": 25.0, "pulse_width_us": 180.0}
     row.plan["max_torque_nm"] = 12.0
     assert limits_of(row, rig)["torque_nm"] == limits_of(row, None)["torque_nm"] == 12.0
-
-
-@pytest.mark.browser
-def test_space_stops_once(running: Any, service: Service) -> None:
-    sent: list[str] = []
-    running.on("request", lambda request: sent.append(request.url) if request.method == "POST" else None)
-    running.keyboard.press(" ")
-    running.get_by_text("The rig confirms that stimulation is off.").wait_for()
-    assert [url.rsplit("/", 1)[1] for url in sent] == ["stop"]
-    assert service.rig.stopped_by is not None
-
-
-@pytest.mark.browser
-def test_a_space_in_a_note_is_a_space_and_esc_stops_there_too(running: Any, service: Service) -> None:
-    running.evaluate(
-        "document.querySelector('#live').insertAdjacentHTML('afterend', '<textarea id=remark></textarea>')"
-    )
-    running.locator("#remark").focus()
-    running.keyboard.type("arm moved ")
-    assert running.locator("#remark").input_value() == "arm moved " and service.rig.state == "running"
-    running.keyboard.press("Escape")
-    running.get_by_text("The rig confirms that stimulation is off.").wait_for()
 
 
 # ---- A stopped test's page shows what was recorded, who stopped it and when; loading a stop's page again stops nothing
@@ -96,12 +72,14 @@ def stops(service: Service) -> int:
 
 @pytest.mark.browser
 def test_a_stopped_tests_page_shows_what_was_recorded(tab: Any, service: Service) -> None:
-    participant(tab, service, f"W{time.time_ns() % 10**9}")
+    participant(tab, service, "W1")
     start(tab)
     tab.locator("#segment", has_text="Random pulses").wait_for()
-    test_page = tab.url
-    tab.get_by_role("button", name="Stop stimulation").click()
+    test_page, sent = tab.url, list[str]()
+    tab.on("request", lambda request: sent.append(request.url) if request.method == "POST" else None)
+    tab.keyboard.press(" ")
     tab.get_by_role("heading", name=re.compile(r"Stopped at \d\d:\d\d:\d\d")).wait_for()
+    assert [url.rsplit("/", 1)[1] for url in sent] == ["stop"], "Space stops once"
     expected(tab.get_by_text("Ada: stop pressed on the page")).to_be_visible()
     assert "/stopped/" in tab.url
     tab.get_by_text("not initialised: switched off, as it is after each stop").wait_for()
@@ -172,7 +150,7 @@ def test_what_was_not_played_begins_where_the_pulses_end(tmp_path: Path, sent_us
     found = recorded(str(made_up(tmp_path / "r.h5", sent_us, 1.2 if sent_us else 0.0)), lambda *_: None)
     plan_us = [100.0] * 400
     figure = model_charts.recorded(found, plan_us, 40.0, "stopped")
-    (faint,) = [trace for trace in figure["data"] if trace["name"] == "planned, not played"]
-    assert faint["x"][0] == pytest.approx(len(sent_us) / 40) and faint["line"]["color"] == "var(--plan)"
+    faint = figure.lines()["planned, not played"]
+    assert faint.x[0] == pytest.approx(len(sent_us) / 40) and faint.colour == "plan"
     whole = model_charts.recorded(found, plan_us[: len(sent_us)], 40.0, "completed")
-    assert not [trace for trace in whole["data"] if trace["name"] == "planned, not played"]
+    assert "planned, not played" not in whole.lines()

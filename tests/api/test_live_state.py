@@ -100,13 +100,6 @@ def test_the_page_before_a_test_stays_once_it_is_started(tab: Any, service: Serv
     assert tab.evaluate("window.stays") is True
 
 
-def test_a_page_that_the_browser_had_kept_is_loaded_anew(tab: Any, service: Service) -> None:
-    says(tab, "ready")
-    with tab.expect_navigation():
-        tab.evaluate("dispatchEvent(new PageTransitionEvent('pageshow', {persisted: true}))")
-    says(tab, "ready")
-
-
 def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: Service) -> None:
     """Nor is anything old shown as current after a sleep."""
     tab.clock.install()
@@ -125,23 +118,23 @@ def test_without_an_answer_the_state_is_not_known_within_2_s(tab: Any, service: 
     assert "Unknown" in tab.locator("#rig-state").inner_text()
 
 
-def test_a_rig_that_does_not_answer_is_not_called_ready(tab: Any, service: Service) -> None:
+def test_what_is_not_known_is_not_shown_as_known(tab: Any, service: Service) -> None:
+    """A page that the browser had kept, an old torque, a rig that does not answer."""
     tab.goto(service.url)
     says(tab, "No stimulation ready")
-    service.rig.mute = True
-    says(tab, "Unknown the rig does not answer")
-    tab.get_by_text("Its state is unknown").wait_for()
-    service.rig.mute = False
-    says(tab, "No stimulation ready")
-
-
-def test_torque_now_is_now_or_blank(tab: Any, service: Service) -> None:
+    with tab.expect_navigation():
+        tab.evaluate("dispatchEvent(new PageTransitionEvent('pageshow', {persisted: true}))")
     torque = tab.locator("dd [data-now=torque]")
     torque.get_by_text(re.compile(r"0\.43 N·m, \d\.\d s old")).wait_for()
     service.rig.cell_speaks = False
     torque.get_by_text(re.compile(r"^no torque for \d+\.\d s$")).wait_for()
     service.rig.cell_speaks = True
     torque.get_by_text("0.43 N·m").wait_for()
+    service.rig.mute = True
+    says(tab, "Unknown the rig does not answer")
+    tab.get_by_text("Its state is unknown").wait_for()
+    service.rig.mute = False
+    says(tab, "No stimulation ready")
 
 
 def test_a_silent_load_cell_leaves_a_way_back_on_pages_of_each_kind(tab: Any, service: Service, done: dict[str, Any]):

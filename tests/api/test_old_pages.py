@@ -48,20 +48,20 @@ def press_stop(tab: Any) -> None:
     tab.get_by_role("button", name="Stop stimulation").click()
 
 
-@pytest.mark.parametrize("path", ["/participants/{code}/calibration", "/models/{model}", "/models/none"])
 def test_every_page_says_that_the_service_is_silent_and_that_it_is_back(
-    paced: Any, service: Service, ids: dict[str, str], path: str
+    paced: Any, service: Service, ids: dict[str, str]
 ) -> None:
-    go(paced, service.url + path.format(**ids))
-    doubt(paced).to_be_hidden()
-    paced.context.set_offline(True)
-    paced.clock.fast_forward(3_000)
-    doubt(paced).to_contain_text(re.compile(r"has not answered since \S*\d\d:\d\d"))
-    expected(paced.locator("#rig-state")).to_contain_text("Unknown")
-    assert paced.locator("#page-old").bounding_box()["y"] < 400, "it is seen without scrolling"
-    paced.context.set_offline(False)
-    paced.clock.fast_forward(1_000)
-    doubt(paced).to_be_hidden()
+    for path in ("/participants/{code}/calibration", "/models/{model}", "/models/none"):
+        go(paced, service.url + path.format(**ids))
+        doubt(paced).to_be_hidden()
+        paced.context.set_offline(True)
+        paced.clock.fast_forward(3_000)
+        doubt(paced).to_contain_text(re.compile(r"has not answered since \S*\d\d:\d\d"))
+        expected(paced.locator("#rig-state")).to_contain_text("Unknown")
+        assert paced.locator("#page-old").bounding_box()["y"] < 400, "it is seen without scrolling"
+        paced.context.set_offline(False)
+        paced.clock.fast_forward(1_000)
+        doubt(paced).to_be_hidden()
 
 
 def test_the_stop_button_stays_and_says_that_it_did_not_get_through(paced: Any, service: Service) -> None:

@@ -9,4 +9,3 @@ function takeToken() {
 }
 addEventListener("hashchange", takeToken);
 takeToken();
-sessionStorage.clear(); // what somebody else had typed before the session ended
