@@ -5,10 +5,12 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 PATIENCE_S = 1.0
 """Work that takes no longer shows no bar."""
 BAR = "{percentage:3.0f} % {bar:20} {remaining} left  {desc}"
+LOG_S = 60.0
 LONGEST = 60
 """Characters of the text beside the bar."""
 
@@ -28,6 +30,15 @@ def progress_bar(wanted: bool = True) -> Iterator[Callable[[float, str], None]]:
             bar.update(share - bar.n)
 
         yield show
+
+
+def records_bar(total: int) -> Any:
+    """Return a bar for many records, to be updated with each: at a terminal; a line a minute in a log."""
+    from tqdm.auto import tqdm
+
+    watched = sys.stderr.isatty() or in_notebook()
+    delay_s, interval_s = (1.0, 0.1) if watched else (LOG_S, LOG_S)
+    return tqdm(total=total, unit=" records", leave=not watched, delay=delay_s, mininterval=interval_s)
 
 
 def in_notebook() -> bool:

@@ -170,28 +170,21 @@ def _first_line(process: subprocess.Popen[bytes]) -> str:
 class Services:
     """The whole rig: with no rig file, the emulator stands in for the hardware.
 
-    `admin_token`: set the administrator's token instead of drawing one. `attach`: socket of a rig that runs already:
-    none is started, and none is ended.
+    `admin_token`: set the administrator's token instead of drawing one.
     """
 
-    def __init__(
-        self,
-        settings: Settings,
-        emulate: Sequence[str] = (),
-        admin_token: str | None = None,
-        attach: Path | None = None,
-    ) -> None:
-        self.settings, self.admin_token, self.attached = settings, admin_token, attach is not None
+    def __init__(self, settings: Settings, emulate: Sequence[str] = (), admin_token: str | None = None) -> None:
+        self.settings, self.admin_token = settings, admin_token
         self._folder_lock: int | None = None
         owner_only.folder(owner_only.folder(settings.data_dir) / settings.logs_dir.name)
         self.runtime = Path(tempfile.mkdtemp(prefix="stimrig-"))  # a Unix socket's path holds 107 characters only
-        self.socket = attach.absolute() if attach else self.runtime / "rig.sock"
+        self.socket = self.runtime / "rig.sock"
         self.emulator: Child | None = None
-        if settings.rig_file is None and not self.attached:
+        if settings.rig_file is None:
             self.emulator = self._child("emulator", "stimrig.hardware_sim", "--die-with-parent", *emulate)
         self.rig, self.api = self._child("rig", "stimrig.rig"), self._child("api", "stimrig.api.web")
-        self.emulated = self.emulator is not None or (self.attached and settings.emulated)
-        """No person is connected: the emulator is started here, or runs behind the attached rig."""
+        # a rig file names devices of the world, whatever was left in the environment
+        self.api.environment["STIMRIG_EMULATED"] = str(self.emulator is not None).lower()
         self.url = ""
 
     def _child(self, name: str, *module: str) -> Child:
@@ -234,21 +227,19 @@ class Services:
         devices = ["--config", str(rig_file)]
         if self.emulator is not None:
             devices = ["--emulator-json", json.dumps(self.emulator.start())]
-        if not self.attached:
-            self.rig.command += [*devices, "--socket", str(self.socket), "--data", data]
-            try:
-                self.rig.start()
-            except LaunchError as error:
-                if error.exit_code != 2 or rig_file is None or str(rig_file) in str(error):
-                    raise
-                raise LaunchError(f"{rig_file}: {error}", 2) from error
-        self.api.environment = {
+        self.rig.command += [*devices, "--socket", str(self.socket), "--data", data]
+        try:
+            self.rig.start()
+        except LaunchError as error:
+            if error.exit_code != 2 or rig_file is None or str(rig_file) in str(error):
+                raise
+            raise LaunchError(f"{rig_file}: {error}", 2) from error
+        self.api.environment |= {
             INHERITED: str(self._folder_lock),
             "STIMRIG_DATA_DIR": data,
             "STIMRIG_RIG_SOCKET": str(self.socket),
             "STIMRIG_HOST": self.settings.host,
             "STIMRIG_PORT": str(self.settings.port),
-            "STIMRIG_EMULATED": str(self.emulated).lower(),
             **({} if self.admin_token is None else {"STIMRIG_ADMIN_TOKEN": self.admin_token}),
         }
         self.url = str(self.api.start()["url"])
@@ -261,5 +252,4 @@ class Services:
         """
         if self.emulator is not None and not self.emulator.alive():
             raise self.emulator.failure()
-        ours = (self.api,) if self.attached else (self.rig, self.api)
-        return [child.restart() for child in ours if not child.alive()]
+        return [child.restart() for child in (self.rig, self.api) if not child.alive()]

@@ -6,7 +6,6 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from stimrig.api.client.connection import Connection
@@ -14,8 +13,8 @@ from stimrig.api.client.errors import NotCompleted, NotFound, ServiceError, refu
 from stimrig.api.web.responses import models
 from stimrig.api.web.responses.base import Document
 from stimrig.api.web.responses.models import JobOut, VersionOut
-from stimrig.api.web.responses.people import NoteOut, ParticipantOut
-from stimrig.api.web.responses.rig import HealthOut, PreviewOut, RigOut, StoppedOut, TestOut, UploadOut
+from stimrig.api.web.responses.people import ParticipantOut
+from stimrig.api.web.responses.rig import HealthOut, PreviewOut, RigOut, StoppedOut, TestOut
 
 if TYPE_CHECKING:
     from stimrig.identify import Model
@@ -25,8 +24,6 @@ Progress = Callable[[float, str], None]
 QUIET: Progress = lambda *_: None  # noqa: E731
 OUTLOOK_S = 300.0
 """So long a busy service may take to say what an adaptive test can reach; usually it takes a few seconds."""
-UPLOAD_S = 3600.0
-"""So long an upload's answer may take: it waits for the fit. The service ends one that takes too long, and says so."""
 D = TypeVar("D", bound=Document)
 
 
@@ -66,9 +63,6 @@ class Client(Connection):
     def _request_as(self, kind: type[D], method: str, path: str, **more: Any) -> D:
         return kind.read(self.request(method, f"/v1{path}", **more).json())
 
-    def _list(self, kind: type[D], path: str, **more: Any) -> list[D]:
-        return [kind.read(row) for row in self.get(f"/v1{path}", **more)]
-
     def health(self) -> HealthOut:
         """Return whether the service and its rig answer; needs no token."""
         return HealthOut.read(self.get("/health"))
@@ -84,18 +78,9 @@ class Client(Connection):
         """
         return self._request_as(StoppedOut, "POST", "/stop", json={"reason": reason} if reason else {})
 
-    def effects(self) -> list[dict[str, Any]]:
-        """The library of effects of the service."""
-        return self.get("/v1/effects")["effects"]
-
     def issue_token(self, name: str, scopes: Sequence[str]) -> str:
         """A new token for a program of this name, with scopes as "read-model"; only an administrator may do this."""
         return self.post("/v1/tokens", json={"name": name, "scopes": list(scopes)})["token"]
-
-    def participants(self, q: str = "", archived: bool | None = None) -> list[ParticipantOut]:
-        """All participants, most recent first. `q`: a part of the code; `archived`: only those that are, or are not."""
-        params = {"q": q} if archived is None else {"q": q, "archived": archived}
-        return self._list(ParticipantOut, "/participants", params=params)
 
     def participant(self, code: str) -> ParticipantOut:
         """One participant with its limits."""
@@ -119,38 +104,6 @@ class Client(Connection):
         except NotFound:
             return self.make_participant(code)
 
-    def set_muscle(
-        self, code: str, side: str | None, muscle: str | None, placement: str | None = None
-    ) -> ParticipantOut:
-        """Say which site is stimulated, as in `make_participant`; refused where a calibration would be lost by it."""
-        site = {"side": side, "muscle": muscle, "placement": placement}
-        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/muscle", json=site)
-
-    def set_limits(self, code: str, **limits: float) -> ParticipantOut:
-        """Change the limits that are named, as `current_ma=20.0`; the others stay as they are."""
-        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/profile", json=limits)
-
-    def archive(self, code: str) -> ParticipantOut:
-        """Put a participant into the archive: no test starts any more, and nothing is deleted."""
-        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/archived", json={"archived": True})
-
-    def unarchive(self, code: str) -> ParticipantOut:
-        """Take a participant out of the archive."""
-        return self._request_as(ParticipantOut, "PUT", f"/participants/{code}/archived", json={"archived": False})
-
-    def notes(self, participant: str) -> list[NoteOut]:
-        """The notes of a participant, newest first, the struck ones among them."""
-        return self._list(NoteOut, f"/participants/{participant}/notes")
-
-    def add_note(self, participant: str, kind: str, text: str = "", **more: Any) -> NoteOut:
-        """Write a note. `more`: `test_id`, and the time in that test as `at_s`, or `now=True` while it runs."""
-        body = {"kind": kind, "text": text, **more}
-        return self._request_as(NoteOut, "POST", f"/participants/{participant}/notes", json=body)
-
-    def strike_note(self, participant: str, note_id: str) -> NoteOut:
-        """Mark a note as wrong; it stays readable."""
-        return self._request_as(NoteOut, "POST", f"/participants/{participant}/notes/{note_id}/strike")
-
     def preview(self, participant: str, **more: Any) -> PreviewOut:
         """Duration, dose and pulse widths of a test. Nothing is played. `more` as in `start_test`."""
         wait = {"timeout": OUTLOOK_S} if more.get("kind") == "adaptive" else {}
@@ -169,10 +122,6 @@ class Client(Connection):
     def test(self, test_id: str) -> TestOut:
         """A test as it is now."""
         return self._request_as(TestOut, "GET", f"/tests/{test_id}")
-
-    def tests(self, participant: str) -> list[TestOut]:
-        """The tests of a participant, newest first."""
-        return self._list(TestOut, "/tests", params={"participant": participant, "limit": 500})
 
     def follow(self, test_id: str) -> Iterator[TestOut]:
         """A test ten times a second until it is done, whatever its end."""
@@ -198,10 +147,6 @@ class Client(Connection):
             raise NotCompleted("", f"the test ended as {test.state}", reason, document=test.to_dict())
         return test
 
-    def set_ran_by(self, test_id: str, name: str | None) -> TestOut:
-        """Say who ran a test at the rig; None: who asked for it."""
-        return self._request_as(TestOut, "PUT", f"/tests/{test_id}/ran-by", json={"ran_by": name})
-
     def enough(self, test_id: str) -> dict[str, Any]:
         """End a running adaptive test well, at the next pulse; its recording is identified like any other."""
         return self.post(f"/v1/tests/{test_id}/enough")
@@ -214,18 +159,9 @@ class Client(Connection):
         """The recording as CSV."""
         return self.request("GET", f"/v1/recordings/{recording_id}/csv").content
 
-    def upload(self, participant: str, data: bytes | Path) -> UploadOut:
-        """Send a recording of another tool (CSV or HDF5). Returns `recording_id`, its new `model`, and `warnings`."""
-        content, path = data if isinstance(data, bytes) else data.read_bytes(), f"/participants/{participant}"
-        return self._request_as(UploadOut, "POST", f"{path}/recordings", content=content, timeout=UPLOAD_S)
-
     def versions(self, participant: str) -> list[VersionOut]:
         """Model versions of a participant, newest first."""
-        return self._list(VersionOut, f"/participants/{participant}/models")
-
-    def trend(self, participant: str) -> models.TrendOut:
-        """Sessions of a participant, oldest first: figures with their uncertainty, and what changed."""
-        return self._request_as(models.TrendOut, "GET", f"/participants/{participant}/trend")
+        return [VersionOut.read(row) for row in self.get(f"/v1/participants/{participant}/models")]
 
     def version(self, model_id: str) -> VersionOut:
         """One model version."""
@@ -293,11 +229,6 @@ class Client(Connection):
         """Measured and predicted torque, pulse widths and step response, for drawing."""
         return self._request_as(models.CurvesOut, "GET", f"/models/{model_id}/curves")
 
-    def comparison(self, model_id: str, recording_id: str | None = None) -> models.ComparisonOut:
-        """The model against its own recording, or against another one."""
-        params = {"recording": recording_id} if recording_id else {}
-        return self._request_as(models.ComparisonOut, "GET", f"/models/{model_id}/comparison", params=params)
-
     def diagnosis(self, model_id: str, progress: Progress = QUIET) -> models.DiagnosisOut:
         """Diagnose what the model lacks. `progress` as in `add_effects`."""
         return self._long(models.DiagnosisOut, "GET", f"/models/{model_id}/diagnosis", progress)
@@ -317,14 +248,6 @@ class Client(Connection):
         """Add effects one by one while the evidence asks for them; returns the last version. `progress` as above."""
         return self._long(VersionOut, "POST", f"/models/{model_id}/improve", progress)
 
-    def job(self, job_id: str) -> JobOut:
-        """Long work as it is now."""
-        return self._request_as(JobOut, "GET", f"/jobs/{job_id}")
-
-    def cancel(self, job_id: str) -> JobOut:
-        """Cancel long work. What is done already stays done."""
-        return self._request_as(JobOut, "DELETE", f"/jobs/{job_id}")
-
     def _long(self, kind: type[D], method: str, path: str, progress: Progress, **more: Any) -> D:
         answer = self.request(method, f"/v1{path}", params={"wait": False}, **more)
         if answer.status_code != 202:
@@ -334,11 +257,11 @@ class Client(Connection):
             while not job.done:
                 progress(job.progress, job.text)
                 time.sleep(POLL_S)
-                job = self.job(job.id)
+                job = self._request_as(JobOut, "GET", f"/jobs/{job.id}")
             progress(1.0, "done")
         except BaseException:
             with contextlib.suppress(ServiceError):  # the first error is the one to tell
-                self.cancel(job.id)
+                self.request("DELETE", f"/v1/jobs/{job.id}")
             raise
         if job.result_url is not None:
             return kind.read(self.get(job.result_url))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import resource
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -31,27 +31,12 @@ Row = dict[str, Any]
 
 
 def compute_row(file: Path, name: str, known: Mapping[str, Any], task: Task) -> Row:
-    """Return the row of a record; whatever goes wrong is its error.
-
-    `file`: where it lies, `name`: as its error names it; `known`: fields of its listing.
-    """
-    row = dict(known)
+    """Return the row of a record; whatever goes wrong is its error. As `read_row`."""
     began_s, processor_s = time.perf_counter(), time.process_time()
-    try:
-        record = read_selected(file, row, Selection(task.select), task.columns)
-        if record is None:
-            return {"status": LEFT_OUT}
-        row |= json_value({"notes": record.notes, **ANSWERS[task.verb](record, task), "status": "ok"})
-    except IdentifyError as error:
-        kinds = {NotIdentifiable: "not identifiable", BadRequest: "bad request"}
-        kind = next((word for type_, word in kinds.items() if isinstance(error, type_)), "bad record")
-        row |= failed(kind, str(error).replace(str(file), file.name).replace(file.name, name))
-    except MemoryError:
-        row |= failed("out of memory", "it takes more memory than --memory allows. Give more, or cut the record.")
-    except RecursionError:
-        row |= failed("unexpected", "too deeply nested")
-    except Exception as error:
-        row |= failed("unexpected", f"{type(error).__name__}: {error}")
+    selection, verb = Selection(task.select), ANSWERS[task.verb]
+    row = read_row(file, name, known, selection, task.columns, lambda record: json_value(verb(record, task)))
+    if row["status"] == LEFT_OUT:
+        return row
     return row | {
         "begun_utc": _parse_utc(row.get("begun_utc") or ""),
         "took_s": round(time.perf_counter() - began_s, 4),
@@ -60,11 +45,37 @@ def compute_row(file: Path, name: str, known: Mapping[str, Any], task: Task) -> 
     }
 
 
-def read_selected(path: Path, row: Row, selection: Selection, columns: Sequence[str]) -> Any:
-    """Read a record, and write into `row` what it says of itself; None if it is not selected. Raises IdentifyError.
+def read_row(
+    file: Path, name: str, known: Mapping[str, Any], selection: Selection, columns: Sequence[str],
+    answer: Callable[[Any], Row],
+) -> Row:  # fmt: skip
+    """Read a record and return its row with what it answers; its status is `ok`, `error` or `left out`.
 
-    `columns`: of other tools' tables, as --map gives them.
+    `file`: where it lies, `name`: as its error names it; `known`: fields of its listing; `columns`: of other tools'
+    tables, as --map gives them. Whatever a record of somebody else's does, the others go on. Raises OSError.
     """
+    row = dict(known)
+    try:
+        record = read_selected(file, row, selection, columns)
+        if record is None:
+            return {"status": LEFT_OUT}
+        return row | {"notes": list(record.notes), "status": "ok", **answer(record)}
+    except IdentifyError as error:
+        kinds = {NotIdentifiable: "not identifiable", BadRequest: "bad request"}
+        kind = next((word for type_, word in kinds.items() if isinstance(error, type_)), "bad record")
+        return row | failed(kind, str(error).replace(str(file), file.name).replace(file.name, name))
+    except MemoryError:
+        return row | failed("out of memory", "it takes more memory than there is. Give more with --memory, or cut it.")
+    except RecursionError:
+        return row | failed("unexpected", "too deeply nested")
+    except OSError:
+        raise
+    except Exception as error:
+        return row | failed("unexpected", f"{type(error).__name__}: {error}")
+
+
+def read_selected(path: Path, row: Row, selection: Selection, columns: Sequence[str]) -> Any:
+    """Read a record, and write into `row` what it says of itself; None if it is not selected. Raises IdentifyError."""
     with path.open("rb") as start:
         sealed = start.read(len(HDF5_MAGIC)) == HDF5_MAGIC
     if sealed:  # what it says of itself is read before all of it is

@@ -12,8 +12,9 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import date, datetime
+from heapq import merge
 from itertools import islice
 from pathlib import Path
 from typing import IO, Any, Self
@@ -119,9 +120,11 @@ class Results:
         if self.output.exists():
             yield from table.read_rows(self.output, columns)
         with self.journal.open("rb") as file:
-            for line in islice(file, 1, None):
-                row = _parse(line, self.journal)
-                yield row | {name: kind.fromisoformat(row[name]) for name, kind in TIMES.items() if row.get(name)}
+            yield from (self._row(line) for line in islice(file, 1, None))
+
+    def _row(self, line: bytes) -> Row:
+        row = _parse(line, self.journal)
+        return row | {name: kind.fromisoformat(row[name]) for name, kind in TIMES.items() if row.get(name)}
 
     def has(self, entry: Entry) -> bool:
         """Return whether this file, in its state of now, has a row."""
@@ -144,21 +147,39 @@ class Results:
             raise _no_room(self.journal, error) from None
 
     def join(self) -> Counter[str]:
-        """Write the output, empty what stands beside it, and count the rows by status.
+        """Write the output in the order of addresses, empty what stands beside it, and count the rows by status.
 
         Raises InterruptedRunError: the disk refuses; the lines stay.
         """
         statuses = self._statuses()
-        rows = ({**row, "status": status} for row, status in zip(self._rows(), statuses, strict=True) if status)
         schema = table.SCHEMA.with_metadata({"format": table.FORMAT, "options": json.dumps(self.task.options())})
         try:
             with whole_path(self.output) as place, pq.ParquetWriter(place, schema, compression="zstd") as writer:
+                rows = ({**row, "status": status} for row, status in self._sorted(statuses) if status)
                 while some := list(islice(rows, GROUP_ROWS)):
                     writer.write_table(table.rows_to_table(some))
         except OSError as error:
             raise _no_room(self.output, error) from None
         self._file.truncate(0)
         return Counter(status for status in statuses if status)
+
+    def _sorted(self, statuses: Sequence[str | None]) -> Iterator[tuple[Row, str | None]]:
+        """Yield the rows in the order of addresses: those of the output are, each line is read where it stands."""
+        old = table.read_rows(self.output) if self.output.exists() else ()
+        with self.journal.open("rb") as file:
+            places, place = list[tuple[str, int]](), len(file.readline())
+            for line in file:
+                places.append((_parse(line, self.journal)["address"], place))
+                place += len(line)
+            count = len(statuses) - len(places)
+
+            def line_at(place: int) -> Row:
+                file.seek(place)
+                return self._row(file.readline())
+
+            order = sorted(zip(places, statuses[count:], strict=True), key=lambda pair: pair[0])
+            new = ((line_at(place), status) for (_address, place), status in order)
+            yield from merge(zip(old, statuses[:count], strict=True), new, key=lambda pair: pair[0]["address"])
 
     def _statuses(self) -> list[str | None]:
         """Return the status of each row, the oldest first; None: its file has a newer row."""

@@ -20,13 +20,13 @@ from distributed.scheduler import KilledWorker
 
 from stimrig.api.cohort.cluster import connect, parse_memory
 from stimrig.api.cohort.errors import RESUMABLE, SCHEDULER_GONE, CohortError, InterruptedRunError
-from stimrig.api.cohort.progress import records_bar
 from stimrig.api.cohort.record import LEFT_OUT, Row, failed
 from stimrig.api.cohort.results import COPY, Results
 from stimrig.api.cohort.select import Selection
 from stimrig.api.cohort.sources import Entry, count_records, list_records
 from stimrig.api.cohort.task import METHOD, Task
 from stimrig.api.cohort.worker import Bounds, base_row, record_row
+from stimrig.api.progress_bar import records_bar
 from stimrig.api.version import software_version
 
 IN_FLIGHT = 24
@@ -48,7 +48,7 @@ def run_cohort(
     verb : str
         fit, diagnose or improve.
     data : sequence of str
-        Files, folders, addresses.
+        Files, folders.
     output : Path
         Parquet file. If it has results of the same options, what is new is added.
     **options

@@ -75,6 +75,8 @@ def _compute(content: bytes, entry: Entry, task: Task, bounds: Bounds) -> Row:
         except TimeoutError:
             process.kill()
             row = failed("timeout", f"ended after {bounds.limit_s:g} s. Give more with --limit, or cut the record.")
+        except OSError as error:
+            row = failed("unreadable", f"{type(error).__name__}: {error}")
         except BrokenProcessPool:
             row = failed("killed", "its process was killed, by the record or by the system for want of memory.")
     return row | {"took_s": round(time.monotonic() - began_s, 3)}

@@ -8,24 +8,25 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from stimrig.api.cohort.errors import CohortError
-from stimrig.api.cohort.progress import records_bar
-from stimrig.api.cohort.record import read_selected
+from stimrig.api.cohort.record import LEFT_OUT, Row, failed, read_row
 from stimrig.api.cohort.select import LABELS, Selection
-from stimrig.api.cohort.sources import EXPORT_TABLES, SourceError, count_records, list_records, read_content
+from stimrig.api.cohort.sources import EXPORT_TABLES, Entry, SourceError, count_records, list_records, read_content
 from stimrig.api.export.record_file import check_format, write_record
+from stimrig.api.progress_bar import records_bar
 from stimrig.api.whole_file import whole_path
-from stimrig.identify.errors import IdentifyError
 from stimrig.identify.records.cells import lines
 from stimrig.identify.records.columns import parse_column_map
 from stimrig.identify.records.record import Record, Source
 
 RECORDS, ERRORS = EXPORT_TABLES
+COPY = "copy"
+"""Status of a record whose content was exported already."""
 UNDATED = ("file", "participant", "record_id", "sha256", "pulse_rate_hz", "rate_hz", "duration_s", "outcome")
 DATED = ("begun_utc", "test_id", "name", *LABELS, "notes")
 """Columns of `records.csv`: those that tell no day, and those that do, or that a person typed."""
@@ -45,7 +46,7 @@ def export_records(
     Parameters
     ----------
     data : sequence of str
-        Files, folders, addresses.
+        Files, folders.
     folder : Path
         New, or empty.
     format : str
@@ -67,7 +68,7 @@ def export_records(
     check_format(format)
     parse_column_map(columns)
     selection, total = Selection(select), count_records(data)
-    rows: dict[str, dict[str, Any]] = {}  # by the SHA-256 of the record's file
+    rows: dict[str, Row] = {}  # by the SHA-256 of the record's file
     errors: list[tuple[str, str]] = []
     counts = Counter(left_out=0, copies=0)
     try:
@@ -76,39 +77,19 @@ def export_records(
             raise CohortError(f"{folder}: is not empty. Give a new folder.")
         with tempfile.TemporaryDirectory(prefix="stimrig-export-") as scratch, records_bar(total) as bar:
             for entry in list_records(data):
-                path, row = Path(scratch) / f"record{Path(entry.name).suffix.lower()[:8]}", dict(entry.known)
-                try:
-                    if selection(row) is False:
-                        counts["left_out"] += 1
-                        continue
-                    path.write_bytes(content := read_content(entry))
-                    sha256 = hashlib.sha256(content).hexdigest()
-                    if sha256 in rows:
-                        counts["copies"] += 1
-                        continue
-                    record = read_selected(path, row, selection, columns)
-                    if record is None:
-                        counts["left_out"] += 1
-                        continue
-                    file = f"{_code(row)}_{sha256[:16]}.{format}"
-                    with whole_path(folder / file) as place:
-                        write_record(_undated(record), place, format)
-                    rate_hz, notes = float(record.pulse_rate_hz), "; ".join(record.notes)
-                    rows[sha256] = row | {"file": file, "sha256": sha256, "pulse_rate_hz": rate_hz, "notes": notes}
-                except (IdentifyError, SourceError) as error:
-                    errors.append((entry.address, str(error).replace(str(path), entry.name)))
-                except MemoryError:
-                    errors.append((entry.address, "it takes more memory than there is"))
-                except OSError:
-                    raise
-                except Exception as error:  # a record of somebody else's: whatever it does, the others go on
-                    errors.append((entry.address, f"unexpected: {type(error).__name__}: {error}"))
-                finally:
-                    path.unlink(missing_ok=True)
-                    bar.update()
+                row: Row = {"status": LEFT_OUT}
+                if selection(entry.known) is not False:
+                    row = _exported(entry, Path(scratch), folder, format, selection, columns, rows)
+                if row["status"] == "ok":
+                    rows[row["sha256"]] = row
+                elif row["status"] == "error":
+                    errors.append((entry.address, row["error"]))
+                else:
+                    counts["copies" if row["status"] == COPY else "left_out"] += 1
+                bar.update()
         header = (*UNDATED, *DATED) if dates else UNDATED
         _write_table(folder / RECORDS, header, ([row.get(column) for column in header] for row in rows.values()))
-        _write_table(folder / ERRORS, ("address", "reason"), ((place, " ".join(why.split())) for place, why in errors))
+        _write_table(folder / ERRORS, ("address", "reason"), errors)
     except OSError as error:
         raise CohortError(f"{folder}: {error.strerror or error}. Give a new folder with room.") from error
     return {
@@ -117,16 +98,34 @@ def export_records(
     }  # fmt: skip
 
 
+def _exported(
+    entry: Entry, scratch: Path, folder: Path, format: str, selection: Selection, columns: Sequence[str],
+    done: Container[str],
+) -> Row:  # fmt: skip
+    """Write one record, unless its content is `done` already; return its row. Raises OSError: there is no room."""
+    try:
+        content = read_content(entry)
+    except SourceError as error:
+        return failed(error.kind, str(error))
+    if (sha256 := hashlib.sha256(content).hexdigest()) in done:
+        return {"status": COPY}
+
+    def write(record: Record) -> Row:
+        code = "".join(letter for letter in record.source.participant if letter.isascii() and letter.isalnum())
+        file = f"{code or 'unknown'}_{sha256[:16]}.{format}"
+        with whole_path(folder / file) as place:
+            write_record(_undated(record), place, format)
+        notes, rate_hz = "; ".join(record.notes), float(record.pulse_rate_hz)
+        return {"file": file, "sha256": sha256, "pulse_rate_hz": rate_hz, "notes": notes}
+
+    path = scratch / f"record{Path(entry.name).suffix.lower()[:8]}"
+    path.write_bytes(content)
+    return read_row(path, entry.name, entry.known, selection, columns, write)
+
+
 def _write_table(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
     with whole_path(path) as place, place.open("w", encoding="utf-8", errors="replace") as file:
         file.writelines(lines([header, *rows]))
-
-
-def _code(row: dict[str, Any]) -> str:
-    """Return the participant's code as a part of a file's name."""
-    return (
-        "".join(letter for letter in row.get("participant") or "" if letter.isascii() and letter.isalnum()) or "unknown"
-    )
 
 
 def _undated(record: Record) -> Record:

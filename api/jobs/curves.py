@@ -36,13 +36,12 @@ def comparison(data: str, progress: Progress, model_json: str) -> dict[str, Any]
 
 def rounded(comparison: dict[str, Any]) -> dict[str, Any]:
     """A comparison whose series hold five digits each."""
-    series = comparison.get("series") or {}
-    short = {key: _rounded(values) if isinstance(values, list) else values for key, values in series.items()}
-    return {**comparison, "series": short}
-
-
-def _rounded(values: list[Any]) -> list[Any]:
-    return [round(value, 5) if isinstance(value, float) else value for value in values]
+    series = {
+        key: [round(value, 5) if isinstance(value, float) else value for value in values]
+        if isinstance(values, list) else values
+        for key, values in comparison["series"].items()
+    }  # fmt: skip
+    return {**comparison, "series": series}
 
 
 def curves(model: Any, record: Any) -> dict[str, Any]:
@@ -56,14 +55,9 @@ def curves(model: Any, record: Any) -> dict[str, Any]:
         "torque_nm": torque_nm[pick].round(5).tolist(),
         "predicted_torque_nm": predicted[pick].round(5).tolist(),
         "pulse_width_us": np.asarray(record.pulse_width_us)[pick].round(2).tolist(),
-        "segments": segments_of(record),
+        "segments": runs([record.segment_names[index] for index in record.segment], time_s),
         "step_response": step_response(model.to_dict()),
     }
-
-
-def segments_of(record: Any) -> list[dict[str, Any]]:
-    """The segments of a record, each with its name and times."""
-    return runs([str(record.segment_names[index]) for index in record.segment], np.asarray(record.time_s))
 
 
 def runs(labels: list[str], time_s: Any) -> list[dict[str, Any]]:

@@ -73,13 +73,9 @@ def diagnosis(data: str, progress: Progress, model_json: str | None = None) -> d
     record = identify.read(Path(data))
     model = None if model_json is None else identify.Model.from_json(model_json)
     structure = held_by(model, record)
-    return finding_of(record, *identify.diagnose_and_improve(record, progress, model), structure)
-
-
-def finding_of(record: Any, diagnosis: Any, improvement: Any, structure: Sequence[str]) -> dict[str, Any]:
-    """Return a diagnosis as it is stored, with the improvement that the same search gives."""
+    found, improvement = identify.diagnose_and_improve(record, progress, model)
     return json_value({
-        **with_experiment(record, diagnosis, structure),
+        **with_experiment(record, found, structure),
         "signatures": signatures(record, improvement),
         "refused": list(improvement.refused),
         "improvement": {**improvement.to_dict(), "structure": list(structure)},

@@ -92,31 +92,29 @@ async def mark(context: Context, code: str, body: MarkIn, by: str, tags: Tags) -
 async def _act(context: Context, code: str, tags: Tags, request: Any) -> dict[str, Any]:
     """Send a request about the last train that was shown; return the state before it."""
     async with context.limits_lock:  # of two presses on the same sight one counts; no train comes between
-        calibration = await _sound(context, code)
-        _check_train(calibration, tags)
+        calibration = await standing(context, code)
+        _check(calibration, tags)
         await context.rig.ask(request)
     return calibration
 
 
-def _check_train(calibration: dict[str, Any], tags: Tags) -> None:
-    """Raise ApiError (412): it is another calibration, or another train was sent or is on its way."""
-    _check_calibration(calibration["calibration_id"], calibration["by"], tags)
-    if calibration["version"] not in tags or calibration["playing"]:
-        raise _out_of_date(
-            "Another train was sent after this page was shown, or another mark was set. Nothing was done now. Look at "
-            "the last train and the marks first."
-        )
+def _check(calibration: dict[str, Any], tags: Tags, *, discard: bool = False) -> None:
+    """Refuse what was decided on another calibration or another train; only discarding takes each train.
 
-
-def _check_calibration(calibration_id: str, by: str, tags: Tags) -> None:
-    """Raise ApiError (412): the one that was decided on has ended, and somebody has begun another one."""
-    if calibration_id not in {tag.partition(".")[0] for tag in tags}:
-        begun = f"{by} has begun another calibration since this page was shown."
-        raise _out_of_date(f"{begun} Nothing was done. Look at that one first.")
-
-
-def _out_of_date(detail: str) -> ApiError:
-    return ApiError(412, "changed-meanwhile", "This page is out of date", detail)
+    Raises ApiError: 409 it is outdated; 412 it has ended and somebody has begun another one, or another train was sent
+    or is on its way.
+    """
+    if calibration["outdated"] and not discard:
+        raise _outdated_error(calibration["outdated"])
+    words = ""
+    if calibration["calibration_id"] not in {tag.partition(".")[0] for tag in tags}:
+        words = f"{calibration['by']} has begun another calibration since this page was shown. Nothing was done. "
+        words += "Look at that one first."
+    elif not discard and (calibration["version"] not in tags or calibration["playing"]):
+        words = "Another train was sent after this page was shown, or another mark was set. Nothing was done now. "
+        words += "Look at the last train and the marks first."
+    if words:
+        raise ApiError(412, "changed-meanwhile", "This page is out of date", words)
 
 
 async def standing(context: Context, code: str) -> dict[str, Any]:
@@ -162,14 +160,6 @@ def _outdated(session: Session, row: Participant, calibration_id: str) -> str:
     )
 
 
-async def _sound(context: Context, code: str) -> dict[str, Any]:
-    """Return the state of a calibration that may go on. Raises ApiError: as `standing`; 409 it is outdated."""
-    calibration = await standing(context, code)
-    if calibration["outdated"]:
-        raise _outdated_error(calibration["outdated"])
-    return calibration
-
-
 def _outdated_error(detail: str) -> ApiError:
     return ApiError(409, "changed-meanwhile", "This calibration goes no further", detail)
 
@@ -180,15 +170,12 @@ async def close(context: Context, code: str, by: str, tags: Tags, discard: bool 
         status = await context.rig.fresh_status()
         waits = status.calibrated
         if waits is not None and waits.participant == code and status.calibration is None:
-            identity = waits.calibration_id
-            _check_calibration(identity, waits.by, tags)
+            calibration = {"calibration_id": waits.calibration_id, "by": waits.by, "outdated": ""}
+            _check(calibration, tags, discard=True)  # it plays no train any more
         else:
-            calibration = await (standing if discard else _sound)(context, code)
-            identity = str(calibration["calibration_id"])
-            if discard:
-                _check_calibration(identity, calibration["by"], tags)
-            else:
-                _check_train(calibration, tags)
+            calibration = await standing(context, code)
+            _check(calibration, tags, discard=discard)
+        identity = str(calibration["calibration_id"])
         request = requests.CalibrateFinishRequest(by=by, discard=discard, calibration_id=identity)
         result = await context.rig.ask_for(messages.CalibrationResult, request)
         profile = await asyncio.to_thread(_store, context, code, result, by, identity)

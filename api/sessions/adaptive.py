@@ -63,11 +63,16 @@ class AdaptiveTests(Watched):
             max_torque_time_nms=body.max_torque_time_nm_s or AT_STOPPING_TORQUE_S * plan.stopping_torque_nm,
             patience_s=PATIENCE_S,
         )
+
+        def known() -> list[str]:
+            person = self.versions.store.get(Participant, plan.participant)
+            return self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
+
         how = {
             "target": body.target.model_dump(),
             "playable_s": bounds.max_duration_s - SAFE_END_S, "max_torque_time_nm_s": bounds.max_torque_time_nms,
             "largest_us": plan.largest_us, "pulse_rate_hz": plan.pulse_rate_hz,
-            "models": await asyncio.to_thread(self._known, plan),
+            "models": await asyncio.to_thread(known),
         }  # fmt: skip
         outlook = await self._outlook({**how, "max_torque_nm": plan.stopping_torque_nm})
         default = await self.rig.ask(PreviewRequest(plan=plan, recruitment=None), timeout_s=preview_s)
@@ -91,11 +96,6 @@ class AdaptiveTests(Watched):
                     raise ApiError(409, "rig-busy", "Another test is running", detail)
                 self._last = wanted, await self.adviser.submit("adaptive_outlook", **wanted).result
             return self._last[1]
-
-    def _known(self, plan: TestPlan) -> list[str]:
-        """List the participant's models at the place of a plan, oldest first."""
-        person = self.versions.store.get(Participant, plan.participant)
-        return self._models(plan.participant, (*site_of(person), plan.profile.current_ma))
 
     def _models(self, participant: str, place: Place) -> list[str]:
         """The participant's approved models, oldest first.

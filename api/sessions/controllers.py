@@ -13,7 +13,7 @@ from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Auth, Principal, Scope, outside
 from stimrig.api.sessions.playing import Requester, refuse_archived
-from stimrig.api.sessions.profiles import LIMITS
+from stimrig.api.sessions.profiles import LIMITS, above
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.sessions.trials import SEQUENCE
@@ -118,10 +118,8 @@ async def _within_plan(runner: Runner, principal: Principal, body: TestIn, parti
     if len(await asyncio.to_thread(runner.store.all, Test.id, *begun)) >= plan["trials"]:
         raise beyond(f"All trials of this key are played: {plan['trials']}. A person can make another key")
     profile, sent = body.profile or ProfileIn(), body.profile.sent() if body.profile else {}
-    for name in LIMITED:
-        if not sent.get(name, 0.0) <= plan[name]:
-            unit = LIMITS[name].unit
-            raise beyond(f"{name} {sent[name]:g} {unit} is above the plan's {plan[name]:g} {unit}")
+    for name, words in above({name: sent[name] for name in LIMITED if name in sent}, plan, "the plan's").items():
+        raise beyond(f"{name} {words}")
     limits = {name: min(sent.get(name, plan[name]), plan[name], participant.profile[name]) for name in LIMITED}
     narrowed = body.model_copy(update={"profile": profile.model_copy(update=limits)})
     preview = await runner.preview(narrowed)
@@ -174,10 +172,15 @@ def make_key(auth: Auth, maker: Principal, participant: str, body: KeyFor, tags:
         person: Participant = require_found(session.get(Participant, participant), "participant", participant)
         refuse_archived(person)
         locking.check(session, person, tags)
+        plan = body.model_dump(exclude={"name"})
+        wider = above({name: plan[name] for name in LIMITED}, person.profile, "the limit of today,")
+        for name, words in wider.items():
+            detail = f"{LIMITS[name].words}: {words}."
+            raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
         row = Token(
             hash=digest(text), prefix=text[:12], created_utc=now, expires_utc=auth.clock.end_of_day_utc(),
             name=f"{body.name} ({digest(text)[:6]})",  # unique, since tests are counted by it
-            participant=participant, plan=_plan_within(body, person), scopes=[str(scope) for scope in KEY_SCOPES],
+            participant=participant, plan={**plan, "site": site_of(person)}, scopes=list(map(str, KEY_SCOPES)),
             made_by=maker.token_hash,
         )  # fmt: skip
         session.add(row)
@@ -186,33 +189,22 @@ def make_key(auth: Auth, maker: Principal, participant: str, body: KeyFor, tags:
     return text, row, person.version
 
 
-def _plan_within(plan: PlanIn, participant: Participant) -> dict[str, Any]:
-    """Return the plan to store with the key; refuse one that is wider than the participant's limits."""
-    for name in LIMITED:
-        value, limit = getattr(plan, name), participant.profile.get(name)
-        if limit is None or not value <= limit:
-            unit = LIMITS[name].unit
-            detail = f"{LIMITS[name].words}: {value:g} {unit} is above the limit of today, {limit or 0:g} {unit}."
-            raise ApiError(422, "wider-profile", "Wider than the participant's limits", detail)
-    return {**plan.model_dump(exclude={"name"}), "site": site_of(participant)}
-
-
 def keys_of(auth: Auth, participant: str) -> list[dict[str, Any]]:
     """Today's keys of a participant, newest first; `id` is for `revoke`, `state` says whether it opens anything."""
     today = Token.participant == participant, Token.created_utc >= auth.clock.start_of_day_utc()
+
+    def state(row: Token) -> str:
+        if row.revoked or auth.creator_lost_rights(row):
+            return "revoked"
+        return "expired" if row.expires_utc is not None and row.expires_utc <= auth.clock.utc() else "valid"
+
     rows = auth.store.all(Token, *today, order=Token.created_utc.desc())
-    return [{"id": row.hash[:16], "state": _key_state(auth, row), **row.as_dict()} for row in rows]
+    return [{"id": row.hash[:16], "state": state(row), **row.as_dict()} for row in rows]
 
 
 def has_key(auth: Auth, participant: str) -> bool:
     """Return whether a valid controller key exists for a participant."""
     return any(row["state"] == "valid" for row in keys_of(auth, participant))
-
-
-def _key_state(auth: Auth, row: Token) -> str:
-    if row.revoked or auth.creator_lost_rights(row):
-        return "revoked"
-    return "expired" if row.expires_utc is not None and row.expires_utc <= auth.clock.utc() else "valid"
 
 
 def revoke_key(auth: Auth, participant: str, token_id: str, by: str) -> bool:

@@ -9,11 +9,12 @@ the part that is not planned is there for a muscle that is stronger elsewhere.
 from __future__ import annotations
 
 import math
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import groupby, product
 from typing import Any
+
+import numpy as np
 
 from stimrig.api.sessions.profiles import TOLERANCE_RAD
 from stimrig.rig.messages import HELD, MOVING, PASSIVE
@@ -61,23 +62,17 @@ class Curve:
     torque_nm: Sequence[float]
     known: bool  # whether it is a model's, in N·m
 
-    def torque(self, width_us: float) -> float:
-        """Steady torque at a width; 0 without a pulse, level beyond the ends."""
-        widths, torques, k = self.pulse_width_us, self.torque_nm, bisect_right(self.pulse_width_us, width_us)
-        if not (width_us > 0.0):
-            return 0.0
-        if k in (0, len(widths)):
-            return torques[min(k, len(widths) - 1)]
-        share = (width_us - widths[k - 1]) / (widths[k] - widths[k - 1])
-        return torques[k - 1] + share * (torques[k] - torques[k - 1])
+    def torque(self, width_us: Any) -> Any:
+        """Steady torque at a width, or at each of several; 0 without a pulse, level beyond the ends."""
+        return np.where(np.asarray(width_us) > 0.0, np.interp(width_us, self.pulse_width_us, self.torque_nm), 0.0)
 
     def width(self, torque_nm: float, largest_us: float) -> float:
         """The smallest width that gives a torque, in steps of a µs; never above the largest."""
-        return float(bisect_left(range(math.floor(largest_us)), torque_nm, key=self.torque))
+        return float(np.searchsorted(self.torque(np.arange(math.floor(largest_us))), torque_nm))
 
-    def torque_time(self, widths_us: Sequence[float], rate_hz: float) -> float:
-        """Expected torque-time of a plan, N·m·s (with a stand-in: s at the torque of the widest pulse)."""
-        return sum(map(self.torque, widths_us)) / rate_hz
+    def torque_time(self, segments: Sequence[Segment], rate_hz: float) -> float:
+        """Expected torque-time of segments, N·m·s (with a stand-in: s at the torque of the widest pulse)."""
+        return float(np.sum(self.torque(widths_of(segments)))) / rate_hz
 
 
 def curve_of(table: Mapping[str, Sequence[float]] | None, largest_us: float, motor_us: float | None) -> Curve:
@@ -87,7 +82,7 @@ def curve_of(table: Mapping[str, Sequence[float]] | None, largest_us: float, mot
     widest pulse of the tests, µs; `motor_us`: what the calibration found, µs.
     """
     if table is not None:
-        curve = Curve(table["pulse_width_us"], [max(0.0, torque) for torque in table["torque_nm"]], True)
+        curve = Curve(table["pulse_width_us"], np.maximum(0.0, table["torque_nm"]).tolist(), True)
         if len(curve.torque_nm) > 1 and curve.torque(largest_us) > 0.0:
             return curve
     begin_us = motor_us if motor_us is not None and 0 < motor_us < largest_us else UNKNOWN_MOTOR_SHARE * largest_us
@@ -106,8 +101,7 @@ def targets(range_rad: Sequence[float]) -> list[float]:
     count = 3 + sum(width >= edge - 1e-9 for edge in RANGES_RAD)
     margin = min(2.0 * TOLERANCE_RAD, width / 6)
     first, last, angles = low + margin, high - margin, []
-    for k in range(count):
-        angle = first + (last - first) * k / (count - 1)
+    for angle in np.linspace(first, last, count).tolist():
         near = round(angle / ROUND_RAD) * ROUND_RAD
         rounded = (near, near + ROUND_RAD, near - ROUND_RAD, angle)
         angles.append(next(each for each in rounded if first - 1e-9 <= each <= last + 1e-9))
@@ -135,7 +129,7 @@ def moving(curve: Curve, largest_us: float, most_nm_s: float, longest_s: float, 
             return segments
         number += 1
         level = _level(f"moving {number}", 0.0, width_us, hold_s, rate_hz)
-        left_nm_s -= curve.torque_time(level["settings"]["pulse_width_us"], rate_hz)
+        left_nm_s -= curve.torque_time([level], rate_hz)
         left_s -= hold_s + PAUSE_S
         segments += [level, still("passive", PAUSE_S, rate_hz)]
 
@@ -143,8 +137,8 @@ def moving(curve: Curve, largest_us: float, most_nm_s: float, longest_s: float, 
 def _level(name: str, before_us: float, width_us: float, hold_s: float, rate_hz: float) -> Segment:
     """A width that is held, reached from the one before it within the time of a rise."""
     count, rise = math.floor(hold_s * rate_hz + 1e-6), max(round(RISE_S * rate_hz), 1)
-    widths = [before_us + (width_us - before_us) * min((i + 1) / rise, 1.0) for i in range(count)]
-    return _segment(name, [math.floor(10.0 * width) / 10.0 for width in widths])
+    widths = np.interp(np.arange(1, count + 1), [0, rise], [before_us, width_us])
+    return _segment(name, (np.floor(10.0 * widths) / 10.0).tolist())
 
 
 def still(name: str, seconds: float, rate_hz: float) -> Segment:
@@ -188,19 +182,21 @@ def layout(
     `range_rad`: the participant's lowest and highest angle, rad; `paper_us`: every width of the paper's test with these
     limits, µs; `moving_s`: the longest moving test without its safe end, s.
     """
-
-    def dose(segments: list[Segment]) -> float:
-        return curve.torque_time(widths_of(segments), rate_hz)
-
-    angles, paper = targets(range_rad), curve.torque_time(paper_us, rate_hz)
-    full, planned = dose(held(curve, largest_us, LONGEST_STAIR_S, rate_hz)), PLANNED_SHARE * paper
-    fits = HELD_SHARE * planned / (full * len(angles)) if angles and full > 0 else 0.0
+    angles = targets(range_rad)
+    paper = float(np.sum(curve.torque(paper_us))) / rate_hz
+    full = curve.torque_time(held(curve, largest_us, LONGEST_STAIR_S, rate_hz), rate_hz)
+    fits = HELD_SHARE * PLANNED_SHARE * paper / (full * len(angles)) if angles and full > 0 else 0.0
     stairs = held(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
-    doses = {"paper": paper, "held_each": dose(stairs), "held": dose(stairs) * len(angles)}
-    levels = moving(curve, largest_us, max(planned - doses["held"], 0.0), moving_s, rate_hz)
-    doses["moving"] = dose(levels)
-    doses["total"] = doses["held"] + doses["moving"]
-    return Layout(angles, stairs, levels, doses, curve.known)
+    each = curve.torque_time(stairs, rate_hz)
+    left = max(PLANNED_SHARE * paper - each * len(angles), 0.0)
+    levels = moving(curve, largest_us, left, moving_s, rate_hz)
+    doses = {
+        "paper": paper,
+        "held_each": each,
+        "held": each * len(angles),
+        "moving": curve.torque_time(levels, rate_hz),
+    }
+    return Layout(angles, stairs, levels, doses | {"total": doses["held"] + doses["moving"]}, curve.known)
 
 
 SLOW_RAD_S, FAST_RAD_S = 0.15, 0.7
@@ -234,43 +230,37 @@ class Coverage:
         margin = max(MARGIN_RAD, MARGIN_SHARE * (high - low))
         first, last = (low + margin, high - margin) if high - low > 4 * margin else (low, high)
         self.columns = min(max(round((last - first) / BIN_RAD), LEAST_BINS), MOST_BINS)
-        self.edges_rad = [first + (last - first) * k / self.columns for k in range(self.columns + 1)]
-        self.seen_s = seen_s
-        self.time_s = [[0.0] * self.columns for _ in ROWS]
+        self.edges_rad = np.linspace(first, last, self.columns + 1)
+        self.seen_s, self.time_s = seen_s, np.zeros((len(ROWS), self.columns))
+        self.needed = np.zeros(self.time_s.shape, bool)
+        for row, kind in enumerate(ROWS):
+            self.needed[row, :] = kind is not None
+            if kind is not None and kind[1] == "fast":
+                self.needed[row, [0, -1]] = False
         self._last_s: float | None = None
 
     def add(self, time_s: float, angle_rad: float, velocity_rad_s: float, counts: bool = True) -> None:
         """Add a sample; one that does not count (no stimulation, say) only moves the time on.
 
-        A sample that is no number is left out.
+        A sample that is no number is left out. Angles beyond the edges belong to the outer columns.
         """
         if not math.isfinite(time_s + angle_rad + velocity_rad_s):
             return
         last_s, self._last_s = self._last_s, time_s
         if not counts or last_s is None or not (0.0 < time_s - last_s <= LONGEST_STEP_S):
             return
-        row, column = self.cell(angle_rad, velocity_rad_s)
-        self.time_s[row][column] += time_s - last_s
+        column = bisect_right(self.edges_rad[1:-1], angle_rad)
+        self.time_s[bisect_right(VELOCITY_EDGES_RAD_S, velocity_rad_s), column] += time_s - last_s
 
-    def cell(self, angle_rad: float, velocity_rad_s: float) -> tuple[int, int]:
-        """Return row and column of a sample; angles beyond the edges belong to the outer columns."""
-        column = min(max(bisect_right(self.edges_rad, angle_rad) - 1, 0), self.columns - 1)
-        return bisect_right(VELOCITY_EDGES_RAD_S, velocity_rad_s), column
-
-    def needed(self, row: int, column: int) -> bool:
-        """Return whether a cell is needed."""
-        kind = ROWS[row]
-        return kind is not None and (kind[1] == "slow" or 0 < column < self.columns - 1)
-
-    def covered(self, row: int, column: int) -> bool:
-        """Return whether the joint was in a cell for long enough; a hair less, for sums of samples."""
-        return self.time_s[row][column] >= self.seen_s - 1e-6
+    @property
+    def covered(self) -> Any:
+        """Return for each cell whether the joint was in it for long enough; a hair less, for sums of samples."""
+        return self.time_s >= self.seen_s - 1e-6
 
     @property
     def share(self) -> float:
         """Share of the needed cells that are covered, 0 to 1."""
-        needed = [cell for cell in product(range(len(ROWS)), range(self.columns)) if self.needed(*cell)]
-        return sum(self.covered(*cell) for cell in needed) / len(needed)
+        return float(np.mean(self.covered[self.needed]))
 
     @property
     def enough(self) -> bool:
@@ -279,28 +269,21 @@ class Coverage:
 
     def missing(self) -> list[dict[str, Any]]:
         """Return the stretches of angles that were not seen yet in a direction at a speed."""
-
-        def is_open(cell: tuple[int, int]) -> bool:
-            return self.needed(*cell) and not self.covered(*cell)
-
-        stretches = []
+        stretches, missing = [], self.needed & ~self.covered
         for row in MISSING_ORDER:
-            kind = ROWS[row]
-            assert kind is not None
-            for lacks, cells in groupby(product([row], range(self.columns)), is_open):
-                columns = [column for _, column in cells]
-                if lacks:
-                    stretch = {"from_rad": self.edges_rad[columns[0]], "to_rad": self.edges_rad[columns[-1] + 1]}
-                    stretches.append({"direction": kind[0], "speed": kind[1], **stretch})
+            direction, speed = ROWS[row] or ("", "")
+            ends = np.flatnonzero(np.diff(missing[row].astype(int), prepend=0, append=0)).reshape(-1, 2)
+            for from_rad, to_rad in self.edges_rad[ends].tolist():
+                stretches.append({"direction": direction, "speed": speed, "from_rad": from_rad, "to_rad": to_rad})
         return stretches
 
     def document(self) -> dict[str, Any]:
         """Return it as clients see it."""
         return {
-            "angle_edges_rad": [round(edge, 4) for edge in self.edges_rad],
+            "angle_edges_rad": self.edges_rad.round(4).tolist(),
             "velocity_edges_rad_s": list(VELOCITY_EDGES_RAD_S),
-            "time_s": [[round(value, 3) for value in row] for row in self.time_s],
-            "asked": [[self.needed(row, k) for k in range(self.columns)] for row in range(len(ROWS))],
+            "time_s": self.time_s.round(3).tolist(),
+            "asked": self.needed.tolist(),
             "seen_s": self.seen_s,
             "share": round(self.share, 4),
             "enough": self.enough,

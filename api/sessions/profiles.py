@@ -42,6 +42,18 @@ LIMITS: dict[str, Named] = {
         "torque that stops a test", "Torque that stops a test (N·m)", "N·m", "torque_nm", 0.1, 200.0
     ),
 }
+
+
+def above(values: Profile, limits: Profile, whose: str) -> dict[str, str]:
+    """Say of each value that is above its limit by how much, by name; what is no number is above every limit."""
+    return {
+        name: f"{values[name]:g} {limit.unit} is above {whose} {limits.get(name) or 0.0:g} {limit.unit} by "
+        f"{values[name] - (limits.get(name) or 0.0):g}"
+        for name, limit in LIMITS.items()
+        if name in values and not (values[name] <= (limits.get(name) or 0.0))
+    }
+
+
 CALIBRATION_FIELDS = ("sensory_pulse_width_us", "motor_pulse_width_us", "set_at_utc", "expires_at_utc")
 """Fields of a profile that only a calibration sets."""
 JUMP = 1.25
@@ -72,11 +84,8 @@ def changed(profile: Profile, changes: Mapping[str, Any]) -> tuple[dict[str, Any
         new = {name: value for name, value in new.items() if name not in (RANGE, SET_AT)}
     if not is_calibrated(profile):
         return new, ""
-    voids = [
-        f"{limit.words} {new[name]:g} {limit.unit} is above the {profile[name]:g} {limit.unit} that it was found with"
-        for name, limit in LIMITS.items()
-        if not (new[name] <= profile[name])
-    ]
+    wider = above(new, profile, "the calibrated")
+    voids = [f"{LIMITS[name].words} {words}" for name, words in wider.items()]
     motor_us, width_us = profile.get("motor_pulse_width_us") or 0.0, new["max_pulse_width_us"]
     if not (width_us >= motor_us):
         voids.append(f"the muscle moves from {motor_us:g} µs on, above the new {width_us:g} µs")

@@ -354,12 +354,7 @@ def limits_of(body: TestIn, participant_profile: Mapping[str, Any] | None) -> di
         fix = "Set all of them: PUT /v1/participants/{code}/profile."
         detail = f"{body.participant} has no {', '.join(lacking)}. {fix}"
         raise ApiError(422, "no-limits", "The participant has no limits", detail)
-    wider = {
-        name: f"{requested[name]:g} {limit.unit} is above the participant's {limits[name]:g} {limit.unit} by "
-        f"{requested[name] - limits[name]:g}"
-        for name, limit in LIMITS.items()
-        if name in requested and not (requested[name] <= limits[name])  # NaN counts as wider
-    }
+    wider = profiles.above(requested, limits, "the participant's")
     range_rad, own_rad = profiles.range_of(requested), profiles.range_of(limits)
     if range_rad is not None and own_rad is None:
         wider[RANGE] = f"{profiles.range_words(range_rad)} narrows nothing: {body.participant} has no range"

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import itertools
 import json
 import logging
 import re
@@ -26,9 +25,6 @@ STATUS_EVERY_S = 1.0
 MOST_LATCHES = 100
 NO_ANSWER = "It closed the connection, or sent something that is no answer."
 
-APART = (requests.StopRequest, requests.WithdrawRequest, requests.PreviewRequest)
-"""Asked on connections of their own: the first two wait behind no start, and a preview is long, both ways, while the
-lasting connection carries a test's live signals."""
 M = TypeVar("M", bound=BaseModel)
 News = messages.StateEvent | messages.LiveEvent | messages.FinishedEvent | messages.Status | bool
 """An event of the rig, a state that was polled, or whether the rig is connected."""
@@ -36,7 +32,9 @@ _events: TypeAdapter[News] = TypeAdapter(messages.Event)
 
 
 class RigClient:
-    """One lasting connection to the rig, and the newest state with its age.
+    """One lasting connection for the rig's events and state; each other request has a connection of its own.
+
+    So a stop waits behind no start, and a long preview delays no live signal.
 
     `path`: the rig's socket; None: there is no rig, every request is refused with the reason. `listeners`: called with
     all news; an error in one is logged and affects neither the others nor the connection.
@@ -51,8 +49,8 @@ class RigClient:
         """Time and reason of the stop, by the latch id that a re-arm names."""
         self._status: messages.Status | None = None
         self._heard_s: float | None = None
-        self._numbers = itertools.count(1)
-        self._waiting: dict[int, tuple[Any, asyncio.Future[messages.Reply]]] = {}
+        self._waiting: list[asyncio.Future[None]] = []
+        """Who asked for the state on the lasting connection, in turn."""
         self._writer: asyncio.StreamWriter | None = None
         self._task: asyncio.Task[None] | None = None
 
@@ -86,17 +84,25 @@ class RigClient:
             await asyncio.gather(self._task, return_exceptions=True)
 
     async def ask(self, message: Any, timeout_s: float | None = None) -> dict[str, Any]:
-        """Send a request and return the body of the reply.
+        """Send a request and return the body of the reply; a stop goes to the rig's own socket for stops.
 
         Raises ApiError: what the rig refuses. 503 no rig, or it does not answer in time. 422 the request is too long.
         """
-        timeout_s = self.patience_s if timeout_s is None else timeout_s
+        if self.path is None:
+            raise no_rig("This service was started without one.")
+        request, opened, timeout_s = line_of(message), None, self.patience_s if timeout_s is None else timeout_s
         try:
             async with asyncio.timeout(timeout_s):  # not wait_for: in Python 3.11 it may lose a cancellation
-                if self._writer is None or isinstance(message, APART):
-                    reply = await self._ask_apart(message)
-                else:
-                    reply = await self._ask_here(message, self._writer)
+                if isinstance(message, requests.StopRequest):  # which nothing else can fill
+                    with contextlib.suppress(OSError):
+                        stops = str(messages.stop_socket(self.path))
+                        opened = await asyncio.open_unix_connection(stops, limit=LINE_LIMIT)
+                reader, writer = opened or await asyncio.open_unix_connection(str(self.path), limit=LINE_LIMIT)
+                try:
+                    writer.write(request)
+                    reply = messages.Reply.model_validate_json(await reader.readline())
+                finally:
+                    writer.close()
         except TimeoutError:
             raise no_rig(f"It did not answer within {timeout_s:g} s.") from None
         except OSError as error:
@@ -116,37 +122,24 @@ class RigClient:
             raise no_rig(NO_ANSWER) from error
 
     async def fresh_status(self) -> messages.Status:
-        """Ask for the state; return the newest one, which may have come behind the answer."""
-        answer = await self.ask_for(messages.Status, requests.StatusRequest())
-        return self.status or answer
+        """Ask for the state; return the newest one, which may have come behind the answer.
 
-    async def _ask_here(self, message: Any, writer: asyncio.StreamWriter) -> messages.Reply:
-        message = message.model_copy(update={"id": next(self._numbers)})
-        future: asyncio.Future[messages.Reply] = asyncio.get_running_loop().create_future()
-        self._waiting[message.id] = message, future
+        On the lasting connection, where answers and events come in their order: no older state takes a newer one's
+        place. Raises as `ask_for`.
+        """
+        if self._writer is None:
+            self.status = answer = await self.ask_for(messages.Status, requests.StatusRequest())
+            return answer
+        told = asyncio.get_running_loop().create_future()
+        self._waiting.append(told)
+        self._writer.write(line_of(requests.StatusRequest()))
         try:
-            writer.write(line_of(message))
-            return await future
-        finally:
-            self._waiting.pop(message.id, None)
-
-    async def _ask_apart(self, message: Any) -> messages.Reply:
-        """Ask on a connection of its own; a stop at the rig's own socket for stops, which nothing else can fill."""
-        if self.path is None:
-            raise no_rig("This service was started without one.")
-        request, limit = line_of(message), LINE_LIMIT
-        opened = None
-        if isinstance(message, requests.StopRequest):
-            with contextlib.suppress(OSError):
-                opened = await asyncio.open_unix_connection(str(messages.stop_socket(self.path)), limit=limit)
-        reader, writer = opened or await asyncio.open_unix_connection(str(self.path), limit=limit)
-        try:
-            writer.write(request)
-            reply = messages.Reply.model_validate_json(await reader.readline())
-            self._take_state(message, reply)
-            return reply
-        finally:
-            writer.close()
+            async with asyncio.timeout(self.patience_s):
+                await told
+        except TimeoutError:
+            raise no_rig(f"It did not answer within {self.patience_s:g} s.") from None
+        assert self._status is not None
+        return self._status
 
     async def _stay_connected(self, path: Path) -> None:
         while True:
@@ -165,22 +158,22 @@ class RigClient:
         if self._writer is not None:
             self._writer.close()
             self._writer = None
-        for _, future in self._waiting.values():
-            if not future.done():
-                future.set_exception(no_rig("The connection to the rig broke."))
+        for told in self._waiting:
+            if not told.done():
+                told.set_exception(no_rig("The connection to the rig broke."))
+        self._waiting.clear()
         if self.connected:
             log.warning("the rig's socket closed")
             self.connected = False
             self._notify(False)
 
     async def _listen(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        subscription = requests.SubscribeRequest(id=next(self._numbers))
-        writer.write(line_of(subscription))
+        writer.write(line_of(requests.SubscribeRequest()))
         poll = asyncio.create_task(self._poll(), name="rig poll")
         try:
             while line := await reader.readline():
                 self._heard_s = self.clock.monotonic_s()
-                self._receive(json.loads(line), subscription.id)
+                self._receive(json.loads(line))
         finally:
             poll.cancel()
 
@@ -195,28 +188,23 @@ class RigClient:
                     self._notify(messages.StateEvent(status=status))
                 self._notify(status)
 
-    def _receive(self, message: dict[str, Any], subscription_id: int) -> None:
+    def _receive(self, message: dict[str, Any]) -> None:
+        """Take an event, or a state: the answer to the subscription, or to who waits for it first."""
         if "event" in message:
             event = _events.validate_python(message)
             if isinstance(event, messages.StateEvent):
                 self.status = event.status
             self._notify(event)
             return
-        reply = messages.Reply.model_validate(message)
-        if reply.id == subscription_id and reply.ok:
+        reply, waits = messages.Reply.model_validate(message), self._waiting if self.connected else []
+        told = waits.pop(0) if waits else None
+        if reply.ok:
             self.status = messages.Status.model_validate(reply.body)
+        if told is not None and not told.done():
+            told.set_result(None) if reply.ok else told.set_exception(no_rig("It does not tell its state."))
+        if reply.ok and not self.connected:
             self.connected = True
             self._notify(True)
-        request, future = self._waiting.get(reply.id, (None, None))
-        self._take_state(request, reply)
-        if future is not None and not future.done():
-            future.set_result(reply)
-
-    def _take_state(self, request: Any, reply: messages.Reply) -> None:
-        """Keep a state when it is read: its requester may resume after a later one has arrived."""
-        if isinstance(request, requests.StatusRequest) and reply.ok:
-            with contextlib.suppress(ValidationError):  # `ask_for` reports it
-                self.status = messages.Status.model_validate(reply.body)
 
     def _notify(self, news: News) -> None:
         for listener in list(self.listeners):

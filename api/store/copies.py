@@ -39,11 +39,3 @@ def copy_database(source: Path, to: Path) -> str:
         why = error.strerror if isinstance(error, OSError) else error
         raise CopyError(f"{to}: no copy of the database could be made ({why}); free some disk space") from error
     return sha256_of(to)
-
-
-def free_name(folder: Path, stem: str) -> Path:
-    """A file name in a folder that nothing has yet."""
-    number = 1
-    while (place := folder / f"{stem}-{number}.db").exists():
-        number += 1
-    return place

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 
 from alembic import command
@@ -64,7 +65,8 @@ def copied_before(database: str | None, current: str | None) -> Iterator[None]:
     if current is None or not path.is_file():
         yield
         return
-    copy = copies.free_name(path.parent / BEFORE, f"{path.stem}-{current}")
+    names = (path.parent / BEFORE / f"{path.stem}-{current}-{number}.db" for number in count(1))
+    copy = next(name for name in names if not name.exists())
     try:
         copies.copy_database(path, copy)
     except copies.CopyError as error:

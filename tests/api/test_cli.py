@@ -20,6 +20,7 @@ from stimrig.api.cli import main
 from stimrig.api.progress_bar import progress_bar
 from stimrig.identify.healing import place_words
 from tests.api.test_jobs import made_up_csv
+from tests.api.test_schemas import unmet
 from tests.harness import few_effects
 
 pytestmark = pytest.mark.slow
@@ -266,6 +267,8 @@ def test_the_verbs_mean_the_same_by_a_structure_and_give_one_verdict(tired: Path
     assert [effect["id"] for effect in fitted["effects"]] == added and "fatigue" in added
     own = json.loads(printed("diagnose", data, "--model", held, "--json"))
     further = json.loads(printed("improve", data, "--model", held, "--json"))
+    for verb, said in (("improve", improved), ("diagnose", own), ("improve", further)):
+        assert unmet(verb, said) == []
     for verdict in (own, further):
         assert [name.partition(":")[0] for name in verdict["structure"]] == added
         assert verdict["verdict"] == "nothing_missing"
@@ -274,7 +277,7 @@ def test_the_verbs_mean_the_same_by_a_structure_and_give_one_verdict(tired: Path
     assert further["steps"][0]["rms_nm"] == pytest.approx(fitted["fit"]["rms_nm"], rel=0.02)
     told = json.loads(printed("explain", data, "--html", page, "--figures", figures, "--json"))
     assert [step["added"] for step in told["improvement"]["steps"][1:]] == told["diagnosis"]["add"] == added
-    assert told["left"]["conclusion"] == own["conclusion"]
+    assert told["left"]["conclusion"] == own["conclusion"] and unmet("explain", told) == []
     assert all(place_words(place) in page.read_text() for place in told["places"]), "the same in words and numbers"
     kinds = {".svg": b"<svg", ".pdf": b"%PDF", ".png": b"\x89PNG"}
     names = {f"{name}{kind}" for name in ("story-torque", "story-place", "falling") for kind in kinds}

@@ -27,6 +27,12 @@ def settings(tmp_path: Path, **more: object) -> Settings:
     return Settings(data_dir=tmp_path, port=0, **more)
 
 
+@pytest.fixture(autouse=True)
+def one_worker(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each loads and compiles for seconds before it is needed."""
+    monkeypatch.setenv("STIMRIG_WORKERS", "1")
+
+
 @contextmanager
 def running(tmp_path: Path) -> Iterator[tuple[Services, Client]]:
     with Services(settings(tmp_path), [], TOKEN) as services, Client(services.url, TOKEN) as client:
@@ -63,13 +69,12 @@ def test_a_test_on_the_wire_ends_in_a_served_model(tmp_path: Path) -> None:
 
 def test_only_the_emulator_makes_an_emulated_rig(tmp_path: Path) -> None:
     """A rig file names devices of the world, whatever was left in the environment."""
-    assert Services(settings(tmp_path)).emulated
-    assert not Services(settings(tmp_path, rig_file=tmp_path / "rig.toml", emulated=True)).emulated
-    attached = {emulated: settings(tmp_path, emulated=emulated) for emulated in (True, False)}
-    assert [Services(s, attach=tmp_path / "s").emulated for s in attached.values()] == [True, False]
+    for more, said in (({}, "true"), ({"rig_file": tmp_path / "rig.toml", "emulated": True}, "false")):
+        assert Services(settings(tmp_path, **more)).api.environment["STIMRIG_EMULATED"] == said
 
 
-def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path) -> None:
+def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Path) -> None:
+    """A killed rig comes back uncertain, and its test is a fault; the next test is under way when all is ended."""
     with running(tmp_path) as (services, client):
         test_id = begin(client)
         services.rig.process.kill()
@@ -82,10 +87,6 @@ def test_killed_rig_comes_back_uncertain_and_the_test_is_a_fault(tmp_path: Path)
         with pytest.raises(Conflict):
             client.start_test("P1")
         assert client.post("/v1/rearm")["state"] == "ready"
-
-
-def test_ending_the_service_in_a_test_stops_it_and_keeps_its_record(tmp_path: Path) -> None:
-    with running(tmp_path) as (_, client):
         test_id = begin(client)
     with running(tmp_path) as (_, client):
         test = client.test(test_id)

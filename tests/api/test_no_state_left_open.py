@@ -125,11 +125,11 @@ def test_a_message_that_cannot_be_taken_costs_one_connection_at_most(
     """An unexpected error outside a listener; a service that never connects again hears of no test's end."""
     rig, failures = service.context.rig, []
 
-    def once(message: dict[str, Any], subscription_id: int) -> None:
+    def once(message: dict[str, Any]) -> None:
         if not failures:
             failures.append(message)
             raise RuntimeError("unexpected")
-        RigClient._receive(rig, message, subscription_id)
+        RigClient._receive(rig, message)
 
     monkeypatch.setattr(rig, "_receive", once)
     soon(lambda: failures and rig.connected, 20)  # its next poll is the message; then it connects anew

@@ -139,8 +139,9 @@ def test_of_many_at_once_one_wins_and_the_others_are_told(client: httpx.Client, 
 
 @pytest.mark.parametrize(
     ("asked", "words"),
-    [({"current_ma": 10, "max_pulse_width_us": 125}, ""), ({"current_ma": 18.5}, "above the 18 mA"),
-     ({"max_torque_nm": 13}, "above the 12 N·m"), ({"max_pulse_width_us": 221}, "above the 220 µs"),
+    [({"current_ma": 10, "max_pulse_width_us": 125}, ""), ({"current_ma": 18.5}, "above the calibrated 18 mA"),
+     ({"max_torque_nm": 13}, "above the calibrated 12 N·m"),
+     ({"max_pulse_width_us": 221}, "above the calibrated 220 µs"),
      ({"max_pulse_width_us": 119}, "moves from 120 µs on")],
 )  # fmt: skip
 def test_a_tighter_limit_keeps_the_calibration(asked: dict[str, float], words: str) -> None:
@@ -156,7 +157,7 @@ def test_a_calibration_is_lost_knowingly_alone(client: httpx.Client, service: Se
         return by.put(f"{P}/profile", params={"confirm": token}, json={"current_ma": current_ma})
 
     found, refused = calibrate(client), problem(put(""), 409)
-    assert "above the 12 mA" in refused["detail"] and client.get(P).json()["profile"] == found
+    assert "above the calibrated 12 mA" in refused["detail"] and client.get(P).json()["profile"] == found
     token = refused["confirm"]["token"]
     lab = service.client(service.token("lab", "run-test"))
     assert put(token, 13.0).status_code == 409 == put(token, by=lab).status_code

@@ -52,6 +52,7 @@ def test_links_and_pictures_are_there() -> None:
 def test_commands_do_what_they_are_said_to(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first test is played, shorter, and stands in for the other; a diagnosis has two effects to choose from."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("STIMRIG_WORKERS", "1")  # each loads and compiles for seconds before it is needed
     commands = blocks("sh")
     assert len(commands) >= 9
     with few_effects.only("fatigue", "output_saturation"):

@@ -1,4 +1,4 @@
-"""A key at the terminal stops a running test; `stimrig serve` attaches to a rig that runs already."""
+"""A key at the terminal stops a running test, in `stimrig test` and in `stimrig serve`."""
 
 from __future__ import annotations
 
@@ -6,26 +6,20 @@ import contextlib
 import functools
 import os
 import pty
-import signal
-import subprocess
-import sys
 import termios
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import httpx
 import pytest
 
 from stimrig.api.cli import main, stop_key
+from stimrig.api.cli.commands import serve
 from stimrig.api.cli.commands import test as test_verb
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
 from tests.api.conftest import TOKEN, Service, soon, wait_done
-from tests.api.fake_rig import RigThread
-from tests.harness.looks_first import LooksFirst
-
-ROOT = Path(__file__).parents[2]
 
 
 class Terminal:
@@ -182,54 +176,21 @@ def test_nothing_that_a_service_says_of_its_rig_keeps_a_key_from_stopping(monkey
     assert posted == ["/v1/stop"]
 
 
-# ---- attaching ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("socket", "other", "named"),
-    [
-        ("rig.sock", ["--rig", "rig.toml"], "--rig"),
-        ("rig.sock", ["--emulate", "--hidden 7"], "--emulate"),
-        ("none.sock", [], "python -m stimrig.rig"),
-    ],
-)
-def test_attaching_to_no_rig_or_beside_one_that_is_started_is_one_line(
-    socket: str, other: list[str], named: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_a_key_stops_in_stimrig_serve(
+    client: httpx.Client, service: Service, participant: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert main.run(["serve", "--rig-socket", socket, "--data", str(tmp_path / "data"), *other]) == 2
-    said = capsys.readouterr().err
-    assert said.count("\n") == 1 and f"--rig-socket {socket}" in said and named in said
-    assert not (tmp_path / "data").exists()
+    test_id, looks = started(client, service, participant), []
 
+    def watch() -> list[str]:
+        looks.append(os.write(terminal.keyboard, b"s") if not looks else 0)
+        if service.rig.state == "latched":
+            raise KeyboardInterrupt
+        return []
 
-@pytest.mark.slow
-def test_serve_attaches_stops_on_a_key_and_leaves_the_rig_alone(short_dir: Path, tmp_path: Path, terminal: Terminal):
-    socket = short_dir / f"attached-{time.time_ns()}.sock"
-    command = [sys.executable, "-m", "stimrig", "serve", "--rig-socket", str(socket), "--port", "0", "--data", "data"]
-    environment = {**os.environ, "STIMRIG_ADMIN_TOKEN": TOKEN, "PYTHONPATH": str(ROOT)}
-    with RigThread(socket, tmp_path / "data" / "recordings", speed=1.0) as thread:
-        served = subprocess.Popen(
-            command, cwd=tmp_path, env=environment, stdin=terminal.program, stdout=subprocess.PIPE, text=True
-        )
-        assert served.stdout is not None
-        try:
-            first = served.stdout.readline()
-            assert "stimrig serves http://127.0.0.1:" in first and f"with the rig at {socket}" in first
-            url = first.split()[2]
-            while "any key stops" not in (line := served.stdout.readline()):
-                assert line, "it says that keys stop"
-            with httpx.Client(base_url=url, auth=LooksFirst(TOKEN), timeout=60) as http:
-                http.post("/v1/participants", json={"code": "A1"})
-                test_id = http.post("/v1/tests", json={"participant": "A1"}).json()["id"]
-                os.write(terminal.keyboard, b"s")
-                assert served.stdout.readline().strip() == stop_key.CONFIRMED
-                ended = wait_done(http, test_id)
-            assert ended["state"] == "stopped" and stop_key.BY in ended["reason"]
-        finally:
-            served.send_signal(signal.SIGTERM)
-            rest = served.stdout.read()
-            assert served.wait(20) == 0
-            served.stdout.close()
-        assert "the rig goes on by itself" in rest
-        assert socket.exists() and thread.rig.state == "latched", "the rig was neither ended nor re-armed"
-    assert [path.name for path in (tmp_path / "data" / "logs").iterdir()] == ["api.log"], "no rig, no emulator started"
+    given = MagicMock(url=service.url, socket=service.rig.path, watch=watch, emulator=None)
+    given.settings, given.api.ready = service.context.settings, {"drawn_token": ""}
+    given.__exit__.return_value = None
+    monkeypatch.setattr(serve, "Services", lambda *_: given)
+    monkeypatch.setattr(stop_key, "standard_input", lambda: terminal.program)
+    serve.serve()
+    assert wait_done(client, test_id)["state"] == "stopped" and service.rig.stopped_by == stop_key.BY

@@ -17,7 +17,6 @@ import pytest
 
 import stimrig
 from stimrig import Client, errors
-from stimrig.api.jobs import worker
 from stimrig.api.progress_bar import in_notebook
 from stimrig.api.web.responses.base import SegmentOut
 from stimrig.api.web.responses.models import JobOut
@@ -188,7 +187,7 @@ def test_long_work_is_a_job_that_is_followed_and_cancelled_by_what_progress_rais
     client.http.event_hooks = {"request": [lambda request: asked.append(str(request.url))]}
     with pytest.raises(KeyboardInterrupt):
         client.improve(model_id, Mock(side_effect=KeyboardInterrupt))
-    assert client.job(asked[-1].rpartition("/")[2])["done"], "nothing goes on behind the person's back"
+    assert client.get(asked[-1])["done"], "nothing goes on behind the person's back"
     child = client.add_effects(model_id, ["fatigue"], progress=lambda *now: told.append(now))
     assert child["parent_id"] == model_id and child["effects"] == ["fatigue"] and told[-1] == (1.0, "done")
     with pytest.raises(errors.Conflict, match=r"in the model"):
@@ -197,14 +196,6 @@ def test_long_work_is_a_job_that_is_followed_and_cancelled_by_what_progress_rais
     for name in ("improve", "diagnosis", "effects"):
         assert any(url.endswith(f"/{name}?wait=false") for url in asked), asked
     assert any("/jobs/J" in url for url in asked), "and the job is asked after"
-
-
-def test_an_upload_waits_as_long_as_the_service_works_on_it(client: Client) -> None:
-    waits: list[Any] = []
-    client.http.event_hooks = {"request": [lambda request: waits.append(request.extensions.get("timeout"))]}
-    with pytest.raises(errors.Invalid):
-        client.upload("P017", b"")
-    assert waits[-1]["read"] >= worker.LIMITS_S["fit"] + worker.LIMITS_S["carry"]
 
 
 def test_live_signals_come_until_the_end(client: Client, service: Service) -> None:
@@ -229,7 +220,7 @@ def test_errors_carry_the_problem(client: Client) -> None:
         (lambda: client.version("M0"), errors.NotFound, 404),
         (lambda: client.make_participant("P017"), errors.Conflict, 409),
         (lambda: client.preview("P017", segments=[{"name": "x", "sequence": "polka"}]), errors.Invalid, 422),
-        (lambda: client.upload("P017", b""), errors.Invalid, 422),
+        (lambda: client.post("/v1/participants/P017/recordings", content=b""), errors.Invalid, 422),
     ]
     for ask, error, status in asked:
         with pytest.raises(error) as caught:
@@ -239,7 +230,7 @@ def test_errors_carry_the_problem(client: Client) -> None:
         assert str(found) == f"{found.request}: {found.title}: {found.detail}"
         assert isinstance(found, errors.ServiceError) and found.document["status"] == status
     with Client(str(client.http.base_url), "guessed") as stranger, pytest.raises(errors.Unauthorized):
-        stranger.participants()
+        stranger.get("/v1/participants")
 
 
 @pytest.mark.parametrize("address", ["http://127.0.0.1:{port}", "no address", "http://[::1"])
@@ -257,12 +248,6 @@ def test_an_answer_is_read_by_name_or_by_key_and_one_of_a_newer_service_is_kept(
     job = JobOut.read(sent)
     assert job.state == job["state"] == job.get("state") == "waiting" and job.get("none") is None
     assert "later" in job and job["later"] == {"a": 1} and job.to_dict() == sent == {**job}
-
-
-def test_who_ran_a_test(client: Client) -> None:
-    test = client.run_test("P017")
-    assert client.set_ran_by(test["id"], "Jörg Müller")["ran_by"] == "Jörg Müller"
-    assert client.set_ran_by(test["id"], None)["ran_by"] == "administrator"
 
 
 # ---- docs/python.md does what it says: its blocks are run in order, against a served app; its table names every name

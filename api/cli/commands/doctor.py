@@ -7,8 +7,6 @@ import shutil
 import stat
 import subprocess
 import sys
-import tempfile
-import time
 import tomllib
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
@@ -25,12 +23,10 @@ from stimrig.api.cli.terminal import report
 from stimrig.api.errors import ApiError
 from stimrig.api.settings import Settings
 from stimrig.api.store import audit
-from stimrig.api.web.server import refuse_open_door
 
 Verdict = Literal["ok", "care", "fails"]
 VERDICTS: tuple[Verdict, ...] = ("ok", "care", "fails")
 LEAST_FREE_GB, GOOD_FREE_GB = 0.5, 5.0
-LATE_MS, SLOW_DISK_MS = 5.0, 200.0
 RIGHTS = (
     ("priority", "import os; os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(50))",
      "this user's programs may run before all others", "LimitRTPRIO=60", "rtprio 60"),
@@ -121,7 +117,7 @@ def check_rig(settings: Settings) -> Iterator[Finding]:
         return
     try:
         status = rig_status(settings.rig_socket)
-    except InputError as error:
+    except ApiError as error:
         yield Finding("rig", "fails", str(error), "systemctl status stimrig-rig; its journal says why")
         return
     fails = status.state in ("latched", "uncertain", "disconnected")
@@ -130,7 +126,7 @@ def check_rig(settings: Settings) -> Iterator[Finding]:
 
 
 def check_data(settings: Settings) -> Iterator[Finding]:
-    """Check the data folder: writable, closed to others, with room, on a disk that is fast enough."""
+    """Check the data folder: writable, closed to others, with room."""
     folder = settings.data_dir.absolute()
     nearest = next(place for place in (folder, *folder.parents) if place.exists())
     if not os.access(nearest, os.W_OK | os.X_OK):
@@ -145,19 +141,6 @@ def check_data(settings: Settings) -> Iterator[Finding]:
     verdict = "fails" if free_gb < LEAST_FREE_GB else "care" if free_gb < GOOD_FREE_GB else "ok"
     fix = "make room, or move old recordings to the backup"
     yield Finding("disk", verdict, f"{free_gb:.1f} GB free; a test takes 5 MB", fix)
-    slowest_ms = max(synced_ms(nearest) for _ in range(5))
-    text = f"slowest of five writes to the disk: {slowest_ms:.0f} ms"
-    yield Finding("disk speed", "care" if slowest_ms > SLOW_DISK_MS else "ok", text, "use a local disk")
-
-
-def synced_ms(folder: Path) -> float:
-    """Return the time to bring one second of a journal to the disk, ms."""
-    with tempfile.TemporaryFile(dir=folder) as file:
-        began = time.perf_counter()
-        file.write(b"\0" * 65536)
-        file.flush()
-        os.fsync(file.fileno())
-        return 1000 * (time.perf_counter() - began)
 
 
 def check_database(settings: Settings) -> Iterator[Finding]:
@@ -174,35 +157,12 @@ def check_database(settings: Settings) -> Iterator[Finding]:
         yield Finding("database", "ok" if broken is None else "fails", text, fix)
 
 
-def check_wake_up(_settings: Settings) -> Iterator[Finding]:
-    """Check that this machine wakes up in time."""
-    late_ms = []
-    for _ in range(200):
-        began = time.perf_counter()
-        time.sleep(0.002)
-        late_ms.append(1000 * (time.perf_counter() - began) - 2)
-    worst_ms = sorted(late_ms)[-3]
-    fix = "end other programs on this machine; give the rig real-time priority"
-    text = f"wakes up {worst_ms:.2f} ms late at the 99th percentile (a pulse is dropped at 3.75 ms)"
-    yield Finding("wake-up", "ok" if worst_ms < LATE_MS else "care", text, fix)
-
-
 def check_rights(_settings: Settings) -> Iterator[Finding]:
     """Check that the rig's sender may run before everything else, from memory that stays."""
     for name, code, right, unit, line in RIGHTS:
         granted = subprocess.run([sys.executable, "-c", code], capture_output=True, timeout=30).returncode == 0
         fix = f"{unit} as in deploy/systemd/stimrig-rig.service, or `USER - {line}` in /etc/security/limits.d"
         yield Finding(name, "ok" if granted else "care", right if granted else f"not granted: {right}", fix)
-
-
-def check_door(settings: Settings) -> Iterator[Finding]:
-    """Check that the service is closed to the network unless TLS stands in front."""
-    try:
-        refuse_open_door(settings)
-    except OSError as error:
-        yield Finding("address", "fails", str(error))
-    else:
-        yield Finding("address", "ok", f"the service listens at {settings.host}:{settings.port}")
 
 
 def doctor(

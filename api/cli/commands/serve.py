@@ -10,13 +10,11 @@ from typing import Annotated
 
 import typer
 
-from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.options import DataDir, RigFile, set_options
 from stimrig.api.cli.stop_key import StopKey, at_rig
 from stimrig.api.cli.supervisor import Services
 from stimrig.api.cli.terminal import print_lines
 from stimrig.api.clock import Clock
-from stimrig.api.errors import ApiError
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.settings import Settings
 from stimrig.rig.messages import Status
@@ -26,54 +24,35 @@ def serve(
     port: Annotated[int | None, typer.Option(min=0, max=65535, help="default 8000, or STIMRIG_PORT")] = None,
     host: Annotated[str | None, typer.Option(help="default 127.0.0.1, or STIMRIG_HOST")] = None,
     rig: RigFile = None,
-    rig_socket: Annotated[
-        Path | None, typer.Option(help="use the running rig that listens here; or STIMRIG_RIG_SOCKET")
-    ] = None,
     data: DataDir = None,
     emulate: Annotated[str, typer.Option(help='options for the emulator, e.g. "--hidden 7"')] = "",
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
-    settings = Settings(**set_options(port=port, host=host, rig_file=rig, rig_socket=rig_socket, data_dir=data))
-    attached = settings.rig_socket
-    if attached is not None:
-        if settings.rig_file is not None or emulate.strip():
-            other = "--emulate" if settings.rig_file is None else f"--rig {settings.rig_file}"
-            fix = "give one of them (STIMRIG_RIG_SOCKET and STIMRIG_RIG_FILE count, too)."
-            raise InputError(f"--rig-socket {attached} attaches to a rig that runs, {other} starts one: {fix}")
-        rig_status(attached)
-    services = Services(settings, emulate.split(), attach=attached)
+    settings = Settings(**set_options(port=port, host=host, rig_file=rig, data_dir=data))
+    services = Services(settings, emulate.split())
     with contextlib.suppress(KeyboardInterrupt), services:
         print_lines(*welcome(services, rig_status(services.socket)))
         try:
             with StopKey(at_rig(services.socket), print_lines) as key:
                 if key.watched:
-                    print_lines(
-                        "any key stops a running test; Ctrl-C ends the service" + ("" if attached else " and the rig")
-                    )
+                    print_lines("any key stops a running test; Ctrl-C ends the service and the rig")
                 while True:
                     time.sleep(0.2)
                     for event in services.watch():
                         print_lines(event)
         except KeyboardInterrupt:
-            print_lines("stopping" + ("; the rig goes on by itself" if attached else ""))
+            print_lines("stopping")
 
 
 def rig_status(socket: Path) -> Status:
-    """Ask the rig at a socket for its state. Raises InputError: none answers there."""
-    try:
-        return asyncio.run(RigClient(socket, Clock()).fresh_status())
-    except ApiError as error:
-        raise InputError(
-            f"--rig-socket {socket}: no rig answers there ({error.detail}) Start it first: "
-            f"python -m stimrig.rig --config RIG.toml --data DIR --socket {socket}"
-        ) from error
+    """Ask the rig at a socket for its state. Raises ApiError: none answers there."""
+    return asyncio.run(RigClient(socket, Clock()).fresh_status())
 
 
 def welcome(services: Services, rig: Status) -> list[str]:
     """Write where the service is, how to get in, and what keeps the rig from working, if anything does."""
     settings, url, new_token = services.settings, services.url, services.api.ready["drawn_token"]
     devices = f"rig file {settings.rig_file}" if settings.rig_file else "the emulated rig"
-    devices = f"the rig at {settings.rig_socket}" if services.attached else devices
     lines = [f"stimrig serves {url}/ with {devices}; data and logs in {settings.data_dir.absolute()}"]
     if new_token:
         lines += [f"first administrator's token, shown this once: {new_token}"]

@@ -19,6 +19,7 @@ import pytest
 from distributed import LocalCluster
 
 from stimrig.api.cli import main
+from stimrig.api.cli.terminal import listed
 from stimrig.api.cohort import cluster
 from tests.api.test_schemas import unmet
 from tests.harness.cohort_records import Session, cohort, write
@@ -83,8 +84,8 @@ def test_the_verb_loads_without_the_extra() -> None:
 @pytest.mark.parametrize(
     ("options", "named"),
     [
-        (["--select", "patient == 'x'"], "'patient'"),
-        (["--select", "__import__('os').abort()"], "--select, character 1"),
+        (["--select", "patient == 'x'"], "no such column: patient"),
+        (["--select", "__import__('os').abort()"], "--select: "),
         (["--method", "magic"], "magic"),
         (["--effects", "magic"], "magic"),
         (["--memory", "much"], "--memory much"),
@@ -115,14 +116,15 @@ def test_scheduler_that_is_not_there_or_has_no_workers(
 
 
 def test_reports(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    """One that could not be read ends the command with 1: a script goes on after an exit code 0."""
     output = str(tmp_path / "r.parquet")
-    words = ["cohort", "fit", str(write(tmp_path / "a.h5", Session())), "-o", output, "--workers", "1"]
-    assert main.run(words) == 0
-    out = capsys.readouterr().out
-    assert "ok           1" in out and output in out
-    assert main.run([*words, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert unmet("cohort", report) == [] and report["done_before"] == 1
+    (tmp_path / "bad.h5").write_bytes(b"\x89HDF\r\n\x1a\nand nothing more")
+    words = [str(write(tmp_path / "a.h5", Session())), str(tmp_path / "bad.h5"), "-o", output, "--workers", "1"]
+    assert main.run(["cohort", "fit", *words, "--json"]) == 1
+    out, err = capsys.readouterr()
+    report = json.loads(out)
+    assert unmet("cohort", report) == [] and (report["ok"], report["errors"]) == (1, 1)
+    assert "1 of 2 records gave no result: column `error`" in err and listed(report)[0].endswith(output)
 
 
 class Processes:
@@ -131,7 +133,7 @@ class Processes:
     def __init__(self, folder: Path) -> None:
         self.output = folder / "r.parquet"
         self.stack = ExitStack()
-        cohort(folder / "sessions", 30)
+        cohort(folder / "sessions", 8)
         self.fit = ("cohort", "fit", str(folder / "sessions"), "-o", str(self.output))
 
     def start(self, *words: str, out: int = subprocess.DEVNULL) -> subprocess.Popen[str]:
@@ -143,6 +145,7 @@ class Processes:
 
     def begin(self, *options: str, pause_s: float) -> subprocess.Popen[str]:
         """Start a run, and wait until it has three rows."""
+        options = ("--workers", "1", *options)
         run = self.start("-c", COMMAND, *self.fit, *options, f"{pause_s}", out=subprocess.PIPE)
         self.until(lambda: self.rows() >= 3 or run.poll() is not None, "three rows")
         return run

@@ -142,21 +142,15 @@ RECORD = {
     ("text", "selected"),
     [
         ("", True),
-        ('participant == "P001"', True),
         ('participant in ("P001", "P002") and kind == "pre-session"', True),
-        ('participant not in ["P001"]', False),
+        ('participant not in ("P001")', False),
         ('day >= "2026-01-01" and day < "2026-03-01"', False),
-        ('"2026-03" in day', True),
         ("duration_s > 20 or bytes > 10", True),
-        ("not (duration_s > 20)", False),
-        ("not " * 400 + 'participant == "P001"', True),
-        ('"calib" in name', True),
-        ('"calib" not in name', False),
-        ("test_id == None", True),
-        ('test_id != "T1"', True),
+        ('not kind = "x" and participant\n  = "P001"', True),
+        ('name not like "%calib%"', False),
+        ("test_id is null", True),
         ('test_id > "T1"', False),
-        ('"T" in test_id', False),
-        ('not kind == "x" and participant\n  == "P001"', True),
+        ('test_id != "T1"', False),
     ],
 )
 def test_selection(text: str, selected: bool) -> None:
@@ -165,59 +159,29 @@ def test_selection(text: str, selected: bool) -> None:
 
 @pytest.mark.parametrize(
     ("text", "selected"),
-    [
-        ('participant == "P001"', None),
-        ('not participant == "P001"', None),
-        ('name == "b" and participant == "P001"', False),
-        ('name == "a" or participant == "P001"', True),
-        ('name == "a" and participant == "P001"', None),
-        ('name == "b" or participant == "P001"', None),
-    ],
+    [('participant = "P001"', None), ("test_id is not null", None), ('name = "b"', False), ('name = "a"', True)],
 )
 def test_selection_before_the_record_is_read(text: str, selected: bool | None) -> None:
     assert Selection(text)({"name": "a"}) is selected
 
 
-def selection_refusal(text: str) -> str:
-    with pytest.raises(CohortError) as caught:
-        Selection(text)
-    message = str(caught.value)
-    assert "\n" not in message and message.startswith("--select")
-    return message
-
-
-def test_unknown_field_is_named_with_all_fields() -> None:
-    message = selection_refusal('patient == "P001"')
-    assert "'patient'" in message
-    assert all(field in message for field in FIELDS)
-
-
 @pytest.mark.parametrize(
-    "text",
+    ("text", "named"),
     [
-        '__import__("os").system("true")',
-        'participant == open("x")',
-        "9**9**9 > bytes",
-        "bytes == 1 == 1",
-        "participant",
-        '"a" == "b"',
-        "participant == 1",
-        'duration_s > "20"',
-        "duration_s in 3",
-        '"2" in duration_s',
-        "20 < duration_s",
-        'day == "yesterday"',
-        "test_id > None",
-        "import os",
-        'participant == "P001"; import os',
-        'participant == "P001',
-        "participant == \0",
-        "((((" * 500,
-        "(" * 190 + 'participant == "P"' + ")" * 150,
-        "bytes > " + "-" * 1500 + "1",
-        'participant == "P" or ' * 90 + "x",
-        'participant == "' + "x" * 3000 + '"',
+        ('patient = "P001"', ", ".join(FIELDS)),
+        ('__import__("os").system("true")', "syntax"),
+        ("(select load_extension(name))", "not authorized"),
+        ("randomblob(1000000000) > bytes", "not authorized"),
+        ("(with recursive x(n) as (select 1 union all select n from x) select n from x)", "not authorized"),
+        ('participant == "P001"; select 1', "syntax"),
+        ('participant == "P001', "unrecognized"),
+        ("participant == \0", "null"),
+        ("((((" * 500, "overflow"),
+        ('participant == "\ud800"', "surrogates"),
+        ('participant == "' + "x" * 3000 + '"', "2000 characters"),
     ],
 )
-def test_anything_else_is_refused_in_one_line(text: str) -> None:
-    selection_refusal(text)
+def test_anything_else_is_refused_in_one_line(text: str, named: str) -> None:
+    with pytest.raises(CohortError, match=r"^--select") as caught:
+        Selection(text)
+    assert "\n" not in str(caught.value) and named in str(caught.value)
