@@ -197,11 +197,8 @@ def test_the_help_lists_the_verbs_line_by_line(given: str, capsys: pytest.Captur
 
 
 def test_emulate_hands_everything_on() -> None:
-    for words, code, said in (("--patient nobody", 2, "nobody"), ("--help", 0, "--hidden SEED")):
-        command = [sys.executable, "-m", "stimrig", "emulate", *words.split()]
-        done = subprocess.run(command, capture_output=True, text=True)
-        assert done.returncode == code and said in (done.stderr if code else done.stdout)
-        assert done.stderr.count("\n") == (1 if code else 0)
+    done = subprocess.run([sys.executable, "-m", "stimrig", "emulate", "--help"], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "") and "--hidden SEED" in done.stdout
 
 
 def test_a_verb_does_not_wait_for_the_libraries_of_others() -> None:

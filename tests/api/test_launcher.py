@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from stimrig.api.cli.errors import LaunchError
-from stimrig.api.cli.supervisor import Services
+from stimrig.api.cli.supervisor import Child, Services
 from stimrig.api.client.errors import Conflict
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
@@ -120,7 +120,9 @@ def test_rig_file_that_does_not_hold_is_one_line(
     assert all(word in done.stderr for word in named)
 
 
-def test_taken_port_is_one_line(tmp_path: Path) -> None:
+def test_taken_port_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    start = Child.start
+    monkeypatch.setattr(Child, "start", lambda child: start(child) if child.name == "api" else child.ready)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         second = settings(tmp_path)
         second.port = taken.getsockname()[1]
