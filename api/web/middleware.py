@@ -29,7 +29,8 @@ STOP, UPLOAD = "/v1/stop", "/recordings"
 NOWHERE = "base-uri 'none'; frame-ancestors 'none'"
 PAGE_POLICY = (
     "default-src 'none'; script-src 'self'; connect-src 'self'; form-action 'self'; "
-    f"style-src 'self' 'unsafe-inline'; img-src 'self'; {NOWHERE}"
+    # plotly writes styles into its drawings, and keeps a picture of a chart as data of the page's own
+    f"style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; {NOWHERE}"
 )
 ALWAYS = {
     "X-Content-Type-Options": "nosniff",

@@ -113,6 +113,14 @@ def settled(page: Any) -> None:
         expected(follows).to_have_count(0)
 
 
+def look_closer(page: Any, *names: str) -> None:
+    """Take hold of charts: each is drawn by the plot library in its still's place."""
+    for name in names:
+        chart(page, name)
+        page.locator(f"[data-figure={name}] .chart-tools button").click()
+        page.locator(f"[data-figure={name}] .modebar-btn").first.wait_for()
+
+
 def participant(page: Any, service: Service, code: str) -> None:
     page.goto(service.url + "/")
     page.get_by_label("Code").fill(code)

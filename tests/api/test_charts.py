@@ -17,6 +17,7 @@ from stimrig import identify
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.charts import figure as fig
 from stimrig.api.charts.figure import LIGHT, Axis, Figure, Line, Note
+from stimrig.api.charts.interactive import for_plotly
 from stimrig.api.charts.plot import plot
 from stimrig.api.jobs.curves import curves
 from stimrig.api.sessions import joint_plan
@@ -192,6 +193,27 @@ def test_words_of_a_recording_are_words() -> None:
     words = words_of(str(LINE.svg()))
     assert {"<i>&", "<a href='x'> & $b$", "w", "1"} <= words
     assert "<i>&" not in words_of(str(LINE.svg(300.0))), "a narrow chart has no room for names"
+
+
+def test_plotly_gets_the_lines_in_roles_without_links_and_without_its_upload() -> None:
+    marks = [
+        Line((0.0, 1.0), (1.0, None), '<a href="x">torque</a> var(--ink)', "measured", step=True),
+        fig.Band((0.0, 1.0), (0.0, 0.0), (2.0, 3.0)),
+        fig.Shade("grid", 0.2, 0.4),
+        fig.Rule(1.5, "limit"),
+        Note(0.5, "prbs"),
+        Line((0.0,), (3.0,), "width", panel=1, marker="o", width=0.0),
+    ]
+    shown = for_plotly(Figure(fig.time_axis(0, 1), (Axis("Torque (N·m)"), Axis("Width (µs)")), marks, 400, (2, 1)), "m")
+    torque, band, width = shown["data"]
+    assert torque["y"] == [1.0, None] and torque["line"]["shape"] == "hv" and "N·m" in torque["hovertemplate"]
+    assert torque["line"]["color"] == "var(--measured)" and "<" not in torque["name"]
+    assert band["y"] == [2.0, 3.0, 0.0, 0.0] and width["yaxis"] == "y2" and width["mode"] == "markers"
+    assert len(shown["layout"]["shapes"]) == 2 and len(shown["layout"]["annotations"]) == 1
+    upper, lower = (shown["layout"][name]["domain"] for name in ("yaxis", "yaxis2"))
+    assert upper[1] == 1.0 and upper[0] > lower[1] and upper[1] - upper[0] == pytest.approx(2 * (lower[1] - lower[0]))
+    assert shown["config"]["showSendToCloud"] is False and shown["config"]["plotlyServerURL"] == ""
+    assert shown["config"]["modeBarButtons"] == [["toImage"], ["zoom2d", "pan2d", "resetScale2d"]]
 
 
 def test_files_open(tmp_path: Path) -> None:

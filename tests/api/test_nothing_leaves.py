@@ -1,4 +1,4 @@
-"""No request leaves a report file, whatever its recording holds."""
+"""Whatever is pressed in whatever chart, no request leaves: neither a page nor a report file."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from stimrig.api.jobs.curves import curves, rounded
 from stimrig.api.models.explanation import step_versions
 from stimrig.api.models.story import story
 from stimrig.api.web.pages.report_file import comparison_html, story_html
-from tests.api.browser import open_tab
-from tests.api.conftest import Service, shared_service
+from tests.api.browser import look_closer, open_tab, settled
+from tests.api.conftest import Service, play_test, shared_service
 from tests.api.test_jobs import made_up_csv
 
 pytestmark = pytest.mark.browser
 LINK = '<a href="https://elsewhere.example/">here</a>'
+BUTTONS = ".js-plotly-plot :is(.modebar-btn, button, a, [role=button])"
 
 
 service = shared_service(speed=8.0)
@@ -33,8 +34,8 @@ def tab(browser: Any, service: Service) -> Iterator[Any]:
 
 
 def watch(page: Any) -> None:
-    """Take down what any tab of the browser's asks another machine for."""
-    page.left, context = [], page.context
+    """Take down what any tab of the browser's asks another machine for, and what is saved here."""
+    page.left, page.downloads, context = [], [], page.context
     own = urlsplit(page.url).netloc
 
     def stop(route: Any) -> None:
@@ -47,6 +48,54 @@ def watch(page: Any) -> None:
 
     context.route("**/*", stop)
     context.on("page", lambda other: page.left.append(f"a new window: {other.url}"))
+    page.on("download", lambda found: page.downloads.append(found))
+
+
+def press_everything(page: Any, figures: int) -> None:
+    """Every button and link of every chart, then the chart itself; the picture of each is made by the browser."""
+    page.locator(".js-plotly-plot .main-svg").first.wait_for()
+    page.wait_for_function("n => document.querySelectorAll('.js-plotly-plot .modebar').length >= n", arg=figures)
+    buttons, count = page.locator(BUTTONS), page.locator(BUTTONS).count()
+    assert count >= 4 * figures
+    for number in range(count):  # a press may draw a chart anew
+        buttons.nth(number).click(force=True, no_wait_after=True)
+    for chart in page.locator(".js-plotly-plot").all():
+        for entry in chart.locator(".legendtoggle").all():
+            entry.click(force=True)
+            entry.dblclick(force=True)
+        for plane in chart.locator(".nsewdrag").all():
+            plane.click(force=True, position={"x": 20, "y": 20})
+            plane.dblclick(force=True, position={"x": 30, "y": 20})
+    for _ in range(600):
+        if len(page.downloads) >= figures:
+            break
+        page.wait_for_timeout(100)
+    assert len(page.downloads) == figures
+    assert all(Path(download.path()).read_bytes().startswith(b"\x89PNG") for download in page.downloads)
+    assert buttons.count() == count, "no press brings up another button, as to upload it"
+    assert page.left == [] and page.errors == []
+
+
+@pytest.mark.campaign
+def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service) -> None:
+    with service.client() as http:
+        model = play_test(http, "N1")["model_id"]
+        added = http.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
+    added = added.get("id") or added["model"]["id"]
+    paths = (f"/models/{model}?diagnose=1", f"/models/{added}?diagnose=0")
+    seen: set[str] = set()
+    for path in paths:
+        tab.goto(service.url + path)
+        if path == paths[0]:
+            tab.locator("[data-figure=signature-fatigue]").first.wait_for(state="attached")
+        settled(tab)
+        tab.evaluate("for (const part of document.querySelectorAll('details')) part.open = true")
+        tab.downloads.clear()
+        names = [str(box.get_attribute("data-figure")) for box in tab.locator("[data-figure]").all()]
+        look_closer(tab, *names)
+        press_everything(tab, len(names))
+        seen |= set(names)
+    assert " ".join(sorted(seen)) == "comparison curve falling overview recruitment residual signature-fatigue step"
 
 
 @pytest.fixture(scope="module")

@@ -1,23 +1,25 @@
-"""A model's charts, each by itself: a still for its page, and a file to keep."""
+"""A model's charts, each by itself: a still for its page, a file to keep, and what plotly takes."""
 
 from __future__ import annotations
 
 import asyncio
 import gzip
 import hashlib
+import json
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Request
 from fastapi.responses import Response
 
 from stimrig.api.charts.figure import Figures
+from stimrig.api.charts.interactive import for_plotly
 from stimrig.api.errors import NotFoundError
 from stimrig.api.web.dependencies import Ctx, ModelReader, Version
 from stimrig.api.web.middleware import entity_tags
 from stimrig.api.web.pages import model_view
 
 router = APIRouter(include_in_schema=False)
-KINDS = {"html": "text/html; charset=utf-8", "svg": "image/svg+xml"}
+KINDS = {"html": "text/html; charset=utf-8", "json": "application/json", "svg": "image/svg+xml"}
 
 
 @router.get("/models/{model_id}/figures/{name}")
@@ -29,8 +31,11 @@ async def figure(
     figures, (stem, _dot, kind) = (await model_view.parts(context, row))["figures"], name.rpartition(".")
     if stem not in figures or kind not in KINDS:
         raise NotFoundError("chart", name)
-    style: dict[str, Any] = {"right": Figures.TOOLS_PX} if kind == "html" else {"light": True}
-    body = (await asyncio.to_thread(figures[stem].svg, width, **style)).encode()
+    if kind == "json":
+        body = json.dumps(for_plotly(figures[stem], f"{row.id}-{stem}")).encode()
+    else:
+        style: dict[str, Any] = {"right": Figures.TOOLS_PX} if kind == "html" else {"light": True}
+        body = (await asyncio.to_thread(figures[stem].svg, width, **style)).encode()
     tag = f'"{hashlib.sha256(body).hexdigest()[:16]}"'
     headers = {"Cache-Control": "private, no-cache", "ETag": tag, "Vary": "Accept-Encoding"}
     if tag in entity_tags(request.headers.get("if-none-match", "")):

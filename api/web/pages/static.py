@@ -1,4 +1,4 @@
-"""Style, scripts and Swagger UI, from this machine only; compressed once, kept by browsers for long.
+"""Style, scripts, plotly and Swagger UI, from this machine only; compressed once, kept by browsers for long.
 
 And the API's description as a page, drawn by Swagger UI.
 """
@@ -21,6 +21,7 @@ router = APIRouter(include_in_schema=False)
 
 KINDS = {".js": "text/javascript; charset=utf-8", ".css": "text/css; charset=utf-8", ".svg": "image/svg+xml"}
 OF_PACKAGES = {
+    "plotly.min.js": ("plotly", "package_data"),
     "swagger-ui-bundle.js": ("fastapi_offline", "static"),
     "swagger-ui.css": ("fastapi_offline", "static"),
 }
