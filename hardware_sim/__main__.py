@@ -16,7 +16,7 @@ from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim import options as command_line
 from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.emulator import Emulator
-from stimrig.hardware_sim.errors import FaultError, HardwareSimError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.factory import HIDDEN, make_devices
 
 PROG = "stimrig emulate"
@@ -70,7 +70,7 @@ def _fault(text: str) -> tuple[str, dict[str, Any]]:
         try:
             settings[key] = {"true": True, "false": False}[value] if value in ("true", "false") else float(value)
         except ValueError:
-            raise FaultError(f"--fault {text}: '{pair}' must be SETTING=NUMBER") from None
+            raise HardwareSimError(f"--fault {text}: '{pair}' must be SETTING=NUMBER") from None
     return name, settings
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from stimrig.hardware_sim.devices import Devices
-from stimrig.hardware_sim.errors import ArmError, FaultError, HardwareSimError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.ports import Client, Reactor, Server
 from stimrig.hardware_sim.timeline import WallClock
 
@@ -85,7 +85,7 @@ class Control(Server):
     def _fault(self, request: dict[str, Any]) -> dict[str, Any]:
         name, on, for_s = str(request.pop("name", "")), request.pop("on", True), request.pop("for_s", None)
         if for_s is not None and not (isinstance(for_s, int | float) and 0 <= for_s < math.inf):
-            raise FaultError(f"'for_s' must be a number of seconds, not {for_s!r}")
+            raise HardwareSimError(f"'for_s' must be a number of seconds, not {for_s!r}")
         faults = self._devices.faults
         if on:
             faults.on(name, request, for_s)
@@ -96,6 +96,6 @@ class Control(Server):
     def _arm(self, request: dict[str, Any]) -> dict[str, Any]:
         limb = self._devices.limb
         if limb is None:
-            raise ArmError("this rig has no arm; start it with --arm")
+            raise HardwareSimError("this rig has no arm; start it with --arm")
         limb.move(str(request.pop("mode", "")), request, self._devices.timeline.now_s)
         return {**self._now(), **limb.state()}

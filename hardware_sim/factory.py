@@ -11,7 +11,7 @@ from stimrig.hardware_sim.arm import description as arms
 from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.tissue import bare
 from stimrig.hardware_sim.devices import Devices
-from stimrig.hardware_sim.errors import ArmError, PatientError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.settings import Settings
 
@@ -32,7 +32,7 @@ def make_devices(
     """
     seed = _hidden_seed(settings.patient)
     if seed is not None and seed < 0:
-        raise PatientError(f"patient '{settings.patient}': give a seed of 0 or above")
+        raise HardwareSimError(f"patient '{settings.patient}': give a seed of 0 or above")
     muscle = _muscle(settings.patient) if seed is None else hidden.make(seed, moving=arm is not None)
     return Devices(muscle, settings, None if arm is None else _arm(arm, arm_laws, seed), epoch_us)
 
@@ -59,7 +59,7 @@ def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:
     if hidden_seed is None:
         return arms.set_laws(arms.read(text), laws)
     if laws:
-        raise ArmError("--arm-law: what the arm of a hidden patient does is hidden, too")
+        raise HardwareSimError("--arm-law: what the arm of a hidden patient does is hidden, too")
     if text == DESIGN:
         return Arm("waves", hidden.movement(hidden_seed), bare())
     return replace(arms.read(text), tissue=bare())

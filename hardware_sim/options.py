@@ -11,7 +11,7 @@ from typing import NoReturn
 
 from stimrig.hardware_sim.arm.movers import MOVERS
 from stimrig.hardware_sim.arm.tissue import DEFAULT_LAWS, PLACES
-from stimrig.hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.load_cells import CELLS, TRANSPORTS
 from stimrig.hardware_sim.load_cells.cells import WithAngle
 from stimrig.hardware_sim.patients import PATIENTS
@@ -99,7 +99,7 @@ def parse(arguments: Sequence[str] | None = None, prog: str = "stimrig emulate")
 
 
 def settings(options: argparse.Namespace, patient: str) -> Settings:
-    """The checked settings of these options. Raises SettingsError: a number is out of its range.
+    """The checked settings of these options. Raises HardwareSimError: a number is out of its range.
 
     The cell with an angle is there where, and only where, the angle is in its frame.
     """
@@ -109,5 +109,5 @@ def settings(options: argparse.Namespace, patient: str) -> Settings:
     in_cell = options.arm is not None and options.angle == "in-cell"
     cell = options.cell or (WithAngle.name if in_cell else DEFAULTS.cell)
     if in_cell != (cell == WithAngle.name):
-        raise SettingsError(f"--cell {WithAngle.name} goes with --arm and --angle in-cell, and no other cell does")
+        raise HardwareSimError(f"--cell {WithAngle.name} goes with --arm and --angle in-cell, and no other cell does")
     return Settings(**values | {"patient": patient, "cell": cell, "sync": not options.no_sync})

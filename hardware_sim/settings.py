@@ -8,15 +8,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
-from stimrig.hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.errors import HardwareSimError
 
 Kind = TypeVar("Kind")
 
 
 def pick(kinds: Mapping[str, Kind], what: str, name: str) -> Kind:
-    """The one of this name. Raises SettingsError: there is none; the message lists all."""
+    """The one of this name. Raises HardwareSimError: there is none; the message lists all."""
     if name not in kinds:
-        raise SettingsError(f"unknown {what} '{name}'; there are {', '.join(kinds)}")
+        raise HardwareSimError(f"unknown {what} '{name}'; there are {', '.join(kinds)}")
     return kinds[name]
 
 
@@ -80,4 +80,4 @@ class Settings:
             value, span = getattr(self, each.name), each.metadata.get("span")
             if span and not (math.isfinite(value) and span[0] <= value <= span[1]):
                 option = "--" + each.name.replace("_", "-")
-                raise SettingsError(f"{option} must be between {span[0]:g} and {span[1]:g}, not {value:g}")
+                raise HardwareSimError(f"{option} must be between {span[0]:g} and {span[1]:g}, not {value:g}")

@@ -8,7 +8,7 @@ from typing import Any
 
 from stimrig.hardware_sim.arm.motion import LARGEST_DEG, SMALLEST_DEG, within
 from stimrig.hardware_sim.arm.tissue import Tissue, law
-from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.errors import HardwareSimError
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Arm:
 
 
 def read(text: str) -> Arm:
-    """The arm that `--arm` describes. Raises ArmError: a setting is no number."""
+    """The arm that `--arm` describes. Raises HardwareSimError: a setting is no number."""
     mode, *pairs = text.split(",")
     return Arm(mode, dict(map(_number, pairs)))
 
@@ -35,7 +35,7 @@ def read(text: str) -> Arm:
 def set_laws(arm: Arm, texts: Sequence[str]) -> Arm:
     """The arm with other laws, each as `--arm-law` takes it.
 
-    Raises ArmError: there is no such place, law or parameter.
+    Raises HardwareSimError: there is no such place, law or parameter.
     """
     laws = {}
     for text in texts:
@@ -50,4 +50,4 @@ def _number(pair: str) -> tuple[str, float]:
     try:
         return key, float(value)
     except ValueError:
-        raise ArmError(f"--arm: '{pair}' must be SETTING=NUMBER") from None
+        raise HardwareSimError(f"--arm: '{pair}' must be SETTING=NUMBER") from None

@@ -48,7 +48,7 @@ class Limb:
     def move(self, mode: str, settings: Mapping[str, Any], time_s: float = 0.0) -> None:
         """Hold or move the forearm otherwise from now on.
 
-        Raises ArmError: there is no such mode, or a setting makes no sense; then it goes on as before.
+        Raises HardwareSimError: there is no such mode, or a setting makes no sense; then it goes on as before.
         """
         self._advance(time_s)
         begin = Begin(self._time_s, self.motion, self._seed + SEEDS_APART * self._moves)

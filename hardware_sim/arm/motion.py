@@ -9,7 +9,7 @@ import math
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
-from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.errors import HardwareSimError
 
 SMALLEST_DEG, LARGEST_DEG = -10.0, 160.0
 """Angles that a mover accepts; people reach -5 to 150 degrees."""
@@ -47,10 +47,10 @@ def radians_per_s(name: str, degrees_per_s: float) -> float:
 
 
 def within(name: str, value: float, low: float, high: float) -> float:
-    """A setting, checked. Raises ArmError: it is no number or out of its range."""
+    """A setting, checked. Raises HardwareSimError: it is no number or out of its range."""
     number = isinstance(value, int | float) and not isinstance(value, bool)
     if not (number and low <= value <= high):
-        raise ArmError(f"the arm's '{name}' must be between {low:g} and {high:g}, not {value!r}")
+        raise HardwareSimError(f"the arm's '{name}' must be between {low:g} and {high:g}, not {value!r}")
     return float(value)
 
 

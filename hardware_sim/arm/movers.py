@@ -24,7 +24,7 @@ from stimrig.hardware_sim.arm.motion import (
     radians_per_s,
     within,
 )
-from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.errors import HardwareSimError
 
 HAND_HZ = 3.0
 PIECES = 5
@@ -158,9 +158,9 @@ def waves(
     """
     lists = (hz, deg, phase_rad)
     if not all(isinstance(each, Sequence) and not isinstance(each, str) for each in lists):
-        raise ArmError("the arm's waves need 'hz', 'deg' and 'phase_rad': lists of numbers")
+        raise HardwareSimError("the arm's waves need 'hz', 'deg' and 'phase_rad': lists of numbers")
     if len({len(each) for each in lists}) != 1:
-        raise ArmError("the arm's 'hz', 'deg' and 'phase_rad' must be equally long")
+        raise HardwareSimError("the arm's 'hz', 'deg' and 'phase_rad' must be equally long")
     parts = [
         (
             radians("deg", size, 0.0, 90.0),
@@ -193,12 +193,12 @@ MOVERS: dict[str, Callable[..., MotionAt]] = {"hand": hand, "held": held, "robot
 def make_mover(mode: str, begin: Begin, settings: Mapping[str, Any]) -> MotionAt:
     """The motion at a time by the named mover.
 
-    Raises ArmError: there is no such mover, or it has no such setting, or a value makes no sense.
+    Raises HardwareSimError: there is no such mover, or it has no such setting, or a value makes no sense.
     """
     if mode not in MOVERS:
-        raise ArmError(f"unknown mode of the arm {mode!r}; there are {', '.join(MOVERS)}")
+        raise HardwareSimError(f"unknown mode of the arm {mode!r}; there are {', '.join(MOVERS)}")
     known = list(inspect.signature(MOVERS[mode]).parameters)[1:]
     for key in settings:
         if key not in known:
-            raise ArmError(f"mode '{mode}' of the arm has no setting '{key}'; it has {', '.join(known)}")
+            raise HardwareSimError(f"mode '{mode}' of the arm has no setting '{key}'; it has {', '.join(known)}")
     return MOVERS[mode](begin, **settings)

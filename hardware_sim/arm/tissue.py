@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.hardware_sim.arm.laws import LAWS, Number, PassiveLaw, above
-from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.errors import HardwareSimError
 
 REFERENCE_RAD = math.pi / 2.0
 DEFAULT_LAWS = {"passive": "double_exponential", "torque_angle": "force_length", "torque_velocity": "hill"}
@@ -62,21 +62,21 @@ PLACES: dict[str, dict[str, Any]] = {**LAWS, "mechanics": {"forearm": Mechanics}
 def law(place: str, name: str, parameters: Mapping[str, float] | None = None) -> Any:
     """The named law of a place, with some of its parameters overridden.
 
-    Raises ArmError: there is no such place, law or parameter, or a value is not a finite number or out of range.
+    Raises HardwareSimError: there is no such place, law or parameter, or a value is no number or out of range.
     """
     if place not in PLACES:
-        raise ArmError(f"the arm has no laws of {place!r}; it has {', '.join(PLACES)}")
+        raise HardwareSimError(f"the arm has no laws of {place!r}; it has {', '.join(PLACES)}")
     if name not in PLACES[place]:
-        raise ArmError(f"unknown law of {place} {name!r}; there are {', '.join(PLACES[place])}")
+        raise HardwareSimError(f"unknown law of {place} {name!r}; there are {', '.join(PLACES[place])}")
     kind, what, values = PLACES[place][name], f"law {name} of {place}", parameters or {}
     lowest = {each.name: each.metadata.get("above", -math.inf) for each in dataclasses.fields(kind)}
     for key, value in values.items():
         if key not in lowest:
-            raise ArmError(f"{what} has no parameter '{key}'; it has {', '.join(lowest) or 'none'}")
+            raise HardwareSimError(f"{what} has no parameter '{key}'; it has {', '.join(lowest) or 'none'}")
         if not math.isfinite(value):
-            raise ArmError(f"parameter '{key}' of {what} must be a finite number, not {value!r}")
+            raise HardwareSimError(f"parameter '{key}' of {what} must be a finite number, not {value!r}")
         if not value > lowest[key]:
-            raise ArmError(f"parameter '{key}' of {what} must be above {lowest[key]:g}, not {value!r}")
+            raise HardwareSimError(f"parameter '{key}' of {what} must be above {lowest[key]:g}, not {value!r}")
     return kind(**values)
 
 

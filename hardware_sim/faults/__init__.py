@@ -19,7 +19,7 @@ from functools import wraps
 from typing import Any, Protocol, TypeVar
 
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
-from stimrig.hardware_sim.errors import FaultError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.stimulators.board import Board, Firmware
 from stimrig.hardware_sim.timeline import Timeline
@@ -101,7 +101,7 @@ def replaced(owner: object, attribute: str, value: object) -> Undo:
 def check_not_negative(setting: str, value: float) -> None:
     """Refuse a setting of a fault that is no number from 0 on."""
     if not 0 <= value < math.inf:
-        raise FaultError(f"setting '{setting}' must be a number from 0 on, not {value:g}")
+        raise HardwareSimError(f"setting '{setting}' must be a number from 0 on, not {value:g}")
 
 
 class Faults:
@@ -126,24 +126,24 @@ class Faults:
     def on(self, name: str, settings: dict[str, Any], for_s: float | None = None) -> None:
         """Switch a fault on, for `for_s` emulated seconds or until it is switched off.
 
-        Raises FaultError: no such fault, or no such setting, or a setting of another type than its default.
+        Raises HardwareSimError: no such fault, or no such setting, or a setting of another type than its default.
         """
         known = _settings(self._find(name))
         for key, value in settings.items():
             if key not in known:
-                raise FaultError(f"fault '{name}' has no setting '{key}'; it has {', '.join(known) or 'none'}")
+                raise HardwareSimError(f"fault '{name}' has no setting '{key}'; it has {', '.join(known) or 'none'}")
             if not isinstance(value, int | float) or isinstance(known[key], bool) != isinstance(value, bool):
-                raise FaultError(f"setting '{key}' of fault '{name}' must be like {known[key]!r}, not {value!r}")
+                raise HardwareSimError(f"setting '{key}' of fault '{name}' must be like {known[key]!r}, not {value!r}")
         self.off(name)
         try:
             undo = self._on[name] = self._library[name](self._target, **settings)
-        except FaultError as error:
-            raise FaultError(f"fault '{name}': {error}") from None
+        except HardwareSimError as error:
+            raise HardwareSimError(f"fault '{name}': {error}") from None
         if for_s is not None:
             self._target.timeline.after(for_s, lambda: self._end(name, undo))
 
     def off(self, name: str) -> None:
-        """Switch a fault off; nothing happens if it is off already. Raises FaultError: no such fault."""
+        """Switch a fault off; nothing happens if it is off already. Raises HardwareSimError: no such fault."""
         self._find(name)
         if undo := self._on.pop(name, None):
             undo()
@@ -154,7 +154,7 @@ class Faults:
 
     def _find(self, name: str) -> Callable[..., Undo]:
         if name not in self._library:
-            raise FaultError(f"unknown fault '{name}'; there are {', '.join(self._library)}")
+            raise HardwareSimError(f"unknown fault '{name}'; there are {', '.join(self._library)}")
         return self._library[name]
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
-from stimrig.hardware_sim.errors import FaultError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.faults import Target, Undo, check_not_negative, fault, hook, hooked, replaced
 from stimrig.hardware_sim.load_cells.frames import Frame, Sample
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
@@ -46,14 +46,14 @@ def angle_frames(target: Target) -> list[Any]:
 
 def _encoder(target: Target) -> Encoder:
     if target.encoder is None:
-        raise FaultError("this rig has no angle sensor; start it with --arm")
+        raise HardwareSimError("this rig has no angle sensor; start it with --arm")
     return target.encoder
 
 
 def _angle_sensor(target: Target) -> AngleSensor:
     _encoder(target)
     if target.angle_sensor is None:
-        raise FaultError("the angle is in the cell's frame: use the load cell's fault")
+        raise HardwareSimError("the angle is in the cell's frame: use the load cell's fault")
     return target.angle_sensor
 
 
@@ -319,7 +319,7 @@ def cell_reports_fault(target: Target) -> FrameHook:
     """The cell says in its status that it is faulty (cells that send one reading and a status)."""
     cell = target.load_cell.cell
     if not cell.has_sync or cell.samples_per_frame > 1:
-        raise FaultError(f"the cell '{cell.name}' has no status in its frames")
+        raise HardwareSimError(f"the cell '{cell.name}' has no status in its frames")
 
     def faulty(frame: Frame) -> Iterable[Frame]:
         data = bytearray(frame.data)
@@ -357,7 +357,7 @@ def _jump(sensor: LoadCell | AngleSensor, step: int) -> Undo:
 
 def _at_another_rate(sensor: LoadCell | AngleSensor, percent: float) -> Undo:
     if not -100.0 < percent < math.inf:
-        raise FaultError(f"setting 'percent' must be above -100, not {percent:g}")
+        raise HardwareSimError(f"setting 'percent' must be above -100, not {percent:g}")
     sensor.clock.set_rate_factor(1.0 + percent / 100.0)
     return lambda: sensor.clock.set_rate_factor(1.0)
 

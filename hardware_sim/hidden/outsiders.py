@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base, delayed, second_order_step
-from stimrig.hardware_sim.hidden.forms import Effect, Form, Numbers, Sign, draws, weighted
+from stimrig.hardware_sim.hidden.base import delayed, second_order_step
+from stimrig.hardware_sim.hidden.forms import Counted, Effect, Form, Numbers, Sign, draws, weighted
 from stimrig.hardware_sim.hidden.kernels import (
     ACTIVATION,
     COUNT,
@@ -21,13 +20,20 @@ from stimrig.hardware_sim.hidden.kernels import (
     normal,
 )
 
-OUTSIDERS: dict[str, Effect] = {}
+NAMES = (
+    "after_discharge", "antagonist", "clonus", "delay_jitter", "fixture_backlash", "gain_jumps", "loose_contact",
+    "pulse_count_memory", "rate_dependent_recruitment", "residual_force", "sensor_gain_swing", "slipped_electrode",
+    "slow_converter", "stick_slip", "width_dependent_delay",
+)  # fmt: skip
+COUNTED: dict[str, Counted] = {
+    **dict.fromkeys(("clonus", "delay_jitter", "gain_jumps", "loose_contact", "sensor_gain_swing"), "all"),
+    "slipped_electrode": "training",
+}
+OUTSIDERS = {name: Effect(COUNTED.get(name, "held out")) for name in NAMES}
+
 
 # Plateau potentials: strong stimulation sets off an after-discharge that goes on by itself until it dies out.
-AFTER_DISCHARGE = OUTSIDERS["after_discharge"] = Effect()
-
-
-@AFTER_DISCHARGE.form(
+@OUTSIDERS["after_discharge"].form(
     "after-discharge switched on by strong stimulation", "plateau potentials, Bennett, Li and Siu 2001"
 )
 @draws("gain", 0.9, "size_share", threshold_share=(0.4, 0.65), takes_s=(0.15, 0.5), lasts_s=(0.5, 1.8))
@@ -46,19 +52,16 @@ def _bistable(x, p, s, c):
 
 
 # Antagonist cross-talk: at large pulse widths current spreads to the antagonist, which pulls back, more slowly.
-ANTAGONIST = OUTSIDERS["antagonist"] = Effect()
-
-
-def _spill_us(rng: Generator, base: Base) -> float:
+def _spill_us(rng, base):
     return min(base.rise_us()[1], base.largest_width_us * 0.8) * float(rng.uniform(0.7, 0.95))
 
 
-def _slower(rng: Generator, base: Base) -> Numbers:
+def _slower(rng, base):
     rate = 1.0 / (base.t_omega_s * float(rng.uniform(2.0, 4.0)))
     return Numbers((rate, 1.1), slower_by=1.0 / (rate * base.t_omega_s))
 
 
-@ANTAGONIST.form(
+@OUTSIDERS["antagonist"].form(
     "a slow, quickly tiring antagonist at large widths", "spill-over to the antagonist, as in Durfee and MacLean 1989"
 )
 @draws("additive", 1.5, "share", threshold_us=_spill_us, rise_us=(15.0, 60.0), _slower=_slower, tiring_s=(1.5, 5.0))
@@ -72,10 +75,9 @@ def _pull_back(x, p, s, c):
 
 
 # Clonus: after a sudden change of torque the muscle beats by itself for a while.
-CLONUS = OUTSIDERS["clonus"] = Effect("all")
-
-
-@CLONUS.form("beats set off by a fall of torque", "Van der Pol oscillator; clonus at 5 to 7 Hz, Hidler and Rymer 1999")
+@OUTSIDERS["clonus"].form(
+    "beats set off by a fall of torque", "Van der Pol oscillator; clonus at 5 to 7 Hz, Hidler and Rymer 1999"
+)
 @draws("additive", 0.8, "size_share", frequency_hz=(4.5, 7.5), decay_s=(0.4, 1.5))
 def _beats(x, p, s, c):
     """p: size share, Hz, drive's decay s, delay s. s: oscillator (2), drive, activation before.
@@ -102,10 +104,7 @@ def _beats(x, p, s, c):
 
 
 # Delay that jitters: the answer comes now sooner, now later, at random.
-DELAY_JITTER = OUTSIDERS["delay_jitter"] = Effect("all")
-
-
-@DELAY_JITTER.form("delay wanders at random", "made to be foreign")
+@OUTSIDERS["delay_jitter"].form("delay wanders at random", "made to be foreign")
 @draws("delay", 0.16, "mean_delay_s", seed_at=2, correlation_s=(0.3, 2.0))
 def _jitter(x, p, s, c):
     """p: mean delay s, its correlation s. s: place in the ring of 800, delay's state, generator."""
@@ -114,10 +113,7 @@ def _jitter(x, p, s, c):
 
 
 # Backlash in the fixture: the load cell follows the torque only after play has been taken up.
-FIXTURE_BACKLASH = OUTSIDERS["fixture_backlash"] = Effect()
-
-
-@FIXTURE_BACKLASH.form("play on torque", "backlash operator, Krasnosel'skii and Pokrovskii 1989")
+@OUTSIDERS["fixture_backlash"].form("play on torque", "backlash operator, Krasnosel'skii and Pokrovskii 1989")
 @draws("structure", 0.4, "half_width_share", settling_s=(0.001, 0.01))
 def _play(x, p, s, c):
     """p: half-width of the play as a share of the largest torque, settling s. s: follower, what is read."""
@@ -128,10 +124,7 @@ def _play(x, p, s, c):
 
 
 # Jumps of gain: an electrode shifts at an instant and with it the share of the nerve it reaches.
-GAIN_JUMPS = OUTSIDERS["gain_jumps"] = Effect("all")
-
-
-def _jump_table(rng: Generator, _base: Base) -> Numbers:
+def _jump_table(rng, _base):
     instants = float(rng.uniform(4.0, 10.0)) + np.cumsum(rng.uniform(3.0, 12.0, 60))
     gains = np.cumsum(np.where(np.arange(60) % 2 == 0, 1.0, -1.0) * rng.uniform(0.4, 1.6, 60))
     gains = np.clip(gains, -1.5, 1.5)
@@ -139,7 +132,7 @@ def _jump_table(rng: Generator, _base: Base) -> Numbers:
     return Numbers(table, first_instants_s=instants[:5].tolist(), first_gains=gains[:5].tolist())
 
 
-@GAIN_JUMPS.form("gain jumps up and down", "electrode shift")
+@OUTSIDERS["gain_jumps"].form("gain jumps up and down", "electrode shift")
 @draws("gain", 0.6, "size", _jump_table=_jump_table)
 def _jumps(x, p, s, c):
     """p: size, then 60 pairs of instant and gain after it. s[0]: present pair."""
@@ -150,16 +143,13 @@ def _jumps(x, p, s, c):
 
 
 # Loose contact: for moments no current flows, though pulses are sent.
-LOOSE_CONTACT = OUTSIDERS["loose_contact"] = Effect("all")
-
-
-def _gap_table(rng: Generator, _base: Base) -> Numbers:
+def _gap_table(rng, _base):
     instants = np.cumsum(rng.uniform(0.6, 4.0, 200))
     table = np.column_stack([instants, rng.uniform(0.4, 1.6, 200)]).ravel()
     return Numbers(table, first_instants_s=instants[:5].tolist())
 
 
-@LOOSE_CONTACT.form("current is cut for moments", "loose electrode lead")
+@OUTSIDERS["loose_contact"].form("current is cut for moments", "loose electrode lead")
 @draws("electrode", 0.35, "typical_gap_s", _gap_table=_gap_table)
 def _gaps(x, p, s, c):
     """p: length of a typical gap s, then 200 pairs of instant and relative length. s[0]: present pair."""
@@ -173,10 +163,7 @@ def _gaps(x, p, s, c):
 
 
 # Memory of the number of pulses: the gain goes up and down with how many pulses there have been.
-PULSE_COUNT_MEMORY = OUTSIDERS["pulse_count_memory"] = Effect()
-
-
-@PULSE_COUNT_MEMORY.form("gain swings with the count of pulses", "no physiology; made to be foreign")
+@OUTSIDERS["pulse_count_memory"].form("gain swings with the count of pulses", "no physiology; made to be foreign")
 @draws("gain", 0.9, "depth", pulses_a_turn=(60.0, 160.0))
 def _all_pulses(x, p, s, c):
     """p: depth, pulses a turn. s[0]: pulses so far. A gain that swings with the pulses, not with time."""
@@ -184,7 +171,7 @@ def _all_pulses(x, p, s, c):
     return x * (1.0 + p[0] * math.sin(2.0 * math.pi * s[0] / p[1]))
 
 
-@PULSE_COUNT_MEMORY.form("groups of pulses strong and weak in turn", "mechanical alternans, transposed")
+@OUTSIDERS["pulse_count_memory"].form("groups of pulses strong and weak in turn", "mechanical alternans, transposed")
 @draws("gain", 0.9, "depth", pulses_a_group=lambda rng, _base: int(rng.integers(6, 14)))
 def _every_other(x, p, s, c):
     """p: depth, pulses of a group. Alternans: groups of pulses of a train are strong and weak in turn."""
@@ -193,10 +180,7 @@ def _every_other(x, p, s, c):
 
 
 # Rate-dependent recruitment: how many fibres answer goes with how quickly the pulse width has just changed.
-RATE_DEPENDENT_RECRUITMENT = OUTSIDERS["rate_dependent_recruitment"] = Effect()
-
-
-@RATE_DEPENDENT_RECRUITMENT.form(
+@OUTSIDERS["rate_dependent_recruitment"].form(
     "the nerve accommodates to the width", "accommodation, Hill 1936, transposed to pulse width"
 )
 @draws(
@@ -212,7 +196,7 @@ def _accommodation(x, p, s, c):
     return max(x + p[0] * (x - s[0]), 0.0) if x > 0.0 else 0.0
 
 
-@RATE_DEPENDENT_RECRUITMENT.form(
+@OUTSIDERS["rate_dependent_recruitment"].form(
     "quick changes of width recruit less", "no law; recruitment that depends on the rate of change"
 )
 @draws("gain", 0.95, "share", time_constant_s=(0.15, 0.6), half_us_per_s=(500.0, 2500.0))
@@ -224,10 +208,7 @@ def _less_when_quick(x, p, s, c):
 
 
 # History-dependent force: after a high torque some of it lingers (or is missing) at the next lower one.
-RESIDUAL_FORCE = OUTSIDERS["residual_force"] = Effect()
-
-
-@RESIDUAL_FORCE.form(
+@OUTSIDERS["residual_force"].form(
     "residual force enhancement or depression", "Abbott and Aubert 1952; Herzog 2004, transposed to activation"
 )
 @draws("gain", 0.95, "share", decay_s=(8.0, 40.0), sign=Sign())
@@ -244,10 +225,7 @@ def _residual(x, p, s, c):
 
 
 # Sensor gain that swings: warmth from a heating cycle changes the load cell's sensitivity, not its zero.
-SENSOR_GAIN_SWING = OUTSIDERS["sensor_gain_swing"] = Effect("all")
-
-
-@SENSOR_GAIN_SWING.form("sensitivity swings in time", "heating cycle; made to be foreign")
+@OUTSIDERS["sensor_gain_swing"].form("sensitivity swings in time", "heating cycle; made to be foreign")
 @draws("sensor", 0.8, "depth", period_s=(3.0, 9.0), _phase=(0.0, 2.0 * math.pi), sharpness=(0.2, 4.0))
 def _swing(x, p, s, c):
     """p: depth, period s, phase, sharpness."""
@@ -256,27 +234,22 @@ def _swing(x, p, s, c):
 
 
 # A slipped electrode: at one moment it comes away from its place, and from then on everything is weaker or later.
-SLIPPED_ELECTRODE = OUTSIDERS["slipped_electrode"] = Effect("training")
-
-
 MOMENTS_S = ((5.0, 12.0), (14.7, 17.7), (19.0, 25.0))
-
-
 """Within the PRBS, between it and the ramp, within the ramp of a full test."""
 
 
-def _moment(rng: Generator, _base: Base) -> float:
+def _moment(rng, _base):
     return float(rng.uniform(*MOMENTS_S[int(rng.integers(len(MOMENTS_S)))]))
 
 
-@SLIPPED_ELECTRODE.form("the gain steps once", "electrode slip")
+@OUTSIDERS["slipped_electrode"].form("the gain steps once", "electrode slip")
 @draws("gain", 0.7, "size", moment_s=_moment, sign=Sign(weighted(0.7, 0.3)))
 def _gain_step(x, p, s, c):
     """p: size with its sign, moment s."""
     return x * max(1.0 + p[0], 0.0) if c[TIME_S] >= p[1] else x
 
 
-@SLIPPED_ELECTRODE.form("the threshold steps once", "electrode slip")
+@OUTSIDERS["slipped_electrode"].form("the threshold steps once", "electrode slip")
 @draws("electrode", 90.0, "size_us", moment_s=_moment, sign=Sign(weighted(0.3, 0.7)))
 def _threshold_step(x, p, s, c):
     """p: size with its sign µs, moment s."""
@@ -288,16 +261,13 @@ def _both_step(size: float, moment_s: float, us_per_size: float, state: tuple[fl
     return threshold + _gain_step.build(-size, moment_s, state=state)
 
 
-SLIPPED_ELECTRODE.form("gain and threshold step once", "electrode slip")(
+OUTSIDERS["slipped_electrode"].form("gain and threshold step once", "electrode slip")(
     Form(_both_step, 0.7, "size", {"moment_s": _moment, "us_per_size": (30.0, 90.0)})
 )
 
 
 # A slow converter: the sensor holds each reading for a while, or rounds it coarsely.
-SLOW_CONVERTER = OUTSIDERS["slow_converter"] = Effect()
-
-
-@SLOW_CONVERTER.form("each reading is held", "sample and hold")
+@OUTSIDERS["slow_converter"].form("each reading is held", "sample and hold")
 @draws("converter", 1.2, "held_s")
 def _sample_and_hold(x, p, s, c):
     """p: how long a reading is held, s. s: reading, time of the next."""
@@ -307,7 +277,7 @@ def _sample_and_hold(x, p, s, c):
     return s[0]
 
 
-@SLOW_CONVERTER.form("coarse steps", "quantiser")
+@OUTSIDERS["slow_converter"].form("coarse steps", "quantiser")
 @draws("converter", 0.6, "step_share")
 def _coarse(x, p, s, c):
     """p: step as a share of the largest torque."""
@@ -316,10 +286,7 @@ def _coarse(x, p, s, c):
 
 
 # Stick-slip: the limb sticks in the splint and the reading stays, then jumps.
-STICK_SLIP = OUTSIDERS["stick_slip"] = Effect()
-
-
-@STICK_SLIP.form("breakaway and slip", "Coulomb friction with a breakaway torque")
+@OUTSIDERS["stick_slip"].form("breakaway and slip", "Coulomb friction with a breakaway torque")
 @draws("structure", 0.6, "breakaway_share", sticks_again_share=(0.05, 0.3), slip_s=(0.005, 0.04))
 def _stick_slip(x, p, s, c):
     """p: breakaway as a share of the largest torque, share at which it sticks again, slip s. s: reading, slipping."""
@@ -334,15 +301,12 @@ def _stick_slip(x, p, s, c):
 
 
 # Delay that depends on the pulse width: weak pulses answer later (or earlier) than strong ones.
-WIDTH_DEPENDENT_DELAY = OUTSIDERS["width_dependent_delay"] = Effect()
-
-
-def _late_when(rng: Generator, _base: Base) -> Numbers:
+def _late_when(rng, _base):
     sign = weighted(0.7, 0.3)(rng)
     return Numbers((sign,), late_when="strong" if sign > 0 else "weak")
 
 
-@WIDTH_DEPENDENT_DELAY.form(
+@OUTSIDERS["width_dependent_delay"].form(
     lambda revealed: f"transport line as long as the pulse is {revealed['late_when']}",
     "conduction of small axons; made to be foreign",
 )

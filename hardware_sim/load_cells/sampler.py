@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from itertools import chain, repeat
 
-from stimrig.hardware_sim.errors import SettingsError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.load_cells.cells import CELLS, Cell
 from stimrig.hardware_sim.load_cells.frames import AngleReading, Frame, Sample
 from stimrig.hardware_sim.patients.muscle import Muscle
@@ -114,11 +114,11 @@ class LoadCell:
 
 
 def _make_cell(settings: Settings) -> Cell:
-    """The cell's electronics. Raises SettingsError: it has no frame of so many samples."""
+    """The cell's electronics. Raises HardwareSimError: it has no frame of so many samples."""
     kind = pick(CELLS, "load cell", settings.cell)
     if settings.samples_per_frame not in kind.layouts:
         allowed = " or ".join(map(str, kind.layouts))
-        raise SettingsError(
+        raise HardwareSimError(
             f"--samples-per-frame must be {allowed} with --cell {settings.cell}, not {settings.samples_per_frame}"
         )
     return kind(settings.samples_per_frame)

@@ -21,7 +21,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from stimrig.hardware_sim.errors import PatientError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.patients.muscle import HeldPulses
 
 PAUSE_S = 5.0
@@ -93,7 +93,7 @@ def _rate(share: float, recovery_s: float) -> float:
     if share == 0.0:
         return 0.0
     if not share < 1.0:
-        raise PatientError(f"a share must lie between -1 and 1, not at {share:g}")
+        raise HardwareSimError(f"a share must lie between -1 and 1, not at {share:g}")
     low, high = 0.0, 1.0
     while _after_session(high, recovery_s) < share:
         low, high = high, 2.0 * high

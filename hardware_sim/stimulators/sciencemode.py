@@ -91,38 +91,25 @@ class ScienceMode(ABC):
         return packets
 
     def _next(self) -> Packet | None:
-        body_at = 1 + 2 * self.HEADER_BYTES
-        while self._find_start() and len(self._buffer) >= body_at:
-            header = self._header()
-            length = None if header is None else self.body_bytes(header)
-            if header is None or length is None:
-                self._reject()
-                continue
-            stop_at = body_at + length
-            if len(self._buffer) <= stop_at:
+        buffer, body_at = self._buffer, 1 + 2 * self.HEADER_BYTES
+        while (start := buffer.find(bytes((START, ESCAPE)))) >= 0:
+            del buffer[:start]
+            if len(buffer) < body_at:
                 return None
-            packet = self.parse(header, bytes(self._buffer[body_at:stop_at])) if self._buffer[stop_at] == STOP else None
-            if packet is not None:
-                del self._buffer[: stop_at + 1]
-                return packet
+            header = bytes(buffer[2:body_at:2].translate(KEYED))
+            escapes = buffer[1:body_at:2].strip(bytes((ESCAPE,)))
+            length = self.body_bytes(header) if not escapes else None
+            if length is not None:
+                stop_at = body_at + length
+                if len(buffer) <= stop_at:
+                    return None
+                packet = self.parse(header, bytes(buffer[body_at:stop_at])) if buffer[stop_at] == STOP else None
+                if packet is not None:
+                    del buffer[: stop_at + 1]
+                    return packet
             self._reject()
+        del buffer[: len(buffer) - buffer.endswith(bytes((START,)))]
         return None
-
-    def _find_start(self) -> bool:
-        """Drop what lies before the next frame's start; whether there is one."""
-        start = self._buffer.find(bytes((START, ESCAPE)))
-        if start < 0:
-            start = len(self._buffer) - (self._buffer[-1:] == bytes((START,)))
-            del self._buffer[:start]
-            return False
-        del self._buffer[:start]
-        return True
-
-    def _header(self) -> bytes | None:
-        escaped = self._buffer[1 : 1 + 2 * self.HEADER_BYTES]
-        if escaped[::2].strip(bytes((ESCAPE,))):
-            return None
-        return bytes(escaped[1::2].translate(KEYED))
 
     def _reject(self) -> None:
         """Skip this start byte: another frame may begin inside what looked like one."""

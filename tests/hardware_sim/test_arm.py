@@ -17,7 +17,7 @@ from stimrig.hardware_sim.arm.limb import Limb
 from stimrig.hardware_sim.arm.motion import Begin, Motion
 from stimrig.hardware_sim.arm.movers import MOVERS, make_mover
 from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Mechanics, Tissue, bare, law
-from stimrig.hardware_sim.errors import ArmError
+from stimrig.hardware_sim.errors import HardwareSimError
 
 STEP_S = 1.0 / 1600.0
 RANGE = np.radians(np.linspace(0.0, 140.0, 71))
@@ -121,7 +121,7 @@ class TestLaws:
         ],
     )
     def test_a_law_that_is_not_there_is_told(self, asked: tuple[Any, ...], told: str) -> None:
-        with pytest.raises(ArmError, match=told):
+        with pytest.raises(HardwareSimError, match=told):
             law(*asked)
 
 
@@ -223,7 +223,7 @@ class TestMovers:
     )
     def test_nonsense_is_told_and_it_goes_on_as_before(self, mode: str, settings: dict[str, Any], told: str) -> None:
         limb = Limb(Constant(), Arm("robot"))
-        with pytest.raises(ArmError, match=told):
+        with pytest.raises(HardwareSimError, match=told):
             limb.move(mode, settings)
         assert limb.mode == "robot"
 

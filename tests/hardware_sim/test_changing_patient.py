@@ -9,7 +9,7 @@ from scipy.stats import weibull_min
 
 from bench.muscles.offline import simulate
 from stimrig.hardware_sim import patients
-from stimrig.hardware_sim.errors import PatientError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.patients.changing import ChangingMuscle, Parameters
 
 pytestmark = pytest.mark.slow
@@ -131,5 +131,5 @@ def test_the_times_of_reading_do_not_matter() -> None:
 def test_a_shift_may_be_negative_a_time_and_a_share_of_one_may_not() -> None:
     assert isinstance(patients.make("changing", {"drift_us": -5.0}), ChangingMuscle)
     for name, value, told in (("spasm_lasts_s", -1.0, "above zero"), ("fatigue_share", 1.0, "share")):
-        with pytest.raises(PatientError, match=told):
+        with pytest.raises(HardwareSimError, match=told):
             patients.make("changing", {name: value})

@@ -8,12 +8,10 @@ import struct
 import numpy as np
 import pytest
 
-from stimrig.hardware_sim.errors import FaultError
 from stimrig.hardware_sim.load_cells.cells import Counts, Plain
 from stimrig.hardware_sim.load_cells.frames import Sample
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from tests.hardware_sim.test_load_cells import cell
-from tests.hardware_sim.virtual_host import LAYOUT, VirtualHost
 
 RATE_HZ = 1600.0
 PERIOD_S = 1 / RATE_HZ
@@ -75,32 +73,3 @@ def test_packed_values_have_stops_and_a_counter_jump_shows() -> None:
     assert frame(1.0, -70.0, 70.0) == (500, -32767, 32767, 0)
     assert frame(math.nan, 0.001, 0.0, counter=1003) == (-32767, 0, 0, 335)
     assert Counts(2).encode([Sample(50.0, 0, False, 1), Sample(-60.0, 1, False, 2)])[1:3] == (b"\xff\xff\0\0", 2)
-
-
-class TestFaults:
-    def test_delivery_jitter_keeps_order_and_stamps_and_loses_nothing_when_it_ends(self) -> None:
-        host = VirtualHost()
-        host.devices.faults.on("delivery_jitter", {"largest_s": 0.03}, for_s=0.5)
-        frames = host.frames(0.6)
-        counters, stamps_us = zip(*((LAYOUT.unpack(frame.data)[1], frame.time_us) for frame in frames), strict=True)
-        late_s = np.array([frame.time_s for frame in frames]) - 1e-6 * np.array(stamps_us)
-        assert counters == tuple(range(960))
-        assert stamps_us == tuple(625 * n for n in counters)
-        assert 0.008 < late_s.max() <= 0.03
-        assert np.abs(late_s[-100:]).max() < 1e-9
-
-    def test_clock_jitter(self) -> None:
-        host = VirtualHost()
-        before = host.frames()
-        host.devices.faults.on("clock_jitter", {"sd_us": 100})
-        after = host.frames(2.0)
-        spreads_us = [np.diff([frame.time_us for frame in frames]).std() for frames in (before, after)]
-        assert spreads_us == pytest.approx([0.0, math.sqrt(2) * 100], rel=0.15)
-
-    @pytest.mark.parametrize(("name", "setting"), [("clock_jitter", "sd_us"), ("delivery_jitter", "largest_s")])
-    def test_nonsense_is_told(self, name: str, setting: str) -> None:
-        faults = VirtualHost().devices.faults
-        for value in (-1, math.nan):
-            with pytest.raises(FaultError, match=setting):
-                faults.on(name, {setting: value})
-        assert faults.active() == []

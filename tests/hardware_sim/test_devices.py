@@ -9,8 +9,7 @@ import pytest
 from stimrig.hardware_sim.factory import make_devices
 from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
-from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
-from tests.hardware_sim.virtual_host import VirtualHost
+from tests.hardware_sim.virtual_host import LL_CONFIG, LL_INIT, VirtualHost, biphasic, config
 
 PULSE = config(*biphasic(250, 20))
 INIT_TO_ACK_S, PULSE_TO_ACK_S = 0.040, 600e-6
@@ -109,6 +108,6 @@ def test_a_power_cycle_forgets_all_but_what_has_happened() -> None:
     assert (host.result(LL_INIT, b"\x00"), host.result(LL_CONFIG, PULSE)) == (0, 0)
     host.devices.received(0.6, ScienceMode4.encode(Packet(1, LL_CONFIG, PULSE)))
     host.devices.power_cycle()
-    assert host.ask(62)[0].data == b"\x00\x00\x00"
-    assert host.samples()[0][1] == pytest.approx(400, abs=1)  # its counter began at 0
+    assert host.ask(62).data == b"\x00\x00\x00"
+    assert host.samples()[0][1] == pytest.approx(80, abs=1)  # its counter began at 0
     assert len(host.devices.electrodes.log) == host.devices.state()["pulses_received"] == 2

@@ -4,27 +4,45 @@ from __future__ import annotations
 
 import contextlib
 import math
+import struct
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import can
+import numpy as np
 import pytest
 import serial
 
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.faults import library
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
-from tests.hardware_sim.bench_board import LL_CONFIG, LL_INIT, biphasic, config
 from tests.hardware_sim.emulated import Emulated, emulated, wait_for
-from tests.hardware_sim.virtual_host import VirtualHost
+from tests.hardware_sim.virtual_host import LAYOUT, LL_CONFIG, LL_INIT, VirtualHost, biphasic, config
 
 PULSE = config(*biphasic(250, 20))
+CELL, ANGLE = 0x181, 0x182
+OF_THE_ANGLE = [name for name in library() if name.startswith("angle_")]
+Row = tuple[float, int, int, int]
+
+
+class Host(VirtualHost):
+    """A cell that reads about 5 N·m, and an angle that rises by 5 degrees a second from 60 on and reads 10 more."""
+
+    def __init__(self, **settings: Any) -> None:
+        angle = {"angle_offset_deg": 10.0, "angle_noise_deg": 0.0, "angle_bits": 20}
+        super().__init__("held", noise_seed=1, torque_offset_nm=5.0, **angle, **settings)
+        self.devices.encoder._angle_deg = lambda time_s: 60.0 + 5.0 * time_s
+
+    def rows(self, seconds: float, can_id: int = ANGLE) -> list[Row]:
+        return [LAYOUT.unpack(frame.data) for frame in self.frames(seconds) if frame.can_id == can_id]
 
 
 @pytest.fixture
-def host() -> VirtualHost:
-    made = VirtualHost(noise_seed=1, torque_offset_nm=5.0)
+def host() -> Host:
+    made = Host()
     assert made.result(LL_INIT, b"\x00") == 0
     return made
 
@@ -38,67 +56,106 @@ def broken(host: VirtualHost, name: str, **settings: Any) -> Iterator[None]:
     assert host.devices.faults.active() == []
 
 
-def delivered(host: VirtualHost) -> int:
-    return host.devices.electrodes.delivered_pulses
-
-
-def test_no_ack_but_the_pulse_is_fired(host: VirtualHost) -> None:
+def test_answers_that_are_lost_or_late_and_the_pulse_is_fired(host: Host) -> None:
     with broken(host, "no_ack"):
-        assert host.ask(LL_CONFIG, PULSE) == []
-    assert delivered(host) == 1
-    assert host.result(LL_CONFIG, PULSE) == 0
-
-
-def test_late_ack(host: VirtualHost) -> None:
+        assert host.answers(LL_CONFIG, PULSE) == []
     with broken(host, "late_ack", delay_s=0.15):
-        sent_s = host.devices.timeline.now_s
+        sent_s = host.timeline.now_s
         assert host.result(LL_CONFIG, PULSE) == 0
-    assert host.answered_s == pytest.approx(sent_s + 0.15 + 600e-6)
+    assert host.sent[-1][0] == pytest.approx(sent_s + 0.15 + 600e-6)
+    assert len(host.pulses) == 2
 
 
-def test_electrode_high_voltage_and_reset(host: VirtualHost) -> None:
+def test_electrode_high_voltage_and_reset(host: Host) -> None:
     for name, result in (("electrode_error", 10), ("emergency_switch", 10), ("high_voltage_error", 8)):
         with broken(host, name):
             assert host.result(LL_CONFIG, PULSE) == result
     assert host.result(LL_CONFIG, PULSE) == 0
     with broken(host, "device_reset", mid_frame=True):
-        assert host.devices.take_bytes() == [(host.devices.timeline.now_s, bytes.fromhex("f0815581"))]
+        assert host.devices.take_bytes() == [(host.timeline.now_s, bytes.fromhex("f0815581"))]
         assert host.result(LL_CONFIG, PULSE) == 7
 
 
-def test_silent_dropped_duplicated_out_of_order_corrupt(host: VirtualHost) -> None:
-    with broken(host, "cell_silent"):
-        assert host.samples() == []
-    assert set(host.steps()) == {1}
-    with broken(host, "frames_dropped", probability=0.1):
-        steps = host.steps()
-        assert min(steps) == 1
-        assert 0.04 < 1 - len(steps) / sum(steps) < 0.18
-    with broken(host, "frames_duplicated", probability=0.1):
-        assert set(host.steps()) == {0, 1}
-    with broken(host, "frames_out_of_order", probability=0.1):
-        assert {0xFFFF, 2} <= set(host.steps())
-    with broken(host, "frames_corrupt", probability=1.0):
-        assert set(host.steps()) != {1}
+def values(rows: list[Row]) -> np.ndarray:
+    return np.array([row[0] for row in rows])
 
 
-def test_values(host: VirtualHost) -> None:
-    with broken(host, "torque_stuck"):
-        samples = host.samples()
-        assert len({torque for torque, *_ in samples}) == 1
-        assert len({counter for _, counter, *_ in samples}) == len(samples)
-    with broken(host, "torque_nan"):
-        assert all(math.isnan(torque) for torque, *_ in host.samples())
-    with broken(host, "torque_sign_flipped"):
-        assert all(torque < -3 for torque, *_ in host.samples())
-    with broken(host, "torque_saturated", limit_nm=3.0):
-        assert {torque for torque, *_ in host.samples()} == {3.0}
-    with broken(host, "torque_step", step_nm=40.0):
-        assert all(torque > 40 for torque, *_ in host.samples())
-    assert all(3 < torque < 12 for torque, *_ in host.samples())
+def steps(rows: list[Row]) -> set[int]:
+    return {(after[1] - before[1]) & 0xFFFF for before, after in pairwise(rows)}
 
 
-def test_bus_errors(host: VirtualHost) -> None:
+def near(value: float) -> Any:
+    return pytest.approx(value, abs=0.1)
+
+
+def jumps(rows: list[Row], _: Row) -> bool:
+    """Of single readings."""
+    off_deg = np.diff(values(rows))
+    return set(np.round(off_deg / 15.0)) >= {-1.0, 0.0, 1.0} and 0.05 < np.mean(np.abs(off_deg) > 7.0) < 0.15
+
+
+def turned(rows: list[Row], last: Row) -> bool:
+    """From where it is: no jump gives it away."""
+    slope_deg_s = np.polyfit(0.005 * np.arange(len(rows)), values(rows), 1)[0]
+    return rows[0][0] == near(last[0]) and slope_deg_s == pytest.approx(-5.0, rel=0.01)
+
+
+SHOWN: list[tuple[str, float, dict[str, Any], Callable[[list[Row], Row], Any]]] = [
+    ("cell_silent", 0.5, {}, lambda rows, _: rows == []),
+    ("frames_dropped", 0.5, {}, lambda rows, _: steps(rows) >= {1, 2} and 660 < len(rows) < 770),
+    ("frames_duplicated", 0.5, {}, lambda rows, _: steps(rows) == {0, 1}),
+    ("frames_out_of_order", 0.5, {}, lambda rows, _: steps(rows) >= {0xFFFF, 2}),
+    ("frames_corrupt", 0.5, {"probability": 1.0}, lambda rows, _: steps(rows) != {1}),
+    ("torque_stuck", 0.5, {}, lambda rows, _: len(set(values(rows))) == 1 and steps(rows) == {1}),
+    ("torque_nan", 0.5, {}, lambda rows, _: np.isnan(values(rows)).all()),
+    ("torque_sign_flipped", 0.5, {}, lambda rows, _: np.all(values(rows) < -3.0)),
+    ("torque_saturated", 0.5, {"limit_nm": 3.0}, lambda rows, _: set(values(rows)) == {3.0}),
+    ("torque_step", 0.5, {"step_nm": 40.0}, lambda rows, _: np.all(values(rows) > 40.0)),
+    ("counter_jump", 0.5, {}, lambda rows, last: (rows[0][1] - last[1]) & 0xFFFF == 1001 and steps(rows) == {1}),
+    ("rate_off", 1.0, {}, lambda rows, _: len(rows) == pytest.approx(1680, abs=1)),
+    ("angle_stuck", 1.0, {}, lambda rows, _: len(set(values(rows))) == 1 and steps(rows) == {1}),
+    ("angle_silent", 1.0, {}, lambda rows, _: rows == []),
+    ("angle_jump", 5.0, {"step_deg": 15.0, "probability": 0.05}, jumps),
+    ("angle_nan", 1.0, {"probability": 0.3}, lambda rows, _: 0.2 < np.isnan(values(rows)).mean() < 0.4),
+    ("angle_offset_step", 1.0, {"step_deg": 7.0}, lambda rows, last: rows[0][0] == near(last[0] + 7.0)),
+    ("angle_reversed", 1.0, {}, turned),
+    ("angle_reversed", 0.1, {"about_present": False}, lambda rows, _: np.all(values(rows) - 10.0 < -60.0)),
+    ("angle_noise_burst", 5.0, {"sd_deg": 3.0}, lambda rows, _: 3.8 < np.diff(values(rows)).std() < 4.7),
+    ("angle_fault_bit", 1.0, {}, lambda rows, _: {row[2] for row in rows} == {1} and rows[-1][0] > rows[0][0]),
+    ("angle_frames_lost", 10.0, {}, lambda rows, _: steps(rows) >= {1, 2} and 1750 < len(rows) < 1850),
+    ("angle_frames_repeated", 5.0, {}, lambda rows, _: steps(rows) == {0, 1}),
+    ("angle_counter_jump", 1.0, {"step": 500}, lambda rows, last: rows[0][1] == last[1] + 501),
+    ("angle_rate_off", 10.0, {"percent": -8.0}, lambda rows, _: len(rows) == pytest.approx(1840, abs=2)),
+]
+"""A fault, for how long, its settings, and what its sensor's frames must show after the last one before it."""
+
+
+@pytest.mark.parametrize(
+    ("name", "seconds", "settings", "shows"), SHOWN, ids=[f"{name} {more}" for name, _, more, _ in SHOWN]
+)
+def test_it_shows(host: Host, name: str, seconds: float, settings: dict[str, Any], shows: Callable[..., Any]) -> None:
+    can_id = ANGLE if name in OF_THE_ANGLE else CELL
+    last = host.rows(0.1, can_id)[-1]
+    with broken(host, name, **settings):
+        rows = host.rows(seconds, can_id)
+    assert shows(rows, last), rows[:20]
+
+
+def test_every_fault_ends_without_a_trace_in_the_readings(host: Host) -> None:
+    for name in library():
+        with broken(host, name):
+            host.answers(LL_CONFIG, PULSE)
+            host.frames(0.1)
+        host.frames(0.1)
+        began_s, frames = host.timeline.now_s, host.frames(0.2)
+        cell, angle = ([LAYOUT.unpack(f.data) for f in frames if f.can_id == can_id] for can_id in (CELL, ANGLE))
+        assert (len(cell), len(angle)) == (pytest.approx(320, abs=1), pytest.approx(40, abs=1)), name
+        assert steps(cell) == steps(angle) == {1} and {row[2] for row in angle} == {0}, name
+        late_deg = values(angle) - 70.0 - 5.0 * (began_s + 0.005 * np.arange(len(angle)))
+        assert np.abs(late_deg).max() < 0.05 and 3.0 < np.median(values(cell)) < 12.0, name
+
+
+def test_errors_of_the_bus(host: Host) -> None:
     with broken(host, "error_frames", probability=0.5):
         errors = [frame for frame in host.frames() if frame.error]
         assert 0.4 < len(errors) / 800 < 0.6
@@ -106,26 +163,69 @@ def test_bus_errors(host: VirtualHost) -> None:
         assert [(frame.can_id, frame.error) for frame in host.frames()] == [(0x20000040, True)]
 
 
-def test_counter_jump_and_rate_off(host: VirtualHost) -> None:
-    before = host.samples()[-1]
-    with broken(host, "counter_jump", step=1000):
-        assert (host.samples()[0][1] - before[1]) & 0xFFFF == 1001
-        assert set(host.steps()) == {1}
-    with broken(host, "rate_off", percent=5.0):
-        assert len(host.samples(1.0)) == pytest.approx(1680, abs=1)
+def test_delivery_jitter_keeps_order_and_stamps_and_loses_nothing_when_it_ends(host: Host) -> None:
+    host.devices.faults.on("delivery_jitter", {"largest_s": 0.03}, for_s=0.5)
+    frames = host.frames(0.6)
+    for can_id, count in ((CELL, 960), (ANGLE, 120)):
+        rows = [(LAYOUT.unpack(frame.data)[1], frame) for frame in frames if frame.can_id == can_id]
+        assert len(rows) == count and {after[0] - before[0] for before, after in pairwise(rows)} == {1}
+        late_s = np.array([frame.time_s - 1e-6 * frame.time_us for _, frame in rows])
+        assert 0.008 < late_s.max() <= 0.03 and np.abs(late_s[-10:]).max() < 1e-6
 
 
-def test_for_s_ends_by_itself(host: VirtualHost) -> None:
+def test_clock_jitter(host: Host) -> None:
+    def spread_us() -> float:
+        return float(np.diff([frame.time_us for frame in host.frames(2.0) if frame.can_id == CELL]).std())
+
+    assert spread_us() == 0.0
+    with broken(host, "clock_jitter", sd_us=100):
+        assert spread_us() == pytest.approx(math.sqrt(2) * 100, rel=0.15)
+
+
+def test_for_s_ends_by_itself(host: Host) -> None:
     host.devices.faults.on("cell_silent", {}, for_s=0.1)
-    assert len(host.samples(0.5)) == pytest.approx(640, abs=1)
+    assert len(host.rows(0.5, CELL)) == pytest.approx(640, abs=1)
     assert host.devices.faults.active() == []
 
 
-def test_every_fault_can_be_switched(host: VirtualHost) -> None:
-    for name in library():
-        if not name.startswith("angle_"):
-            with broken(host, name):
-                host.ask(LL_CONFIG, PULSE)
+def test_an_angle_sensor_that_is_unplugged_starts_anew(host: Host) -> None:
+    with broken(host, "angle_unplugged"):
+        assert host.rows(1.0) == []
+    assert host.rows(0.01)[0][1] == 0
+
+
+def test_an_angle_is_delayed_by_what_was_asked_and_stamped_as_if_not(host: Host) -> None:
+    now = host.timeline.now_s
+    with broken(host, "angle_delayed", delay_s=0.2):
+        rows = host.rows(1.0)
+    late_deg = 70.0 + 5.0 * (now + 0.005 * np.arange(len(rows))) - values(rows)
+    assert late_deg[-1] == pytest.approx(1.0, abs=0.03) and steps(rows) == {1}
+
+
+def test_in_the_cells_frame_readings_fail_and_frames_are_the_cells() -> None:
+    host = Host(angle="in-cell", cell="with_angle")
+    host.devices.faults.on("angle_nan", {})
+    host.devices.faults.on("angle_fault_bit", {})
+    assert {struct.unpack("<fhBB", frame.data)[1::2] for frame in host.frames(0.1)} == {(-32768, 2)}
+    with pytest.raises(HardwareSimError, match="use the load cell's fault"):
+        host.devices.faults.on("angle_silent", {})
+
+
+NONSENSE = {
+    "angle_delayed": {"delay_s": math.nan}, "angle_rate_off": {"percent": -100.0}, "clock_jitter": {"sd_us": -1},
+    "delivery_jitter": {"largest_s": math.nan},
+}  # fmt: skip
+
+
+def test_nonsense_is_told(host: Host) -> None:
+    for name, settings in NONSENSE.items():
+        with pytest.raises(HardwareSimError, match=f"'{name}': setting '{next(iter(settings))}'"):
+            host.devices.faults.on(name, settings)
+    assert host.devices.faults.active() == []
+    armless = VirtualHost()
+    for name in OF_THE_ANGLE:
+        with pytest.raises(HardwareSimError, match="start it with --arm"):
+            armless.devices.faults.on(name, {})
 
 
 @pytest.fixture(scope="module")

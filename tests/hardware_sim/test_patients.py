@@ -10,7 +10,7 @@ from scipy.signal import lsim
 
 from bench.muscles.offline import simulate
 from stimrig.hardware_sim import patients
-from stimrig.hardware_sim.errors import PatientError
+from stimrig.hardware_sim.errors import HardwareSimError
 from stimrig.hardware_sim.patients.paper import PaperMuscle
 from stimrig.hardware_sim.patients.paper import Parameters as PaperParameters
 from tests.harness.muscle import Patient
@@ -98,7 +98,7 @@ class TestRegistry:
         path = tmp_path / "patient.toml"
         if text is not None:
             path.write_text(text)
-        with pytest.raises(PatientError) as caught:
+        with pytest.raises(HardwareSimError) as caught:
             patients.from_file(path)
         assert told in str(caught.value)
         assert str(path) in str(caught.value)

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from stimrig.hardware_sim.stimulators.rehastim2 import RehaStim2
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2
-from tests.hardware_sim.bench_board import Bench
+from tests.hardware_sim.virtual_host import VirtualHost
 
 INIT, INIT_ACK, UNKNOWN, WATCHDOG, GET_MODE, INIT_LIST, START, STOP, SINGLE, ERROR = 1, 2, 3, 4, 10, 30, 32, 34, 36, 38
 OK, TRANSFER, PARAMETER, WRONG_MODE, BUSY = 0, -1, -2, -3, -8
 START_MODE, INITIALISED, STARTED = 0, 1, 2
 
 
-class Host(Bench):
+class Host(VirtualHost):
     """A RehaStim 2's, which acknowledges at once."""
 
     def __init__(self) -> None:
-        super().__init__(RehaStim2)
+        super().__init__(stimulator="rehastim2", rate_hz=10.0)
 
     def packets(self, command: int) -> list[Packet]:
         return [packet for _, packet in self.sent if packet.command == command]
@@ -35,10 +34,10 @@ class Host(Bench):
         return self.sent[-1][1].data[1]
 
     def widths(self) -> list[float]:
-        return [width for _, width, _ in self.muscle.pulses]
+        return [width for _, width, _ in self.pulses]
 
     def times(self) -> list[float]:
-        return [time for time, _, _ in self.muscle.pulses]
+        return [time for time, _, _ in self.pulses]
 
 
 def pulse(width_us: int, current_ma: int, mode: int = 0) -> bytes:
@@ -88,7 +87,7 @@ class TestConnection:
         assert bench.packets(GET_MODE + 1) == []
         bench.run(1.0)
         assert len(bench.packets(INIT)) == 3
-        assert bench.muscle.pulses == []
+        assert bench.pulses == []
 
     def test_watchdog_command_keeps_the_connection_without_an_ack(self, connected: Host) -> None:
         have = len(connected.sent)
@@ -117,7 +116,7 @@ class TestConnection:
         connected.send(command, setup() if command == INIT_LIST else b"")
         connected.run(1.0)
         assert connected.firmware.state()["mode"] != "none"
-        connected.firmware.received(ScienceMode2.encode(Packet(1, WATCHDOG, b""))[:2] + b"\x00\x81\x57\x01\x04\x0f")
+        connected.receive(ScienceMode2.encode(Packet(1, WATCHDOG, b""))[:2] + b"\x00\x81\x57\x01\x04\x0f")
         connected.run(0.3)
         assert connected.firmware.state()["mode"] == "none"
 
@@ -128,9 +127,9 @@ class TestConnection:
     def test_a_damaged_command_is_a_transfer_error(self, connected: Host) -> None:
         frame = bytearray(ScienceMode2.encode(Packet(6, SINGLE, pulse(300, 24))))
         frame[-2] ^= 0x40
-        connected.firmware.received(bytes(frame))
+        connected.receive(bytes(frame))
         assert connected.sent[-1][1] == Packet(6, SINGLE + 1, bytes((TRANSFER & 0xFF,)))
-        assert connected.muscle.pulses == []
+        assert connected.pulses == []
         assert connected.firmware.state()["corrupt_frames"] == 1
 
 
@@ -138,10 +137,10 @@ class TestSinglePulse:
     def test_a_pulse_is_balanced_and_flows_at_receipt(self, connected: Host) -> None:
         now_s = connected.timeline.now_s
         assert connected.result(SINGLE, pulse(300, 24)) == OK
-        assert connected.muscle.pulses == [(now_s, 300.0, 24.0)]
+        assert connected.pulses == [(now_s, 300.0, 24.0)]
         assert connected.electrodes.unbalanced_pulses == 0
         connected.run(1.0)
-        assert len(connected.muscle.pulses) == 1
+        assert len(connected.pulses) == 1
 
     @pytest.mark.parametrize(
         ("asked", "given"), [((300, 25), (300, 24)), ((20, 126), (20, 126)), ((500, 2), (500, 2)), ((21, 3), (21, 2))]
@@ -150,14 +149,14 @@ class TestSinglePulse:
         self, connected: Host, asked: tuple[int, int], given: tuple[int, int]
     ) -> None:
         assert connected.result(SINGLE, pulse(*asked)) == OK
-        assert connected.muscle.pulses[0][1:] == given
+        assert connected.pulses[0][1:] == given
 
     @pytest.mark.parametrize("asked", [(0, 20), (19, 20), (501, 20), (65535, 20), (250, 127), (250, 255), (300, 1)])
     def test_beyond_the_limits_and_without_current_there_is_no_pulse(self, connected: Host, asked: tuple[int, int]):
         assert connected.result(SINGLE, pulse(*asked)) == (OK if asked[1] == 1 else PARAMETER)
         assert connected.result(SINGLE, pulse(250, 20)[1:]) == PARAMETER
         assert connected.result(SINGLE, pulse(250, 20, mode=8)) == PARAMETER
-        assert (connected.muscle.pulses, connected.electrodes.log) == ([], [])
+        assert (connected.pulses, connected.electrodes.log) == ([], [])
 
     def test_start_mode_only(self, running: Host) -> None:
         assert running.result(SINGLE, pulse(300, 24)) == WRONG_MODE
@@ -172,11 +171,11 @@ class TestSinglePulse:
         assert connected.result(SINGLE, pulse(300, 24)) == BUSY
         connected.run(20e-6)
         assert connected.result(SINGLE, pulse(300, 24)) == OK
-        assert len(connected.muscle.pulses) == 2
+        assert len(connected.pulses) == 2
 
     def test_the_muscle_hangs_on_channel_1(self, connected: Host) -> None:
         assert connected.result(SINGLE, pulse(300, 24, mode=1)) == OK
-        assert connected.muscle.pulses == []
+        assert connected.pulses == []
         assert connected.packets(ERROR) == [Packet(1, ERROR, b"\xfe")]
 
 
@@ -203,9 +202,9 @@ class TestChannelList:
     def test_stop_ends_it_and_the_mode(self, running: Host) -> None:
         running.run(0.1)
         assert running.result(STOP) == OK
-        fired = len(running.muscle.pulses)
+        fired = len(running.pulses)
         running.run(1.0)
-        assert len(running.muscle.pulses) == fired
+        assert len(running.pulses) == fired
         assert running.mode() == START_MODE
         assert running.result(START, pulse(250, 20)) == WRONG_MODE
         assert running.result(STOP) == OK
@@ -244,20 +243,20 @@ class TestErrors:
     )
     def test_the_device_stops_by_itself_and_says_why_once(self, running: Host, break_it, error: int) -> None:
         running.run(0.05)
-        delivered = len(running.muscle.pulses)
+        delivered = len(running.pulses)
         break_it(running)
         running.run(0.5)
         assert running.packets(ERROR) == [Packet(1, ERROR, bytes((error & 0xFF,)))]
-        assert len(running.muscle.pulses) == delivered
+        assert len(running.pulses) == delivered
         assert running.mode() == START_MODE
         assert running.result(SINGLE, pulse(300, 24)) == OK  # taken, then failed
         assert running.sent[-1][1] == Packet(2, ERROR, bytes((error & 0xFF,)))
-        assert len(running.muscle.pulses) == delivered
+        assert len(running.pulses) == delivered
 
     def test_reset_forgets_everything_and_offers_a_connection_anew(self, running: Host) -> None:
         running.firmware.reset()
-        fired, have = len(running.muscle.pulses), len(running.sent)
+        fired, have = len(running.pulses), len(running.sent)
         running.send(START, pulse(250, 20))
         running.run(0.6)
-        assert len(running.muscle.pulses) == fired
+        assert len(running.pulses) == fired
         assert [packet for _, packet in running.sent[have:]] == [Packet(0, INIT, b"\x01")]

@@ -258,6 +258,16 @@ def kill_hard(process: Process) -> None:
     process.popen.wait()
 
 
+def later(bench: Bench) -> dict[str, Any]:
+    """What the emulator says half a second of its own time later."""
+    began_s = bench.state()["time_s"]
+    end = time.monotonic() + 60
+    while (state := bench.state())["time_s"] < began_s + 0.5:
+        assert time.monotonic() < end
+        time.sleep(0.02)
+    return state
+
+
 def made_ready(bench: Bench, client: RigClient) -> tuple[Bench, RigClient]:
     """A pair without faults, re-armed, whose events are read."""
     for name in bench.fault(cmd="faults")["active"]:

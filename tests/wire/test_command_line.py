@@ -7,11 +7,13 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
-from tests.harness.processes import ROOT, Bench, Process, RigClient
+from stimrig.rig import __main__ as program
+from tests.harness.processes import ROOT, Bench, Process, RigClient, later
 
 pytestmark = pytest.mark.wire
 
@@ -29,32 +31,42 @@ ANSWERS = "no\nyes\n"
 """Nobody pulls at the emulator's lever; the dummy load is there."""
 
 
-def run(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "stimrig.rig", *arguments]
-    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=60, check=False)
+@pytest.fixture(scope="module")
+def fast(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
+    """An emulator four times as fast as the world: what a check listens to is judged by the devices' clocks."""
+    bench = Bench(tmp_path_factory.mktemp("fast"), "--noise-seed", "7", speed=4.0)
+    yield bench
+    bench.close()
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Callable[..., int]:
+    """The command's exit code, in this process and without its log."""
+    monkeypatch.setattr(program.logs, "configure", lambda *_: None)
+    return lambda *arguments: program.main([str(argument) for argument in arguments])
 
 
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [("/data", "/rig.toml/data", "data_dir"), ("{folder}/rig.sock", "{folder}/" + "x" * 120, "socket")],
 )
-def test_a_mistake_is_one_line_and_exit_2(tmp_path: Path, old: str, new: str, words: str):
+def test_a_mistake_is_one_line_and_exit_2(
+    tmp_path: Path, run: Callable[..., int], capsys: pytest.CaptureFixture[str], old: str, new: str, words: str
+):
     path = tmp_path / "rig.toml"
     path.write_text(CONFIG.replace(old, new).format(folder=tmp_path))
-    ended = run("--config", str(path))
-    assert ended.returncode == 2
-    lines = [line for line in ended.stderr.splitlines() if not line.startswith("{")]  # beside the log
-    assert len(lines) == 1
-    assert words in lines[0]
-    assert ended.stdout == ""
+    assert run("--config", path) == 2
+    output, errors = capsys.readouterr()
+    assert (output, errors.count("\n")) == ("", 1) and words in errors
 
 
-def test_check_reads_the_file_and_the_dbc_only(tmp_path: Path):
+def test_check_reads_the_file_and_the_dbc_only(
+    tmp_path: Path, run: Callable[..., int], capsys: pytest.CaptureFixture[str]
+):
     path = tmp_path / "rig.toml"
     path.write_text(CONFIG.format(folder=tmp_path))
-    ended = run("--config", str(path), "--check")
-    assert ended.returncode == 0
-    assert json.loads(ended.stdout)["stimulator"] == "p24"
+    assert run("--config", path, "--check") == 0
+    assert json.loads(capsys.readouterr().out)["stimulator"] == "p24"
 
 
 def test_a_port_that_is_not_there_is_told_until_it_is(emulator: Bench, tmp_path: Path):
@@ -63,7 +75,7 @@ def test_a_port_that_is_not_there_is_told_until_it_is(emulator: Bench, tmp_path:
     path.write_text(
         CONFIG.format(folder=tmp_path).replace("port = 9", f"port = {emulator.emulator.ready['can']['port']}")
     )
-    rig = Process("rig", "--config", str(path), log=tmp_path / "rig.log")
+    rig = Process("stimrig.rig", "--config", str(path), log=tmp_path / "rig.log")
     try:
         assert rig.ready["state"] == "disconnected"
         client = RigClient(tmp_path / "rig.sock")
@@ -84,13 +96,13 @@ def check(bench: Bench, folder: Path, *module: str) -> subprocess.Popen[str]:
     )  # fmt: skip
 
 
-def test_one_small_pulse_where_a_person_says_yes(emulator: Bench, tmp_path: Path) -> None:
-    before = len(emulator.felt())
-    out, err = check(emulator, tmp_path, "stimrig.rig.check").communicate(ANSWERS, timeout=120)
+def test_one_small_pulse_where_a_person_says_yes(fast: Bench, tmp_path: Path) -> None:
+    before = len(fast.felt())
+    out, err = check(fast, tmp_path, "stimrig.rig.check").communicate(ANSWERS, timeout=120)
     report = json.loads(out)
     outcomes = {step["name"]: step["outcome"] for step in report["steps"]}
     assert outcomes.pop("sign of the torque") == "not done", err
-    pulses = emulator.felt()[before:]
+    pulses = fast.felt()[before:]
     pulse = next(step for step in report["steps"] if step["name"] == "test pulse")
     if "DROPPED" in pulse["figure"]:  # the machine stood still while it was due
         assert pulses == []
@@ -102,22 +114,21 @@ def test_one_small_pulse_where_a_person_says_yes(emulator: Bench, tmp_path: Path
 @pytest.mark.parametrize(
     ("module", "end"), [(["stimrig.rig.check"], signal.SIGINT), (["stimrig", "rig", "check"], signal.SIGKILL)]
 )
-def test_ctrl_c_stops_the_stimulator(emulator: Bench, tmp_path: Path, module: list[str], end: int) -> None:
+def test_ctrl_c_stops_the_stimulator(fast: Bench, tmp_path: Path, module: list[str], end: int) -> None:
     """And so does the end of the command that started the check."""
-    before = emulator.state()["pulses_received"]
-    process = check(emulator, tmp_path, *module)
+    before = fast.state()["pulses_received"]
+    process = check(fast, tmp_path, *module)
     assert process.stdin is not None
     process.stdin.write(ANSWERS)
     process.stdin.flush()
     end_s = time.monotonic() + 60
-    while emulator.state()["mode"] == "none":  # until the stimulator is made ready for the pulse
+    while fast.state()["mode"] == "none":  # until the stimulator is made ready for the pulse
         assert process.poll() is None and time.monotonic() < end_s, process.communicate()
         time.sleep(0.02)
     process.send_signal(end)
     out, err = process.communicate(timeout=60)  # until the check itself has ended, too
     assert (process.returncode, out) == (130 if end == signal.SIGINT else -end, ""), err
     assert err.strip().splitlines()[-1] == "check: interrupted; the stimulator was stopped"
-    state = emulator.state()
+    state = fast.state()
     assert state["mode"] == "none", "it was told to stop, not only left alone"
-    time.sleep(0.3)
-    assert emulator.state()["pulses_received"] == state["pulses_received"] <= before + 1
+    assert later(fast)["pulses_received"] == state["pulses_received"] <= before + 1

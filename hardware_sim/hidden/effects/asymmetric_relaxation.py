@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from stimrig.hardware_sim.hidden.base import Base, force_after, lag_after, second_order_step
+from stimrig.hardware_sim.hidden.base import force_after, lag_after, second_order_step
 from stimrig.hardware_sim.hidden.forms import Effect, Sign, draws, mostly, second_order, two_lags
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, STEP_S
 
 EFFECT = Effect()
 
 
-def _lags(rng: Generator, base: Base) -> tuple[float, float]:
+def _lags(rng, base):
     """The time constant that becomes asymmetric, and the other."""
     fast, slow = base.two_lags_s()
     return (slow, fast) if rng.random() < 0.7 else (fast, slow)

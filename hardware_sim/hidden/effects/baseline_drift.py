@@ -5,16 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, Sign, draws
 from stimrig.hardware_sim.hidden.kernels import TIME_S, smooth_table
 
 EFFECT = Effect()
 
 
-def _knots(rng: Generator, _base: Base) -> list[float]:
+def _knots(rng, _base):
     knots = np.concatenate([[0.0], np.cumsum(rng.normal(0.0, 1.0, 199))])
     return list(knots / np.abs(knots[:6]).max())
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base, delayed
+from stimrig.hardware_sim.hidden.base import delayed
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, STEP_S
 
@@ -33,7 +32,7 @@ def _lags(x, p, s, c):
     return x
 
 
-def _delays(rng: Generator, _base: Base) -> Numbers:
+def _delays(rng, _base):
     shape = np.sort(rng.uniform(0.6, 1.4, 10))  # large fast axons, recruited first, conduct faster
     return Numbers(shape, earliest=float(shape[0]), latest=float(shape[-1]))
 

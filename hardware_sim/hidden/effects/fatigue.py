@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws
 from stimrig.hardware_sim.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, SPEED, STEP_S
 
@@ -44,7 +42,7 @@ def _three_compartments(x, p, s, c):
 UNITS = 24
 
 
-def _rates(rng: Generator, _base: Base) -> Numbers:
+def _rates(rng, _base):
     rate = np.sort(np.exp(rng.normal(0.0, 0.7, UNITS)))[::-1]  # large fast units come first under stimulation
     recovery = rng.uniform(0.01, 0.04, UNITS)
     return Numbers((*rate, *recovery), fastest_over_slowest=float(rate[0] / rate[-1]))

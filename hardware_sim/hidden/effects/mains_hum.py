@@ -5,20 +5,18 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws
 from stimrig.hardware_sim.hidden.kernels import STEP_S, TIME_S, normal
 
 EFFECT = Effect("added")
 
 
-def _mains(rng: Generator, _base: Base) -> float:
+def _mains(rng, _base):
     return float(rng.choice([50.0, 60.0]) + rng.normal(0.0, 0.01))
 
 
-def _amplitudes(rng: Generator, _base: Base) -> Numbers:
+def _amplitudes(rng, _base):
     amplitude = np.array([1.0, 0.1, 0.4, 0.05, 0.2]) * rng.uniform(0.3, 1.2, 5)
     parts = np.column_stack([amplitude, rng.uniform(0.0, 2.0 * np.pi, 5)]).ravel()
     return Numbers(parts, harmonics=amplitude.tolist())

@@ -5,9 +5,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base, second_order_step
+from stimrig.hardware_sim.hidden.base import second_order_step
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws, second_order
 from stimrig.hardware_sim.hidden.kernels import LARGEST_NM, STEP_S
 
@@ -42,7 +41,7 @@ EFFECT.form(
 SPREAD = 7
 
 
-def _times(rng: Generator, base: Base) -> Numbers:
+def _times(rng, base):
     share, z = rng.dirichlet(np.full(SPREAD, 4.0)), np.linspace(-1.5, 1.5, SPREAD)
     z = z - float(share @ z)
     return Numbers((base.t_omega_s, base.zeta, *share, *z), shares=share.tolist())

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws
 from stimrig.hardware_sim.hidden.kernels import ANGLE_RAD, STEP_S, VELOCITY_RAD_S
 
 EFFECT = Effect(moving=True)
 
 
-def _spring(rng: Generator, _base: Base) -> Numbers:
+def _spring(rng, _base):
     per_rad = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.4, 0.7))
     slack = 0.5 * math.pi - math.copysign(float(rng.uniform(0.1, 0.6)), per_rad)
     return Numbers((per_rad, slack), lengths_per_rad=per_rad, slack_rad=slack)

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from numpy.random import Generator
-
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, draws
 from stimrig.hardware_sim.hidden.kernels import ACTIVATION, FORCE, LARGEST_NM, PULSE, STEP_S
 
 EFFECT = Effect("larger")
 
 
-def _decay_per_s(rng: Generator, _base: Base) -> float:
+def _decay_per_s(rng, _base):
     return 1.0 / float(rng.uniform(15.0, 80.0))
 
 

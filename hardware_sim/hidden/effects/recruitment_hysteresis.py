@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base, look_up
+from stimrig.hardware_sim.hidden.base import look_up
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws, recruitment_table
 
 EFFECT = Effect()
@@ -31,7 +30,7 @@ def _bouc_wen(x, p, s, c):
 SIDE = 20
 
 
-def _plane(rng: Generator, base: Base) -> Numbers:
+def _plane(rng, base):
     top = float(base.largest_width_us)
     i, j = np.tril_indices(SIDE)
     gap = (i - j) * top / SIDE
@@ -62,7 +61,7 @@ def _preisach(x, p, s, c):
     return max(x + p[0] * shift, 0.0) if x > 0.0 else 0.0
 
 
-def _half_gaps(rng: Generator, _base: Base) -> Numbers:
+def _half_gaps(rng, _base):
     shape = np.exp(rng.normal(0.0, 0.4, 512))
     larger_above = float(rng.uniform(-0.5, 0.8))
     shape *= 1.0 + larger_above * np.linspace(-0.5, 0.5, 512)

@@ -5,9 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, Sign, draws, mostly
 from stimrig.hardware_sim.hidden.kernels import STEP_S, TIME_S, WIDTH_US, smooth_table
 
@@ -43,7 +41,7 @@ def _strength_duration(x, p, s, c):
     return max(x * (p[2] * (1.0 + change) - 1.0) / (p[2] - 1.0), 0.0)
 
 
-def _knots(rng: Generator, _base: Base) -> Numbers:
+def _knots(rng, _base):
     sign = MOSTLY_UP.draw(rng)
     steps = np.abs(rng.normal(1.0, 0.5, 199)) * np.exp(-np.arange(199) / 12.0)
     knots = np.concatenate([[0.0], np.cumsum(steps)])

@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 
-from numpy.random import Generator
-
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, draws
 from stimrig.hardware_sim.hidden.kernels import ANGLE_RAD
 
 EFFECT = Effect(moving=True)
 
 
-def _best_rad(rng: Generator, _base: Base) -> float:
+def _best_rad(rng, _base):
     return float(0.5 * math.pi + rng.choice([-1.0, 1.0]) * rng.uniform(0.15, 0.6))
 
 
-def _coefficients(rng: Generator, _base: Base) -> list[float]:
+def _coefficients(rng, _base):
     first = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.1, 0.5))
     return [first, -float(rng.uniform(0.2, 0.8)), float(rng.uniform(-0.2, 0.2))]
 

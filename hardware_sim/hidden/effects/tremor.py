@@ -6,9 +6,7 @@ import math
 from typing import Any
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws
 from stimrig.hardware_sim.hidden.kernels import FORCE, STEP_S, TIME_S, normal
 
@@ -50,7 +48,7 @@ def _wandering(x, p, s, c):
 EFFECT.form("action tremor, grows with force", "McAuley and Marsden 2000", **OSCILLATOR, _with_force=1.0)(_wandering)
 
 
-def _lines(rng: Generator, _base: Base) -> Numbers:
+def _lines(rng, _base):
     centre = float(rng.uniform(3.4, 7.5))
     lines = np.column_stack([centre + rng.uniform(-0.35, 0.35, 3), rng.uniform(0.0, 2.0 * np.pi, 3)])
     return Numbers(lines.ravel(), lines_hz=lines[:, 0].tolist())

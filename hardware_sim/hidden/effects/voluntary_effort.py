@@ -3,26 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import numpy as np
-from numpy.random import Generator
 
-from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws
-from stimrig.hardware_sim.hidden.kernels import STEP_S, TIME_S, normal
+from stimrig.hardware_sim.hidden.kernels import STEP_S, TIME_S, helper, normal
 
 EFFECT = Effect("all")
-
-
 EVENTS = 60
 
 
-def _efforts(
-    between_s: tuple[float, float], lengths_s: tuple[float, float], shapes: Callable[[Generator], np.ndarray]
-) -> Callable[[Generator, Base], Numbers]:
-    def draw(rng: Generator, _base: Base) -> Numbers:
-        starts_s, lasts_s = _events(rng, between_s), rng.uniform(*lengths_s, EVENTS)
+def _efforts(between_s, lengths_s, shapes):
+    def draw(rng, _base):
+        gaps = rng.uniform(*between_s, EVENTS)
+        starts_s = float(rng.uniform(0.0, 5.0)) + np.cumsum(gaps) - gaps[0] * float(rng.uniform(0.0, 0.8))
+        lasts_s = rng.uniform(*lengths_s, EVENTS)
         table = np.column_stack([starts_s, lasts_s, rng.uniform(0.5, 1.5, EVENTS), shapes(rng)])
         if rng.random() < 0.15:  # the antagonist's
             table[:, 2] *= -1.0
@@ -31,9 +26,13 @@ def _efforts(
     return draw
 
 
-def _events(rng: Generator, between_s: tuple[float, float]) -> np.ndarray:
-    gaps = rng.uniform(*between_s, EVENTS)
-    return float(rng.uniform(0.0, 5.0)) + np.cumsum(gaps) - gaps[0] * float(rng.uniform(0.0, 0.8))
+@helper
+def _begun(p, c):
+    """How many events have begun; the start of each is at p[1], p[5], …"""
+    count = 0
+    while count < EVENTS and c[TIME_S] >= p[1 + 4 * count]:
+        count += 1
+    return count
 
 
 @EFFECT.form("smooth bumps", "bell-shaped efforts, Flash and Hogan 1985")
@@ -45,11 +44,8 @@ def _events(rng: Generator, between_s: tuple[float, float]) -> np.ndarray:
 )
 def _bumps(x, p, s, c):
     """p: size N·m, then for each event: start s, length s, height, skewness. Raised cosines."""
-    for i in range(60):
-        start = p[1 + 4 * i]
-        if c[TIME_S] < start:
-            break
-        part = (c[TIME_S] - start) / p[2 + 4 * i]
+    for i in range(_begun(p, c)):
+        part = (c[TIME_S] - p[1 + 4 * i]) / p[2 + 4 * i]
         if part < 1.0:
             x += p[0] * p[3 + 4 * i] * 0.5 * (1.0 - math.cos(2.0 * math.pi * part ** p[4 + 4 * i]))
     return x
@@ -64,11 +60,8 @@ def _bumps(x, p, s, c):
 )
 def _ramps(x, p, s, c):
     """p: size, then for each event: start, length, height, share of it spent rising (and falling). Smooth ramps."""
-    for i in range(60):
-        start = p[1 + 4 * i]
-        if c[TIME_S] < start:
-            break
-        length = p[2 + 4 * i]
+    for i in range(_begun(p, c)):
+        start, length = p[1 + 4 * i], p[2 + 4 * i]
         since_start, until_end = c[TIME_S] - start, start + length - c[TIME_S]
         if until_end > 0.0:
             edge = p[4 + 4 * i] * length
@@ -86,10 +79,8 @@ def _ramps(x, p, s, c):
 )
 def _spasms(x, p, s, c):
     """p: size, then for each event: start, decay s, height, rise s. Quick rise, exponential release."""
-    for i in range(60):
+    for i in range(_begun(p, c)):
         age = c[TIME_S] - p[1 + 4 * i]
-        if age < 0.0:
-            break
         decay, rise = p[2 + 4 * i], p[4 + 4 * i]
         if age < 12.0 * decay:
             x += p[0] * p[3 + 4 * i] * (math.exp(-age / decay) - math.exp(-age / rise)) * 1.3
