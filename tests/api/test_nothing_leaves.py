@@ -9,14 +9,12 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from stimrig import identify
-from stimrig.api.jobs.curves import curves, rounded
 from stimrig.api.models.explanation import step_versions
 from stimrig.api.models.story import story
 from stimrig.api.web.pages.report_file import comparison_html, story_html
+from tests.api import stub_worker
 from tests.api.browser import look_closer, open_tab, settled
 from tests.api.conftest import Service, play_test, shared_service
-from tests.api.test_jobs import made_up_csv
 
 pytestmark = pytest.mark.browser
 LINK = '<a href="https://elsewhere.example/">here</a>'
@@ -101,13 +99,10 @@ def test_no_request_leaves_a_page_whatever_is_pressed(tab: Any, service: Service
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A report of each kind, of a recording that tries to bring links into its charts."""
-    folder = tmp_path_factory.mktemp("reports")
-    record = made_up_csv(folder / "record.csv")
-    record.write_text(record.read_text().replace(",prbs", ',"' + LINK.replace('"', '""') + '"'))
-    read = identify.read(record)
-    model = identify.fit(read)
-    drawn, against = curves(model, read), rounded(identify.compare(model, read).to_dict())
-    (folder / "compare.html").write_text(comparison_html(model.to_dict(), drawn, LINK, None, against))
+    folder, segments = tmp_path_factory.mktemp("reports"), [{"name": LINK, "start_s": 0.0, "end_s": 20.0}]
+    drawn, against = stub_worker.curves(lambda *_: None), stub_worker.comparison(lambda *_: None)
+    drawn["segments"], against["where"] = segments, [{**against["where"][0], "segment": LINK, "text": LINK}]
+    (folder / "compare.html").write_text(comparison_html(stub_worker.model([LINK]), drawn, LINK, None, against))
     steps = [
         {"added": added, "fit_percent": 97.0, "rms_nm": rms, "held_out_rms_nm": rms, "held_out_fit_percent": 97.0}
         for added, rms in ((None, 0.12), (LINK, 0.041))
