@@ -5,10 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-import os
 import re
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -33,17 +30,11 @@ def block(language: str) -> str:
 GOOD = block("python")
 
 
-def run(words: list[str], place: Path, effects: str = "", status: int = 0) -> str:
-    """What a command says, on standard output or, where it fails, in one line on standard error."""
-    command = [str(Path(sys.executable).with_name("stimrig")), *words]
-    environment = os.environ | {"STIMRIG_EFFECTS_DIR": effects}
-    done = subprocess.run(command, cwd=place, env=environment, capture_output=True, text=True, timeout=900)
-    assert done.returncode == status, done.stderr
-    if status == 0:
-        return done.stdout
-    (line,) = done.stderr.strip().splitlines()
-    assert done.stdout == ""
-    return line
+def answer(words: list[str]) -> str:
+    """What a command says on standard output."""
+    with contextlib.redirect_stdout(io.StringIO()) as out:
+        assert main.run(words) == 0
+    return out.getvalue()
 
 
 @pytest.fixture(scope="module")
@@ -66,10 +57,8 @@ def test_every_command_of_the_page_does_what_it_says(place: Path, monkeypatch: p
         assignment, name, *words = line.split()
         assert (assignment, name) == ("STIMRIG_EFFECTS_DIR=my_effects", "stimrig")
         flags = [] if words[0] == "predict" else ["--json"]
-        out = io.StringIO()
-        with few_effects.only("fatigue", "tremor"), contextlib.redirect_stdout(out):
-            assert main.run(words + flags) == 0
-        outputs[words[0]] = out.getvalue()
+        with few_effects.only("fatigue", "tremor"):
+            outputs[words[0]] = answer(words + flags)
     assert "sensor_gain_swing" in [effect["id"] for effect in json.loads(outputs["effects"])["effects"]]
     found = json.loads(outputs["diagnose"])
     assert found["verdict"] == "effect_missing"
@@ -86,11 +75,13 @@ def test_every_command_of_the_page_does_what_it_says(place: Path, monkeypatch: p
 
 @pytest.mark.campaign  # on one record it is found in every run, above
 @pytest.mark.parametrize("seed", [3011, 3012, 3013, 3014])
-def test_it_is_found_on_other_records_that_have_it(place: Path, seed: int) -> None:
+def test_it_is_found_on_other_records_that_have_it(place: Path, monkeypatch, seed: int) -> None:
     """The emulator's own amplifiers: period, phase and shape are drawn by the seed. No seed was looked at before."""
     record = hidden_records.generate("sensor_gain_swing", "strong", seed=seed, rate_hz=100)
     hidden_records.write_csv(record, place / f"{seed}.csv")
-    found = json.loads(run(["diagnose", f"{seed}.csv", "--json"], place, "my_effects"))
+    monkeypatch.chdir(place)
+    monkeypatch.setenv("STIMRIG_EFFECTS_DIR", "my_effects")
+    found = json.loads(answer(["diagnose", f"{seed}.csv", "--json"]))
     first, true = found["missing"][0], record["truth"]["parameters"]["sensor_gain_swing"]
     assert first["effect"] == "sensor_gain_swing"
     assert first["parameters"]["period_s"]["value"] == pytest.approx(true["period_s"], rel=0.02)
@@ -169,17 +160,16 @@ def test_two_files_of_one_id_are_told(tmp_path, monkeypatch) -> None:
     assert "is also in " in told(tmp_path, monkeypatch, GOOD)
 
 
-def test_the_command_line_says_it_in_one_line(tmp_path: Path) -> None:
-    rows = "".join(f"{k / 40},{100 * (k // 20 % 2)},{0.1 * (k % 7)},prbs\n" for k in range(400))
-    (tmp_path / "r.csv").write_text("time_s,pulse_width_us,torque_nm,segment\n" + rows)
+def test_the_command_line_says_it_in_one_line(tmp_path: Path, monkeypatch, capsys) -> None:
     (tmp_path / "mine.py").write_text(GOOD.replace('stage="output"', 'stage="outptu"'))
-    line = run(["diagnose", "r.csv"], tmp_path, str(tmp_path), status=2)
-    assert line.startswith(f"stimrig diagnose: {tmp_path / 'mine.py'}, form 'sine': no stage is called 'outptu'")
+    monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
+    assert main.run(["effects"]) == 2
+    told = capsys.readouterr()
+    assert told.out == "" and told.err.count("\n") == 1
+    line = f"stimrig effects: {tmp_path / 'mine.py'}, form 'sine': no stage is called 'outptu'"
+    assert told.err.startswith(line)
 
 
 def test_an_effect_that_is_not_found_names_the_way_to_its_file() -> None:
     with pytest.raises(stimrig.errors.BadRequest, match=r"set STIMRIG_EFFECTS_DIR to the folder with its .*fatigue"):
         effects.find_effect("sensor_gain_swing")
-
-
-# ---- names ----
