@@ -15,16 +15,8 @@ RIG_STATUS = {"refused": 422, "rest-needed": 422, "bad-plan": 422, "disconnected
 class ApiError(Exception):
     """Root of the service's errors: a problem that can be shown to the client as it is.
 
-    Parameters
-    ----------
-    status : int
-        HTTP status.
-    code : str
-        Stable id, the last part of the problem's ``type``.
-    title, detail : str
-        What is wrong, and where, and the fix.
-    extra : dict
-        More members of the problem, e.g. ``holder`` or ``errors``.
+    `status`: of HTTP; `code`: stable id, the last part of the problem's ``type``; `title`, `detail`: what is wrong, and
+    where, and the fix; `extra`: more members of the problem, as ``holder`` or ``errors``.
     """
 
     def __init__(self, status: int, code: str, title: str, detail: str = "", **extra: Any) -> None:

@@ -29,21 +29,11 @@ def read(
 ) -> Any:
     """Read one file, or several joined to one record.
 
-    Parameters
-    ----------
-    paths : sequence of Path
-        At least one; where all begins are known they are put in the order of time.
-    needs : sequence of str
-        Columns that each of them must have.
-    name : callable, optional
-        How a file is called in an error, by its number from 0; default: its path.
-    note : callable, optional
-        Gets what was assumed, a line each.
+    `paths`: at least one; where all begins are known they are put in the order of time. `needs`: columns that each of
+    them must have. `name`: how a file is called in an error, by its number from 0; else its path. `note`: gets what was
+    assumed, a line each.
 
-    Raises
-    ------
-    BadRecord
-        A file cannot be read or lacks a column, or they do not go together: names the file.
+    Raises BadRecord: a file cannot be read or lacks a column, or they do not go together: names the file.
     """
     called = [name(number) if name else str(path) for number, path in enumerate(paths)]
     records = [identify.read(path, map=columns) for path in paths]

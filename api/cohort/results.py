@@ -40,21 +40,11 @@ TIMES = {"day": date, "begun_utc": datetime, "computed_utc": datetime}
 
 
 class Results:
-    """The results of one run; a `with` statement holds their lock.
+    """The results of one run, in a Parquet file `output`; a `with` statement holds their lock.
 
-    Parameters
-    ----------
-    output : Path
-        The Parquet file to write.
-    task : Task
-        With the options that all rows share.
-    again : bool
-        Compute records with a transient error again.
+    `task`: with the options that all rows share; `again`: compute records with a transient error again.
 
-    Raises
-    ------
-    CohortError
-        The place cannot be written, another run writes it, or what is there was made with other options.
+    Raises CohortError: the place cannot be written, another run writes it, or it was made with other options.
     """
 
     def __init__(self, output: Path, task: Task, again: bool = False) -> None:

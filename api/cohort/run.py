@@ -43,23 +43,11 @@ def run_cohort(
 ) -> dict[str, Any]:  # fmt: skip
     """Do one verb with every record, and write the results; return the keys of `--json`.
 
-    Parameters
-    ----------
-    verb : str
-        fit, diagnose or improve.
-    data : sequence of str
-        Files, folders.
-    output : Path
-        Parquet file. If it has results of the same options, what is new is added.
-    **options
-        Those of the command line.
+    `verb`: fit, diagnose or improve; `data`: files, folders, addresses; `output`: Parquet file: if it has results of
+    the same options, what is new is added. The others are options of the command line.
 
-    Raises
-    ------
-    CohortError
-        An option is wrong, an address is missing, or a scheduler does not answer.
-    InterruptedRunError
-        The run cannot go on.
+    Raises CohortError: an option is wrong, an address is missing, or a scheduler does not answer. InterruptedRunError:
+    the run cannot go on.
     """
     task = Task(verb, Selection(select).text, method, tuple(effects), tuple(columns or ()), software_version())
     task.check()
@@ -89,12 +77,8 @@ def run_records(
 
     `results` is open; the caller joins them. `total`: of the entries, for the bar.
 
-    Raises
-    ------
-    CohortError
-        An address is missing, or a worker has another version.
-    InterruptedRunError
-        The scheduler is gone, a worker cannot compute, or the disk is full.
+    Raises CohortError: an address is missing, or a worker has another version. InterruptedRunError: the scheduler is
+    gone, a worker cannot compute, or the disk is full.
     """
     counts, selection = Counter[str](), Selection(task.select)
     with records_bar(total) as bar:

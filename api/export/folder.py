@@ -43,27 +43,11 @@ def export_records(
 ) -> dict[str, Any]:
     """Write records into a folder; return the keys of `stimrig export --json`.
 
-    Parameters
-    ----------
-    data : sequence of str
-        Files, folders.
-    folder : Path
-        New, or empty.
-    format : str
-        A key of `WRITERS`.
-    select : str
-        Which of them.
-    columns : sequence of str
-        Columns of other tools' tables, as --map gives them.
-    dates : bool
-        Whether `records.csv` has the columns of `DATED`.
+    `data`: files, folders, addresses; `folder`: new, or empty; `format`: a key of `WRITERS`; `select`: which of them;
+    `columns`: of other tools' tables, as --map gives them; `dates`: whether `records.csv` has the columns of `DATED`.
 
-    Raises
-    ------
-    BadRequest
-        There is no such format or column, or pyarrow is missing.
-    CohortError
-        An address is missing, or the folder is not empty or cannot be written.
+    Raises BadRequest: there is no such format or column, or pyarrow is missing. CohortError: an address is missing, or
+    the folder is not empty or cannot be written.
     """
     check_format(format)
     parse_column_map(columns)

@@ -22,14 +22,9 @@ MOST_QUEUED = 50
 class Pool:
     """A few workers and a queue; the fit after a test goes before everything else.
 
-    Parameters
-    ----------
-    workers : int
-        Processes. Of several the first is kept free for urgent jobs. A pool of one keeps what its process remembers.
-    worker : callable
-        Makes a `Worker`; tests put another in its place.
-    background : bool
-        Whether one more process, of low priority, does jobs that nobody waits for. A new test cancels them.
+    `workers`: processes. Of several the first is kept free for urgent jobs; a pool of one keeps what its process
+    remembers. `worker`: makes a `Worker`; tests put another in its place. `background`: whether one more process, of
+    low priority, does jobs that nobody waits for; a new test cancels them.
     """
 
     def __init__(self, workers: int, worker: Callable[..., Worker] = Worker, *, background: bool = False) -> None:

@@ -36,16 +36,8 @@ class _Context(ForkServerContext):
 class Process:
     """A pool of one process, which is started by `start` and ended by `kill` or by its work.
 
-    Parameters
-    ----------
-    modules : sequence of str
-        Loaded before the memory is limited.
-    memory_bytes : int
-        What calls may take beyond these.
-    nice : int
-        How far it stands back.
-    most_calls : int
-        After so many it is replaced: what a library never gives back does not add up.
+    `modules`: loaded before the memory is limited; `memory_bytes`: what calls may take beyond these; `nice`: how far it
+    stands back; `most_calls`: after so many it is replaced, so that what a library never gives back does not add up.
     """
 
     def __init__(self, modules: Sequence[str], memory_bytes: int, nice: int = 0, most_calls: int = 10**9) -> None:

@@ -64,7 +64,9 @@ class Worker:
         except TimeoutError:
             self.end()
             await self.close()
-            raise too_long(job.kind, limit_s) from None
+            words = f"The {job.kind} was ended after {limit_s:g} s. "
+            words += "If the machine is not busy, cut the recording, or lower its rate."
+            raise ApiError(422, "data", "The data do not allow this", words) from None
         except BrokenExecutor:
             code = await self.close()
             raise (cancelled() if job.state == "cancelled" else died(job.kind, code)) from None
@@ -113,14 +115,6 @@ class Worker:
         """Wait for the process that has ended or was killed; return its exit code."""
         self._stop_reading()
         return await asyncio.to_thread(self.process.close)
-
-
-def too_long(kind: str, seconds: float) -> ApiError:
-    """Return the error of a job that was ended because it took too long."""
-    detail = (
-        f"The {kind} was ended after {seconds:g} s. If the machine is not busy, cut the recording, or lower its rate."
-    )
-    return ApiError(422, "data", "The data do not allow this", detail)
 
 
 def died(kind: str, code: int | None) -> ApiError:

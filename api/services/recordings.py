@@ -78,7 +78,12 @@ async def take_in(
     part = uploads.part_of(whole)
     try:
         with _about_the_upload(part):
-            assumed = await _rename_columns(context, part, columns) if columns else []
+            assumed: list[str] = []
+            if columns:
+                out = str(part.with_suffix(".plain"))
+                table = await context.pool.submit("plain_csv", data=str(part), out=out, columns=list(columns)).result
+                await asyncio.to_thread(Path(out).replace, part)
+                assumed = table["notes"]
             fitted = await context.analyses.run("fit", data=str(part))
         new = Recording(id=whole.stem, participant=code, test_id=None, path=str(whole), origin="upload")
         new.file_sha256 = await asyncio.to_thread(sha256_of, part)
@@ -87,7 +92,8 @@ async def take_in(
         await _read_samples(context)
         of = await asyncio.to_thread(_other_owner, context, new, principal, fitted.get("of") or "", of)
     except BaseException:  # refused, or nobody waits for it any more
-        part.unlink(missing_ok=True)
+        for left in (part, part.with_suffix(".plain")):
+            left.unlink(missing_ok=True)
         raise
 
     def keep() -> tuple[Recording, Model]:
@@ -136,17 +142,6 @@ def _other_owner(context: Context, new: Recording, principal: Principal, stated_
         button = f"Take the recording of {owner} for {code}"
         more = {"confirm": {"title": title, "button": button, "rows": [], "warnings": [detail], "token": owner}}
     raise ApiError(409, "other-participant", title, detail, of=owner, **more)
-
-
-async def _rename_columns(context: Context, path: Path, columns: Sequence[str]) -> list[str]:
-    """Replace an upload by the CSV table converted from it; return what was assumed."""
-    out = path.with_suffix(".plain")
-    try:
-        table = await context.pool.submit("plain_csv", data=str(path), out=str(out), columns=list(columns)).result
-        await asyncio.to_thread(out.replace, path)
-    finally:
-        out.unlink(missing_ok=True)
-    return table["notes"]
 
 
 @contextlib.contextmanager

@@ -141,7 +141,10 @@ class Follower(Watcher):
         if kind != "next":
             request = EnoughRequest(test_id=test_id, by=SERVICE, at_once=kind == "enough")
             # before the request: samples that arrive during it are not part of this decision
-            ended = "known-enough" if kind == "enough" else self._spent()
+            assert self._newest is not None and self.plan.adaptive is not None
+            left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
+            spent = "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"  # no room for another piece
+            ended = "known-enough" if kind == "enough" else spent
             status.state, status.ended = "ending", status.ended or ended
         self._added += (widths := [segment.settings["pulse_width_us"] for segment in chosen])
         try:
@@ -157,12 +160,6 @@ class Follower(Watcher):
             return
         row["sample_to_plan_ms"] = round(1e3 * (self.clock.monotonic_s() - received_s), 1)
         self.kind.publish()
-
-    def _spent(self) -> str:
-        """Return which bound leaves no room for another piece."""
-        assert self._newest is not None and self.plan.adaptive is not None
-        left_s = self.plan.adaptive.max_duration_s - self._newest.boundary_s
-        return "time" if left_s < SHORTEST_PIECE_S + SAFE_END_S else "torque-time"
 
     def _played_so_far(self, event: LiveEvent) -> tuple[list[float], list[tuple[str, int, int]]]:
         """Return the width of each scheduled pulse, and the segments."""

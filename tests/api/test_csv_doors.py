@@ -13,12 +13,10 @@ from hypothesis import strategies as st
 
 from stimrig import identify
 from stimrig.api import record_files
-from stimrig.api.cli import main
 from stimrig.api.cli.files import inversion_table
 from stimrig.identify.records import cells
 from stimrig.identify.records.join import write_joined
 from stimrig.identify.records.record import Record, Source
-from tests.harness.cohort_records import Session, write
 
 HOSTILE = ("=HYPERLINK(1)", "+1+cmd|' /C calc'!A0", "-2+3", "@SUM(1)", "\uff1d1", "a;=1", "'=1")
 
@@ -59,25 +57,6 @@ def test_a_recording(tmp_path: Path) -> None:
     given, back = identify.read(tmp_path / "in.csv"), identify.read(tmp_path / "out.csv")
     assert back.segment_names == given.segment_names
     assert np.array_equal(back.torque_nm, given.torque_nm)
-
-
-def test_an_export(tmp_path: Path) -> None:
-    """The records, the list of them, and the list of what could not be exported."""
-    data = tmp_path / "data"
-    data.mkdir()
-    for number, text in enumerate(HOSTILE):
-        write(data / f"{number}.h5", Session(f"{text}{number}", seed=number, kind=text))
-    (data / "=broken.csv").write_text("a,b\n=1,2\n")
-    assert main.run(["export", str(data), "-o", str(tmp_path / "out"), "--json"]) == 1
-    tables = sorted((tmp_path / "out").iterdir())
-    assert len(tables) == len(HOSTILE) + 2
-    for path in tables:
-        texts_of(path)
-    codes = texts_of(tmp_path / "out" / "records.csv", "participant")
-    assert codes == {cells.cell_text(f"{text}{number}") for number, text in enumerate(HOSTILE)}
-    assert "broken" in " ".join(texts_of(tmp_path / "out" / "errors.csv", "address"))
-    (tmp_path / "errors.csv").write_text("".join(cells.lines([("address", "reason"), ("=a", "-c")])))
-    assert texts_of(tmp_path / "errors.csv", "address", "reason") == {"'=a", "'-c"}
 
 
 COLUMNS = ("pulse_width_us", "reference_torque_nm", "predicted_torque_nm")

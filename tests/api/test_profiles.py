@@ -109,7 +109,7 @@ def test_the_least_limits_are_the_stimulators_finest_steps() -> None:
     assert (least["current_ma"], least["max_pulse_width_us"]) == (FINEST.current_ma, FINEST.shortest_us)
 
 
-@pytest.mark.parametrize("form", ["utf-8-sig", "utf-16-le", "utf-16-be", "utf-32-le", "utf-32-be", "utf-16", "utf-32"])
+@pytest.mark.parametrize("form", ["utf-8-sig", "utf-16-le", "utf-32"])
 def test_what_is_not_in_plain_utf_8_is_refused_at_the_door(
     client: httpx.Client, tight: dict[str, float], form: str
 ) -> None:

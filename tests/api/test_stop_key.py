@@ -69,29 +69,6 @@ def test_any_key_stops_a_running_test(
     assert termios.tcgetattr(terminal.program) == before, "the terminal is as it was"
 
 
-def test_a_key_stops_what_the_service_has_not_yet_heard_of(
-    client: httpx.Client, service: Service, participant: str, terminal: Terminal, monkeypatch: pytest.MonkeyPatch
-) -> None:
-
-    async def last_known() -> Any:
-        return service.context.rig.status
-
-    monkeypatch.setattr(service.context.rig, "fresh_status", last_known)
-    monkeypatch.setattr(service.rig, "_send", lambda _event: None)
-    with terminal.watch(at_service(service.url, TOKEN)):
-        started(client, service, participant)
-        assert client.get("/v1/rig").json()["state"] == "ready" and service.rig.state == "running"
-        assert terminal.press() == stop_key.CONFIRMED
-    assert service.rig.stopped_by == "administrator"
-
-
-def test_a_key_is_no_stray_one_where_the_service_does_not_hear_its_rig(service: Service, terminal: Terminal) -> None:
-    with service.client() as http, terminal.watch(at_service(service.url, TOKEN)):
-        service.rig_thread.__exit__(None, None, None)
-        soon(lambda: not http.get("/v1/rig").json()["connected"], 20)
-        assert "emergency switch" in terminal.press()
-
-
 def test_a_key_while_nothing_runs_does_not_latch(service: Service, terminal: Terminal) -> None:
     with terminal.watch(at_rig(service.rig.path)):
         assert terminal.press(b"\n") == stop_key.NOTHING
@@ -162,7 +139,11 @@ def test_a_key_stops_stimrig_test_once_it_plays_and_keeps_it_from_beginning_befo
     assert service.rig.starts == int(plays)
 
 
-@pytest.mark.parametrize("body", ["null", "[]", "{}", "<p>", '{"state": "ready", "connected": true, "age_s": 9.0}'])
+@pytest.mark.parametrize("body", [
+    "null", "[]", "{}", "<p>", '{"state": "ready", "connected": true, "age_s": 9.0, "holder": null}',
+    '{"state": "ready", "connected": false, "age_s": 0.1, "holder": null}',
+    '{"state": "ready", "connected": true, "age_s": 0.1, "holder": {"test_id": "T1"}}',
+])  # fmt: skip
 def test_nothing_that_a_service_says_of_its_rig_keeps_a_key_from_stopping(monkeypatch: pytest.MonkeyPatch, body: str):
     posted: list[str] = []
 

@@ -87,28 +87,23 @@ def check_rig_file(settings: Settings) -> Iterator[Finding]:
 def examine_port(device: str, port: Path) -> Finding:
     """Check a serial port."""
     rights = "add this user to the port's group (dialout), or install deploy/udev/70-stimrig.rules; sign in again"
-    for wrong, text, fix in (
-        (
-            not port.exists(),
-            "is not there",
-            "plug it in and switch it on; `ls -l /dev/serial/by-id` shows what is there",
-        ),
-        (not port.is_char_device(), "is no serial port", "give its name under /dev in the rig file"),
-        (not os.access(port, os.R_OK | os.W_OK), "may not be read and written by this user", rights),
-    ):
-        if wrong:
-            return Finding(device, "fails", f"{port} {text}", fix)
+    if not port.exists():
+        fix = "plug it in and switch it on; `ls -l /dev/serial/by-id` shows what is there"
+        return Finding(device, "fails", f"{port} is not there", fix)
+    if not port.is_char_device():
+        return Finding(device, "fails", f"{port} is no serial port", "give its name under /dev in the rig file")
+    if not os.access(port, os.R_OK | os.W_OK):
+        return Finding(device, "fails", f"{port} may not be read and written by this user", rights)
     return Finding(device, "ok", f"{port} is there and may be used")
 
 
 def examine_interface(channel: str) -> Finding:
     """Check that a CAN interface is up."""
     flags = Path("/sys/class/net") / channel / "flags"
+    up = flags.exists() and int(flags.read_text(), 16) & 1
+    says = f"{channel} is {'up' if up else 'down'}" if flags.exists() else f"there is no interface {channel}"
     fix = f"plug the adapter in; systemctl start stimrig-can@{channel} brings it up"
-    if not flags.exists():
-        return Finding("load cell", "fails", f"there is no interface {channel}", fix)
-    up = int(flags.read_text(), 16) & 1
-    return Finding("load cell", "ok" if up else "fails", f"{channel} is {'up' if up else 'down'}", fix)
+    return Finding("load cell", "ok" if up else "fails", says, fix)
 
 
 def check_rig(settings: Settings) -> Iterator[Finding]:
