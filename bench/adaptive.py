@@ -1,6 +1,6 @@
 """An adaptive test against fixed tests, on the same simulated patients.
 
-    python -m bench.adaptive --patients 40 --seeds 80000 [--kinds sigmoid,shaped] [--hidden 20] [--json FILE]
+    python -m bench.adaptive --patients 40 --seeds 80000 [--kinds sigmoid,shaped] [--json FILE]
 
 Each patient has noise of 0.05 N·m at 400 Hz, the same in every test. Seeds from 50000 were developed on. Tests: the
 paper's (PRBS and ramp with their rests, 29.7 s, without the held-out levels of the default test), the protocol `short`
@@ -11,7 +11,6 @@ torque of random levels.
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 import warnings
@@ -23,10 +22,6 @@ import numpy as np
 
 from bench.common import bench_parser, table, write_json_lines
 from stimrig import identify
-from stimrig.hardware_sim.hidden.library import STILL
-from stimrig.hardware_sim.hidden.scenario import draw_scenario, rng_of
-from stimrig.identify.diagnosis import diagnose
-from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.estimation.earlier import Earlier
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.experiments.adaptive import Target
@@ -35,7 +30,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.rig import protocols
 from stimrig.rig.sequences import build
-from tests.harness.adaptive import Hidden, Muscle, Played, play, recorded, shaped, sigmoid
+from tests.harness.adaptive import Muscle, Played, play, recorded, shaped, sigmoid
 
 RATE_HZ, NOISE_NM = 400.0, 0.05
 TARGET = Target()
@@ -163,55 +158,6 @@ def compare_tests(kind: str, seed: int, wanted: str) -> list[dict[str, Any]]:
     ]
 
 
-def hidden_muscle(seed: int) -> tuple[str, str, Hidden]:
-    """Name and strength of one hidden effect, and the muscle."""
-    for attempt in range(20):
-        rng = rng_of(seed, "adaptive", str(attempt))
-        effect, strength = str(rng.choice(STILL)), str(rng.choice(["weak", "middle", "strong"]))
-        try:
-            return effect, strength, Hidden(draw_scenario((effect,), strength, seed + attempt, noise_sd_nm=NOISE_NM))
-        except ValueError:
-            continue
-    raise ValueError(f"seed {seed}: no muscle found")
-
-
-def hidden(seed: int) -> dict[str, Any]:
-    """Diagnose one hidden effect after our test, after the paper's test, and after the paper's test played twice."""
-    workers.WORKERS = 1
-    effect, strength, muscle = hidden_muscle(seed)
-    noise = np.random.default_rng([seed, 5]).standard_normal(int(3 * LONGEST_S * RATE_HZ)) * NOISE_NM
-    paper = paper_test(muscle.top_us, held_out=True)
-    dose = float(np.sum(muscle.curve(paper[0]))) / 40.0
-    played = play(muscle, noise, TARGET, left_s=LONGEST_S / 2.0, left_nm_s=dose)
-    adaptive_test = played.widths_us, played.names
-    if played.decision.kind == "misfit":
-        adaptive_test = np.r_[adaptive_test[0], paper[0]], adaptive_test[1] + paper[1]
-    tests = {"ours": adaptive_test, "paper": paper, "paper twice": (np.tile(paper[0], 2), paper[1] * 2)}
-    line: dict[str, Any] = {"seed": seed, "effect": effect, "strength": strength, "ended": played.decision.kind}
-    for name, test in tests.items():
-        diagnosis = diagnose(recorded(muscle, *test, noise, RATE_HZ))
-        line[name] = {
-            "verdict": diagnosis.verdict,
-            "named": [entry["effect"] for entry in diagnosis.missing],
-            "group": diagnosis.missing[0]["confused_with"] if diagnosis.missing else [],
-            "dose_share": round(float(np.sum(muscle.curve(test[0]))) / 40.0 / dose, 3),
-        }
-    return line
-
-
-def hidden_table(rows: list[dict[str, Any]]) -> list[str]:
-    """Count for each test the diagnoses that name the effect."""
-    lines = []
-    for test in ("ours", "paper", "paper twice"):
-        first = sum(line[test]["named"][:1] == [line["effect"]] for line in rows)
-        others = sum(bool(line[test]["named"]) and line["effect"] not in line[test]["named"] for line in rows)
-        nothing = sum(not line[test]["named"] for line in rows)
-        share = float(np.median([line[test]["dose_share"] for line in rows]))
-        lines.append([test, len(rows), first, others, nothing, f"{100 * share:.0f} %"])
-    heads = "test; n; named first; only others named; nothing named; dose, of the paper's, median"
-    return table(heads.split("; "), lines)
-
-
 def medians(rows: list[dict[str, Any]]) -> list[str]:
     """Medians and counts as lines of a table."""
     heads = "patients; test; n; unseen, %; against the paper's test, points; dose, N·m·s; dose; time, s; time"
@@ -250,7 +196,6 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=80_000, help="the first")
     parser.add_argument("--kinds", default="sigmoid,shaped")
     parser.add_argument("--peers", default="paper; short; ours, new; ours, known")
-    parser.add_argument("--hidden", type=int, default=0, help="patients with one hidden effect")
     parser.add_argument("--json", type=Path, help="every row goes here, one a line")
     settings = parser.parse_args()
     warnings.filterwarnings("ignore", category=RuntimeWarning)
@@ -261,11 +206,6 @@ def main() -> None:
             print(seed, kind, file=sys.stderr, flush=True)
         write_json_lines(settings.json, rows)
     print(*(medians(rows) if rows else []), sep="\n")
-    hidden_rows: list[dict[str, Any]] = []
-    for seed in range(settings.seeds, settings.seeds + settings.hidden):
-        hidden_rows.append(hidden(seed))
-        print(json.dumps(hidden_rows[-1]), file=sys.stderr, flush=True)
-    print(*(hidden_table(hidden_rows) if hidden_rows else []), sep="\n")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,6 @@
 """f, G, g and h of simulated arms from joined records, beside the truth; see docs/moving-joint.md.
 
     python -m bench.moving_joint --arms 1000:1050 [--json FILE]
-    python -m bench.moving_joint --arms 1000:1016 --sensors clean,noise,steps,late,all
-
-With `--sensors` the angle is read by each of them instead, in the unseen trial too: what its error costs, all tests
-joined.
 
 The arms come from `hardware_sim.arm_patient`, whose laws and distributions were written apart from the library. Arms
 0 to 99 were developed on; report on arms from 1000. Of each arm: the paper's isometric test, and the three guided tests
@@ -15,34 +11,22 @@ from __future__ import annotations
 
 import sys
 import time
-from functools import partial
-from itertools import product
 from typing import Any
 
 import numpy as np
 
 from bench.common import bench_parser, in_processes, write_json, written_by
 from bench.muscles.arm_patient import ArmPatient, arm_patient
-from bench.muscles.arm_records import ENCODER, AngleSensor, record
+from bench.muscles.arm_records import record
 from stimrig.api.sessions import joint_plan
-from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.fitting import MOVING_JOINT, fit
 from stimrig.identify.model import Model
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.predict import predict, problem_of, sensor_cost_nm
+from stimrig.identify.simulation.predict import predict
 from tests.harness.carried_sessions import as_record
 
-SENSORS = {
-    "clean": ENCODER,
-    "noise": AngleSensor(noise_deg=0.3),
-    "steps": AngleSensor(step_deg=0.35),
-    "late": AngleSensor(delay_s=0.02),
-    "all": AngleSensor(noise_deg=0.3, step_deg=0.35, delay_s=0.02),
-}
 PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0
-EARLIER = 1_000_000
-"""Added to the seed of a trial that comes before the unseen one."""
 
 
 def torque_time_nms(arm: ArmPatient, simulated: dict[str, Any]) -> float:
@@ -69,60 +53,18 @@ def identify_arm(seed: int) -> dict[str, Any]:
     return row
 
 
-def identify_by_sensors(seed: int, names: tuple[str, ...]) -> dict[str, Any]:
-    """Identify one arm once for each named sensor, which reads the angle in its tests and in the unseen trial."""
-    arm, by_sensor = arm_patient(seed), {}
-    alone = fit(as_record(record(arm, "isometric", seed)))
-    for name in names:
-        sensor = SENSORS[name]
-        isometric = record(arm, "isometric", seed, sensor=sensor)
-        tests = joined([isometric, *guided_tests(arm, alone, isometric, seed, sensor)])
-        began = time.process_time()
-        model = fit(tests, effects=MOVING_JOINT)
-        unseen = record(arm, "unseen", seed, duration_s=UNSEEN_S, sensor=sensor)
-        by_sensor[name] = {"cpu_s": time.process_time() - began, **model.data["joint_sensor"]}
-        by_sensor[name] |= {"error": over_noise(model, unseen)}
-        cost_nm = sensor_cost_nm(*problem_of(model, make_grid(as_record(unseen))))
-        by_sensor[name]["cost"] = cost_nm / unseen["truth"]["noise_sd_nm"]
-        if name == "clean":
-            by_sensor["predict"] = {kind: noise_costs(arm, model, kind, seed) for kind in ("unseen", "reaching")}
-    return {"seed": seed, "sensors": by_sensor}
-
-
-def noise_costs(arm: ArmPatient, model: Model, kind: str, seed: int) -> dict[str, float]:
-    """Error along an angle with noise over that along a clean one; causal: with an earlier trial of the same kind."""
-    make = partial(record, arm, kind, duration_s=UNSEEN_S)
-    clean, noisy, earlier = (
-        make(seed=number, sensor=SENSORS[name])
-        for number, name in ((seed, "clean"), (seed, "noise"), (seed + EARLIER, "noise"))
-    )
-    clean_error = over_noise(model, clean)
-    return {
-        "both ways": over_noise(model, noisy) / clean_error,
-        "causal": over_noise(model, noisy, as_record(earlier)) / clean_error,
-    }
-
-
-def over_noise(model: Model, unseen: dict[str, Any], earlier: Record | None = None) -> float:
-    """Error of the prediction over the noise, root mean square; the load cell's zero is not the model's."""
-    error_nm = unseen["torque_nm"] - predict(model, as_record(unseen), earlier)
-    return float(np.std(error_nm - np.median(error_nm))) / unseen["truth"]["noise_sd_nm"]
-
-
-def guided_tests(
-    arm: ArmPatient, model: Model, isometric: dict[str, Any], seed: int, sensor: AngleSensor = ENCODER
-) -> list[dict[str, Any]]:
+def guided_tests(arm: ArmPatient, model: Model, isometric: dict[str, Any], seed: int) -> list[dict[str, Any]]:
     """The three tests as the service plans them with the model of the isometric test: passive, held, moving."""
     width_us, torque_nm = model.recruitment.table()
     top_us = float(arm.largest_width_us)
     curve = joint_plan.curve_of({"pulse_width_us": list(width_us), "torque_nm": list(torque_nm)}, top_us, None)
     every = round(isometric["time_s"].size / (isometric["time_s"][-1] * RATE_HZ))
     layout = joint_plan.layout(arm.range_rad, curve, top_us, isometric["pulse_width_us"][::every], RATE_HZ)
-    records = [record(arm, "passive", seed, duration_s=PASSIVE_S, sensor=sensor)]
+    records = [record(arm, "passive", seed, duration_s=PASSIVE_S)]
     for place, x in enumerate(layout.targets_rad):
-        held_record = record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held), sensor=sensor)
+        held_record = record(arm, "held", 10 * seed + place, angle_rad=x, parts=parts_of(layout.held))
         records.append(held_record)
-    return [*records, record(arm, "moving", seed, parts=parts_of(layout.moving), sensor=sensor)]
+    return [*records, record(arm, "moving", seed, parts=parts_of(layout.moving))]
 
 
 def parts_of(segments: list[dict[str, Any]]) -> list[tuple[str, np.ndarray]]:
@@ -214,43 +156,11 @@ def print_goals(rows: list[dict[str, Any]]) -> None:
     print(f"torque-time of the three over the paper's test: median {np.median(share):.2f}, largest {share.max():.2f}")
 
 
-def print_sensor_costs(rows: list[dict[str, Any]], names: tuple[str, ...]) -> None:
-    """Print the error and its part that is the sensor's, for each sensor."""
-    for name in names:
-        sensor_rows = [row["sensors"][name] for row in rows]
-        error, cost, cpu_s = (np.array([each[key] for each in sensor_rows]) for key in ("error", "cost", "cpu_s"))
-        apart = np.sqrt(np.maximum(error**2 - cost**2, 0.0))
-        late_ms = 1e3 * np.array([each["delay_s"] for each in sensor_rows])
-        print(
-            f"{name}: error {np.median(error):.2f} x noise (median), worst {error.max():.2f}, within 1.3: "
-            f"{np.sum(error <= 1.3)} of {error.size}; without the sensor's own cost ({np.median(cost):.2f}) "
-            f"{np.median(apart):.2f}, within 1.3: {np.sum(apart <= 1.3)}; delay found "
-            f"{np.median(late_ms):.1f} ms ({late_ms.min():.1f} to {late_ms.max():.1f}); "
-            f"fit {np.median(cpu_s):.1f} s of a processor, longest {cpu_s.max():.1f}"
-        )
-    if "clean" in names:
-        for kind, way in product(("unseen", "reaching"), ("both ways", "causal")):
-            ratio = np.array([row["sensors"]["predict"][kind][way] for row in rows])
-            print(
-                f"{kind}: the clean model on an angle with 0.3° of noise, {way}: {np.median(ratio):.2f} x its error on "
-                f"a clean one (median), worst {ratio.max():.2f}, within 1.5: {np.sum(ratio <= 1.5)} of {ratio.size}"
-            )
-
-
 def main() -> None:
     """Run."""
     parser = bench_parser(__doc__, "1000:1050", "--arms")
     parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--sensors", default="", help=f"some of {','.join(SENSORS)}")
     options = parser.parse_args()
-    if options.sensors:
-        names = tuple(options.sensors.split(","))
-        rows = list(in_processes(partial(identify_by_sensors, names=names), options.arms, options.workers))
-        arguments = f"--arms {options.arms.start}:{options.arms.stop} --sensors {options.sensors}"
-        print(written_by(f"python -m bench.moving_joint {arguments}"))
-        print_sensor_costs(rows, names)
-        write_json(options.json, rows)
-        return
     rows = []
     for row in in_processes(identify_arm, options.arms, options.workers):
         rows.append(row)

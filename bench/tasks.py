@@ -25,27 +25,13 @@ RATE_HZ = 40.0
 
 @dataclass(frozen=True)
 class Task:
-    """One record.
-
-    Parameters
-    ----------
-    name : str
-        For people.
-    record : Record
-        Rows of `validate` may not be fitted, and are scored.
-    unit : str
-        What the error is told in.
-    scale : float
-        One of that unit, in the record's torque.
-    true : bool
-        Whether it is the paper's muscle, with its five parameters.
-    """
+    """One record; rows of `validate` may not be fitted, and are scored."""
 
     name: str
     record: Record
-    unit: str = "× noise"
-    scale: float = 1.0
-    true: bool = False
+    unit: str = "× noise"  # what the error is told in
+    scale: float = 1.0  # one of that unit, in the record's torque
+    true: bool = False  # whether it is the paper's muscle, with its five parameters
 
     @property
     def rate_hz(self) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest, NotIdentifiable
-from stimrig.identify.estimation.effect_fit import add_effects, effect_names
+from stimrig.identify.estimation.effect_fit import add_effects
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.plain import renewed_curve
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
@@ -21,7 +21,6 @@ from stimrig.identify.methods.maximum_likelihood import start
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 
-AUTO = "auto"
 Progress = Callable[[float, str], None]
 MOVING_JOINT = ("passive_torque:surface|relaxing", "torque_angle:smooth", "torque_velocity:surface")
 """Effects with which `fit` estimates all of the paper's Fig. 2 together, from joined records: h(x, ẋ), then g(x, ẋ) as
@@ -48,7 +47,7 @@ def fit(
         Id of a method, see `identify.methods.methods()`.
     effects : sequence of str
         Ids of effects to add to the Hammerstein model, or "id:form" to choose the form; all are estimated jointly by
-        maximum likelihood. "auto" adds those that the evidence asks for, as `improve` does.
+        maximum likelihood.
     fit_on : sequence of str, optional
         Names of the segments to fit; by default all but `validate`, or those that the method needs.
     progress : callable, optional
@@ -89,8 +88,6 @@ def fit(
                 return chosen.fit(grid, names, **options)
             rows = fitted_rows(grid, names)
             report = progress or (lambda _share, _text: None)
-            if AUTO in wanted:
-                return _fit_auto(grid, raw, wanted, rows, options, report)
             return _fit_effects(grid, raw, wanted, rows, options, report)
     except np.linalg.LinAlgError as error:
         fix = "Check that torque follows the pulses."
@@ -100,27 +97,6 @@ def fit(
             listed = ", ".join(f"{key}={value}" for key, value in options.items())
             raise BadRequest(f"invalid option ({error})", place=listed, fix="See the options of the method.") from error
         raise
-
-
-def _fit_auto(
-    grid: Grid, raw: Raw, wanted: Sequence[str], rows: np.ndarray, options: dict[str, Any], progress: Progress
-) -> Model:
-    """Maximum likelihood with the effects that the evidence asks for."""
-    if len(wanted) > 1:
-        others = ", ".join(name for name in wanted if name != AUTO)
-        fix = f"Give {AUTO}, or a list of effects."
-        raise BadRequest(f"{AUTO} chooses the effects itself, but {others} is given as well", place="effects", fix=fix)
-    if options:
-        listed = ", ".join(sorted(options))
-        fix = "Leave out the options."
-        raise BadRequest(f"{AUTO} takes no options, but {listed} is given", place="effects", fix=fix)
-    from stimrig.identify.diagnosis.free import searched  # here: a fit without a search needs them not
-    from stimrig.identify.diagnosis.search import helpful
-
-    last = helpful(searched(grid, raw, progress, rows=rows)[0])[0][-1]
-    progress(1.0, "done")
-    added = f"effects added: {', '.join(effect_names(last.fitted)) or 'none'}"
-    return finish(MAXIMUM_LIKELIHOOD.id, last.fitted, [added], last.statistics)
 
 
 def _fit_effects(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass, field, replace
-from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,15 @@ from stimrig.identify.dynamics.linear import Linear, SecondOrder, linear_from_di
 from stimrig.identify.errors import BadModel
 from stimrig.identify.json_text import BadJson, json_value, parse
 from stimrig.identify.recruitment import Curve, basis_from_dict, landmarks
-from stimrig.identify.summary import Sheet, Summarised, estimate, fit_words, held_out_label, quantity
+from stimrig.identify.summary import (
+    Sheet,
+    Summarised,
+    estimate,
+    fit_words,
+    held_out_label,
+    parameter_words,
+    quantity,
+)
 from stimrig.identify.yardstick import repetition_words
 
 if TYPE_CHECKING:
@@ -24,20 +31,13 @@ if TYPE_CHECKING:
 SCHEMA_VERSION = "1.0"
 LARGEST_TEXT = 16 * 2**20
 """Characters. A model with 1000 knots and all effects has two million."""
+try:
+    MADE_BY = {"name": "stimrig", "version": version("stimrig")}
+except PackageNotFoundError:  # run from its folder, without an installation
+    MADE_BY = {"name": "stimrig", "version": "0"}
+MOST_PARAMETERS = 4
+"""Parameters of an effect that a summary shows."""
 WRITTEN_AS_THEY_ARE = ("fit", "residual_tests", "valid_for", "quality", "data", "joint", "extra", "software")
-
-
-@cache
-def _version() -> str:
-    try:
-        return version("stimrig")
-    except PackageNotFoundError:  # run from its folder, without an installation
-        return "0"
-
-
-def made_by() -> dict[str, Any]:
-    """Name and version of this software."""
-    return {"name": "stimrig", "version": _version()}
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ class Model(Summarised):
     extra: dict[str, Any] = field(default_factory=dict)  # what the method adds
     model_id: str = ""  # of this version
     created: str = ""  # UTC, ISO 8601
-    software: dict[str, Any] = field(default_factory=made_by)  # name and version
+    software: dict[str, Any] = field(default_factory=lambda: dict(MADE_BY))  # name and version
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""
@@ -192,11 +192,11 @@ class Model(Summarised):
         try:
             model = _from_dict(data)
             with np.errstate(all="ignore"):
-                table = model.recruitment.table()[1]
+                finite = np.isfinite(model.recruitment.table()[1]).all()
         except (KeyError, TypeError, ValueError, IndexError, AttributeError, ArithmeticError) as error:
             cause = " ".join(f"{type(error).__name__} {error}".split())[:100]
             raise BadModel(f"the parts do not match ({cause})", fix=model_schema.FIX) from error
-        if not np.isfinite(table).all():
+        if not finite:
             raise BadModel("the curve is not finite", place="recruitment.basis", fix=model_schema.FIX)
         for index, entry in enumerate(model.effects):
             _check_effect(entry, f"effects.{index}.parameters", model.recruitment.basis.largest_us)
@@ -237,7 +237,7 @@ class Model(Summarised):
             ("dynamics", self._dynamics()),
             ("recruitment", f"largest {largest}, at {quantity(top_us, 'µs')}; 5 % of it at {low}, 95 % at {high}"),
             ("baseline", estimate(self.baseline_nm, self._sd("baseline_nm"), "N·m")),
-            *[(str(effect["id"]), _parameters(effect.get("parameters", {}))) for effect in self.effects],
+            *[(str(effect["id"]), _some_parameters(effect.get("parameters", {}))) for effect in self.effects],
         ]
         if "pulse_width_us" in known and "pulse_rate_hz" in known:
             widths, rates = _span(known["pulse_width_us"], "µs"), _span(known["pulse_rate_hz"], "pulses/s")
@@ -275,6 +275,14 @@ def _from_dict(data: dict[str, Any]) -> Model:
     if coefficients.shape != (basis.size,):
         message = f"{coefficients.size} coefficients for a basis of {basis.size}"
         raise BadModel(message, place="recruitment.basis.coefficients_nm")
+    covariance, known = None, uncertainty.get("covariance")
+    if known:
+        values, matrix = np.asarray(known["values"], float), np.asarray(known["matrix"], float)
+        covariance, size = Covariance(tuple(known["names"]), values, matrix), len(known["names"])
+        if values.shape != (size,) or matrix.shape != (size, size):
+            message, place = "names, values and matrix differ in size", "uncertainty.covariance"
+            raise BadModel(message, place=place, fix=model_schema.FIX)
+    torque_nm, rate_nm_s = data.get("initial", (0.0, 0.0))[:2]
     return Model(
         method=str(data["method"]),
         recruitment=Curve(basis, coefficients),
@@ -282,10 +290,10 @@ def _from_dict(data: dict[str, Any]) -> Model:
         pulse_rate_hz=float(data["pulse_rate_hz"]),
         sample_rate_hz=float(data.get("record_rate_hz", data["sample_rate_hz"])),
         baseline_nm=float(data.get("baseline_nm", 0.0)),
-        initial=(float(data.get("initial", (0, 0))[0]), float(data.get("initial", (0, 0))[1])),
+        initial=(float(torque_nm), float(rate_nm_s)),
         noise=Noise(**{key: data["noise"][key] for key in vars(Noise()) if data.get("noise", {}).get(key) is not None}),
         effects=tuple(data.get("effects", ())),
-        covariance=_covariance(uncertainty.get("covariance")),
+        covariance=covariance,
         bands=uncertainty.get("bands", {}),
         reasons=tuple(data.get("reasons", ())),
         model_id=str(data.get("model_id", "")),
@@ -323,24 +331,10 @@ def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
     model_schema.check(values, {"type": "object", "properties": wanted, "x-needed": list(wanted)}, place)
 
 
-def _covariance(data: dict[str, Any] | None) -> Covariance | None:
-    if not data:
-        return None
-    names, size = tuple(data["names"]), len(data["names"])
-    values, matrix = np.asarray(data["values"], float), np.asarray(data["matrix"], float)
-    if values.shape != (size,) or matrix.shape != (size, size):
-        raise BadModel("names, values and matrix differ in size", place="uncertainty.covariance", fix=model_schema.FIX)
-    return Covariance(names, values, matrix)
-
-
-def _parameters(values: dict[str, Any], max_shown: int = 4) -> str:
-    parts = []
-    for name, entry in list(values.items())[:max_shown]:
-        entry = entry if isinstance(entry, dict) else {"value": entry}
-        value = estimate(entry.get("value"), entry.get("sd"), str(entry.get("unit") or "1"))
-        parts.append(f"{name} {value} {entry.get('direction') or ''}".rstrip())
-    more = len(values) - max_shown
-    return ", ".join([*parts, *([f"{more} more parameters"] if more > 0 else [])])
+def _some_parameters(parameters: dict[str, Any]) -> str:
+    words = parameter_words(parameters, MOST_PARAMETERS)
+    more = len(parameters) - len(words)
+    return ", ".join([*words, *([f"{more} more parameters"] if more else [])])
 
 
 def _span(value: Any, unit: str) -> str:

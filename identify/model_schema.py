@@ -24,19 +24,47 @@ LARGEST = 1e300
 """Largest number without a limit in the schema."""
 PLAUSIBLE = 1e6
 """Larger than any torque, N·m, or time, s, in a record."""
+PYTHON: dict[str, Any] = {
+    "object": dict, "array": list, "string": str, "boolean": bool, "number": int | float, "integer": int | float,
+    "null": NoneType,
+}  # fmt: skip
 NUMBERS = {"type": "object", "additionalProperties": {"type": "number"}}
 WITH_SD = {"type": "object", "additionalProperties": {"type": "object", "x-needed": ["value", "sd"]}}
+TABLES = ("g", "h_nm", "g_lower", "g_upper", "h_lower_nm", "h_upper_nm", "seen_g", "seen_h")
 
 
 def check_model(document: dict[str, Any]) -> None:
     """Raises BadModel: the document, or what its parts have to do with one another, is not as in a MODEL.json."""
     check(document, SCHEMA, "")
     for index, effect in enumerate(document.get("effects", ())):
-        _effect(effect, f"effects.{index}")
+        place, parameters = f"effects.{index}", effect["parameters"]
+        values = {name: parameter_value(value) for name, value in parameters.items()}
+        check(values, NUMBERS, f"{place}.parameters")
+        if "shape" in effect:  # a free effect has an sd for each parameter, and a value of each line at each place
+            check(parameters, WITH_SD, f"{place}.parameters")
+            count = len(effect["shape"]["at"])
+            as_many = {"type": "array", "items": {"type": "number"}, "minItems": count, "maxItems": count}
+            for name, line in effect["shape"]["lines"].items():
+                line_place = f"{place}.shape.lines.{name}"[:100]
+                check(line, {"type": "object", "additionalProperties": as_many}, line_place)
     if "joint" in document:
-        _tables(document["joint"])
-    if "narx" in document.get("extra", {}):
-        _narx(document["extra"]["narx"])
+        joint = document["joint"]
+        rows, columns = len(joint["angle_rad"]), len(joint["velocity_rad_s"])
+        for name in TABLES:
+            table = joint.get(name)
+            if table is not None and (len(table) != rows or any(len(row) != columns for row in table)):
+                raise BadModel(f"not {rows} rows of {columns}", place=f"joint.{name}", fix=FIX)
+    if (narx := document.get("extra", {}).get("narx")) is not None:
+        if len(narx["terms"]) != len(narx["weights"]):
+            raise BadModel("terms and weights differ in number", place="extra.narx", fix=FIX)
+        largest = max((index for term in narx["terms"] for index in term), default=-1)
+        if not (largest < len(narx["variables"])):
+            raise BadModel(f"a term uses variable {largest}, which does not exist", place="extra.narx.terms", fix=FIX)
+
+
+def parameter_value(value: Any) -> Any:
+    """The number of a parameter, which is given alone or as {"value", "sd", "unit"}."""
+    return value["value"] if isinstance(value, dict) and "value" in value else value
 
 
 def check(value: Any, schema: dict[str, Any], place: str) -> None:
@@ -45,49 +73,36 @@ def check(value: Any, schema: dict[str, Any], place: str) -> None:
         schema = SCHEMA["$defs"][schema["$ref"].rpartition("/")[2]] | schema
     named, also = schema.get("type", []), schema.get("x-also", ())
     kinds = [*([named] if isinstance(named, str) else named), *also]
-    fitting = (kind for kind in kinds if isinstance(value, PYTHON[kind]))
-    kind = next(fitting, kinds[0] if kinds else "")
+    kind = next((kind for kind in kinds if isinstance(value, PYTHON[kind])), kinds[0] if kinds else "")
     known = schema.get("enum", [schema["const"]] if "const" in schema else None)
+    wrong = ""
     if known is not None and kind not in also and (isinstance(value, bool | list | dict) or value not in known):
-        listed = " or ".join("null" if choice is None else str(choice) for choice in known)
-        raise BadModel(f"{_short(value)} is not {listed}", place=place, fix=FIX)
-    if kind in CHECKS:
-        CHECKS[kind](value, schema, place)
+        wrong = f"is not {' or '.join('null' if choice is None else str(choice) for choice in known)}"
+    elif kind in ("number", "integer"):
+        lo, hi = schema.get("minimum", -LARGEST), schema.get("maximum", LARGEST)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not (lo <= value <= hi):
+            wrong = f"is not a number from {lo:g} to {hi:g}"
+        elif kind == "integer" and value != int(value):
+            wrong = "is not a whole number"
+    elif kind == "string" and (not isinstance(value, str) or len(value) > LONGEST):
+        wrong = "is not a text, or too long"
+    elif kind == "boolean" and not isinstance(value, bool):
+        wrong = "is not true or false"
+    elif kind == "object" and not isinstance(value, dict):
+        wrong = "is not a JSON object"
+    elif kind == "array":
+        min_items, max_items = schema.get("minItems", 0), schema.get("maxItems", LONGEST)
+        if not isinstance(value, list) or not (min_items <= len(value) <= max_items):
+            wrong = f"is not a list of {min_items} to {max_items}"
+    if wrong:
+        raise BadModel(f"{_short(value)} {wrong}", place=place, fix=schema.get("x-mend", FIX))
+    if kind == "array":
+        _check_items(value, schema, place)
+    elif kind == "object":
+        _check_keys(value, schema, place)
 
 
-def parameter_value(value: Any) -> Any:
-    """The number of a parameter, which is given alone or as {"value", "sd", "unit"}."""
-    return value["value"] if isinstance(value, dict) and "value" in value else value
-
-
-def _number(value: Any, schema: dict[str, Any], place: str) -> None:
-    lo, hi = schema.get("minimum", -LARGEST), schema.get("maximum", LARGEST)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not (lo <= value <= hi):
-        fix = schema.get("x-mend", FIX)
-        raise BadModel(f"{_short(value)} is not a number from {lo:g} to {hi:g}", place=place, fix=fix)
-
-
-def _integer(value: Any, schema: dict[str, Any], place: str) -> None:
-    _number(value, schema, place)
-    if value != int(value):
-        raise BadModel(f"{_short(value)} is not a whole number", place=place, fix=FIX)
-
-
-def _text(value: Any, _schema: dict[str, Any], place: str) -> None:
-    if not isinstance(value, str) or len(value) > LONGEST:
-        raise BadModel(f"{_short(value)} is not a text, or too long", place=place, fix=FIX)
-
-
-def _boolean(value: Any, _schema: dict[str, Any], place: str) -> None:
-    if not isinstance(value, bool):
-        raise BadModel(f"{_short(value)} is not true or false", place=place, fix=FIX)
-
-
-def _array(value: Any, schema: dict[str, Any], place: str) -> None:
-    min_items, max_items = schema.get("minItems", 0), schema.get("maxItems", LONGEST)
-    if not isinstance(value, list) or not (min_items <= len(value) <= max_items):
-        what = f"a list of {len(value)}" if isinstance(value, list) else _short(value)
-        raise BadModel(f"{what}, not a list of {min_items} to {max_items}", place=place, fix=FIX)
+def _check_items(value: list[Any], schema: dict[str, Any], place: str) -> None:
     items = schema["items"]
     lo, hi = items.get("minimum", -LARGEST), items.get("maximum", LARGEST)
     sound = items.get("type") == "number" and all(type(item) in (int, float) and lo <= item <= hi for item in value)
@@ -97,9 +112,7 @@ def _array(value: Any, schema: dict[str, Any], place: str) -> None:
         raise BadModel("the values are not strictly rising", place=place, fix=FIX)
 
 
-def _object(value: Any, schema: dict[str, Any], place: str) -> None:
-    if not isinstance(value, dict):
-        raise BadModel(f"{_short(value)} is not a JSON object", place=place, fix=FIX)
+def _check_keys(value: dict[str, Any], schema: dict[str, Any], place: str) -> None:
     prefix = f"{place}." if place else ""
     needed, known = schema.get("x-needed", ()), schema.get("properties", {})
     for name in value if "additionalProperties" in schema else [name for name in known if name in value]:
@@ -108,57 +121,16 @@ def _object(value: Any, schema: dict[str, Any], place: str) -> None:
         if name not in value:
             raise BadModel("the key is missing", place=prefix + name, fix=FIX)
     if "if" in schema:
-        _object(value, schema["then" if _matches(value, schema["if"]) else "else"], place)
-
-
-def _matches(value: Any, schema: dict[str, Any]) -> bool:
-    try:
-        _object(value, schema, "")
-    except BadModel:
-        return False
-    return True
-
-
-PYTHON: dict[str, Any] = {
-    "object": dict, "array": list, "string": str, "boolean": bool, "number": int | float, "integer": int | float,
-    "null": NoneType,
-}  # fmt: skip
-CHECKS = {
-    "object": _object, "array": _array, "string": _text, "boolean": _boolean, "number": _number, "integer": _integer,
-}  # fmt: skip
+        try:
+            _check_keys(value, schema["if"], "")
+            branch = "then"
+        except BadModel:
+            branch = "else"
+        _check_keys(value, schema[branch], place)
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
     text = repr(value) if isinstance(value, str | int | float | None) else f"a {type(value).__name__}"
     return text if len(text) <= 40 else f"{text[:40]}…"
-
-
-def _effect(effect: dict[str, Any], place: str) -> None:
-    """Check an effect; a free one has an sd for each parameter, and a value of each line at each place."""
-    parameters = effect["parameters"]
-    check({name: parameter_value(value) for name, value in parameters.items()}, NUMBERS, f"{place}.parameters")
-    if "shape" not in effect:
-        return
-    check(parameters, WITH_SD, f"{place}.parameters")
-    count = len(effect["shape"]["at"])
-    as_many = {"type": "array", "items": {"type": "number"}, "minItems": count, "maxItems": count}
-    for name, line in effect["shape"]["lines"].items():
-        check(line, {"type": "object", "additionalProperties": as_many}, f"{place}.shape.lines.{name}"[:100])
-
-
-def _narx(narx: dict[str, Any]) -> None:
-    """One weight per term, and terms that use existing variables."""
-    if len(narx["terms"]) != len(narx["weights"]):
-        raise BadModel("terms and weights differ in number", place="extra.narx", fix=FIX)
-    largest = max((index for term in narx["terms"] for index in term), default=-1)
-    if not (largest < len(narx["variables"])):
-        raise BadModel(f"a term uses variable {largest}, which does not exist", place="extra.narx.terms", fix=FIX)
-
-
-def _tables(joint: dict[str, Any]) -> None:
-    """One row for each angle and one column for each velocity."""
-    rows, columns = len(joint["angle_rad"]), len(joint["velocity_rad_s"])
-    for name in ("g", "h_nm", "g_lower", "g_upper", "h_lower_nm", "h_upper_nm", "seen_g", "seen_h"):
-        table = joint.get(name)
-        if table is not None and (len(table) != rows or any(len(row) != columns for row in table)):
-            raise BadModel(f"not {rows} rows of {columns}", place=f"joint.{name}", fix=FIX)

@@ -133,7 +133,7 @@ def table1(
         unseen (means over trials, %); and the settings.
     """
     rows: list[dict[str, Any]] = []
-    total, done = len(noise_levels_nm) * len(OURS), 0
+    total = len(noise_levels_nm) * len(OURS)
     for level in noise_levels_nm:
         count = trials if level > 0 else 1
         records = [simulate(level, FIRST_SEED + trial) for trial in range(count)]
@@ -142,9 +142,13 @@ def table1(
             for trial, (record, clean) in enumerate(records):
                 scores.append(score(record, clean, method))
                 if progress is not None:
-                    progress((done + (trial + 1) / count) / total, f"{method}, noise {level:g} N·m")
-            done += 1
-            rows.append(_row(level, method, scores))
+                    progress((len(rows) + (trial + 1) / count) / total, f"{method}, noise {level:g} N·m")
+            printed = method in PAPER and level in NOISE_NM
+            paper, paper_sd = PAPER[method][NOISE_NM.index(level)] if printed else (None, None)
+            mean = {key: float(np.mean([each[key] for each in scores])) for key in scores[0]}
+            sd = float(np.std([each["noisy"] for each in scores], ddof=1)) if count > 1 else 0.0
+            row = {"noise_nm": level, "method": method, "paper": paper, "paper_sd": paper_sd}
+            rows.append(row | {"ours": mean.pop("noisy"), "ours_sd": sd} | mean)
     return {
         "rows": rows,
         "trials": trials,
@@ -152,20 +156,4 @@ def table1(
         "unit": "best fit, % (mean over trials); noise in N·m",
         "scored_on": "ours and ceiling: the noisy ramp; clean: the ramp without noise; unseen: multi-level, no noise",
         "explained_in": "docs/results/table1.md",
-    }
-
-
-def _row(level: float, method: str, scores: list[dict[str, float]]) -> dict[str, Any]:
-    printed = PAPER.get(method, ())[NOISE_NM.index(level)] if method in PAPER and level in NOISE_NM else (None, None)
-    mean = {key: float(np.mean([s[key] for s in scores])) for key in scores[0]}
-    return {
-        "noise_nm": level,
-        "method": method,
-        "paper": printed[0],
-        "paper_sd": printed[1],
-        "ours": mean["noisy"],
-        "ours_sd": float(np.std([s["noisy"] for s in scores], ddof=1)) if len(scores) > 1 else 0.0,
-        "ceiling": mean["ceiling"],
-        "clean": mean["clean"],
-        "unseen": mean["unseen"],
     }

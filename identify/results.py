@@ -19,8 +19,8 @@ from stimrig.identify.summary import (
     Summarised,
     both_words,
     certainty,
-    estimate,
     fit_words,
+    parameter_words,
     probability,
     quantity,
     torque,
@@ -203,21 +203,11 @@ class Explanation(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """The keys of `explain --json`: no models, and no series for plots."""
-        improvement = self.improvement.to_dict()
-        del improvement["models"]
-        before, after = self.before.to_dict(), self.after.to_dict()
-        places = healed_places(before, after)
-        for comparison in (before, after):
-            del comparison["series"]
-        return {
-            "diagnosis": self.diagnosis.to_dict(),
-            "improvement": improvement,
-            "left": self.left.to_dict(),
-            "ended": why_ended(vars(self.left)),
-            "places": places,
-            "before": before,
-            "after": after,
-        }
+        document: dict[str, Any] = {name: getattr(self, name).to_dict() for name in vars(self)}
+        document["places"] = healed_places(document["before"], document["after"])
+        for result, left_out in (("improvement", "models"), ("before", "series"), ("after", "series")):
+            del document[result][left_out]
+        return document | {"ended": why_ended(vars(self.left))}
 
     def _sheet(self) -> Sheet:
         rows, before = [("at first", self.diagnosis.conclusion.title)], self.before.to_dict()
@@ -258,9 +248,7 @@ class Carried(Result):
 
     def finding(self) -> dict[str, Any]:
         """Return `to_dict()` without the models."""
-        result = self.to_dict()
-        del result["models"]
-        return result
+        return {name: value for name, value in self.to_dict().items() if name != "models"}
 
     def _sheet(self) -> Sheet:
         rows = [("offered", f"{_effect_ids(self.model)}. {self.reason}")]
@@ -298,8 +286,6 @@ def _read_row(row: Row) -> str:
         f"{torque(row, 'rms_after_nm')}, held out from {torque(row, 'held_out_rms_before_nm')} to "
         f"{torque(row, 'held_out_rms_after_nm')}"
     )
-    for name, entry in list(row["parameters"].items())[:MOST_PARAMETERS]:
-        direction = f" {entry['direction']}" if entry.get("direction") else ""
-        text += f"; {name} {estimate(entry['value'], entry['sd'], entry['unit'])}{direction}"
+    text = "; ".join([text, *parameter_words(row["parameters"], MOST_PARAMETERS)])
     others = ", ".join(row["confused_with"])
     return f"{text}; this record cannot separate it from {others}" if others else text

@@ -29,15 +29,11 @@ class Sheet:
     title: str  # what it is, with the most important values, in one line
     rows: tuple[tuple[str, str], ...]  # one line each
 
-    def line(self) -> str:
-        """The title alone."""
-        return one_line(self.title)
-
     def text(self) -> str:
         """Title and rows, with aligned labels."""
         rows = [(one_line(label), one_line(words)) for label, words in self.rows]
         width = max((len(label) for label, _ in rows), default=0)
-        return "\n".join([self.line(), *[f"{label.ljust(width)}  {words}".rstrip() for label, words in rows]])
+        return "\n".join([one_line(self.title), *[f"{label.ljust(width)}  {words}".rstrip() for label, words in rows]])
 
     def html(self) -> str:
         """An HTML table without style sheet, script or other file; all text is escaped."""
@@ -76,7 +72,7 @@ class Summarised:
         return self.summary()
 
     def __repr__(self) -> str:
-        return f"<{self._sheet().line()}>"
+        return f"<{one_line(self._sheet().title)}>"
 
     def _repr_html_(self) -> str:
         return self._sheet().html()
@@ -131,6 +127,16 @@ def estimate(value: Any, sd: Any, unit: str) -> str:
     """An estimate with its standard deviation, such as "0.53 ± 0.01 s"; without the ± if there is no deviation."""
     spread = "" if sd is None or quantity(sd, "") == NONE else f" ± {sd:.2g}"
     return f"{quantity(value, '')}{spread}{'' if unit in ('', '1') else f' {unit}'}"
+
+
+def parameter_words(parameters: Mapping[str, Any], max_shown: int) -> list[str]:
+    """The first parameters of an effect, each a number alone or with `sd`, `unit` and `direction`."""
+    words = []
+    for name, entry in list(parameters.items())[:max_shown]:
+        entry = entry if isinstance(entry, dict) else {"value": entry}
+        value = estimate(entry.get("value"), entry.get("sd"), str(entry.get("unit") or "1"))
+        words.append(f"{name} {value} {entry.get('direction') or ''}".rstrip())
+    return words
 
 
 def fit_words(figures: Mapping[str, Any], prefix: str = "") -> str:

@@ -18,7 +18,7 @@ from stimrig import errors
 from stimrig.identify.summary import register_plotter
 
 if TYPE_CHECKING:
-    from stimrig import cohort
+    from stimrig import cohort, identify
     from stimrig.api.charts.plot import plot
     from stimrig.api.cli.files import save
     from stimrig.api.client.rest import Client
@@ -26,50 +26,46 @@ if TYPE_CHECKING:
     from stimrig.identify import Model, Record, compare, next_experiment, predict, read
     from stimrig.identify.effects import library as effects
     from stimrig.identify.tracking import track
-    from stimrig.progress import carry, diagnose, explain, fit, improve
-    from stimrig.verbs import emulate, export, invert, join, recover, table1
+    from stimrig.progress import with_bar
+    from stimrig.verbs import emulate, invert, join, table1
+
+    carry, diagnose, explain = with_bar(identify.carry), with_bar(identify.diagnose), with_bar(identify.explain)
+    fit, improve = with_bar(identify.fit), with_bar(identify.improve)
 
 _PLACES = {
-    "read": ("stimrig.identify.records", "read"),
-    "Record": ("stimrig.identify.records.record", "Record"),
-    "Model": ("stimrig.identify.model", "Model"),
-    "predict": ("stimrig.identify.simulation.predict", "predict"),
-    "compare": ("stimrig.identify.criticism", "compare"),
-    "next_experiment": ("stimrig.identify.diagnosis", "next_experiment"),
-    "track": ("stimrig.identify.tracking", "track"),
-    "effects": ("stimrig.identify.effects", "library"),
-    "schema": ("stimrig.api.schemas", "load"),
-    "plot": ("stimrig.api.charts.plot", "plot"),
-    "save": ("stimrig.api.cli.files", "save"),
-    "Client": ("stimrig.api.client.rest", "Client"),
-    **{name: ("stimrig.progress", name) for name in ("carry", "diagnose", "explain", "fit", "improve")},
-    **{name: ("stimrig.verbs", name)
-       for name in ("emulate", "export", "invert", "join", "recover", "table1")},
-}  # fmt: skip
+    **dict.fromkeys(("Model", "Record", "compare", "next_experiment", "predict", "read"), "stimrig.identify"),
+    **dict.fromkeys(("emulate", "invert", "join", "table1"), "stimrig.verbs"),
+    "Client": "stimrig.api.client.rest",
+    "effects": "stimrig.identify.effects:library",
+    "plot": "stimrig.api.charts.plot",
+    "save": "stimrig.api.cli.files",
+    "schema": "stimrig.api.schemas:load",
+    "track": "stimrig.identify.tracking",
+}
+_WITH_BAR = ("carry", "diagnose", "explain", "fit", "improve")
 
 __all__ = [
-    "Client", "Model", "Record", "carry", "cohort", "compare", "diagnose", "effects", "emulate", "errors", "explain",
-    "export", "fit", "improve", "invert", "join", "next_experiment", "plot", "predict", "read",
-    "recover", "save", "schema", "table1", "track",
+    "Client", "Model", "Record", "carry", "cohort", "compare", "diagnose", "effects", "emulate", "errors",
+    "explain", "fit", "improve", "invert", "join", "next_experiment", "plot", "predict", "read", "save", "schema",
+    "table1", "track",
 ]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:
     if name == "cohort":
         return import_module("stimrig.cohort")
+    if name in _WITH_BAR:
+        bar = import_module("stimrig.progress").with_bar
+        return globals().setdefault(name, bar(getattr(import_module("stimrig.identify"), name)))
     if name not in _PLACES:
         raise AttributeError(f"module 'stimrig' has no attribute {name!r}")
-    module, attribute = _PLACES[name]
-    return getattr(import_module(module), attribute)
+    module, _, attribute = _PLACES[name].partition(":")
+    return getattr(import_module(module), attribute or name)
 
 
 def __dir__() -> list[str]:
     return __all__
 
 
-def _draw(result: Any, record: Any) -> Any:
-    """What `model.plot(record)` calls; the plotting library is loaded by the first figure."""
-    return import_module("stimrig.api.charts.plot").plot(result, record)
-
-
-register_plotter(_draw)
+# What `model.plot(record)` calls; the plotting library is loaded by the first figure.
+register_plotter(lambda result, record: import_module("stimrig.api.charts.plot").plot(result, record))

@@ -1,11 +1,8 @@
-"""`stimrig cohort`: one verb over many recordings (docs/cohorts.md).
-
-`options` are those of the command line: `select`, `method`, `effects`, `scheduler`, `workers`, `memory`, `limit`, …
-"""
+"""`stimrig cohort`: one verb over many recordings (docs/cohorts.md)."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,20 +10,7 @@ from stimrig.verbs import Report
 
 __all__ = ["diagnose", "fit", "improve"]
 
-
-def _run(verb: str, data: Sequence[str | Path], output: str | Path, options: dict[str, Any]) -> Report:
-    from stimrig.api.cli.commands.cohort import require_extra
-    from stimrig.api.cli.options import names
-
-    require_extra()
-    from stimrig.api.cohort.run import run_cohort
-
-    options["effects"] = names(options.get("effects"))
-    return Report(f"cohort {verb}", run_cohort(verb, [str(place) for place in data], Path(output), **options))
-
-
-def fit(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
-    """Fit a model to every selected record; one row each in Parquet.
+PARAMETERS = """
 
     Parameters
     ----------
@@ -35,36 +19,26 @@ def fit(data: Sequence[str | Path], output: str | Path, **options: Any) -> Repor
     output : path
         Parquet file to write; one that was cut off goes on.
     **options
-        Those of the command line.
-    """
-    return _run("fit", data, output, options)
+        Those of the command line: `select`, `method`, `effects`, `scheduler`, `workers`, `memory`, `limit`, …
+"""
 
 
-def diagnose(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
-    """What is missing in the plain structure, for every selected record; one row each in Parquet.
+def _over_records(verb: str, words: str) -> Callable[..., Report]:
+    def run(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
+        from stimrig.api.cli.commands.cohort import require_extra
+        from stimrig.api.cli.options import names
 
-    Parameters
-    ----------
-    data : sequence of path
-        Files, folders, buckets.
-    output : path
-        Parquet file to write; one that was cut off goes on.
-    **options
-        Those of the command line.
-    """
-    return _run("diagnose", data, output, options)
+        require_extra()
+        from stimrig.api.cohort.run import run_cohort
+
+        options["effects"] = names(options.get("effects"))
+        return Report(f"cohort {verb}", run_cohort(verb, [str(place) for place in data], Path(output), **options))
+
+    run.__name__ = run.__qualname__ = verb
+    run.__doc__ = f"{words}, for every selected record; one row each in Parquet.{PARAMETERS}"
+    return run
 
 
-def improve(data: Sequence[str | Path], output: str | Path, **options: Any) -> Report:
-    """Add effects as long as the evidence lasts, for every selected record; one row each in Parquet.
-
-    Parameters
-    ----------
-    data : sequence of path
-        Files, folders, buckets.
-    output : path
-        Parquet file to write; one that was cut off goes on.
-    **options
-        Those of the command line.
-    """
-    return _run("improve", data, output, options)
+fit = _over_records("fit", "Fit a model")
+diagnose = _over_records("diagnose", "What is missing in the plain structure")
+improve = _over_records("improve", "Add effects as long as the evidence lasts")

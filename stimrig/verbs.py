@@ -1,4 +1,4 @@
-"""The verbs of the command line as functions, but for those of `stimrig.progress`: the same work, by the same code."""
+"""The verbs of the command line as functions, but for those with a progress bar: the same work, by the same code."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from typing import Any
 from stimrig import identify
 from stimrig.api.client.rest import Client
 from stimrig.api.progress_bar import progress_bar
-from stimrig.identify.inversion import Inversion
+from stimrig.identify.inversion import Inversion, Reference
+from stimrig.identify.inversion import invert as widths_for
+from stimrig.identify.inversion.reference import read_reference
 from stimrig.identify.results import Result
 from stimrig.identify.summary import Sheet
 
@@ -84,67 +86,12 @@ def invert(
     BadModel, BadRecord, BadRequest
         The model cannot be inverted; the reference cannot be read, or used.
     """
-    from stimrig.identify.inversion import Reference
-    from stimrig.identify.inversion import invert as widths_for
-    from stimrig.identify.inversion.reference import read_reference
-
     rate_hz = model.pulse_rate_hz
     if isinstance(reference, str | Path):
         wanted = read_reference(Path(reference).read_bytes(), str(reference), rate_hz)
     else:
         wanted = Reference.of(reference, time_s, angle_rad=angle_rad, pulse_rate_hz=rate_hz)
     return widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us)
-
-
-def export(
-    data: Sequence[str | Path],
-    output: str | Path,
-    format: str = "csv",
-    select: str = "",
-    no_dates: bool = False,
-    map: Sequence[str] = (),
-) -> Report:
-    """Write records as CSV, MAT or Parquet, one file each, with a table of them.
-
-    Parameters
-    ----------
-    data : sequence of path
-        Files, folders, buckets.
-    output : path
-        Folder to write, new or empty.
-    format : str
-        "csv", "mat" or "parquet".
-    select : str
-        Which recordings, as `participant == "P001"`.
-    no_dates : bool
-        Leave out days, times of day and what a person typed.
-    map : sequence of str
-        As of `read`.
-
-    Returns
-    -------
-    Report
-        How many were written, and where.
-    """
-    from stimrig.api.export.folder import export_records
-
-    places = [str(place) for place in data]
-    return Report("export", export_records(places, Path(output), format, select, list(map), dates=not no_dates))
-
-
-def recover(journal: str | Path, folder: str | Path | None = None) -> Report:
-    """A sealed recording from a journal of the rig, which may be damaged; the journal is kept.
-
-    Parameters
-    ----------
-    journal : path
-        Its file.
-    folder : path, optional
-        For the recording; default: beside the journal.
-    """
-    from stimrig.api.cli.commands.recover import sealed
-
-    return Report("recover", json.loads(sealed(Path(journal), None if folder is None else Path(folder))))
 
 
 def table1(trials: int = 100) -> Report:

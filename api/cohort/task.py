@@ -35,8 +35,7 @@ class Task:
         try:
             method_of(self.method)
             for name in self.effects:
-                if name != "auto":
-                    find_effect(name.partition(":")[0])
+                find_effect(name.partition(":")[0])
             parse_column_map(list(self.columns) or None)
         except IdentifyError as error:
             raise CohortError(str(error)) from error

@@ -194,21 +194,6 @@ def write_csv(record: dict[str, Any], path: str | Path) -> None:
     Path(path).write_text("\n".join(lines) + "\n")
 
 
-def _record_of(effect: str | None, strength: str, seed: int, settings: argparse.Namespace) -> dict[str, Any]:
-    names = list(draw_pair(rng_of(seed, "pair"))) if effect == "pairs" else effect.split("+") if effect else None
-    return generate(
-        names,
-        strength,
-        seed,
-        rate_hz=settings.rate_hz,
-        design=settings.design,
-        noise=settings.noise,
-        noise_sd_nm=settings.noise_sd_nm,
-        steep=settings.steep,
-        with_validate=not settings.no_validate,
-    )
-
-
 def main(arguments: list[str] | None = None) -> int:
     """Write a set of records and `truth.json`."""
     parser = argparse.ArgumentParser(prog="python -m bench.muscles.hidden_records", description=main.__doc__)
@@ -221,11 +206,6 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--strengths", default="weak,middle,strong")
     parser.add_argument("--rate-hz", type=float, default=400)
-    parser.add_argument("--design", default="full")
-    parser.add_argument("--noise", choices=NOISES, default="white")
-    parser.add_argument("--noise-sd-nm", type=float, default=0.04)
-    parser.add_argument("--steep", action="store_true")
-    parser.add_argument("--no-validate", action="store_true")
     settings = parser.parse_args(arguments)
     settings.out.mkdir(parents=True, exist_ok=True)
     effects: list[str | None] = []
@@ -237,7 +217,8 @@ def main(arguments: list[str] | None = None) -> int:
             for seed in settings.seeds:
                 name = f"{effect or 'none'}-{strength}-{seed}.csv"
                 try:
-                    record = _record_of(effect, strength, seed, settings)
+                    drawn = list(draw_pair(rng_of(seed, "pair"))) if effect == "pairs" else effect and effect.split("+")
+                    record = generate(drawn, strength, seed, rate_hz=settings.rate_hz)
                 except ValueError as problem:
                     print(f"{name}: {problem}", file=sys.stderr)
                     continue

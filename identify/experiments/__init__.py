@@ -23,8 +23,8 @@ ENOUGH = 7.0
 """Expected log evidence that is enough to decide: odds of about 1000 to 1."""
 PER_PULSE = 4
 """Samples per pulse of the simulated test."""
-REFERENCE = 8
-"""Seed of the levels on which designs are compared: none of a design's own, which would speak for it."""
+SEED, REFERENCE = 7, 8
+"""Seeds of the levels of designs, and of those on which they are compared: their own would speak for them."""
 NOTHING = "nothing"
 """The name of a model without effects, as a rival."""
 
@@ -65,32 +65,22 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     fits : mapping
         By effect id, or `NOTHING`.
     """
-    largest_us = float(record.pulse_width_us.max())
-    rows = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(largest_us)]
-    expected = [expected_log_evidence(width, record, fits) for _, width in rows]
-    enough = [place for place, gain in enumerate(expected) if gain >= ENOUGH]
-    if enough:
-        best = min(enough, key=lambda place: rows[place][1].size)
-    else:
-        best = max(range(len(rows)), key=lambda place: expected[place] / rows[place][1].size)
-    (design, width), gain = rows[best], expected[best]
-    names = tuple(name for name in fits if name != NOTHING)
-    text = _text(design, width.size / record.pulse_rate_hz, gain, names)
-    decides = gain >= ENOUGH
-    return Experiment(names, *_played(design, width, record, next(iter(fits.values()))), gain, decides, text)
-
-
-def _played(
-    design: Design, width_us: np.ndarray, record: Record, fitted: Fitted
-) -> tuple[Any, float, dict[str, float]]:
-    """Segments, duration, s, and dose of a test."""
-    torque_nm = fitted.physical[fitted.problem.coefficients] @ fitted.problem.setup.basis.design(width_us).T
-    dose = {
-        "pulses": int(np.sum(width_us > 0)),
-        "pulse_width_sum_us": float(width_us.sum()),
-        "torque_time_nm_s": float(np.abs(torque_nm).sum() / record.pulse_rate_hz),
-    }
-    return tuple(segment.to_dict() for segment in design.segments), width_us.size / record.pulse_rate_hz, dose
+    tests = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(_largest_us(record))]
+    gains = [expected_log_evidence(width, record, fits) for _, width in tests]
+    # the shortest of those that decide; if none does, the one with the largest gain for its length
+    decides = max(gains) >= ENOUGH
+    best = max(range(len(tests)), key=lambda n: (gains[n] >= ENOUGH, (1.0 if decides else gains[n]) / tests[n][1].size))
+    names, gain = tuple(name for name in fits if name != NOTHING), gains[best]
+    played = _played(*tests[best], record, next(iter(fits.values())))
+    those = " from ".join([*(find_effect(name).name.lower() for name in names[:2]), "no effect"][:2])
+    test = f"{tests[best][0].words} ({played[1]:.0f} s)"
+    text = f"{test} should separate {those}: expected log evidence {gain:.0f}."
+    if not decides:
+        text = (
+            f"{test} is the best test to separate {those}, but it may not be enough: expected log evidence "
+            f"{gain:.1f}; at least {ENOUGH:g} is required."
+        )
+    return Experiment(names, *played, gain, decides, text)
 
 
 def plan_further(record: Record, fitted: Fitted) -> Experiment:
@@ -106,52 +96,42 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
     fitted : Fitted
         The last model.
     """
-    largest_us, rate_hz = float(record.pulse_width_us.max()), record.pulse_rate_hz
+    rate_hz = record.pulse_rate_hz
     # the smallest width with a tenth of the largest torque
     widths_us = np.linspace(0.0, fitted.problem.setup.basis.largest_us, 201)
-    torque_nm = fitted.problem.setup.basis.design(widths_us) @ fitted.physical[fitted.problem.coefficients]
-    threshold_us = float(widths_us[np.argmax(np.abs(torque_nm) >= 0.1 * np.abs(torque_nm).max())])
-    rows = [(design, design.pulse_widths(rate_hz)) for design in held_levels(largest_us, threshold_us, rate_hz)]
-    others = [design.pulse_widths(rate_hz) for design in held_levels(largest_us, threshold_us, rate_hz, REFERENCE)]
-    reference = _simulate(fitted, _blank(record, np.concatenate(others)), True)[1]
-    before = _expected_nm(fitted, reference, np.zeros((fitted.theta.size, 1)))
-    after = [_expected_nm(fitted, reference, _whitened_slopes(fitted, _blank(record, width))) for _, width in rows]
+    torque_nm = np.abs(_steady_nm(fitted, widths_us))
+    threshold_us = float(widths_us[np.argmax(torque_nm >= 0.1 * torque_nm.max())])
+    tests, others = (
+        [
+            (design, design.pulse_widths(rate_hz))
+            for design in held_levels(_largest_us(record), threshold_us, rate_hz, seed)
+        ]
+        for seed in (SEED, REFERENCE)
+    )
+    reference = _simulate(fitted, _blank(record, np.concatenate([width for _, width in others])))[1]
+
+    def error_nm(information: np.ndarray | float) -> float:
+        """Standard error of the model on the reference, N·m, once it knows so much more."""
+        solution = np.linalg.lstsq(fitted.hessian + information, reference, rcond=None)[0]
+        return float(np.sqrt(max(np.mean(np.sum(reference * solution, axis=0)), 0.0)))
+
+    after = []
+    for _, width in tests:
+        white = _whitened(_simulate(fitted, _blank(record, width))[1], fitted)
+        after.append(error_nm(white @ white.T))
     best = int(np.argmin(after))
-    design, width = rows[best]
-    fall, played = 1.0 - after[best] / before, _played(design, width, record, fitted)
+    fall, played = 1.0 - after[best] / error_nm(0.0), _played(*tests[best], record, fitted)
     text = (
-        f"{design.words} ({played[1]:.0f} s) would teach most about what is left: the model's own standard error on "
-        f"levels is expected to fall by {100.0 * fall:.0f} %."
+        f"{tests[best][0].words} ({played[1]:.0f} s) would teach most about what is left: the model's own standard "
+        f"error on levels is expected to fall by {100.0 * fall:.0f} %."
     )
     return Experiment((), *played, 0.0, False, text, fall)
 
 
-def _whitened_slopes(fitted: Fitted, record: Record) -> np.ndarray:
-    slopes = _simulate(fitted, record, True)[1]
-    assert slopes is not None
-    return whitened(slopes, ends_of([slice(0, slopes.shape[1])]), fitted.noise)
-
-
-def _expected_nm(fitted: Fitted, reference: np.ndarray | None, white: np.ndarray) -> float:
-    """Standard error of the model on a reference, N·m, once it has also seen a test of such whitened slopes."""
-    assert reference is not None
-    solution = np.linalg.lstsq(fitted.hessian + white @ white.T, reference, rcond=None)[0]
-    return float(np.sqrt(max(np.mean(np.sum(reference * solution, axis=0)), 0.0)))
-
-
-def _text(design: Design, duration_s: float, gain: float, names: tuple[str, ...]) -> str:
-    those = " from ".join([*(find_effect(name).name.lower() for name in names[:2]), "no effect"][:2])
-    test = f"{design.words} ({duration_s:.0f} s)"
-    if gain >= ENOUGH:
-        return f"{test} should separate {those}: expected log evidence {gain:.0f}."
-    return (
-        f"{test} is the best test to separate {those}, but it may not be enough: expected log evidence {gain:.1f}; "
-        f"at least {ENOUGH:g} is required."
-    )
-
-
 def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[str, Fitted]) -> float:
     """Log evidence by which a test of such widths separates that pair of rivals which it separates least.
+
+    If one of a pair is true, the other is fitted again to the new test, with its fit to the old record as prior.
 
     Parameters
     ----------
@@ -162,8 +142,35 @@ def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[st
     fits : mapping
         By effect id, or `NOTHING`.
     """
-    simulated = _blank(record, width_us)
-    return float(min(separation(fits[truth], fits[rival], simulated) for truth, rival in permutations(fits, 2)))
+    blank, gains = _blank(record, width_us), []
+    simulated = {name: _simulate(fitted, blank) for name, fitted in fits.items()}
+    for truth, rival in permutations(fits, 2):
+        (true_mean, _), (rival_mean, slopes) = simulated[truth], simulated[rival]
+        white = _whitened(np.vstack([true_mean - rival_mean, slopes]), fits[truth])
+        gap, slopes = white[0], white[1:]
+        b = slopes @ gap
+        gain = b @ np.linalg.lstsq(fits[rival].hessian + slopes @ slopes.T, b, rcond=None)[0]
+        gains.append(max(0.5 * float(gap @ gap - gain), 0.0))
+    return min(gains)
+
+
+def _largest_us(record: Record) -> float:
+    return float(record.pulse_width_us.max())
+
+
+def _steady_nm(fitted: Fitted, width_us: np.ndarray) -> np.ndarray:
+    return fitted.problem.setup.basis.design(width_us) @ fitted.physical[fitted.problem.coefficients]
+
+
+def _played(design: Design, width_us: np.ndarray, record: Record, fitted: Fitted) -> tuple[Any, float, Any]:
+    """Segments, duration, s, and dose of a test."""
+    torque_nm = _steady_nm(fitted, width_us)
+    dose = {
+        "pulses": int(np.sum(width_us > 0)),
+        "pulse_width_sum_us": float(width_us.sum()),
+        "torque_time_nm_s": float(np.abs(torque_nm).sum() / record.pulse_rate_hz),
+    }
+    return tuple(segment.to_dict() for segment in design.segments), width_us.size / record.pulse_rate_hz, dose
 
 
 def _blank(record: Record, width: np.ndarray) -> Record:
@@ -174,45 +181,21 @@ def _blank(record: Record, width: np.ndarray) -> Record:
     return Record.from_arrays(time_s, width_us, zeros, angle_rad=angle, velocity_rad_s=still, pulse_rate_hz=rate_hz)
 
 
-def separation(truth: Fitted, rival: Fitted, record: Record) -> float:
-    """Log evidence by which a rival is expected to lose in a new test, if `truth` is true.
-
-    The rival is fitted again to the new test, with its fit to the old record as prior.
-
-    Parameters
-    ----------
-    truth : Fitted
-        The fit that is taken for true.
-    rival : Fitted
-        The other one.
-    record : Record
-        The new test.
-    """
-    true_mean = _simulate(truth, record, False)[0]
-    rival_mean, slopes = _simulate(rival, record, True)
-    assert slopes is not None
-    whole = ends_of([slice(0, true_mean.size)])
-    white = whitened(np.vstack([true_mean - rival_mean, slopes]), whole, truth.noise)
-    gap, slopes = white[0], white[1:]
-    b = slopes @ gap
-    gain = b @ np.linalg.lstsq(rival.hessian + slopes @ slopes.T, b, rcond=None)[0]
-    return max(0.5 * float(gap @ gap - gain), 0.0)
+def _whitened(rows: np.ndarray, fitted: Fitted) -> np.ndarray:
+    return whitened(rows, ends_of([slice(0, rows.shape[1])]), fitted.noise)
 
 
-def _simulate(fitted: Fitted, record: Record, derivatives: bool) -> tuple[np.ndarray, np.ndarray | None]:
-    """Interval means of a fitted candidate on another record, without sporadic effects."""
+def _simulate(fitted: Fitted, record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Interval means of a fitted candidate on another record, without sporadic effects, and their slopes."""
     grid = make_grid(record)
     setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
-    lasting = [(effect, form) for effect, form in fitted.effects if not find_effect(effect).sporadic]
-    problem = Problem(setup, lasting)
+    problem = Problem(setup, [(effect, form) for effect, form in fitted.effects if not find_effect(effect).sporadic])
     # Parameters are copied by name: the new test has one part, starts at rest, and has no sporadic effects.
     known = {name: place for place, name in enumerate(fitted.problem.names)}
     place = np.array([known[name] for name in problem.names])
     theta = fitted.theta[place]
     theta[list(problem.initials)] = 0.0
-    mean, slopes = problem.run(theta, derivatives=derivatives)
-    if slopes is None:
-        return mean, None
+    mean, slopes = problem.run(theta, derivatives=True)
     full = np.zeros((fitted.theta.size, mean.size))
     full[place] = slopes
     return mean, full

@@ -8,6 +8,7 @@ list of pulse widths, which the rig's sequence `widths` plays as it is.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
@@ -40,14 +41,20 @@ class Design:
         return np.concatenate([SHAPES[s.sequence](s.settings, pulse_rate_hz) for s in self.segments])
 
 
-def _rest(s: dict[str, Any], rate: float) -> np.ndarray:
-    return np.zeros(round(s["duration_s"] * rate))
+def _prbs(s: dict[str, Any], _rate: float) -> np.ndarray:
+    taps = {5: (5, 3), 6: (6, 5), 7: (7, 6)}[s["bits"]]
+    state = (s["seed"] - 1) % (2 ** s["bits"] - 1) + 1
+    bits = []
+    for _ in range(s["chips"]):
+        bits.append(state >> (s["bits"] - 1) & 1)
+        feedback = (state >> (taps[0] - 1) ^ state >> (taps[1] - 1)) & 1
+        state = (state << 1 | feedback) & (2 ** s["bits"] - 1)
+    return np.repeat(np.array(bits, float) * s["max_pulse_width_us"], s["clock_pulses"])
 
 
 def _ramp(s: dict[str, Any], rate: float) -> np.ndarray:
     up, down = round(s["up_s"] * rate), round(s["down_s"] * rate)
-    shape = np.r_[np.arange(1, up + 1) / up, np.arange(down - 1, -1, -1) / down]
-    return shape * s["max_pulse_width_us"]
+    return np.r_[np.arange(1, up + 1) / up, np.arange(down - 1, -1, -1) / down] * s["max_pulse_width_us"]
 
 
 def _steps(s: dict[str, Any], rate: float) -> np.ndarray:
@@ -57,29 +64,15 @@ def _steps(s: dict[str, Any], rate: float) -> np.ndarray:
 
 def _staircase(s: dict[str, Any], rate: float) -> np.ndarray:
     up = np.arange(1, s["levels"] + 1) / s["levels"]
-    shape = np.r_[up, up[-2::-1], 0.0] if s.get("down", True) else up
-    return np.repeat(shape * s["max_pulse_width_us"], round(s["hold_s"] * rate))
+    return np.repeat(np.r_[up, up[-2::-1], 0.0] * s["max_pulse_width_us"], round(s["hold_s"] * rate))
 
 
-def _prbs(s: dict[str, Any], rate: float) -> np.ndarray:
-    del rate
-    taps = {5: (5, 3), 6: (6, 5), 7: (7, 6)}[s["bits"]]
-    state = (s["seed"] - 1) % (2 ** s["bits"] - 1) + 1
-    bits = []
-    for _ in range(s.get("chips") or 2 ** s["bits"] - 1):
-        bits.append(state >> (s["bits"] - 1) & 1)
-        feedback = 0
-        for tap in taps:
-            feedback ^= state >> (tap - 1) & 1
-        state = (state << 1 | feedback) & (2 ** s["bits"] - 1)
-    return np.repeat(np.array(bits, float) * s["max_pulse_width_us"], s["clock_pulses"])
-
-
-def _widths(s: dict[str, Any], _rate: float) -> np.ndarray:
-    return np.array(s["pulse_width_us"], float)
-
-
-SHAPES = {"rest": _rest, "ramp": _ramp, "steps": _steps, "staircase": _staircase, "prbs": _prbs, "widths": _widths}
+SHAPES: dict[str, Callable[[dict[str, Any], float], np.ndarray]] = {
+    "rest": lambda s, rate: np.zeros(round(s["duration_s"] * rate)),
+    "widths": lambda s, _rate: np.array(s["pulse_width_us"], float),
+    "ramp": _ramp, "steps": _steps, "staircase": _staircase, "prbs": _prbs,
+}  # fmt: skip
+"""Pulse widths of the designs' sequences, by the settings that these designs have."""
 
 
 def designs(largest_us: float) -> list[Design]:
@@ -132,13 +125,13 @@ OFTEN_S = 5.0
 """Seconds of levels after which there is a rest of one second: it shows what the muscle keeps of its work."""
 
 
-def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, seed: int = 7) -> list[Design]:
+def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, seed: int) -> list[Design]:
     """Random levels, each held for a while, as no ramp and no PRBS has them: jumps of level while stimulated.
 
     In one design they are even between the threshold and the largest width, in the other half of them lie near the
     threshold, where a slow ramp spends little time and a PRBS none.
     """
-    sequences = []
+    pause, tests = Segment("rest", "rest", {"duration_s": 2.0}), []
     for words, near in (
         ("Random levels, each held for a moment", 0.0),
         ("Random levels, many near the threshold", 0.5),
@@ -153,27 +146,14 @@ def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, se
             if rested_s > OFTEN_S:
                 levels.append((0.0, 1.0))
                 rested_s = 0.0
-        sequences.append((words, levels))
-    return [
-        Design(
-            words,
-            (
-                _pause(),
-                Segment("levels", "widths", {"pulse_width_us": _pulse_widths(levels, pulse_rate_hz), "jumps": True}),
-                _pause(),
-            ),
-        )
-        for words, levels in sequences
-    ]
+        widths_us = [np.full(round(seconds * pulse_rate_hz), us) for us, seconds in levels]
+        tests.append(Design(words, (pause, played_widths("levels", np.concatenate(widths_us)), pause)))
+    return tests
 
 
-def _pause() -> Segment:
-    return Segment("rest", "rest", {"duration_s": 2.0})
-
-
-def _pulse_widths(levels: list[tuple[float, float]], rate_hz: float) -> list[float]:
-    """Widths of pulses, rounded down as the rig takes them."""
-    return [float(np.floor(10.0 * us) / 10.0) for us, seconds in levels for _ in range(round(seconds * rate_hz))]
+def played_widths(name: str, width_us: np.ndarray) -> Segment:
+    """A segment of given widths, rounded down as the rig takes them."""
+    return Segment(name, "widths", {"pulse_width_us": (np.floor(10.0 * width_us) / 10.0).tolist(), "jumps": True})
 
 
 PIECE_S = 1.0
@@ -193,8 +173,7 @@ class Piece:
 
     def segment(self, number: int) -> Segment:
         """As the rig plays it."""
-        widths = [float(np.floor(10.0 * u) / 10.0) for u in self.pulse_width_us]
-        return Segment(f"{self.kind} {number}", "widths", {"pulse_width_us": widths, "jumps": True})
+        return played_widths(f"{self.kind} {number}", self.pulse_width_us)
 
 
 def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:

@@ -41,6 +41,12 @@ WIDTHS_SD = 3.0
 LEAST_PERCENT, MOST_PERCENT = 0.2, 50.0
 
 
+def require_number(value: object, place: str, what: str, fix: str, lower: float, upper: float) -> None:
+    """Raise BadRequest unless a value is a number within bounds, both included."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not lower <= value <= upper:
+        raise BadRequest(f"{value!r} is {what}", place=place, fix=fix)
+
+
 @dataclass(frozen=True)
 class Target:
     """Largest half-widths of the 95 % bands of whole curves. Raises BadRequest: not a number from 0.2 to 50."""
@@ -51,9 +57,7 @@ class Target:
     def __post_init__(self) -> None:
         fix = f"Give a number from {LEAST_PERCENT:g} to {MOST_PERCENT:g} %."
         for name, value in vars(self).items():
-            number = isinstance(value, int | float) and not isinstance(value, bool)
-            if not (number and LEAST_PERCENT <= value <= MOST_PERCENT):
-                raise BadRequest(f"{value!r} is no target", place=f"target.{name}", fix=fix)
+            require_number(value, f"target.{name}", "no target", fix, LEAST_PERCENT, MOST_PERCENT)
 
 
 @dataclass(frozen=True)
@@ -129,71 +133,50 @@ def whole_band(at: np.ndarray, draws: np.ndarray, factor: float = 1.0) -> Band:
 # ---- what pieces would teach ----
 
 
-@dataclass(frozen=True)
-class Foresight:
-    """D directions of what is not known, with the muscle's state at the end of what is planned.
+def foresee(
+    short: Short, played_us: np.ndarray, target: Target, candidates: list[Piece]
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """Width of the bands now and after each candidate, in the norm of this module; and the candidate's dose, N·m·s.
 
-    The first of 1 + D rows is the mean; each other one is the mean moved along a direction by one standard deviation.
+    `played_us`: widths of all pulses that are played or committed. What is not known has D directions: the first of
+    1 + D rows is the mean, each other one is the mean moved along a direction by one standard deviation.
     """
-
-    coefficients_nm: np.ndarray  # of the curves, shape (1 + D, n)
-    cores: np.ndarray  # T, ζ, delay, shape (1 + D, 3)
-    states: np.ndarray  # torque, N·m, and its rate, N·m/s, when the next piece begins, shape (1 + D, 2)
-    targets: np.ndarray  # what a direction moves: points of both curves, divided by the target, shape (B, D)
-    noise_nm: float  # of an interval's mean
-    short: Short
-
-    @classmethod
-    def of(cls, short: Short, played_us: np.ndarray, target: Target) -> Foresight:
-        """From a fit, the widths of all pulses that are played or committed, and the target."""
-        draws = np.c_[short.coefficients_nm, np.log(short.dynamics[:, :2]), short.dynamics[:, 2]]
-        mean = draws.mean(axis=0)
-        scale = np.r_[np.full(short.basis.size, short.plateau_nm), 1.0, 1.0, 0.02]
-        _, size, right = np.linalg.svd((draws - mean) / scale, full_matrices=False)
-        right *= np.sign(
-            np.take_along_axis(right, np.abs(right).argmax(axis=1)[:, None], 1)
-        )  # the same on any computer
-        directions = min(DIRECTIONS, int(np.sum(size > 1e-9 * size[0])))
-        moved = mean + (size[:directions, None] / np.sqrt(len(draws))) * right[:directions] * scale
-        rows = np.vstack([mean, moved])
-        cores = np.c_[np.exp(rows[:, -3:-1]), rows[:, -1]]
-        curves = rows[:, :-3]
-        known = knowledge(short)
-        width, time_s = known.curve.at, known.step.at
-        f = curves @ short.basis.design(width).T / short.plateau_nm
-        steps = step_responses(cores, time_s)
-        # standard deviations in the half-width of the whole band
-        sd = (draws[:, :-3] @ short.basis.design(width).T / short.plateau_nm).std(axis=0)
-        at = int(np.argmax(sd))
-        factor = float(np.clip(known.curve.half[at] / max(sd[at], 1e-12), 2.0, 8.0))
-        of_curve = (f[1:] - f[0]).T * (factor * 100.0 / target.curve_percent)
-        of_step = (steps[1:] - steps[0]).T * (WIDTHS_SD * 100.0 / target.step_percent)
-        design = short.basis.design(played_us)
-        even = np.array([step_matrix(t, z, short.grid.step_s) for t, z in cores[:, :2]])
-        drive = np.ascontiguousarray(curves @ design.T)
-        torque, rate = held_states(drive, even, FROM_START, np.zeros((len(cores), 1, 2)))
-        return cls(
-            curves, cores, np.c_[torque[:, -1], rate[:, -1]], np.vstack([of_curve, of_step]), short.noise.sd_nm, short
-        )
-
-    @property
-    def now(self) -> float:
-        """Present width of the bands relative to the target, in the norm of this module."""
-        return _norm(np.sum(self.targets**2, axis=1)[None, :])[0]
-
-    def after(self, candidates: list[Piece]) -> tuple[np.ndarray, np.ndarray]:
-        """Expected width of the bands after each piece, in the norm of this module, and its dose, N·m·s."""
-        step_s = self.short.grid.step_s
-        widths = [piece.pulse_width_us for piece in candidates]
-        places = np.cumsum([0, *(w.size for w in widths)]).astype(np.int64)
-        levels, index = np.unique(np.concatenate(widths), return_inverse=True)
-        curves = np.ascontiguousarray(self.coefficients_nm @ self.short.basis.design(levels).T)
-        information = _information(curves, index, places, self.cores, self.states, step_s)
-        size = len(self.cores) - 1
-        covariance = np.linalg.inv(np.eye(size) + information / self.noise_nm**2)
-        variance = np.einsum("bi,cij,bj->cb", self.targets, covariance, self.targets, optimize=True)
-        dose = np.add.reduceat(curves[0][index], places[:-1]) * step_s
-        return _norm(np.maximum(variance, 0.0)), dose
+    draws = np.c_[short.coefficients_nm, np.log(short.dynamics[:, :2]), short.dynamics[:, 2]]
+    mean = draws.mean(axis=0)
+    scale = np.r_[np.full(short.basis.size, short.plateau_nm), 1.0, 1.0, 0.02]
+    _, size, right = np.linalg.svd((draws - mean) / scale, full_matrices=False)
+    largest = np.take_along_axis(right, np.abs(right).argmax(axis=1)[:, None], 1)
+    right *= np.sign(largest)  # the same on any computer
+    directions = min(DIRECTIONS, int(np.sum(size > 1e-9 * size[0])))
+    moved = mean + (size[:directions, None] / np.sqrt(len(draws))) * right[:directions] * scale
+    rows = np.vstack([mean, moved])
+    curves, cores = rows[:, :-3], np.c_[np.exp(rows[:, -3:-1]), rows[:, -1]]  # of T, ζ, delay
+    known = knowledge(short)
+    design = short.basis.design(known.curve.at).T / short.plateau_nm
+    f, steps = curves @ design, step_responses(cores, known.step.at)
+    # standard deviations in the half-width of the whole band
+    sd = (draws[:, :-3] @ design).std(axis=0)
+    at = int(np.argmax(sd))
+    factor = float(np.clip(known.curve.half[at] / max(sd[at], 1e-12), 2.0, 8.0))
+    of_curve = (f[1:] - f[0]).T * (factor * 100.0 / target.curve_percent)
+    of_step = (steps[1:] - steps[0]).T * (WIDTHS_SD * 100.0 / target.step_percent)
+    # what a direction moves: points of both curves, divided by the target, shape (B, D)
+    targets = np.vstack([of_curve, of_step])
+    # torque, N·m, and its rate, N·m/s, when the next piece begins, shape (1 + D, 2)
+    step_s = short.grid.step_s
+    even = np.array([step_matrix(t, z, step_s) for t, z in cores[:, :2]])
+    drive = np.ascontiguousarray(curves @ short.basis.design(played_us).T)
+    torque, rate = held_states(drive, even, FROM_START, np.zeros((len(cores), 1, 2)))
+    states = np.c_[torque[:, -1], rate[:, -1]]
+    widths = [piece.pulse_width_us for piece in candidates]
+    places = np.cumsum([0, *(w.size for w in widths)]).astype(np.int64)
+    levels, index = np.unique(np.concatenate(widths), return_inverse=True)
+    level_nm = np.ascontiguousarray(curves @ short.basis.design(levels).T)
+    information = _information(level_nm, index, places, cores, states, step_s) / short.noise.sd_nm**2
+    covariance = np.linalg.inv(np.eye(directions) + information)
+    variance = np.einsum("bi,cij,bj->cb", targets, covariance, targets, optimize=True)
+    dose = np.add.reduceat(level_nm[0][index], places[:-1]) * step_s
+    return float(_norm(np.sum(targets**2, axis=1)[None, :])[0]), _norm(np.maximum(variance, 0.0)), dose
 
 
 def _norm(variance: np.ndarray) -> np.ndarray:

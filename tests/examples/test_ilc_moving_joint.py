@@ -17,7 +17,6 @@ import h5py
 import numpy as np
 import pytest
 
-from stimrig import Client
 from tests.examples.test_ilc_controller import MODEL, UNLIKE_THE_MODEL, felt, model_of, patient_of
 
 pytestmark = pytest.mark.slow
@@ -136,11 +135,6 @@ def service(ilc: ModuleType, client: Answers, begun: Callable[[], None] = lambda
     return ilc.MovingService(client, "P", begun)
 
 
-def test_the_client_that_is_made_up_has_no_method_that_the_real_one_lacks() -> None:
-    made_up = {name for name in vars(Answers) if not name.startswith("_")}
-    assert [name for name in made_up if not hasattr(Client, name)] == []
-
-
 def test_the_movement_is_started_once_when_the_first_pulse_is_due(ilc: ModuleType) -> None:
     client, begun = Answers(recording()), []
     torque_nm, sent_us, angle_rad = service(ilc, client, lambda: begun.append(list(client.asked))).play_moving(
@@ -198,10 +192,3 @@ def test_a_file_that_is_no_movement_is_told_in_a_line(ilc: ModuleType, tmp_path:
         path.write_text(text)
     with pytest.raises(SystemExit, match=rf"--movement {path}: .*{says}"):
         ilc.movement_of(str(path))
-
-
-def test_only_a_model_with_g_and_h_is_told_the_angles(ilc: ModuleType) -> None:
-    client = Answers(b"")
-    for model in ({"model_id": "M", "joint": {"g": []}}, {"model_id": "M", "joint": {}}, {"model_id": "M"}):
-        service(ilc, client).foretell(model, np.zeros(2), np.array([1.0, 1.1]))
-    assert client.asked == [[1.0, 1.1], None, None]

@@ -44,7 +44,7 @@ VOLATILE = (
     (re.compile(r"\b(?:stimrig )?\d+\.\d+\.\d+(?:[.+]\w+)*\b"), "<version>"),
     (re.compile(r"\b(?:stimrig\.)?((?:identify|api|rig|hardware_sim)\.[a-z_.]+)"), r"\1"),
 )
-NEW_EACH_TIME = {"model_id", "created", "software", "elapsed_s", "took_s", "age_s", "torque_age_s", "uptime_s", "csrf"}
+NEW_EACH_TIME = {"model_id", "created", "software", "elapsed_s", "took_s", "age_s", "torque_age_s", "uptime_s"}
 
 
 @contextlib.contextmanager
@@ -252,7 +252,6 @@ LOOSE: tuple[tuple[str, float, float], ...] = (
     ("/sd$", 1e-3, 1e-9),  # of second differences
     (f"/({WEAK})/(?!recording/)", 0.05, 0.01),
     ("/(processor_s|worker_memory_mb)/", 1.0, 0.0),  # the machine's
-    ("^routes/.*(last_sample_to_model_s|/delay_s)$", 1.0, 0.0),  # the fake rig's clock is the world's, not the day's
 )
 """Pattern of a place, and how much a number there may differ: relative, absolute. The last that fits counts."""
 

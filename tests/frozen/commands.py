@@ -6,7 +6,9 @@ import json
 from pathlib import Path
 from typing import Any
 
-from tests.frozen.answers import call, condensed_file, run, working_in
+from stimrig.api.settings import Settings
+from stimrig.api.web.app import create_app
+from tests.frozen.answers import call, condensed, condensed_file, run, working_in
 from tests.frozen.records import MORE_WORDS, RECORDS
 from tests.frozen.rig_records import of_kind
 from tests.harness import cohort_records
@@ -37,7 +39,7 @@ REFUSED = (
 )  # fmt: skip
 DONE = (
     "--version", "effects", "effects --json", "table1 --trials 2", "table1 --trials 1 --json",
-    "fit plain.csv again.csv -o both.json --json", "fit plain.csv -o model.mat", "fit plain.csv --effects auto --json",
+    "fit plain.csv again.csv -o both.json --json", "fit plain.csv -o model.mat",
     "predict model.json plain.csv -o p.mat", "invert model.json reference.csv -o i.csv",
     "recover T1.journal -o recovered --json", "recover cut_end.journal -o again",
     "export cohort -o parquet --format parquet --json", "export cohort -o mat --format mat --no-dates",
@@ -104,6 +106,27 @@ def without_record(folder: Path) -> dict[str, Any]:
         schemas = [address.split(":")[-2] for address in run("schema")["out"].split()]
         more = [*(f"schema {name}" for name in schemas), *(f"{verb} --help" for verb in VERBS)]
         return {line: call(line) for line in (*REFUSED, *DONE, "schema", *more)}
+
+
+WORDS = {"description", "summary", "title", "examples", "operationId", "tags"}
+
+
+def rest(folder: Path) -> Any:
+    """The routes of REST: parameters, bodies, answers and their statuses, without what is said about them."""
+
+    def bare(value: Any, named: bool = False) -> Any:
+        """`named`: keys are names of fields, whatever they are."""
+        if isinstance(value, list):
+            return [bare(part) for part in value]
+        if not isinstance(value, dict):
+            return value
+        fields = "properties", "schemas", "paths", "responses"
+        return {
+            key: bare(part, key in fields and not named) for key, part in value.items() if named or key not in WORDS
+        }
+
+    document = create_app(Settings(data_dir=folder, rig_file=None)).openapi()
+    return condensed(bare({name: document[name] for name in ("paths", "components")}), folder)
 
 
 def _reference(folder: Path) -> None:

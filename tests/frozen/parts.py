@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tests.frozen import commands, routes
+from tests.frozen import commands
 from tests.frozen.answers import WEAK, differences
 from tests.frozen.records import RECORDS
 
@@ -20,7 +20,7 @@ HERE = Path(__file__).parent
 PARTS: dict[str, Callable[[Path], Any]] = {
     **{f"fitted/{name}": partial(commands.of_record, name) for name in RECORDS},
     "without_record": commands.without_record,
-    "routes": routes.of_day,
+    "rest": commands.rest,
     **{f"diagnosed/{name}": partial(commands.diagnosed, name) for name in RECORDS if name not in WEAK.split("|")},
 }
 

@@ -6,13 +6,11 @@ import pytest
 
 from tests.frozen.parts import HERE, PARTS, compare
 
-PARTS_HERE = ("fitted/plain_short", "fitted/rig_stopped", "fitted/other_words")
+PARTS_HERE = ("rest", "fitted/plain_short", "fitted/rig_stopped")
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "part", [*PARTS_HERE, pytest.param("routes", marks=[pytest.mark.service, pytest.mark.campaign])]
-)
+@pytest.mark.parametrize("part", PARTS_HERE)
 def test_what_users_hold_is_as_it_was(part: str) -> None:
     assert compare(part)[0] == []
 

@@ -10,15 +10,12 @@ from typing import Any
 import numpy as np
 
 from stimrig.hardware_sim.hidden import recruitment
-from stimrig.hardware_sim.hidden.chain import Chain, split
-from stimrig.hardware_sim.hidden.scenario import Scenario
 from stimrig.identify.experiments.adaptive import AdaptiveGoal, Decision, Target, decide
 from stimrig.identify.records.record import Record
 from tests.harness.muscle import FINE_HZ, Patient, second_order, torque_after
 from tests.harness.patients import as_record
 
 PULSE_RATE_HZ = 40.0
-HIDDEN_STEP_S = 1.0 / 1600.0
 
 
 @dataclass(frozen=True)
@@ -74,36 +71,6 @@ def shaped(seed: int) -> Muscle:
 
 def _dynamics(rng: np.random.Generator) -> tuple[float, float, float]:
     return float(rng.uniform(0.1, 0.6)), float(rng.uniform(0.6, 1.2)), float(rng.uniform(0.0, 0.002))
-
-
-@dataclass(frozen=True)
-class Hidden:
-    """A muscle with hidden effects, by the emulator's physics."""
-
-    scenario: Scenario
-
-    @property
-    def top_us(self) -> float:
-        return float(self.scenario.base.largest_width_us)
-
-    def curve(self, width_us: np.ndarray | float) -> np.ndarray:
-        """Steady torque without the effects, N·m."""
-        table = self.scenario.base.table_nm
-        return np.interp(width_us, np.arange(table.size), table)
-
-    def torque(self, widths_us: np.ndarray, rate_hz: float) -> np.ndarray:
-        """Clean torque at the samples, N·m."""
-        size = round(widths_us.size / PULSE_RATE_HZ / HIDDEN_STEP_S)
-        held = np.floor((np.arange(size) - 1) * (HIDDEN_STEP_S * PULSE_RATE_HZ) + 1e-9).astype(int)
-        width = np.where(held >= 0, widths_us[np.maximum(held, 0)], 0.0)
-        pulse = np.zeros(size)
-        pulse[1:] = (np.diff(held) > 0) & (width[1:] > 0.0)
-        still = np.zeros(size)
-        torque = width
-        for stages in split(self.scenario.stages()):
-            if stages:
-                torque = Chain(stages, self.scenario.base.largest_nm, HIDDEN_STEP_S).run(torque, pulse, still, still)
-        return torque[np.round(np.arange(round(size * HIDDEN_STEP_S * rate_hz)) / rate_hz / HIDDEN_STEP_S).astype(int)]
 
 
 def recorded(

@@ -77,7 +77,7 @@ def test_a_train_of_a_calibration_is_fitted_and_not_diagnosed():
     torque_nm += 0.05 * np.random.default_rng(2).standard_normal(torque_nm.size)
     train = Record.from_arrays(np.arange(torque_nm.size) / 200, np.repeat(width_us, 5), torque_nm)
     assert identify.fit(train).quality["verdict"] == "usable with care"
-    for search in (identify.diagnose, identify.improve, lambda record: identify.fit(record, effects=["auto"])):
+    for search in (identify.diagnose, identify.improve):
         with pytest.raises(identify.NotIdentifiable, match="only 100 pulse intervals may be fitted"):
             search(train)
 

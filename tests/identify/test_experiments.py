@@ -34,7 +34,7 @@ def played_us(experiment):
     return np.concatenate([build(one["sequence"], dict(one["settings"]), 40.0) for one in experiment.segments])
 
 
-@pytest.mark.parametrize("design", [*held_levels(300.0, 80.0, 40.0), *designs(300.0)], ids=lambda one: one.words)
+@pytest.mark.parametrize("design", [*held_levels(300.0, 80.0, 40.0, 7), *designs(300.0)], ids=lambda one: one.words)
 def test_the_rig_plays_what_was_simulated(design):
     for segment in design.segments:
         played = build(segment.sequence, segment.settings, 40.0)

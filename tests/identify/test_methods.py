@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from stimrig import identify
 from stimrig.identify import paper
@@ -51,7 +52,7 @@ def test_options_that_a_method_does_not_have(clean_record):
         identify.fit(clean_record[0], knots="many")
 
 
-@pytest.mark.parametrize("options", [{}, {"order": "auto"}, {"order": "2,1,1"}, {"iterations": 3}])
+@pytest.mark.parametrize("options", [{}, {"order": "auto", "iterations": 3}])
 def test_two_stage_recovers_the_muscle(clean_record, options):
     model, ramp, unseen = scores(*clean_record, "two-stage", **options)
     assert ramp >= 99.98
@@ -131,37 +132,26 @@ def test_other_recruitment_curves(clean_record, recruitment):
     assert kind == {"spline": "cubic-spline"}.get(recruitment, recruitment)
 
 
-def test_monotone_curves_never_fall():
-    fell = 0
-    for seed in range(2):
-        record, _ = make_record(Patient(gain=1.5), np.random.default_rng(seed), rate_hz=40, noise_nm=0.15)
-        for sign in (1.0, -1.0):
-            signed = record.with_torque(sign * record.torque_nm)
-            width = np.linspace(0, 300, 601)
-            free, held = identify.fit(signed), identify.fit(signed, monotone=True)
-            fell += np.min(np.diff(sign * free.recruitment(width))) < -1e-9
-            assert np.min(np.diff(sign * held.recruitment(width))) > -1e-9
-            assert held.fit["rms_nm"] < 1.02 * free.fit["rms_nm"]
-    assert fell > 0
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_monotone_curves_never_fall(sign):
+    record, _ = make_record(Patient(gain=1.5), np.random.default_rng(0), rate_hz=40, noise_nm=0.15)
+    signed, width = record.with_torque(sign * record.torque_nm), np.linspace(0, 300, 601)
+    free, held = identify.fit(signed), identify.fit(signed, monotone=True)
+    assert np.min(np.diff(sign * free.recruitment(width))) < -1e-9, "else nothing is tried"
+    assert np.min(np.diff(sign * held.recruitment(width))) > -1e-9
+    assert held.fit["rms_nm"] < 1.02 * free.fit["rms_nm"]
 
 
 def test_order_is_chosen_from_the_data():
     rng = np.random.default_rng(0)
     drive = np.r_[np.zeros(40), prbs(30, 1.0, rng)]
-    make_record(Patient(), rng, rate_hz=40)
     patient = Patient(time_constant_s=0.2, damping=0.7)
-    torque = patient.torque(drive * 300, 40) / patient.gain
-    noisy = torque + 0.01 * rng.standard_normal(torque.size)
-    best, reasons = choose_order(noisy, drive, np.ones(drive.size, bool), 1)
-    assert len(best.a) - 1 == 2 and best.delay_samples == 1
-    assert sum("chosen" in reason for reason in reasons) == 1
-    first_order = np.zeros(drive.size)
-    for k in range(1, drive.size):
-        first_order[k] = 0.9 * first_order[k - 1] + 0.1 * drive[k - 1]
-    noisy = first_order + 0.01 * rng.standard_normal(drive.size)
-    best, _ = choose_order(noisy, drive, np.ones(drive.size, bool), 1)
-    assert len(best.a) - 1 == 1
-    assert best.a[1] == pytest.approx(-0.9, abs=0.01)
+    second = patient.torque(drive * 300, 40) / patient.gain
+    first = lfilter([0.0, 0.1], [1.0, -0.9], drive)
+    for torque, order in ((second, 2), (first, 1)):
+        noisy = torque + 0.01 * rng.standard_normal(torque.size)
+        best, reasons = choose_order(noisy, drive, np.ones(drive.size, bool), 1)
+        assert len(best.a) - 1 == order and sum("chosen" in reason for reason in reasons) == 1
 
 
 def test_table1_rows_and_progress():

@@ -21,7 +21,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Part, Record
 from stimrig.identify.simulation.predict import predict, problem_of
 from stimrig.identify.tracking import State, follow, model_for_next
-from stimrig.identify.tracking.follow import begin, moved_model, passed, rested, set_states, slow_forms
+from stimrig.identify.tracking.follow import begin, moved_model, passed, rested, set_states
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
 
@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 
 SEED = 54200
 PER, RATE_HZ, CURRENT_MA = 10, 400.0, 20.0
-FORMS = [(effect.id, form.name) for effect in effects().values() for form in effect.forms if form.state is not None]
+SLOW = [(effect.id, form.name) for effect in effects().values() for form in effect.forms if form.state is not None]
 PATIENT = Patient.with_rise(45.0, 120.0, gain=8.0, time_constant_s=0.2, damping=0.9)
 WIDTHS = np.r_[np.zeros(40), np.linspace(60.0, 200.0, 160), np.full(120, 160.0), np.zeros(120), np.full(120, 140.0)]
 
@@ -60,7 +60,7 @@ def record_of(widths_us: np.ndarray, begun_s: float | None = None, torque_nm: np
     return Record.from_arrays(time_s, np.repeat(widths_us, PER), torque_nm, names, parts=(Part(begun_s=begun_s),))
 
 
-@pytest.mark.parametrize(("effect", "form"), FORMS)
+@pytest.mark.parametrize(("effect", "form"), SLOW)
 def test_a_record_cut_in_two_with_its_state_is_the_uncut_one(plain: Model, effect: str, form: str) -> None:
     model, cut = having(plain, effect, form), 240
     whole = problem_of(model, make_grid(record_of(WIDTHS)))
@@ -78,7 +78,7 @@ def test_a_record_cut_in_two_with_its_state_is_the_uncut_one(plain: Model, effec
         assert np.max(np.abs(predict(model, after) - wanted)) > 0.2
 
 
-@pytest.mark.parametrize(("effect", "form"), FORMS)
+@pytest.mark.parametrize(("effect", "form"), SLOW)
 def test_a_rest_is_as_long_as_the_same_silence(plain: Model, effect: str, form: str) -> None:
     model = having(plain, effect, form)
     tired = passed(model, begin(model), record_of(WIDTHS))
@@ -146,14 +146,6 @@ def test_the_tracked_gain_takes_part_in_what_tires(plain: Model) -> None:
     assert less.effects["fatigue"] < 0.75 * usual.effects["fatigue"]
     served = moved_model(model, weak.mean)
     assert less.effects == pytest.approx(passed(served, begin(served), record_of(WIDTHS)).effects, abs=1e-6)
-
-
-def test_a_model_without_such_effects_is_followed_as_ever(plain: Model) -> None:
-    record = trial_of(plain, 1000.0)
-    step = follow(plain, passed(plain, begin(plain), record), record)
-    other = follow(plain, None, record, rest_s=7.0)
-    assert slow_forms(plain) == {} and step.after.effects == {} and step.coming.ended_s is None
-    assert step.to_dict() == other.to_dict()
 
 
 # ---- against a muscle with laws of its own ----------------------------------------------------------------------

@@ -16,7 +16,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.tracking import Outcome, State, Step, follow, model_for_next
 from stimrig.identify.tracking.follow import moved_model
-from stimrig.identify.tracking.state import USUAL, learn_rates, values_of
+from stimrig.identify.tracking.state import learn_rates, values_of
 from tests.harness.changing import Changing, reach_widths
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
@@ -95,9 +95,7 @@ def test_where_nothing_changes_no_trial_moves_the_model_by_more_than_its_band(mo
     assert {step.outcome for step in steps} <= {Outcome.FOLLOWED, Outcome.LITTLE}
 
 
-@pytest.mark.parametrize(
-    ("size_nm", "at_s", "width_s"), [(4.0, 5.0, 0.15), (-2.5, 8.0, 0.3), (1.5, 6.0, 1.2), (3, 4, 2)]
-)
+@pytest.mark.parametrize(("size_nm", "at_s", "width_s"), [(-2.5, 8.0, 0.3), (1.5, 6.0, 1.2)])
 def test_a_spasm_or_an_effort_moves_nothing_by_more_than_its_band(
     model: Model, size_nm: float, at_s: float, width_s: float
 ) -> None:
@@ -122,9 +120,8 @@ def test_a_sudden_change_is_followed_when_the_next_trial_says_the_same(model: Mo
     assert gains[5] / gains[2] == pytest.approx(0.7, abs=0.03)
 
 
-@pytest.mark.parametrize("left", [0.0, 0.2])
-def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model, left: float) -> None:
-    steps = followed(model, session(Changing(PATIENT, gain=lambda n: left if 3 <= n < 6 else 1.0), 8))
+def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model) -> None:
+    steps = followed(model, session(Changing(PATIENT, gain=lambda n: 0.2 if 3 <= n < 6 else 1.0), 8))
     assert {step.outcome for step in steps[3:6]} == {Outcome.NO_TORQUE}
     assert {step.outcome for step in (*steps[:3], *steps[6:])} == {Outcome.FOLLOWED}
     for step in steps[3:6]:
@@ -133,18 +130,17 @@ def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model, left:
     assert np.all(moves(steps) < 1.0)
 
 
-@pytest.mark.parametrize("gain", [0.6, 0.3])
-def test_a_sudden_loss_is_found_and_not_taken_for_a_threshold(model: Model, gain: float) -> None:
-    for seed in (7, 11):  # the fit of a trial has a second place to end, where the threshold rose
-        steps = followed(model, session(Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else gain), 6, seed))
-        assert steps[3].outcome is Outcome.ODD
-        assert steps[-1].after.values["gain"] == pytest.approx(gain, rel=0.06)
-        assert abs(steps[-1].after.values["threshold_shift_us"]) < 2.0
+@pytest.mark.parametrize("seed", [7, 11])
+def test_a_sudden_loss_is_found_and_not_taken_for_a_threshold(model: Model, seed: int) -> None:
+    """The fit of a trial has a second place to end, where the threshold rose."""
+    steps = followed(model, session(Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else 0.3), 6, seed))
+    assert steps[3].outcome is Outcome.ODD
+    assert steps[-1].after.values["gain"] == pytest.approx(0.3, rel=0.06)
+    assert abs(steps[-1].after.values["threshold_shift_us"]) < 2.0
 
 
-@pytest.mark.parametrize("drift_nm", [0.3, -0.6])
-def test_a_zero_that_drifts_within_trials_is_no_change_of_the_muscle(model: Model, drift_nm: float) -> None:
-    drifting = Changing(PATIENT, added=lambda _, time_s: drift_nm * time_s / time_s[-1])
+def test_a_zero_that_drifts_within_trials_is_no_change_of_the_muscle(model: Model) -> None:
+    drifting = Changing(PATIENT, added=lambda _, time_s: -0.6 * time_s / time_s[-1])
     plain, found = (followed(model, session(muscle, 5))[-1] for muscle in (Changing(PATIENT), drifting))
     sd = np.sqrt(np.diag(plain.after.covariance)[:3])
     assert np.all(np.abs(found.after.mean - plain.after.mean)[:3] < 0.3 * sd)
@@ -193,14 +189,6 @@ def test_what_changes_nothing_about_the_muscle_changes_no_answer(model: Model, n
     assert usual.outcome == other.outcome
 
 
-def test_a_trial_that_begins_within_a_contraction(model: Model) -> None:
-    whole = Changing(PATIENT, gain=lambda _: 0.9).play(WIDTHS, 0, np.random.default_rng(2))
-    late = whole.time_s > 4.0
-    cut = Record.from_arrays(whole.time_s[late], whole.pulse_width_us[late], whole.torque_nm[late])
-    part, all_of_it = follow(model, None, cut).after, follow(model, None, whole).after
-    assert np.all(np.abs(part.mean - all_of_it.mean)[:3] < 1.96 * np.sqrt(np.diag(part.covariance)[:3]))
-
-
 def test_the_moved_model_is_the_muscle_as_it_is_now(model: Model) -> None:
     moved = Model.from_json(moved_model(model, np.array([np.log(0.8), 9.0, np.log(1.2)])).to_json())
     width = np.linspace(0.0, 300.0, 601)
@@ -233,21 +221,6 @@ def test_a_trial_without_a_second_to_use_is_refused(model: Model, held_out: bool
         follow(model, None, cut)
 
 
-def test_many_trials_stay_well_behaved(model: Model) -> None:
-    swaying = Changing(PATIENT, gain=lambda n: 1.0 + 0.1 * np.sin(n / 9))
-    steps = followed(model, session(swaying, 20, seed=9))
-    assert np.linalg.eigvalsh(steps[-1].after.covariance).min() > -1e-12
-    assert steps[-1].after.values["gain"] == pytest.approx(1.0 + 0.1 * np.sin(19.5 / 9), abs=0.04)
-    assert moves(steps[-1:]).max() < 1.0
-
-
-def test_another_pulse_rate_is_refused(model: Model) -> None:
-    time_s = np.arange(2000) / 400.0
-    record = Record.from_arrays(time_s, np.full(2000, 100.0), np.zeros(2000), pulse_rate_hz=20.0)
-    with pytest.raises(BadModel, match="pulses a second"):
-        follow(model, None, record)
-
-
 def test_a_person_who_always_tires_is_expected_to(model: Model) -> None:
     muscle = Changing(PATIENT, gain=lambda n: 0.95**n)
     told = [[step.after.bands() for step in followed(model, session(muscle, 6, seed))] for seed in (11, 12, 13)]
@@ -258,12 +231,3 @@ def test_a_person_who_always_tires_is_expected_to(model: Model) -> None:
     usual, learnt = follow(model, None, first), follow(model, None, first, rates)
     wanted = usual.after.values["gain"] * 0.95
     assert abs(learnt.coming.values["gain"] - wanted) < 0.75 * abs(usual.coming.values["gain"] - wanted)
-
-
-def test_a_person_who_jumps_about_gets_wider_bands(model: Model) -> None:
-    rng = np.random.default_rng(6)
-    levels = rng.normal(0.0, 0.06, 30)
-    jumping = Changing(PATIENT, gain=lambda n: float(np.exp(levels[int(n)])))
-    told = [[step.after.bands() for step in followed(model, session(jumping, 10, seed))] for seed in (21, 22)]
-    rates = learn_rates(told)
-    assert rates.step[0] > 3.0 * USUAL.step[0] and rates.step[2] < 1.5 * USUAL.step[2]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +11,10 @@ import pytest
 from bench.muscles import arm_records
 from bench.muscles.arm_patient import arm_patient
 from bench.muscles.bout_records import RAMPS, record_of_bouts
-from bench.muscles.hidden_records import draw_noise, generate, main
-from bench.muscles.other_physics import SETS, PhysicsMuscle, draw_muscle
-from bench.muscles.physics_records import DISTURBED, record_of_physics
-from bench.muscles.recorders import COUNT_NM, KINDS, SHIFT_S, recorded
+from bench.muscles.hidden_records import generate, main
+from bench.muscles.other_physics import SETS, draw_muscle
+from bench.muscles.physics_records import record_of_physics
+from bench.muscles.recorders import COUNT_NM, SHIFT_S, recorded
 from stimrig.hardware_sim.hidden.chain import Chain
 
 pytestmark = pytest.mark.slow
@@ -23,7 +22,12 @@ pytestmark = pytest.mark.slow
 COLUMNS = ("time_s", "pulse_width_us", "torque_nm", "segment", "angle_rad", "velocity_rad_s")
 RATE_HZ, HELD = 1600, 40
 """Steps a second, and those of a pulse's period."""
-DRAWN = [(kinds, name) for kinds in SETS for name in SETS[kinds]]
+DRAWN = [
+    pytest.param(kinds, place, marks=[pytest.mark.campaign] * (place > 0), id=name)
+    for kinds in SETS
+    for place, name in enumerate(SETS[kinds])
+]
+"""One of each set; to compile all takes a minute."""
 
 
 def test_the_seed_settles_everything() -> None:
@@ -40,18 +44,6 @@ def test_the_seed_settles_everything() -> None:
 # ---- hidden effects ----------------------------------------------------------------------------------------------
 
 
-def test_noise_is_what_it_says() -> None:
-    rng = np.random.default_rng(9)
-    white = draw_noise("white", rng, 200_000, 400, 0.04, 0.9)
-    coloured = draw_noise("ar1", rng, 400_000, 400, 0.04, 0.9)
-    slow = draw_noise("slow", rng, 400_000, 400, 0.04, 0.9)
-    assert white.std() == pytest.approx(0.04, rel=0.02)
-    assert coloured.std() == pytest.approx(0.04, rel=0.05)
-    assert np.corrcoef(coloured[:-10], coloured[10:])[0, 1] == pytest.approx(0.9, abs=0.02)
-    assert slow.std() == pytest.approx(0.04 * np.sqrt(2), rel=0.03)
-    assert np.corrcoef(slow[:-30], slow[30:])[0, 1] == pytest.approx(0.5 / np.e, abs=0.03)
-
-
 def test_command_line_writes_records_and_the_truth(tmp_path: Path) -> None:
     arguments = ["--out", str(tmp_path), "--seeds", "310:311", "--effects", "fatigue,none,pairs", "--strengths", "weak"]
     assert main([*arguments, "--rate-hz", "100"]) == 0
@@ -65,7 +57,7 @@ def test_command_line_writes_records_and_the_truth(tmp_path: Path) -> None:
 # ---- recorders ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", [*KINDS, "gap+shifted+negative", "real+gap"])
+@pytest.mark.parametrize("kind", ["counts", "gap+shifted+negative", "real"])
 def test_a_recorder_changes_only_what_its_kind_says(kind: str) -> None:
     made = generate(None, seed=330, moving=True, rate_hz=200)
     before = {name: made[name].copy() for name in COLUMNS}
@@ -84,14 +76,13 @@ def test_a_recorder_changes_only_what_its_kind_says(kind: str) -> None:
     assert error < (0.501 * COUNT_NM if "counts" in kind or "real" in kind else 1e-9)
     lost = np.setdiff1d(np.arange(made["time_s"].size), rows)
     assert not np.any(made["segment"][lost] == "validate")
-    if kind in ("plain", "offset", "counts", "negative", "scaled", "shifted"):
-        assert not lost.size
+    assert bool(lost.size) == (kind != "counts")
 
 
 # ---- arms --------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [0, 10, 20])
+@pytest.mark.parametrize("seed", [0, 10])
 def test_g_is_one_where_the_muscle_is_described_and_everything_is_finite(seed: int) -> None:
     patient = arm_patient(seed)
     assert patient.g(patient.reference_rad, 0.0) == pytest.approx(1.0)
@@ -104,7 +95,7 @@ def test_g_is_one_where_the_muscle_is_described_and_everything_is_finite(seed: i
     assert np.all(np.diff(h, axis=0) < 0.0), "viscosity takes torque from whatever moves"
 
 
-@pytest.mark.parametrize("kind", arm_records.KINDS)
+@pytest.mark.parametrize("kind", ["held", "moving"])
 def test_an_arms_torque_is_the_contracts_equation_and_white_noise(kind: str) -> None:
     patient = next(each for each in map(arm_patient, range(50)) if "solid" not in each.truth["passive"]["law"])
     made = arm_records.record(patient, kind, 7)
@@ -121,9 +112,8 @@ def test_an_arms_torque_is_the_contracts_equation_and_white_noise(kind: str) -> 
 # ---- bouts -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_readings_are_held_and_the_last_of_four_equal_ramps_is_unseen(seed: int) -> None:
-    made = record_of_bouts(seed)
+def test_readings_are_held_and_the_last_of_four_equal_ramps_is_unseen() -> None:
+    made = record_of_bouts(0)
     changes = np.flatnonzero(np.diff(made["torque_nm"])) + 1
     read_hz = made["truth"]["rate_hz"] / np.mean(np.diff(changes))
     assert 18.0 < read_hz < 48.0
@@ -138,62 +128,14 @@ def test_readings_are_held_and_the_last_of_four_equal_ramps_is_unseen(seed: int)
 # ---- other physics -----------------------------------------------------------------------------------------------
 
 
-def drawn(kinds: str, name: str, round_: int = 0) -> PhysicsMuscle:
-    return draw_muscle(kinds, list(SETS[kinds]).index(name) + round_ * len(SETS[kinds]))
-
-
-def answer_of(muscle: PhysicsMuscle) -> Callable[[np.ndarray], np.ndarray]:
-    """Torque of the rested muscle at 1600 Hz to widths at 40 pulses/s."""
-
-    def answer(widths_us: np.ndarray) -> np.ndarray:
-        chain = Chain(muscle.stages(), muscle.base.largest_nm, 1.0 / RATE_HZ)
-        held, still = np.repeat(widths_us, HELD), np.zeros(widths_us.size * HELD)
-        pulse = still.copy()
-        pulse[::HELD] = widths_us > 0.0
-        return chain.run(held, pulse, still, still)
-
-    return answer
-
-
-def departure(muscle: PhysicsMuscle) -> float:
-    """How far the muscle is from every static curve before linear dynamics, over its largest torque.
-
-    Of those the answer to two trains is the sum of the answers to each, and another width gives the same shape.
-    """
-    answer, top_us = answer_of(muscle), muscle.base.largest_width_us
-    first, second = np.zeros(200), np.zeros(200)
-    first[:60], second[60:120] = top_us, top_us
-    alone, both = answer(first), answer(first + second)
-    apart = np.max(np.abs(both - alone - answer(second)))
-    weaker = answer(np.where(first > 0.0, muscle.base.rise_us()[0] + 0.4 * np.ptp(muscle.base.rise_us()), 0.0))
-    share = weaker @ alone / (alone @ alone)
-    return max(apart, np.max(np.abs(weaker - share * alone))) / np.max(both)
-
-
-@pytest.mark.parametrize(("kinds", "name"), DRAWN)
-def test_a_muscle_rests_rises_and_decays(kinds: str, name: str) -> None:
-    muscle = drawn(kinds, name)
-    answer, rest, train = answer_of(muscle), np.zeros(80), np.full(120, float(muscle.base.largest_width_us))
-    torque = answer(np.concatenate([rest, train, np.zeros(600)]))
+@pytest.mark.parametrize(("kinds", "place"), DRAWN)
+def test_a_muscle_rests_rises_and_decays(kinds: str, place: int) -> None:
+    muscle = draw_muscle(kinds, place)
+    widths_us = np.r_[np.zeros(80), np.full(120, float(muscle.base.largest_width_us)), np.zeros(600)]
+    held, pulse, still = np.repeat(widths_us, HELD), np.zeros(800 * HELD), np.zeros(800 * HELD)
+    pulse[::HELD] = widths_us > 0.0
+    torque = Chain(muscle.stages(), muscle.base.largest_nm, 1.0 / RATE_HZ).run(held, pulse, still, still)
     assert not torque[: 80 * HELD].any()
     assert 1.79 < np.max(torque) < 9.01
     assert np.argmax(torque) < 205 * HELD
     assert np.max(np.abs(torque[-10 * HELD :])) < 0.2 * np.max(torque)
-
-
-@pytest.mark.parametrize(("kinds", "name"), DRAWN)
-def test_no_muscle_is_a_static_curve_before_linear_dynamics(kinds: str, name: str) -> None:
-    assert np.median([departure(drawn(kinds, name, round_)) for round_ in range(12)]) > 0.05
-
-
-def test_the_oracle_sees_nothing_in_a_plain_muscle() -> None:
-    assert max(departure(draw_muscle("plain", seed)) for seed in range(2)) < 1e-3
-
-
-@pytest.mark.parametrize("kind", DISTURBED)
-def test_what_lies_over_a_record_is_not_in_the_unseen_one(kind: str) -> None:
-    bare, over = (record_of_physics("plain", 0, chosen) for chosen in ((), (kind,)))
-    added = over["torque_nm"] - bare["torque_nm"]
-    assert 0.01 < np.std(added) < 0.4
-    assert np.array_equal(over["unseen"]["torque_nm"], bare["unseen"]["torque_nm"])
-    assert over["truth"]["disturbed"] == [kind]

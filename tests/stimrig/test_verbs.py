@@ -12,10 +12,9 @@ import pytest
 
 import stimrig
 from stimrig.api.cli import main
-from stimrig.errors import BadRequest, InputError
+from stimrig.errors import BadRequest
 from tests.api.conftest import PATIENCE_S, TOKEN, Service
 from tests.api.test_jobs import made_up_csv
-from tests.frozen.rig_records import of_kind
 from tests.harness import few_effects
 from tests.stimrig.verbs_table import COMMAND_ONLY, PAGE, function_of, page, verbs
 
@@ -55,8 +54,6 @@ def test_the_tables_of_the_page_are_those_of_the_code() -> None:
 SAME: dict[str, tuple[str, Callable[[Any, Any, Path], Any]]] = {
     "fit": ("{0}/record.csv", lambda record, _model, _at: stimrig.fit(record)),
     "compare": ("{0}/MODEL.json {0}/record.csv", lambda record, model, _at: stimrig.compare(model, record)),
-    "diagnose": ("{0}/record.csv", lambda record, _model, _at: stimrig.diagnose(record)),
-    "improve": ("{0}/record.csv", lambda record, _model, _at: stimrig.improve(record)),
     "explain": ("{0}/record.csv", lambda record, _model, _at: stimrig.explain(record)),
     "invert": ("{0}/MODEL.json {0}/torque.csv -o {1}/widths.csv",
                lambda _record, model, at: stimrig.invert(model, at / "torque.csv")),
@@ -100,25 +97,9 @@ def predicts(at: Path, _new: Path) -> None:
     assert [float(row.split(",")[2]) for row in rows] == pytest.approx(list(stimrig.predict(model, record)), abs=1e-6)
 
 
-def recovers(_at: Path, new: Path) -> None:
-    (data,) = (data for name, data in of_kind("journal").items() if name.endswith(".journal"))
-    (new / "t.journal").write_bytes(data)
-    sealed = stimrig.recover(new / "t.journal", new)
-    assert stimrig.read(sealed["recording"]).time_s.size and "recording_id" in str(sealed)
-    with pytest.raises(InputError, match="nowhere"):
-        stimrig.recover(new / "nowhere")
-
-
 def cohort_fits(at: Path, new: Path) -> None:
     found = stimrig.cohort.fit([at / "record.csv"], new / "results.parquet", workers=1)
     assert (found["ok"], found["errors"]) == (1, 0), found
-
-
-def exports(at: Path, new: Path) -> None:
-    found = stimrig.export([at / "record.csv"], new / "mat", format="mat")
-    assert (found["records"], found["format"]) == (1, "mat")
-    with pytest.raises(BadRequest, match="no such format"):
-        stimrig.export([at / "record.csv"], new / "fhir", format="fhir")
 
 
 def emulates(_at: Path, new: Path) -> None:
@@ -133,15 +114,13 @@ def emulates(_at: Path, new: Path) -> None:
 
 REST: dict[str, Callable[[Path, Path], Any]] = {
     "predict": predicts,
-    "recover": recovers,
-    "export": exports,
     "cohort fit": cohort_fits,
     "emulate": emulates,
     "effects": lambda *_: [row["equation"] and row["source"] for row in stimrig.effects()],
     "schema": lambda *_: stimrig.schema("invert")["properties"]["pulse_width_us"],
 }
-ELSEWHERE = ("test", "cohort diagnose", "cohort improve")
-"""Run by another one of these tests, or as the others of a cohort by `tests/api/cohort`."""
+ELSEWHERE = ("test", "cohort diagnose", "cohort improve", "diagnose", "improve")
+"""Run by another one of these tests, as the parts of `explain`, or as the others of a cohort by `tests/api/cohort`."""
 
 
 @pytest.mark.slow
@@ -176,13 +155,6 @@ def test_what_is_saved_is_read_again(folder: Path, record: Any, model: Any, tmp_
     for what, name in ((record, "r.json"), (model, "m.csv"), (plan, "p.html"), (model, "without_record.html")):
         with pytest.raises(BadRequest):
             stimrig.save(what, tmp_path / name)
-
-
-def test_a_report_is_the_one_of_the_verb(folder: Path, record: Any, model: Any, tmp_path: Path) -> None:
-    ours, theirs = tmp_path / "record.csv.html", tmp_path / "theirs.html"
-    stimrig.save(model, ours, record)
-    assert main.run(["compare", str(folder / "MODEL.json"), str(folder / "record.csv"), "--html", str(theirs)]) == 0
-    assert ours.read_text() == theirs.read_text()
 
 
 def test_a_model_is_tracked_over_trials(record: Any, model: Any) -> None:
