@@ -52,7 +52,7 @@ class FakeStimulator:
         self.ack_delay_s: float | None = 0.001
         self.error: str | None = None
         self.send_error: str | None = None
-        self.silent = False
+        self.silent = self.stalled = False
         self.on_send: Callable[[int], None] = lambda _: None
         self._number = 0
 
@@ -64,11 +64,13 @@ class FakeStimulator:
         return len(self.stopped_s)
 
     async def open(self) -> dict[str, Any]:
+        await self._asked()
         return {"device": "fake"}
 
     async def arm(self) -> None:
         self._answer()
         self.armed = True
+        await self._asked()
 
     def feed(self) -> None:
         self.fed_s.append(self.clock.now_s())
@@ -89,28 +91,43 @@ class FakeStimulator:
         return number
 
     def _acknowledge(self, number: int, error: str | None) -> None:
+        if self.stalled:
+            self.clock.call_at(self.clock.now_s() + 0.002, lambda: self._acknowledge(number, error))
+            return
         self.acked_s.append(self.clock.now_s())
         self.on_ack(Ack(number, self.clock.now_s(), error))
 
     async def stop(self) -> None:
         self.stopped_s.append(self.clock.now_s())
+        self.armed = self.armed and self.stalled
+        await self._asked()
         self._answer()
-        self.armed = False
 
     async def state(self) -> tuple[bool, str]:
+        await self._asked()
         self._answer()
         return not self.armed, "armed" if self.armed else "not initialised"
 
     def close(self) -> None:
         self.armed = False
 
+    async def _asked(self) -> None:
+        """Wait as long as it takes to answer."""
+
     def _answer(self) -> None:
-        if self.silent:
+        if self.silent or self.stalled:
             raise DeviceError("stimulator fake: no answer")
 
 
+class MistakenBlock(Block):
+    """What a driver with a mistake gives."""
+
+    def __len__(self) -> int:
+        raise ZeroDivisionError("a mistake in a driver")
+
+
 class FakeCell:
-    """Blocks of ten samples with a 16-bit counter, delivered by the clock; torque follows the pulses slowly."""
+    """Blocks with a 16-bit counter, delivered by the clock while it is open; torque follows the pulses slowly."""
 
     sample_rate_hz = RATE_HZ
     counter_modulus = 65536
@@ -118,8 +135,8 @@ class FakeCell:
     def __init__(self, clock: VirtualClock, stimulator: FakeStimulator) -> None:
         self.clock = clock
         self.stimulator = stimulator
-        self.silent = False
-        self.nan = False
+        self.silent = self.nan = self.gone = self.broken = self.is_open = False
+        self.per_block = 10
         self.add_nm = 0.0
         self.skip = 0
         self.rate = 1.0
@@ -137,20 +154,35 @@ class FakeCell:
         self.torque_nm = 0.0
         self.held: Callable[[float], bool] = lambda _: False
         self._held: list[Any] = []
-        self._seen = 0
+        self._seen = self._opened = 0
 
-    async def open(self, *_: Callable[..., None]) -> dict[str, Any]:
+    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+        if self.gone:
+            raise DeviceError("load cell: the bus is not there")
+        self._opened, self.is_open = self._opened + 1, True
+        self._schedule(self._opened, self.clock.now_s(), on_block, on_lost)
         return {"device": "fake", "bus": "can0"}
 
     async def close(self) -> None:
-        self.silent = True
+        self.is_open = False
 
-    def feed(self, receiver: Receiver, until_s: float, per_block: int = 10) -> None:
-        """Schedule blocks for the receiver until a time."""
-        period_s = per_block / RATE_HZ / self.rate
-        first_s = self.clock.now_s()
-        for i in range(1, math.ceil((until_s - first_s) / period_s)):
-            self.clock.call_at(first_s + i * period_s, lambda: self._block(receiver.add, per_block))
+    def _schedule(
+        self, opened: int, before_s: float, on_block: Callable[[Block], None], on_lost: Callable[[str], None]
+    ) -> None:
+        """The next block, one period after the time at which the one before was due."""
+        due_s = round(before_s + self.per_block / RATE_HZ / self.rate, 9)
+
+        def beat() -> None:
+            if not self.is_open or opened != self._opened:
+                return
+            if self.gone:
+                on_lost("load cell: the bus is gone")
+                return
+            take = (lambda block: on_block(MistakenBlock(block.samples))) if self.broken else on_block
+            self._block(take, self.per_block)
+            self._schedule(opened, due_s, on_block, on_lost)
+
+        self.clock.call_at(due_s, beat)
 
     def _block(self, take: Callable[[Block], None], n: int) -> None:
         self.counter += n + self.skip
@@ -242,7 +274,7 @@ class VirtualRig:
     def execute(self) -> RunResult:
         if self.angle is not None:
             self.sensor.feed(self.angle, self.clock.now_s() + self.test.longest_s + 8)
-        self.cell.feed(self.receiver, self.clock.now_s() + self.test.longest_s + 8)
+        self.machine.run(self.receiver.open())
         return self.machine.run(self.run.execute())
 
     def recording(self) -> assembly.Recording:

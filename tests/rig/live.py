@@ -13,7 +13,6 @@ import pytest
 from stimrig.rig import config
 from stimrig.rig.control import pair
 from stimrig.rig.control.rig import Rig
-from stimrig.rig.errors import DeviceError
 from stimrig.rig.machine import Disk
 from stimrig.rig.messages import (
     Direction,
@@ -28,15 +27,14 @@ from stimrig.rig.messages import (
     Threshold,
 )
 from stimrig.rig.requests import CalibrateMarkRequest, CalibrateStepRequest, PreviewRequest
-from stimrig.rig.signals import Block
 from stimrig.rig.tasks import Outcome, Task, Tasks
-from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, hold, rest
+from tests.rig.fakes import FakeCell, FakeStimulator, hold, rest
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 T = TypeVar("T")
 SPEED = 4.0
-BLOCK_S, ACK_S = 0.02, 0.002
-"""Rig seconds from one block of the cell to the next, and until a pulse is acknowledged."""
+PER_BLOCK, ACK_S = 32, 0.002
+"""Samples of the cell at once, and rig seconds until a pulse is acknowledged."""
 ANSWER_S, WORK_S = 0.002, 0.003
 """Real seconds until the stimulator answers, and for which a disk or a plan keeps whoever waits for it."""
 PATIENCE_S = 100.0
@@ -58,78 +56,15 @@ class LiveMachine(VirtualMachine):
 
 
 class LiveStimulator(FakeStimulator):
-    """Answers a moment later, or not at all."""
+    """Answers a moment later."""
 
     def __init__(self, machine: LiveMachine) -> None:
         super().__init__(machine.clock)
         self.machine, self.ack_delay_s = machine, ACK_S
-        self.missing = self.deaf = self.stalled = False
 
-    async def open(self) -> dict[str, Any]:
-        await self._wait()
-        if self.missing:
-            raise DeviceError("stimulator: the port is not there")
-        return {"device": "live"}
-
-    async def arm(self) -> None:
-        self.armed = True
-        await self._wait()
-
-    def _acknowledge(self, number: int, error: str | None) -> None:
-        if self.stalled:
-            self.clock.call_at(self.clock.now_s() + ACK_S, lambda: self._acknowledge(number, error))
-        else:
-            super()._acknowledge(number, error)
-
-    async def stop(self) -> None:
-        self.armed = self.armed and self.stalled
-        await self._wait()
-        self.silent = self.stalled
-        self._answer()
-
-    async def state(self) -> tuple[bool, str]:
-        await self._wait()
-        self.silent = self.deaf or self.stalled
-        return await super().state()
-
-    async def _wait(self) -> None:
+    async def _asked(self) -> None:
         self.machine.asked += 1
         await self.machine.tasks.sleep(ANSWER_S)
-
-
-class MistakenBlock(Block):
-    """What a driver with a mistake gives."""
-
-    def __len__(self) -> int:
-        raise ZeroDivisionError("a mistake in a driver")
-
-
-class LiveCell(FakeCell):
-    def __init__(self, clock: VirtualClock, stimulator: LiveStimulator) -> None:
-        super().__init__(clock, stimulator)
-        self.noise_nm, self.lasting_s = 0.01, 0.1
-        self.gone = self.broken = False
-        self._opened = 0
-
-    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
-        if self.gone:
-            raise DeviceError("load cell: the bus is not there")
-        self._opened += 1
-        self._beat(self._opened, on_block, on_lost)
-        return {"device": "live"}
-
-    async def close(self) -> None:
-        self._opened += 1
-
-    def _beat(self, opened: int, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> None:
-        if opened != self._opened:
-            return
-        if self.gone:
-            on_lost("load cell: the bus is gone")
-            return
-        take = (lambda block: on_block(MistakenBlock(block.samples))) if self.broken else on_block
-        self._block(take, round(BLOCK_S * RATE_HZ))
-        self.clock.call_at(self.clock.now_s() + BLOCK_S, lambda: self._beat(opened, on_block, on_lost))
 
 
 class LiveRig:
@@ -156,7 +91,8 @@ class LiveRig:
         self.clock.speed = SPEED
         self.machine = LiveMachine(self.clock, disk)
         self.stimulator = LiveStimulator(self.machine)
-        self.cell = LiveCell(self.clock, self.stimulator)
+        self.cell = FakeCell(self.clock, self.stimulator)
+        self.cell.noise_nm, self.cell.lasting_s, self.cell.per_block = 0.01, 0.1, PER_BLOCK
         self.stimulator.armed = armed
         made = self.devices()
         found = SimpleNamespace(find=lambda kind, _: SimpleNamespace(create=lambda _settings, _machine: made[kind]))

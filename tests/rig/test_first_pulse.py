@@ -57,7 +57,6 @@ def rig_of(folder: Path, rest_s: float = 0.0, watch: Watch = DEFAULT_WATCH, nois
 
 def play(rig: VirtualRig, idle_s: float, *events: tuple[float, Callable[[], object]]) -> RunResult:
     """Connect the cell, let it idle, then start the test; `events` come so long before the start."""
-    rig.cell.feed(rig.receiver, rig.clock.now_s() + idle_s + rig.test.longest_s + 8)
     rig.machine.run(rig.receiver.open())
     for before_s, action in events:
         rig.clock.call_at(rig.clock.now_s() + idle_s - before_s, lambda action=action: void(action()))

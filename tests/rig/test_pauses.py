@@ -70,7 +70,7 @@ Fault = Callable[[VirtualRig], object]
 DOUBTS: dict[str, tuple[Fault, str]] = {
     "longer than a second": (lambda r: r.clock.advance(LONGEST_S + 0.03), "the computer was blocked for 1.0 s"),
     "a cell that stays silent": (
-        lambda r: (setattr(r.cell, "silent", True), r.clock.advance(0.4)), "torque is stale"),
+        lambda r: (setattr(r.cell, "silent", True), r.clock.advance(0.4)), "silent for 1 s"),
     "a cell that was silent before": (
         lambda r: (setattr(r.cell, "silent", True), r.at(-0.165 + 0.15, lambda: r.clock.advance(0.4))), "stale"),
     "a cell that counts on another clock": (

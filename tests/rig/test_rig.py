@@ -150,7 +150,7 @@ def test_a_device_that_is_gone_is_told_and_opened_anew_by_rearming(make: Make):
 
 def test_a_stop_of_a_deaf_device_is_not_called_confirmed(make: Make):
     live = make()
-    live.stimulator.deaf = True
+    live.stimulator.silent = True
     assert not live.stop("check").confirmed
     assert live.rig.status().state == "latched"
 

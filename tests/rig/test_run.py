@@ -320,7 +320,7 @@ def test_no_torque_no_test(tmp_path: Path):
     rig.cell.silent = True
     result = rig.execute()
     assert result.outcome == "fault"
-    assert result.reason == f"no torque has come from the load cell on its bus yet: {LOOK_AT}"
+    assert result.reason == f"no torque has come from the load cell on can0 yet: {LOOK_AT}"
     assert rig.stimulator.sent == []
     recording = rig.recording()
     assert recording.names == []
