@@ -42,12 +42,14 @@ Cause = Literal["stopped", "fault", "withdrawn"]
 class Halt:
     """The only way to end a test early: the first reason counts, and wakes the sender at once.
 
-    Set once, or once more after a withdrawal; `signal` wakes all who wait.
+    Set once, or once more after a withdrawal; `signal` wakes all who wait for that, `settled` those who wait for the
+    evidence, which is None where no pulse could be sent.
     """
 
     def __init__(self, clock: Clock) -> None:
-        self.signal = Signal()
+        self.signal, self.settled = Signal(), Signal()
         self.cause: Cause | None = None
+        self.evidence: StopEvidence | None = None
         self.reason = ""
         self.time_s = 0.0
         self._clock = clock
@@ -125,8 +127,6 @@ class TestRun:
         self.score = Score(test, table, journal, machine.tasks)
         self.halt = halt
         self.started = Signal()
-        self.on_evidence: Callable[[StopEvidence], None] = lambda _: None
-        """Called when the device has been stopped and the torque watched."""
         self.t0_s: float | None = None
         self.told_pulses = 0
         """Count of entries of `Gate.done` that live events have published; written by the thread that makes them."""
@@ -175,7 +175,8 @@ class TestRun:
             log.exception("the test failed")
             self._fault(f"internal: {type(error).__name__}: {error}")
         evidence = await self._stop()
-        self.on_evidence(evidence)  # whoever waits for it waits for no disk
+        self.halt.evidence = evidence
+        self.halt.settled.set()  # whoever waits for it waits for no disk
         elapsed_s = max((self._clock.now_s() - began_s) / self._clock.speed, 1e-9)
         cpu_percent = 100 * (self._machine.cpu_s() - cpu_s) / elapsed_s
         await disk.end()

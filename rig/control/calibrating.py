@@ -6,7 +6,6 @@ import logging
 from collections.abc import Callable
 
 from stimrig.rig import plan
-from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibration import Calibration
 from stimrig.rig.control.memory import Result
 from stimrig.rig.control.playing import Player, check_names
@@ -26,10 +25,8 @@ log = logging.getLogger("rig")
 class Calibrations:
     """Opens, plays step by step, marks and closes a calibration. Every answer but that of `finish` is the status."""
 
-    def __init__(
-        self, player: Player, joint: Joint, result: Result, table: dict[str, Limit], publish: Callable[[], None]
-    ) -> None:
-        self._player, self._joint, self._result, self._table, self._publish = player, joint, result, table, publish
+    def __init__(self, player: Player, result: Result, table: dict[str, Limit], publish: Callable[[], None]) -> None:
+        self._player, self._result, self._table, self._publish = player, result, table, publish
         self._state, self._pair, self._rest = player.state, player.pair, player.rest
         self._store, self._tasks = player.store, player.tasks
 
@@ -67,7 +64,7 @@ class Calibrations:
             await self._tasks.work(self._store.check_room, train.test_id)
             self._open()  # a stop may have come meanwhile
             following = self._state.phase.train(train.test_id)
-            await self._player.launch(test, calibration.table, following, self._joint.described())
+            await self._player.launch(test, calibration.table, following)
 
     async def mark(self, request: CalibrateMarkRequest) -> None:
         """Mark the last train's width as a threshold. Raises PlanError, BusyError, RefusedError (its day is over)."""

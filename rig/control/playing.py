@@ -11,21 +11,21 @@ import logging
 import math
 import re
 from collections.abc import Callable
-from typing import Any
 
 from stimrig.rig import limits, plan
 from stimrig.rig.acquire.health import Watch
 from stimrig.rig.acquire.run import Cause, Halt, RunResult, TestRun
+from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.memory import Rest
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
 from stimrig.rig.errors import DeviceError, PlanError, RigError, TooLateError, WithdrawnError
 from stimrig.rig.machine import Machine
-from stimrig.rig.messages import Event, Extended, FinishedEvent, StopEvidence, Withdrawn
+from stimrig.rig.messages import Event, Extended, FinishedEvent, Withdrawn
 from stimrig.rig.phase import Phase
 from stimrig.rig.requests import EnoughRequest, ExtendRequest, WithdrawRequest
-from stimrig.rig.tasks import Signal, Task
+from stimrig.rig.tasks import Task
 
 log = logging.getLogger("rig")
 
@@ -40,17 +40,15 @@ class Player:
     """Plays planned and admitted tests, one at a time. What is asked meanwhile waits for no start and no re-arm."""
 
     def __init__(
-        self, state: State, pair: Pair, rest: Rest, store: RecordingStore, machine: Machine, watch: Watch,
-        publish: Callable[[Event], None],
+        self, state: State, pair: Pair, joint: Joint, rest: Rest, store: RecordingStore, machine: Machine,
+        watch: Watch, publish: Callable[[Event], None],
     ) -> None:  # fmt: skip
-        self.state, self.pair, self.rest, self.store = state, pair, rest, store
+        self.state, self.pair, self.joint, self.rest, self.store = state, pair, joint, rest, store
         self._machine, self.tasks, self._clock, self._watch = machine, machine.tasks, machine.tasks.clock, watch
         self._publish = publish
         self.run: TestRun | None = None
         self.playing: Task[None] | None = None
         self.finished: FinishedEvent | None = None
-        self.evidence: StopEvidence | None = None
-        self.evidence_ready = Signal()
         self.withdrawals: dict[str, str] = {}
         """Tests that must not begin any more, and why: the newest ones."""
         self._halt: Halt | None = None
@@ -62,42 +60,38 @@ class Player:
             raise WithdrawnError(f"test {test_id}: {withdrawn}; ask for a new test")
 
     async def launch(
-        self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Phase, angle: dict[str, Any] | None,
-        key: str = "",
-    ) -> None:  # fmt: skip
+        self, test: plan.PlannedTest, table: dict[str, limits.Limit], following: Phase, key: str = ""
+    ) -> None:
         """Create latch file and journal, then play: for every test and every train of a calibration.
 
         From here on a stop ends this test, also while its files are being made. Raises RigError: it does not begin.
 
-        `following`: the state from now on. `angle`: what the journal says of the angle sensor; None: there is none.
-        `key`: what extensions of an adaptive test must know.
+        `following`: the state from now on. `key`: what extensions of an adaptive test must know.
         """
         state, before, halt = self.state, self.state.phase, Halt(self._clock)
         halt.on_set(lambda: self._ending(halt))
-        self._halt, self.evidence, self._key = halt, None, key
-        self.evidence_ready.clear()
+        self._halt, self._key = halt, key
         state.change(following)
         try:
             await state.file.write("running", f"test {following.test_id} of participant {following.participant}")
-            journal = await self.tasks.work(self.store.begin, test, self.pair.identity, angle)
+            journal = await self.tasks.work(self.store.begin, test, self.pair.identity, self.joint.described())
             gate, receiver, sensor = self.pair.gate, self.pair.receiver, self.pair.angle
             if gate is None or receiver is None:
                 raise DeviceError("the devices were disconnected before the test began")
         except Exception:
-            await self._not_begun(before)
+            await self._not_begun(before, halt)
             raise
         self.run = TestRun(test, table, journal, gate, receiver, self._machine, halt, self._watch, sensor)
-        self.run.on_evidence = self._take_evidence
         self.playing = self.tasks.spawn(self._execute(self.run), "test")
 
-    def end(self, cause: Cause, reason: str, latch_idle: bool = True) -> bool:
-        """End the running test, or latch; True if a test runs."""
+    def end(self, cause: Cause, reason: str, latch_idle: bool = True) -> Halt | None:
+        """End the running test, or latch; None: no test runs."""
         self.state.count_stop()
         halt = self._halt if self.state.phase.busy else None
         ends_now = halt is not None and halt.set(cause, reason)
         if latch_idle and not ends_now:  # of a test that was ending both reasons are told
             self.state.halted(reason)
-        return halt is not None
+        return halt
 
     def trouble(self) -> str | None:
         """That the task of the test has died; None: it has not."""
@@ -167,7 +161,7 @@ class Player:
         else:
             self.state.halted(halt.reason)
 
-    async def _not_begun(self, before: Phase) -> None:
+    async def _not_begun(self, before: Phase, halt: Halt) -> None:
         """No pulse was sent. A stop that came meanwhile counts as one of an idle rig."""
         state, halted = self.state, self.state.phase
         idle = before.disconnected(halted.lost) if halted.lost else before
@@ -177,11 +171,7 @@ class Player:
             state.change(idle)
             with contextlib.suppress(RigError):
                 await state.file.clear()
-        self.evidence_ready.set()
-
-    def _take_evidence(self, evidence: StopEvidence) -> None:
-        self.evidence = evidence
-        self.evidence_ready.set()
+        halt.settled.set()
 
     async def _execute(self, run: TestRun) -> None:
         self.tasks.spawn(self._announce(run), "announce")
@@ -195,6 +185,7 @@ class Player:
             await self._finish(run, result, finished)
         except Exception as error:  # a bug in this program: stay stopped, keep the journal for the next start
             log.exception("the test could not be ended properly")
+            run.halt.settled.set()
             await self._broken(f"internal: {type(error).__name__}: {error}")
 
     async def _announce(self, run: TestRun) -> None:
@@ -217,7 +208,6 @@ class Player:
             self._publish(finished)
 
     async def _broken(self, reason: str) -> None:
-        self.evidence_ready.set()
         self.run = None
         self.state.change(Phase("latched", reason, lost=reason))
         await self.state.remember(Phase("uncertain", reason))

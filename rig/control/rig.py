@@ -73,8 +73,8 @@ class Rig:
         self.rest = Rest(config.data_dir, machine)
         self.store = RecordingStore(config, machine)
         self._result = Result(config.data_dir, machine)
-        self.player = Player(self.state, self.pair, self.rest, self.store, machine, config.watch, publish)
-        self.calibrations = Calibrations(self.player, self.joint, self._result, self.table, self._publish_status)
+        self.player = Player(self.state, self.pair, self.joint, self.rest, self.store, machine, config.watch, publish)
+        self.calibrations = Calibrations(self.player, self._result, self.table, self._publish_status)
 
     @property
     def latch(self) -> str:
@@ -218,7 +218,7 @@ class Rig:
             self.joint.check(request, table)
             self.player.refuse_withdrawn(request.test_id)
             # nothing is waited for from here until it can be halted
-            await self.player.launch(test, table, following, self.joint.described(), key)
+            await self.player.launch(test, table, following, key)
         return self.status()
 
     async def preview(self, request: PreviewRequest) -> Preview:
@@ -259,14 +259,13 @@ class Rig:
         words = f"{reason:.{LONGEST_WORDS}} (by {by:.{LONGEST_WORDS}})" if by else f"{reason:.{LONGEST_WORDS}}"
         until_s = self._clock.now_s() + STORED_S * self._clock.speed
         player, state = self.player, self.state
-        if player.end("stopped", words, latch_idle):
-            await self._tasks.sleep(STOP_TIMEOUT_S, player.evidence_ready)
+        halt = player.end("stopped", words, latch_idle)
+        if halt is not None:
+            await self._tasks.sleep(STOP_TIMEOUT_S, halt.settled)
             if state.phase.state == "sealing":
                 await state.written(until_s)
-            if player.evidence is not None or state.phase.busy:
-                return player.evidence or self._unconfirmed(
-                    "no more pulses are sent; the device did not answer in time"
-                )
+            if halt.evidence is not None or state.phase.busy:
+                return halt.evidence or self._unconfirmed("no more pulses are sent; the device did not answer in time")
         evidence = await self._stop_idle()
         await state.written(until_s)
         return evidence
