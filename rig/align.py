@@ -77,22 +77,11 @@ def describe(method: Method, error_s: float, host_s: Array, time_s: Array, rate:
 def align(
     cell_s: Array, host_s: Array, sync: NDArray[np.uint8], written_s: Array, sample_rate_hz: float
 ) -> tuple[Array, Alignment]:
-    """Aligned time of each torque sample.
+    """Aligned time of each torque sample, shape (N,), on the test's clock, and how it was obtained.
 
-    Parameters
-    ----------
-    cell_s, host_s, sync
-        Time on the cell's clock (s), receive time on the test's clock (s) and sync line (255: none), shape (N,).
-    written_s
-        When the pulses were written, s on the test's clock, shape (M,), rising, no NaN.
-    sample_rate_hz
-        Nominal; a sync edge lies half a sample, on average, before the sample that shows it.
-
-    Returns
-    -------
-    time_s
-        Shape (N,), on the test's clock.
-    Alignment
+    `cell_s`, `host_s`, `sync`: time on the cell's clock (s), receive time on the test's clock (s) and sync line (255:
+    none), shape (N,). `written_s`: when the pulses were written, s on the test's clock, shape (M,), rising, no NaN.
+    `sample_rate_hz`: nominal; a sync edge lies half a sample, on average, before the sample that shows it.
     """
     if len(cell_s) < 2:
         return host_s.copy(), Alignment("regression", float("nan"), 0.0, 0.0)

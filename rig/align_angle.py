@@ -126,16 +126,9 @@ def align_angle(
 ) -> tuple[Array, Alignment]:
     """Time of each angle sample on the test's clock.
 
-    Parameters
-    ----------
-    samples
-        Dtype `ANGLE_SAMPLE`, shape (N,), their counters unwrapped.
-    rate_hz
-        Nominal.
-    torque
-        Of the same test.
-    of_the_cell, one_bus
-        Whether the angle stands in the cell's frames; whether its frames come over the cell's adapter.
+    `samples`: dtype `ANGLE_SAMPLE`, shape (N,), their counters unwrapped; `rate_hz`: nominal; `torque`: of the same
+    test. `of_the_cell`, `one_bus`: whether the angle stands in the cell's frames, and whether its frames come over the
+    cell's adapter.
     """
     host_s = samples["host_time_s"] - torque.t0_s
     if len(samples) < 2:

@@ -86,23 +86,9 @@ class Score:
     async def extend(self, after: int, chosen: Sequence[SegmentPlan]) -> None:
         """Lay segments behind everything that is laid: all of them, or none.
 
-        Parameters
-        ----------
-        after
-            `decided` when the client did.
-        chosen
-            Empty: nothing more comes from this client, so the fixed plan plays on.
-
-        Raises
-        ------
-        TooLateError
-            More was laid meanwhile, or the test is ending.
-        BusyError
-            Too many extensions at the same time, or for one boundary.
-        PlanError, RefusedError
-            As for a plan.
-        JournalError
-            It could not be written.
+        `after`: `decided` when the client did. `chosen`: empty: nothing more comes from this client, so the fixed plan
+        plays on. Raises TooLateError: more was laid meanwhile, or the test is ending. BusyError: too many extensions at
+        the same time, or for one boundary. PlanError, RefusedError: as for a plan. JournalError: it was not written.
         """
         self._may_grow(after)
         if not chosen:

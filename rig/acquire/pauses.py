@@ -47,16 +47,9 @@ class Pauses:
     async def fault(self, due_s: float, t0_s: float, first: bool = False) -> str | None:
         """Return the fault that must end the test before the due pulse; None: no fault, or the test is ending.
 
-        After a standstill it returns once all is whole again.
-
-        Parameters
-        ----------
-        due_s
-            When the sender should have asked. What came due in a pause is not asked about again.
-        t0_s
-            Start of the test's clock.
-        first
-            Whether the first pulse is due: with a doubt of the torque it waits as after a standstill.
+        After a standstill it returns once all is whole again. `due_s`: when the sender should have asked; what came due
+        in a pause is not asked about again. `first`: the first pulse is due: with a doubt of the torque it waits as
+        after a standstill.
         """
         if due_s < self.until_s:
             return None

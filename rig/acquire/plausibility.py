@@ -136,20 +136,9 @@ values and returns to the smallest again and again; a cell that fails there is n
 class PlausibilityCheck:
     """Checks the samples of one test, block by block.
 
-    Parameters
-    ----------
-    jump_nm
-        Largest change from one sample to the next.
-    stuck_s
-        How long, in rig seconds, a cell that had noise before may repeat exactly the same value.
-    clipped_s
-        The same for a saturated amplifier.
-    rate_hz
-        Nominal.
-    speed
-        Rig seconds per real second.
-    noisy
-        How often the value changed shortly before the test, so that a cell that is stuck from the start is found.
+    `jump_nm`: largest change from one sample to the next. `stuck_s`, `clipped_s`: how long, in rig seconds, a cell that
+    had noise before may repeat exactly the same value, and a saturated amplifier its own. `noisy`: how often the value
+    changed shortly before the test, so that a cell that is stuck from the start is found.
     """
 
     def __init__(

@@ -124,17 +124,10 @@ class Receiver(Stream):
         return int(np.sum(np.abs(np.diff(means_nm)) > 1e-9))  # means of equal samples differ by rounding
 
     def suspicion(self, stuck_s: float, unmoved_s: float) -> tuple[str, float] | None:
-        """Why no pulse may come yet: what arrives may not be the torque of now; None: it is.
+        """Return why no pulse may come yet, and for how many real seconds that may be waited for; None: nothing is odd.
 
-        Parameters
-        ----------
-        stuck_s, unmoved_s
-            Of `Watch`: how long a restless cell may stand still, and one that never gave another value; real seconds.
-
-        Returns
-        -------
-        tuple of str and float
-            In words, with what to look at; and for how many real seconds it may be waited for.
+        What arrives may not be the torque of now. `stuck_s`, `unmoved_s`: of `Watch`: how long a restless cell may
+        stand still, and one that never gave another value; real seconds.
         """
         now_s, speed, still = self._clock.now_s(), self._clock.speed, self._stillness
         age_s = self.age_s(now_s) / speed

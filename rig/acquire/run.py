@@ -97,16 +97,8 @@ class RunResult:
 class TestRun:
     """A test in progress.
 
-    Parameters
-    ----------
-    test, table
-        What to play, and the limits narrowed by the participant's profile.
-    journal
-        Already contains header and plan.
-    halt
-        Ends the test early.
-    angle
-        The angle sensor's receiver; None: the rig has none.
+    `table`: the limits narrowed by the participant's profile. `journal`: contains header and plan already. `halt`: ends
+    the test early. `angle`: None: the rig has no angle sensor.
     """
 
     __test__ = False

@@ -47,22 +47,10 @@ MOST_MISSED = 0.1
 class Calibration:
     """An open calibration.
 
-    Parameters
-    ----------
-    request
-        As the client sent it.
-    table
-        The rig's limits, hard ones narrowed by the rig file.
-    unix_s
-        Time now; its day is the day of the calibration.
-    steps
-        The stimulator's resolution.
-
-    Raises
-    ------
-    RefusedError
-        Step, train, current or rate outside the limits, or too small to stimulate; or the current is so high that
-        even the shortest pulse is too strong to begin with.
+    `table`: the rig's limits, hard ones narrowed by the rig file. `unix_s`: time now; its day is the day of the
+    calibration. `steps`: the stimulator's resolution. Raises RefusedError: step, train, current or rate outside the
+    limits, or too small to stimulate; or the current is so high that even the shortest pulse is too strong to begin
+    with.
     """
 
     def __init__(
@@ -320,21 +308,11 @@ def check_range(plan: TestPlan, angle_set_at_utc: str | None) -> None:
 
 
 def check_profile(profile: Profile, unix_s: float, required: bool, duration_s: float = 0.0) -> None:
-    """Check that a profile is consistent and still valid.
+    """Check that a profile is consistent and still valid. Raises RefusedError, which says what is wrong with it.
 
-    Parameters
-    ----------
-    unix_s
-        Time now. This is the only decision that uses UTC, since a day ends by the calendar.
-    required
-        Whether a profile without a calibration is refused.
-    duration_s
-        Real seconds of the test; it must end before the profile expires.
-
-    Raises
-    ------
-    RefusedError
-        The message says what is wrong with the profile.
+    `unix_s`: time now; this is the only decision that uses UTC, since a day ends by the calendar. `required`: whether a
+    profile without a calibration is refused. `duration_s`: real seconds of the test, which must end before the profile
+    expires.
     """
     sensory_us, motor_us = profile.sensory_pulse_width_us, profile.motor_pulse_width_us
     thresholds = (sensory_us, motor_us, profile.set_at_utc, profile.expires_at_utc)

@@ -23,14 +23,8 @@ def live_event(
 ) -> LiveEvent | None:
     """Return what is new, or None if there is no new torque. Numbers are only copied: no pulse waits for it.
 
-    Parameters
-    ----------
-    run
-        The test in progress; None when idle, and as long as its clock does not run.
-    zero_s
-        Rig time that counts as zero: the test's start, or the rig's when idle.
-    angle
-        The angle sensor's receiver; None: the rig has none.
+    `run`: the test in progress; None when idle, and as long as its clock does not run. `zero_s`: rig time that counts
+    as zero: the test's start, or the rig's when idle. `angle`: None: the rig has no angle sensor.
     """
     torque = _emptied(receiver.live)
     if not torque:

@@ -120,16 +120,8 @@ class Player:
     async def extend(self, request: ExtendRequest) -> Extended:
         """Lay segments behind everything that is laid.
 
-        Raises
-        ------
-        TooLateError
-            That test is over or ending, or more was laid since the client decided.
-        PlanError, RefusedError
-            The test is not adaptive, its key is another, a segment is wrong or outside a limit.
-        BusyError
-            Too many at once.
-        JournalError
-            It could not be written.
+        Raises TooLateError: that test is over or ending, or more was laid since the client decided. PlanError: it is
+        not adaptive, or its key is another. Others as `Score.extend`.
         """
         run = self._running(request.test_id)
         if not hmac.compare_digest(request.key.encode("utf-8", "replace"), self._key.encode("utf-8", "replace")):

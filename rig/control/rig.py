@@ -182,16 +182,9 @@ class Rig:
     async def start(self, request: TestPlan, key: str = "") -> Status:
         """Start a test; `key` is what extensions of an adaptive test must know.
 
-        Raises
-        ------
-        BusyError, LatchedError, UncertainError, DeviceError
-            See `Phase.start`.
-        PlanError, RefusedError
-            The plan is wrong, or outside a limit.
-        LatchChangedError, WithdrawnError
-            The rig was stopped, or this test withdrawn, while this waited.
-        JournalError, RigError
-            The journal or the latch file cannot be written.
+        Raises as `Phase.start`; PlanError, RefusedError: the plan is wrong, or outside a limit; LatchChangedError,
+        WithdrawnError: the rig was stopped, or this test withdrawn, while this waited; JournalError, RigError: the
+        journal or the latch file cannot be written.
         """
         state = self.state
         state.phase.may_start()  # before its turn: a start that was asked for while stopped must not run later

@@ -75,27 +75,13 @@ class FrameSamples:
 class SampleFrame:
     """Decoder of the message that contains the torque or the angle.
 
-    Parameters
-    ----------
-    dbc
-        Path of a DBC file or the name of a packaged one.
-    message
-        Name of the message; None: the first one with the signal.
-    signals
-        Names of the signals, in order of time (several if a frame contains several samples).
-    counter, flag
-        Names of the signals of the counter and of a word of which every value but 0 says the same (a cell's sync line,
-        a sensor's fault); None or empty if there is none.
-    flag_key
-        How the rig file calls that word.
-    fault
-        Signal of a word of which every value but 0 says that the frame's values are no numbers; None or empty if there
-        is none. `CELL_FAULT` may be missing.
+    `dbc`: path of a DBC file or the name of a packaged one. `message`: None: the first one with the signal. `signals`:
+    names, in order of time (several if a frame contains several samples). `counter`, `flag`: signals of the counter and
+    of a word of which every value but 0 says the same (a cell's sync line, a sensor's fault), None or empty if there is
+    none; `flag_key` is how the rig file calls that word. `fault`: signal of a word of which every value but 0 says that
+    the frame's values are no numbers; `CELL_FAULT` may be missing.
 
-    Raises
-    ------
-    ConfigError
-        The file lacks the message or signal; the message lists those that it has.
+    Raises ConfigError: the file lacks the message or signal; lists those that it has.
     """
 
     def __init__(

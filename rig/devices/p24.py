@@ -57,21 +57,9 @@ def result_text(result: int) -> str:
 def ll_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float, connector: int = 0) -> bytes:
     """Frame of one symmetric biphasic pulse: (w, +I), (100 µs, 0), (w, −I).
 
-    Parameters
-    ----------
-    number
-        Packet number, 0 … 63.
-    channel, connector
-        Counted from 0.
-    pulse_width_us
-        Width of each phase, whole µs, 1 … 4095.
-    current_ma
-        0 … 130 mA in steps of 0.5.
-
-    Raises
-    ------
-    WireError
-        A value that the frame cannot carry: no pulse is better than another pulse.
+    `number`: of the packet, 0 … 63; `channel`, `connector`: counted from 0; `pulse_width_us`: of each phase, whole µs,
+    1 … 4095; `current_ma`: 0 … 130 in steps of 0.5. Raises WireError: a value that the frame cannot carry: no pulse is
+    better than another pulse.
     """
     half_ma = 2 * current_ma
     if not (isinstance(pulse_width_us, int) and 1 <= pulse_width_us <= 4095):

@@ -72,21 +72,9 @@ def result_text(result: int) -> str:
 def single_pulse(number: int, channel: int, pulse_width_us: int, current_ma: float) -> bytes:
     """Frame of one symmetric biphasic pulse, drawn by the device.
 
-    Parameters
-    ----------
-    number
-        Packet number, 0 … 255.
-    channel
-        0 … 7.
-    pulse_width_us
-        Width of each phase, whole µs, 20 … 500.
-    current_ma
-        0 … 126 mA in steps of 2.
-
-    Raises
-    ------
-    WireError
-        A value that the frame cannot carry: no pulse is better than another pulse.
+    `number`: of the packet, 0 … 255; `channel`: 0 … 7; `pulse_width_us`: of each phase, whole µs, 20 … 500;
+    `current_ma`: 0 … 126 in steps of 2. Raises WireError: a value that the frame cannot carry: no pulse is better than
+    another pulse.
     """
     if not (isinstance(pulse_width_us, int) and 20 <= pulse_width_us <= 500):
         raise WireError(f"pulse width {pulse_width_us} µs is not a whole number from 20 to 500")
