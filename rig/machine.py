@@ -60,7 +60,6 @@ class Listener(NamedTuple):
     them."""
     handle: Callable[[Any], None]  # gets each block, in the tasks' own thread
     lost: OnMessage  # called once with the reason when the bus is gone
-    gather_s: float  # real seconds for which frames are gathered after the first one
 
 
 class Bus(Protocol):

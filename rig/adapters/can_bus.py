@@ -68,6 +68,8 @@ ATTEMPTS = 5
 STAMPING = ("socketcand", "socketcan", "pcan", "kvaser", "ixxat", "vector")
 """Timestamps of these interfaces are the sender's or the kernel's, of the others the host's at reading."""
 READ_TIMEOUT_S = 0.02
+GATHER_S = 0.005
+"""Real seconds for which frames are gathered after the first one."""
 JOIN_S = 2.0
 SO_RCVBUFFORCE = 33
 BUFFER_BYTES = 4_000_000
@@ -89,7 +91,9 @@ class CanBus:
         self._name, self._clock, self._post = name, clock, post
         self._key, self.place = _key(arguments), place_of(arguments)
         self._arguments = dict(arguments)
-        self._listening: tuple[_Gathering, ...] = ()
+        self._listening: tuple[Listener, ...] = ()
+        self._gathered: list[tuple[Listener, Frame]] = []
+        self._gathered_until_s, self._damaged, self._errors = math.inf, 0, 0
         self._stamped = arguments.get("interface") in STAMPING
         self._tells_length = arguments.get("interface") != "socketcand"
         """True where a frame's identifier length is certain; some gateways write all identifiers with eight digits."""
@@ -115,10 +119,10 @@ class CanBus:
         return bus
 
     def listen(self, listener: Listener) -> None:
-        self._listening = (*self._listening, _Gathering(listener))
+        self._listening = (*self._listening, listener)
 
     def detach(self, listener: Listener) -> None:
-        self._listening = tuple(other for other in self._listening if other.listener is not listener)
+        self._listening = tuple(other for other in self._listening if other is not listener)
 
     def send(self, frames: Sequence[tuple[int, bytes, bool]]) -> None:
         for frame_id, data, is_extended in frames:
@@ -142,8 +146,8 @@ class CanBus:
 
     def _lose(self, reason: str) -> None:
         listening, self._listening = self._listening, ()
-        for gathering in listening:
-            self._post(lambda lost=gathering.listener.lost: lost(reason))
+        for listener in listening:
+            self._post(lambda lost=listener.lost: lost(reason))
 
     def _read(self) -> None:
         while not self._closing.is_set():
@@ -158,38 +162,37 @@ class CanBus:
 
     def _read_once(self) -> None:
         try:
-            message = self.can.recv(self._wait_s(time.monotonic()))
+            message = self.can.recv(max(0.0, min(READ_TIMEOUT_S, self._gathered_until_s - time.monotonic())))
         except ValueError:  # slcan: a damaged line
             message = None
-            self._count(damaged=1)
+            self._damaged += 1
         if message is not None:
             self._sort(message)
-        now_s = time.monotonic()
-        for gathering in self._listening:
-            gathering.hand_over(now_s, self._post)
-
-    def _wait_s(self, now_s: float) -> float:
-        """Real seconds to wait for the next frame: not beyond the end of any gathering."""
-        ends_s = (gathering.end_s for gathering in self._listening)
-        return max(0.0, min([READ_TIMEOUT_S, *(end_s - now_s for end_s in ends_s)]))
+        if self._damaged or self._errors or time.monotonic() >= self._gathered_until_s:
+            self._hand_over()
 
     def _sort(self, message: can.Message) -> None:
         if message.is_error_frame:
-            self._count(errors=1)
+            self._errors += 1
         elif not message.is_remote_frame:
             stamp_s = message.timestamp if self._stamped else math.nan
             frame = Frame(message.arbitration_id, bytes(message.data), self._clock.now_s(), stamp_s)
-            for gathering in self._listening:
-                listener = gathering.listener
+            for listener in self._listening:
                 same_length = message.is_extended_id == listener.is_extended or not self._tells_length
                 if listener.frame_id == message.arbitration_id and same_length:
-                    gathering.add(frame)
+                    self._gathered.append((listener, frame))
+                    self._gathered_until_s = min(self._gathered_until_s, time.monotonic() + GATHER_S)
 
-    def _count(self, damaged: int = 0, errors: int = 0) -> None:
-        """Report counts that belong to no identifier to the listener that opened the bus."""
-        for gathering in self._listening[:1]:
-            gathering.damaged += damaged
-            gathering.errors += errors
+    def _hand_over(self) -> None:
+        """Decode and post what was gathered; counts that belong to no identifier go to who opened the bus."""
+        gathered, counts = self._gathered, (self._damaged, self._errors)
+        self._gathered, self._gathered_until_s, self._damaged, self._errors = [], math.inf, 0, 0
+        for number, listener in enumerate(self._listening):
+            frames = [frame for of, frame in gathered if of is listener]
+            damaged, errors = counts if number == 0 else (0, 0)
+            if frames or damaged or errors:
+                block = listener.decode(frames, damaged, errors)
+                self._post(lambda handle=listener.handle, block=block: handle(block))
 
     def _opened(self) -> can.BusABC:
         self._probe()
@@ -226,29 +229,6 @@ class CanBus:
                 f"{_table(self._name)}.bus: no socketcand answers at {host}:{port} ({_line(error)}); check that it is "
                 "running"
             ) from None
-
-
-class _Gathering:
-    """The frames of one listener that wait to be handed over."""
-
-    def __init__(self, listener: Listener) -> None:
-        self.listener = listener
-        self.damaged = self.errors = 0
-        self.end_s = math.inf
-        self._frames: list[Frame] = []
-
-    def add(self, frame: Frame) -> None:
-        if not self._frames:
-            self.end_s = time.monotonic() + self.listener.gather_s
-        self._frames.append(frame)
-
-    def hand_over(self, now_s: float, post: Callable[[Callable[[], None]], None]) -> None:
-        """Decode what was gathered and post it, once the time is over."""
-        if now_s < self.end_s and not (self.damaged or self.errors):
-            return
-        block = self.listener.decode(self._frames, self.damaged, self.errors)
-        self._frames, self.damaged, self.errors, self.end_s = [], 0, 0, math.inf
-        post(lambda: self.listener.handle(block))
 
 
 def _size_buffer(bus: can.BusABC) -> None:

@@ -166,8 +166,6 @@ class CanSensor:
     name: ClassVar[str]
     """For messages; with `_` it is its table in the rig file."""
     dtype: ClassVar[np.dtype[Any]]
-    gather_s: ClassVar[float]
-    """Real seconds: a block is returned at most this long after its first sample arrived."""
 
     def __init__(self, settings: CanSettings, machine: Machine, *frame: Any) -> None:
         try:
@@ -197,9 +195,7 @@ class CanSensor:
         """Take the bus's frames from now on; the identity to display."""
         message = self._frame.message
         self._bus = bus
-        self._listener = Listener(
-            message.frame_id, message.is_extended_frame, self.decode, on_block, on_lost, self.gather_s
-        )
+        self._listener = Listener(message.frame_id, message.is_extended_frame, self.decode, on_block, on_lost)
         bus.listen(self._listener)
         return {
             "device": self._device,

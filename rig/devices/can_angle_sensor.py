@@ -52,7 +52,7 @@ class Settings(CanSettings):
 class CanAngleSensor(CanSensor):
     """Driver of one sensor; see `rig.devices.AngleSensor` for what the methods promise."""
 
-    name, dtype, gather_s = "angle sensor", ANGLE_SAMPLE, 0.01
+    name, dtype = "angle sensor", ANGLE_SAMPLE
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings

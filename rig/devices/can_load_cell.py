@@ -64,7 +64,7 @@ def message_of(frame: str) -> tuple[int, bytes, bool]:
 class CanLoadCell(CanSensor):
     """Driver of one cell."""
 
-    name, dtype, gather_s = "load cell", SAMPLE, 0.005
+    name, dtype = "load cell", SAMPLE
 
     def __init__(self, settings: Settings, machine: Machine) -> None:
         self._settings = settings
