@@ -98,7 +98,7 @@ class PlannedTest:
     @property
     def charge_uc(self) -> float:
         """Charge of one phase summed over the pulses, µC."""
-        return sequences.dose_uc(self.pulse_width_us, self.plan.profile.current_ma)
+        return charge_uc(self.pulse_width_us, self.plan.profile.current_ma)
 
     @property
     def first_pulse(self) -> int | None:
@@ -110,6 +110,11 @@ class PlannedTest:
             return int(first[0]) if len(first) else None
         extended = self.segments[0].end  # the first segment that a client adds may begin here
         return min(int(first[0]), extended) if len(first) else extended
+
+
+def charge_uc(widths_us: NDArray[np.float64], current_ma: float) -> float:
+    """Charge of one phase summed over the pulses, µC."""
+    return float(np.sum(widths_us)) * current_ma * 1e-3
 
 
 def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
@@ -198,10 +203,10 @@ def check_pieces(pieces: Sequence[Piece], plan: TestPlan, table: dict[str, Limit
             raise RefusedError(f"{_place(pieces, width_us)}: {verdict}")
     whole = len(before_us) + len(added_us)
     window = min(max(1, round(rate_hz)), whole)
-    charge_uc = np.concatenate([before_us[max(0, len(before_us) - window + 1) :], added_us]) * current_ma * 1e-3
-    worst_uc = float(np.max(np.convolve(charge_uc, np.ones(window), "valid")))
+    recent_us = np.concatenate([before_us[max(0, len(before_us) - window + 1) :], added_us])
+    worst_uc = float(np.max(np.convolve(recent_us * current_ma * 1e-3, np.ones(window), "valid")))
     refuse(table["charge_per_second_uc"], worst_uc, "plan")
-    whole_uc = sequences.dose_uc(before_us, current_ma) + sequences.dose_uc(added_us, current_ma)
+    whole_uc = charge_uc(before_us, current_ma) + charge_uc(added_us, current_ma)
     refuse(table["charge_per_test_uc"], whole_uc, "plan")
     refuse(table["duration_s"], whole / rate_hz, "plan")
     last_us = float(before_us[-1]) if len(before_us) else 0.0
@@ -258,7 +263,7 @@ def preview(test: PlannedTest, recruitment: RecruitmentTable | None = None) -> P
         widths, torques = recruitment.pulse_width_us, recruitment.torque_nm
         if len(widths) != len(torques) or len(widths) < 2 or not np.all(np.diff(widths) > 0):
             raise PlanError("recruitment: give as many torques as pulse widths, at least two; the widths must increase")
-        torque_time_nms = sequences.torque_time_nms(test.pulse_width_us, rate_hz, widths, torques)
+        torque_time_nms = float(np.sum(np.interp(test.pulse_width_us, widths, torques)) / rate_hz)
     return Preview(
         duration_s=test.duration_s,
         charge_uc=test.charge_uc,

@@ -129,7 +129,7 @@ class Score:
         """Return the scheduled part of an adaptive test, and the remainder of its bounds."""
         assert self.adaptive is not None
         queue, rate_hz = self.queue, self.plan.pulse_rate_hz
-        charge_uc = float(np.sum(queue.pulse_width_us)) * self.plan.profile.current_ma * 1e-3
+        charge_uc = plan.charge_uc(queue.pulse_width_us, self.plan.profile.current_ma)
         return Extended(
             test_id=self.plan.test_id,
             laid=self.decided,

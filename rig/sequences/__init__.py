@@ -26,8 +26,6 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from stimrig.rig.errors import PlanError
 from stimrig.rig.messages import SequenceInfo
 
-Floats = NDArray[np.float64] | list[float]
-
 
 class SequenceSettings(BaseModel):
     """Base of every sequence's settings: unknown names, NaN and infinities are refused.
@@ -109,13 +107,3 @@ def pulse_count(sequence_id: str, settings: dict[str, Any], pulse_rate_hz: float
 def pulses_in(duration_s: float, pulse_rate_hz: float) -> int:
     """Number of pulses in a duration, to the nearest."""
     return round(duration_s * pulse_rate_hz)
-
-
-def dose_uc(pulse_width_us: Floats, current_ma: float) -> float:
-    """Charge of one phase summed over the pulses, µC (width × current)."""
-    return float(np.sum(np.asarray(pulse_width_us, dtype=np.float64)) * current_ma * 1e-3)
-
-
-def torque_time_nms(pulse_width_us: Floats, pulse_rate_hz: float, table_us: Floats, table_nm: Floats) -> float:
-    """Estimated torque-time, N·m·s: the steady torque of each pulse by a recruitment table, times its period."""
-    return float(np.sum(np.interp(np.asarray(pulse_width_us), table_us, table_nm)) / pulse_rate_hz)

@@ -29,6 +29,10 @@ def widths(*values: float) -> list[SegmentPlan]:
 
 def test_preview():
     test = built()
+    short = plan.preview(
+        built(widths(0.0, 50.0, 100.0)), RecruitmentTable(pulse_width_us=[0, 50, 100], torque_nm=[0, 1, 9])
+    )
+    assert (short.charge_uc, short.torque_time_nms) == pytest.approx((3.0, 10 / 40))
     shown = plan.preview(test, RecruitmentTable(pulse_width_us=[0, 300], torque_nm=[0, 6]))
     assert shown.duration_s == pytest.approx(38.7)
     assert shown.charge_uc == test.charge_uc == pytest.approx(test.pulse_width_us.sum() * 0.02)

@@ -77,12 +77,6 @@ def test_every_sequence_stays_between_zero_and_c(name: str, rate_hz: float, c_us
     assert np.array_equal(widths, sequences.build(name, settings, rate_hz))  # pure
 
 
-def test_dose_and_torque_time():
-    widths = [0.0, 100.0, 300.0]
-    assert sequences.dose_uc(widths, 20.0) == pytest.approx(8.0)
-    assert sequences.torque_time_nms(widths, 40.0, [0, 100, 300], [0, 1, 9]) == pytest.approx(10 / 40)
-
-
 @pytest.mark.parametrize(
     ("name", "settings", "words"),
     [
