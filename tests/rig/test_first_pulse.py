@@ -73,7 +73,7 @@ MOMENTS = [
     (EMULATOR, 0.0, 0.08),
     (EMULATOR, 1.0, -0.705),
 ]
-"""The watch, how long the test rests first, and how long before its start the cell fails; negative: so long after it."""
+"""The watch, how long the test rests first, and how long before its start the cell fails (negative: after it)."""
 
 
 @pytest.mark.parametrize(("watch", "rest_s", "before_s"), MOMENTS)
