@@ -224,7 +224,7 @@ class Rig:
         self._previews += 1
         try:
             async with self.state.in_turn():
-                if self.state.phase.busy:
+                if self.state.phase.state in ("arming", "running", "stopping"):
                     raise BusyError(f"test {self.state.phase.test_id} is in progress; look at the plan afterwards")
                 check_range(request.plan, self.joint.set_at_utc)
                 return await self._tasks.work(self._previewed, request)

@@ -70,12 +70,7 @@ class LiveStimulator(FakeStimulator):
 class LiveRig:
     """A `Rig` on both, opened, and every event that it published.
 
-    Parameters
-    ----------
-    clock
-        Of a rig that was closed: time goes on where that one ended.
-    changes
-        To its configuration.
+    `clock`: of a rig that was closed: time goes on where that one ended. `changes`: to its configuration.
     """
 
     def __init__(

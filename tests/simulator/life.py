@@ -63,12 +63,7 @@ def rig_file(settings: Settings, devices: Devices, arm: str | None) -> config.Ri
 class Life:
     """Builds the rig of a seed and lives it.
 
-    Parameters
-    ----------
-    seed
-        Of everything.
-    only
-        Numbers of the accidents that happen; None: all. A failing life is shrunk by leaving some out.
+    `only`: numbers of the accidents that happen; None: all. A failing life is shrunk by leaving some out.
     """
 
     def __init__(self, seed: int, only: Collection[int] | None = None) -> None:

@@ -40,12 +40,8 @@ LONGEST_ADAPTIVE_S = 6.0
 class People:
     """One of those of a life. Once it is quiet the first only re-arms, and starts a test until one plays to its end.
 
-    Parameters
-    ----------
-    jumping
-        Tests of widths that say of themselves that they jump on purpose; of all people of the life.
-    leads
-        Whether it is the first one; the others leave when it becomes quiet.
+    `jumping`: tests of widths that say of themselves that they jump on purpose; of all people of the life. `leads`:
+    whether it is the first one; the others leave when it becomes quiet.
     """
 
     def __init__(self, life: Life, jumping: set[str], leads: bool = True) -> None:

@@ -22,10 +22,7 @@ MOST_HELD_BYTES = 4096
 class Direction:
     """One direction of the line. What befalls it: `stall`, and the deviances with their probabilities.
 
-    Parameters
-    ----------
-    deliver
-        Gets each piece that arrives: its bytes, when it was written (world's time), and whether it came as it was sent.
+    `deliver`: gets each piece that arrives: its bytes, when it was written (world's time), whether it came as sent.
     """
 
     def __init__(self, world: World, name: str, deliver: Callable[[bytes, float, bool], None]) -> None:
@@ -96,14 +93,9 @@ class Direction:
 
 
 class Wires:
-    """Serial line and CAN bus of one rig.
+    """Serial line and CAN bus of one rig, on which `devices` hang.
 
-    Parameters
-    ----------
-    devices
-        What hangs on them.
-    fired
-        Called after a piece of bytes has reached the stimulator: when it was written, and whether it came as sent.
+    `fired`: called after a piece of bytes has reached the stimulator: when it was written, whether it came as sent.
     """
 
     def __init__(self, world: World, devices: Devices, block_s: float, fired: Callable[[float, bool], None]) -> None:

@@ -12,10 +12,7 @@ from itertools import count
 class World:
     """True time in seconds, from 0; events in the order of their time, those of one moment in the order they were made.
 
-    Parameters
-    ----------
-    seed
-        Of every chance in this life.
+    `seed`: of every chance in this life.
     """
 
     def __init__(self, seed: int) -> None:
