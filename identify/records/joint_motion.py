@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 from numba import njit
-from scipy.optimize import minimize
 
 MOTION = ("angle_rad", "velocity_rad_s", "acceleration_rad_s2")
 BLOCK_S = 0.01
@@ -206,6 +205,8 @@ def smooth(
 
 def pace_of(time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: float) -> tuple[float, Pace]:
     """Intensity of the jerk and pace that make one part's angles most likely beside a sensor's noise."""
+    from scipy.optimize import minimize  # here: its import takes longer than a fit, which mostly does not need it
+
     known = np.isfinite(angle_rad)
     at_s, read_rad, nothing = time_s[known], angle_rad[known], [np.empty((0, size)) for size in (3, 6, 5)]
     every = max(int(BLOCK_S / max(np.median(np.diff(at_s)), 1e-9)), 1) if at_s.size > LEAST_BLOCKS else 1

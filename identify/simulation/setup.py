@@ -72,8 +72,8 @@ class Setup:
         scene = self._scene((np.arange(grid.size) + self._middle) * grid.step_s, grid.pulse_width_us, grid.begins)
         pauses = np.zeros(grid.size)
         pauses[grid.begins] = [part.pause_s - part.folded_s for part in grid.record.parts]
-        states, within = self.states, self._scene_within()
-        return replace(scene, fitted=self.fitted, pauses_s=pauses, states=states, within=within)
+        within = None if scene.angle_rad is None else self._scene_within()
+        return replace(scene, fitted=self.fitted, pauses_s=pauses, states=self.states, within=within)
 
     @cached_property
     def present(self) -> np.ndarray:
