@@ -61,7 +61,7 @@ def locate_pulses(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[Pul
     sound = sent.sound
     # Even slots, late by what the promptest pulses were late together.
     lag = float(np.quantile((sent.written_s - sent.planned_s)[sound], PROMPT)) if sound.any() else 0.0
-    late, unsure, extra_s = _pulse_lateness(sent, time_s, sync)
+    late, unsure, extra_s = _lateness(sent, time_s, sync)
     may = sent.width_us > 0
     wild = ~(np.abs(late) <= LONGEST_LATE_S)
     unsure = may & (unsure | wild)
@@ -74,52 +74,38 @@ def locate_pulses(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[Pul
     return Pulses(slot, sent.width_us, late, lost), _inside(time_s, *spans)
 
 
-def _pulse_lateness(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _lateness(sent: Sent, time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Lateness of each pulse behind the promptest, s; whether it is unsure; times of unplanned pulses."""
-    late, unsure = _host_lateness(sent)
-    sync_edges = _edges(time_s, sync)
-    match = None if sync_edges is None else _matched(sent, *sync_edges)
-    if sync_edges is None or match is None:
-        return late, unsure, np.zeros(0)
-    edge, extra_s = match
-    on_line = edge >= 0
-    earliest, newest = (side[np.maximum(edge, 0)] for side in sync_edges)
-    # The line gives the sample, the host's clock the time within it.
-    shift = float(np.median((0.5 * (earliest + newest) - sent.written_s)[on_line]))
-    felt_s = np.clip(sent.written_s + shift, earliest, newest)
-    prompt = on_line & sent.sound
-    base = float(np.quantile((felt_s - sent.planned_s)[prompt], PROMPT))
-    # Where the cell lost samples the line shows nothing, and the host's times are used.
-    watched = _watched(sent, time_s)
-    late = np.where(on_line, felt_s - sent.planned_s - base, late)
-    return late, np.where(on_line, False, unsure | watched), extra_s
-
-
-def _host_lateness(sent: Sent) -> tuple[np.ndarray, np.ndarray]:
-    """Lateness and doubt by writing and acknowledgement alone."""
-    sound = sent.sound & np.isfinite(sent.acknowledged_s)
-    middle = 0.5 * (sent.written_s + sent.acknowledged_s)
-    if not sound.any():
-        return np.zeros(sent.planned_s.size), ~sent.sound
-    late = middle - sent.planned_s
-    late = late - float(np.quantile(late[sound], PROMPT))
-    span = sent.acknowledged_s - sent.written_s
-    usual = float(np.quantile(span[sound], PROMPT))
-    unsure = ~sound | (span - usual > UNSURE * sent.interval_s)
-    return np.where(sound, late, 0.0), unsure
-
-
-def _edges(time_s: np.ndarray, sync: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """For each pulse on the sync line the last sample without it and the first with it, s; None without a line."""
-    if time_s.size < 2 or not np.any(sync == 1):
-        return None
-    period_s = float(np.median(np.diff(time_s)))
+    known = sent.sound & np.isfinite(sent.acknowledged_s)
+    late, unsure = np.zeros(sent.planned_s.size), ~sent.sound
+    if known.any():
+        middle_s, span_s = 0.5 * (sent.written_s + sent.acknowledged_s), sent.acknowledged_s - sent.written_s
+        late_s, usual_s = (float(np.quantile(x[known], PROMPT)) for x in (middle_s - sent.planned_s, span_s))
+        late = np.where(known, middle_s - sent.planned_s - late_s, 0.0)
+        unsure = ~known | (span_s - usual_s > UNSURE * sent.interval_s)
+    period_s = float(np.median(np.diff(time_s))) if time_s.size > 1 else np.inf
     rising = np.flatnonzero((sync[1:] == 1) & (sync[:-1] == 0) & (np.diff(time_s) < 1.5 * period_s))
-    return (time_s[rising], time_s[rising + 1]) if rising.size else None
+    # Of each pulse on the sync line the last sample without it and the first with it.
+    earliest_s, newest_s = time_s[rising], time_s[rising + 1]
+    edge, extra_s = _matched(sent, earliest_s, newest_s)
+    if edge is None:
+        return late, unsure, extra_s
+    on_line = edge >= 0
+    earliest_s, newest_s = earliest_s[edge], newest_s[edge]
+    # The line gives the sample, the host's clock the time within it.
+    shift_s = float(np.median((0.5 * (earliest_s + newest_s) - sent.written_s)[on_line]))
+    late_s = np.clip(sent.written_s + shift_s, earliest_s, newest_s) - sent.planned_s
+    late_s -= float(np.quantile(late_s[on_line & sent.sound], PROMPT))
+    # Where the cell lost samples the line shows nothing, and the host's times are used.
+    unsure = unsure | _watched(sent, time_s, period_s)
+    return np.where(on_line, late_s, late), np.where(on_line, False, unsure), extra_s
 
 
-def _matched(sent: Sent, earliest: np.ndarray, newest: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _matched(sent: Sent, earliest: np.ndarray, newest: np.ndarray) -> tuple[np.ndarray | None, np.ndarray]:
     """For each pulse its edge, −1 for none, and the times of edges left over; None where the line is not believed."""
+    nothing = None, np.zeros(0)
+    if not newest.size:
+        return nothing
     may = (sent.width_us > 0) & np.isfinite(sent.written_s)
     reach_s = REACH * sent.interval_s
     centre = 0.5 * (earliest + newest)
@@ -135,7 +121,7 @@ def _matched(sent: Sent, earliest: np.ndarray, newest: np.ndarray) -> tuple[np.n
     expected = int(np.sum(may & sent.sound))
     matched = int(np.sum((edge >= 0) & sent.sound))
     if not expected or matched < SYNC_SHARE * expected or unmatched.size > (1 - SYNC_SHARE) * expected:
-        return None
+        return nothing
     return edge, newest[unmatched]
 
 
@@ -145,9 +131,8 @@ def _by(acknowledged_s: np.ndarray, begin_s: np.ndarray) -> np.ndarray:
     return np.where(known, np.clip(acknowledged_s, begin_s, begin_s + LONGEST_LATE_S), begin_s)
 
 
-def _watched(sent: Sent, time_s: np.ndarray) -> np.ndarray:
+def _watched(sent: Sent, time_s: np.ndarray, period_s: float) -> np.ndarray:
     """bool, shape (P,): pulses during whose possible time the cell lost no sample."""
-    period_s = float(np.median(np.diff(time_s)))
     holes = np.flatnonzero(np.diff(time_s) >= 1.5 * period_s)
     start = np.where(np.isfinite(sent.written_s), sent.written_s, sent.planned_s)
     stop = _by(sent.acknowledged_s, start) + REACH * sent.interval_s

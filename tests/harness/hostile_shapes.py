@@ -43,9 +43,10 @@ def columns() -> dict[str, Any]:
         torque[k] = torque[k - 1] + (drive[k] - torque[k - 1]) / 40
     torque += 0.02 * np.sin(np.arange(time_s.size) ** 1.7)
     return {
-        "torque/time_s": time_s, "torque/torque_nm": torque,
+        "torque/time_s": time_s, "torque/torque_nm": torque, "torque/sync": np.full(time_s.size, 255, np.uint8),
         "pulses/planned_time_s": pulses, "pulses/sent_pulse_width_us": width,
         "pulses/written_time_s": np.where(width > 0, pulses + 0.001, np.nan),
+        "pulses/acknowledged_time_s": np.where(width > 0, pulses + 0.002, np.nan),
         "pulses/status": np.where(width > 0, 0, 1).astype(np.uint8),
         "segments/start_s": np.array([0.0, 1.0, 9.0]), "segments/end_s": np.array([1.0, 9.0, 16.0]),
     }  # fmt: skip

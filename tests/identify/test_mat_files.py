@@ -194,8 +194,8 @@ def weapons() -> dict[str, bytes]:
         "a terabyte of numbers": matrix(6, huge, b"time_s", struct.pack("<II", 9, 2**31)),
         "numbers that are not there": matrix(6, (1_000_000, 1), b"time_s", struct.pack("<IId", 9, 8, 1.0)),
         "a terabyte of cells": matrix(1, huge, b"time_s"),
-        "a bomb": packed(matrix(6, (1_000_000, 1), b"time_s", struct.pack("<II", 9, 8_000_000) + bytes(60_000_000))),
-        "a bomb in a text": packed(matrix(4, (1, 9), b"time_s", bytes(60_000_000))),
+        "a bomb": packed(matrix(6, (1_000_000, 1), b"time_s", struct.pack("<II", 9, 8_000_000) + bytes(30_000_000))),
+        "a bomb in a text": packed(matrix(4, (1, 9), b"time_s", bytes(30_000_000))),
         "a function handle": matrix(16, (1, 1), b"time_s", matrix(2, (1, 1), b"")),
         "an object": matrix(3, (1, 1), b"time_s", matrix(2, (1, 1), b"")),
         "a sparse matrix": matrix(5, (1000, 1), b"time_s"),
@@ -220,7 +220,7 @@ def test_files_as_weapons_are_refused_in_one_line_and_little_memory(tmp_path: Pa
         tracemalloc.start()
         try:
             assert told(path), weapon
-            assert tracemalloc.get_traced_memory()[1] < 40_000_000, weapon
+            assert tracemalloc.get_traced_memory()[1] < 20_000_000, weapon
         finally:
             tracemalloc.stop()
 
