@@ -126,7 +126,7 @@ def rest(folder: Path) -> Any:
         }
 
     document = create_app(Settings(data_dir=folder, rig_file=None)).openapi()
-    return condensed(bare({name: document[name] for name in ("paths", "components")}), folder)
+    return condensed(bare({"paths": document["paths"], "schemas": document["components"]["schemas"]}), folder)
 
 
 def _reference(folder: Path) -> None:
