@@ -18,8 +18,6 @@ LARGEST_MODEL_BYTES = 32 * 2**20
 
 def load_model(path: Path) -> identify.Model:
     """Read a model. Raises OSError; InputError: the file holds no model."""
-    if path.suffix.lower() == ".mat":
-        raise InputError(f"{path}: a MAT file is for other tools. Give the MODEL.json of the same fit.")
     with path.open("rb") as file:
         text = file.read(LARGEST_MODEL_BYTES)
     try:
@@ -62,16 +60,12 @@ def short(data: Sequence[Path]) -> str:
 
 
 def write(path: Path | None, content: str | bytes | identify.Model) -> None:
-    """Write a file, if one is asked for: a text, or a model as MODEL.json or, where the name ends in .mat, as MAT."""
+    """Write a file, if one is asked for: a text, or a model as MODEL.json."""
     if path is None:
         return
     with whole_path(path) as place:
         if not isinstance(content, identify.Model):
             place.write_bytes(content.encode() if isinstance(content, str) else content)
-        elif path.suffix.lower() == ".mat":
-            from stimrig.identify import plain_mat
-
-            plain_mat.write(place, content.to_dict())
         else:
             place.write_text(content.to_json(), "utf-8", newline="")
 
@@ -82,9 +76,8 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
     Parameters
     ----------
     what : Model, Record, Inversion or Explanation
-        A model: MODEL.json, `.mat` for other tools, or `.html`, a report beside its record. A record: `.csv` (joined
-        ones, too), `.mat` or `.parquet`, as `read` takes them. An inversion: `.csv`, as `stimrig invert -o`. An
-        explanation: `.html`.
+        A model: MODEL.json, or `.html`, a report beside its record. A record: `.csv` (joined ones, too), `.mat` or
+        `.parquet`, as `read` takes them. An inversion: `.csv`, as `stimrig invert -o`. An explanation: `.html`.
     path : str or Path
         The file; one that is there is replaced.
     record : Record, optional
@@ -109,7 +102,7 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
     kind = path.suffix.lower()
     if kind == ".html":
         write(path, html_report(what, record, path.stem))
-    elif isinstance(what, identify.Model) and kind in (".json", ".mat"):
+    elif isinstance(what, identify.Model) and kind == ".json":
         write(path, what)
     elif isinstance(what, identify.Record) and kind[1:] in WRITERS:
         with whole_path(path) as place:
@@ -117,9 +110,7 @@ def save(what: Any, path: str | Path, record: identify.Record | None = None) -> 
     elif isinstance(what, Inversion) and kind == ".csv":
         write(path, inversion_table(what.to_dict()))
     else:
-        fix = (
-            "A model is .json, .mat or .html, an explanation .html, a record .csv, .mat or .parquet, an inversion .csv."
-        )
+        fix = "A model is .json or .html, an explanation .html, a record .csv, .mat or .parquet, an inversion .csv."
         raise identify.BadRequest(f"no {kind or 'such'} file of a {type(what).__name__}", place=str(path), fix=fix)
     return path
 

@@ -32,7 +32,7 @@ ColumnMap = Annotated[
     ),
 ]
 Html = Annotated[Path | None, typer.Option(help="write a report with charts here")]
-LastModel = Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json, or MODEL.mat")]
+LastModel = Annotated[Path | None, typer.Option("-o", "--output", help="write the last MODEL.json")]
 ModelFile = Annotated[
     Path, typer.Argument(help="MODEL.json of `stimrig fit -o`", metavar="MODEL.json", show_default=False)
 ]

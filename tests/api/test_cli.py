@@ -74,21 +74,6 @@ def test_a_record_of_another_tool_gives_the_same_and_what_was_assumed_is_said(
     assert "Kraftmoment" in refused(capsys, "diagnose", other)
 
 
-def test_models_and_predictions_as_mat_files(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path, record: Path, model: Path
-) -> None:
-    from scipy.io import loadmat
-
-    assert run(capsys, "fit", record, "-o", tmp_path / "M.mat")[0] == 0
-    linear = loadmat(tmp_path / "M.mat", squeeze_me=True, struct_as_record=False)["linear"]
-    assert linear.b == pytest.approx(json.loads(model.read_text())["linear"]["b"])
-    assert sum(linear.b) / sum(linear.a) == pytest.approx(1.0, abs=1e-6), "unit gain at DC"
-    assert run(capsys, "predict", model, record, "-o", tmp_path / "p.mat")[0] == 0
-    found = loadmat(tmp_path / "p.mat", squeeze_me=True)
-    assert found["predicted_torque_nm"].shape == found["time_s"].shape == (1000,)
-    assert "MODEL.json of the same fit" in refused(capsys, "compare", tmp_path / "M.mat", record)
-
-
 @pytest.fixture(scope="module")
 def parts(tmp_path_factory: pytest.TempPathFactory, model: Path) -> dict[str, Path]:
     """A record, another one with an angle, and files that cannot be used."""

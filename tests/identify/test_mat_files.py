@@ -15,7 +15,6 @@ import pytest
 from scipy.io import loadmat, savemat
 
 from stimrig import identify
-from stimrig.identify import plain_mat
 from stimrig.identify.records.mat import variables
 from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
@@ -106,19 +105,6 @@ def test_no_segments_a_pulse_rate_and_holes(tmp_path: Path, record: Record) -> N
     assert found.time_s.size == record.time_s.size - 1
     assert "(first at torque_nm(11))" in found.notes[0]
     assert "no segment column: found from the pulse widths" in found.notes[-1]
-
-
-def test_a_model_and_its_prediction_open_in_other_tools(tmp_path: Path, record: Record) -> None:
-    model = identify.fit(record)
-    plain_mat.write(tmp_path / "MODEL.mat", model.to_dict())
-    theirs = loadmat(tmp_path / "MODEL.mat", squeeze_me=True, struct_as_record=False)
-    linear, curve = theirs["linear"], theirs["recruitment"]
-    assert np.array_equal(linear.b, model.to_dict()["linear"]["b"])
-    assert np.array_equal(curve.torque_nm, model.to_dict()["recruitment"]["torque_nm"])
-    assert theirs["model_id"] == model.model_id and theirs["fit"].fit_percent == model.fit["fit_percent"]
-    plain_mat.write(tmp_path / "p.mat", columns(record) | {"predicted_torque_nm": identify.predict(model, record)})
-    again = identify.read(tmp_path / "p.mat")
-    assert np.array_equal(again.torque_nm, record.torque_nm) and again.segment_names == record.segment_names
 
 
 # ---- what cannot be taken ------------------------------------------------------------------------------------

@@ -45,7 +45,7 @@ def fit(
             show_default=False,
         ),
     ] = None,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="write MODEL.json, or MODEL.mat")] = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="write MODEL.json")] = None,
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:

@@ -17,14 +17,13 @@ from stimrig.api.whole_file import whole_path
 def predict(
     model_json: ModelFile,
     data: Data,
-    output: Annotated[Path, typer.Option("-o", "--output", help="CSV or .mat file to write", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="CSV file to write", show_default=False)],
     columns: ColumnMap = None,
     as_json: Json = False,
 ) -> None:
     """Free-run simulation from the recorded pulse widths: time_s,torque_nm,predicted_torque_nm."""
     import numpy as np
 
-    from stimrig.identify import plain_mat
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
     from stimrig.identify.summary import fit_words
 
@@ -33,10 +32,7 @@ def predict(
     predicted = np.asarray(identify.predict(model, record))
     rows = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
     with whole_path(output) as place:
-        if output.suffix.lower() == ".mat":
-            plain_mat.write(place, rows)
-        else:
-            np.savetxt(place, np.column_stack(list(rows.values())), "%.9g", ",", header=",".join(rows), comments="")
+        np.savetxt(place, np.column_stack(list(rows.values())), "%.9g", ",", header=",".join(rows), comments="")
     figures = {
         "fit_percent": best_fit_percent(record.torque_nm, predicted),
         "rms_nm": float(np.sqrt(np.mean((record.torque_nm - predicted) ** 2))),
