@@ -59,34 +59,6 @@ def structure_of(effects: Collection[str], figures: dict[str, Figure]) -> tuple[
 # ---- in figures ---------------------------------------------------------------------------------------------------
 
 
-def difference(name: str, before: State, now: State) -> dict[str, Any] | None:
-    """Return the change of a figure and its uncertainty; None where it is unknown.
-
-    `figure`, `unit`, `before`, `now`, `difference` and `uncertainty` (one standard deviation of the difference) in that
-    unit; `percent` of the value before; `times`, the difference over its uncertainty; `beyond`.
-    """
-    old, new = before.figures.get(name) or {}, now.figures.get(name) or {}
-    first, second = old.get("value"), new.get("value")
-    if first is None or second is None:
-        return None
-    spread, times = None, None
-    if old.get("sd") is not None and new.get("sd") is not None:
-        same = (before.method, before.structure) == (now.method, now.structure)
-        spread = math.hypot(old["sd"], new["sd"], max(_floor(name, same, first), _floor(name, same, second)))
-        times = abs(second - first) / spread if spread > 0 else 0.0
-    return {
-        "figure": name,
-        "unit": new.get("unit") or "1",
-        "before": first,
-        "now": second,
-        "difference": second - first,
-        "percent": 100 * (second - first) / abs(first) if first else None,
-        "uncertainty": spread,
-        "times": times,
-        "beyond": times is not None and times > BEYOND,
-    }
-
-
 def uncertainty(name: str, figure: Figure) -> float | None:
     """Return the uncertainty of a figure in its unit; those of two figures add up to that of their difference."""
     if figure.get("value") is None or figure.get("sd") is None:
@@ -117,9 +89,25 @@ def same_current(before: State, now: State) -> bool:
 
 
 def changed(before: State, now: State) -> list[dict[str, Any]]:
-    """List the differences beyond twice their uncertainty, the most certain first."""
-    differences = [difference(name, before, now) for name in comparable(before, now)]
-    return sorted((item for item in differences if item and item["beyond"]), key=lambda item: -item["times"])
+    """List the differences beyond twice their uncertainty, the most certain first.
+
+    `before`, `now`, `difference` and `uncertainty` (one standard deviation of the difference) are in the `unit` of the
+    `figure`; `percent` is of the value before; `times`: the difference over its uncertainty.
+    """
+    differences = []
+    same = (before.method, before.structure) == (now.method, now.structure)
+    for name in comparable(before, now):
+        old, new = before.figures[name], now.figures[name]
+        first, second = old.get("value"), new.get("value")
+        if first is None or second is None or old.get("sd") is None or new.get("sd") is None:
+            continue
+        spread = math.hypot(old["sd"], new["sd"], max(_floor(name, same, first), _floor(name, same, second)))
+        if abs(second - first) > BEYOND * spread > 0:
+            change = {"before": first, "now": second, "difference": second - first, "uncertainty": spread}
+            percent, times = 100 * (second - first) / abs(first) if first else None, abs(second - first) / spread
+            unit = new.get("unit") or "1"
+            differences.append({"figure": name, "unit": unit, **change, "percent": percent, "times": times})
+    return sorted(differences, key=lambda item: -item["times"])
 
 
 # ---- in words -----------------------------------------------------------------------------------------------------
@@ -185,13 +173,11 @@ def dose_words(charge_uc: float | None) -> str:
     return value_words(charge_uc, LAST_NAMES["charge_uc"])
 
 
-def uncertain_words(value: float | None, uncertainty: float | None, name: Name, sign: bool = False) -> str:
-    """Format a value with twice its uncertainty, without the unit; a difference has its sign."""
+def uncertain_words(value: float | None, uncertainty: float | None, name: Name) -> str:
+    """Format a value with twice its uncertainty, without the unit."""
     if uncertainty and name.digits is None:  # digits follow the uncertainty
         name = replace(name, digits=max(0, _digits(BEYOND * uncertainty * name.factor) - 1))
     words = value_words(value, name, unit=False)
-    if sign and value is not None and not words.startswith("−"):
-        words = f"+{words}"
     if value is None or uncertainty is None:
         return words
     return f"{words} ± {value_words(BEYOND * uncertainty, name, unit=False)}"
