@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tests.api.conftest import TOKEN, Service, soon
+from tests.api.conftest import PASSWORD, TOKEN, Service, soon
 
 PROGRAMS = ("chromium-headless-shell", "chromium", "chromium-browser")
 """The first without windows of its own: with the others each tab costs three times the processor."""
@@ -24,7 +24,7 @@ UNCOVERED = """() => { const b = document.getElementById('stop').getBoundingClie
   const at = (x, y) => document.elementFromPoint(b.left + b.width * x, b.top + b.height * y);
   return [[.5, .5], [.03, .1], [.97, .9]].every(([x, y]) => at(x, y)?.id === 'stop'); }"""
 """Nothing lies over the stop button."""
-NAME, PASSWORD = "Ada", "correct horse battery"
+NAME = "Ada"
 
 
 def watched(browser: Any, **options: Any) -> Any:

@@ -31,7 +31,6 @@ from stimrig.api.web.app import create_app
 from stimrig.api.web.server import configuration
 from tests.api import thread_worker
 from tests.api.fake_rig import FakeRig, RigThread
-from tests.api.forms import Page
 from tests.harness.looks_first import LooksFirst
 
 TOKEN = "administrator-token-of-the-tests"
@@ -393,8 +392,19 @@ def signed_in(service: Service, token: str = TOKEN) -> Iterator[httpx.Client]:
         yield browser
 
 
-def csrf(browser: httpx.Client) -> str:
-    return Page(browser.get("/").text).meta
+PASSWORD = "correct horse battery"
+
+
+def person(service: Service, name: str = "Ada", password: str = PASSWORD, **more: Any) -> httpx.Client:
+    """The browser of a person who has signed in; who is not there yet is added. It sends the session's CSRF token."""
+    with service.client() as admin:
+        added = admin.post("/v1/users", json={"name": name, "password": password, **more})
+        assert added.status_code in (201, 409), added.text
+    browser = service.client(token=None)
+    signed = browser.post("/v1/sessions", json={"name": name, "password": password})
+    assert signed.status_code == 201, signed.text
+    browser.headers["X-CSRF-Token"] = signed.json()["csrf"]
+    return browser
 
 
 @pytest.fixture

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -15,8 +15,8 @@ from sqlalchemy.exc import OperationalError
 from stimrig.api.people.auth import IdleLock
 from stimrig.api.store import Store
 from stimrig.api.store.tables import PageSession
-from tests.api.browser import PASSWORD, without_values
-from tests.api.conftest import HTML, STUB, TOKEN, Service, SetClock, run_service, wait_done
+from tests.api.browser import without_values
+from tests.api.conftest import HTML, PASSWORD, STUB, TOKEN, Service, SetClock, person, run_service, wait_done
 from tests.api.forms import find, press
 from tests.api.test_people import standing_still
 
@@ -43,8 +43,6 @@ SCRIPT = {"Sec-Fetch-Dest": "empty", "Sec-Fetch-Mode": "cors"}
 def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
     for service in run_service(tmp_path_factory.mktemp("idle"), short_dir, STUB, idle_lock_min=10):
         with service.client() as http:
-            for name in ("Ada", "Jörg Müller"):
-                assert http.post("/v1/users", json={"name": name, "password": PASSWORD}).status_code == 201
             http.post("/v1/participants", json={"code": "L1"})
         yield service
 
@@ -58,15 +56,6 @@ def clock(service: Service) -> SetClock:
     return clock
 
 
-@contextmanager
-def signed_in(service: Service, name: str = "Ada") -> Iterator[httpx.Client]:
-    with service.client(token=None) as http:
-        answer = http.post("/v1/sessions", json={"name": name, "password": PASSWORD})
-        assert answer.status_code == 201, answer.text
-        http.headers["X-CSRF-Token"] = answer.json()["csrf"]
-        yield http
-
-
 def locked(http: httpx.Client) -> bool:
     """Asked as a script asks, which is nobody's action."""
     now = http.get("/rig/now").json()
@@ -75,7 +64,7 @@ def locked(http: httpx.Client) -> bool:
 
 
 def test_it_locks_after_ten_minutes_without_an_action_on_any_tab(service: Service, clock: SetClock) -> None:
-    with signed_in(service) as http, service.client(token=None, cookies=http.cookies) as other:
+    with closing(person(service)) as http, service.client(token=None, cookies=http.cookies) as other:
         clock.unix += 590
         assert http.post("/v1/sessions/acted").status_code == 204
         clock.unix += 590
@@ -100,7 +89,7 @@ def test_it_locks_after_ten_minutes_without_an_action_on_any_tab(service: Servic
 def test_what_scripts_read_by_themselves_keeps_no_session_open(
     service: Service, clock: SetClock, path: str, headers: dict[str, str]
 ) -> None:
-    with signed_in(service) as http:
+    with closing(person(service)) as http:
         for _ in range(2):
             clock.unix += 295
             http.get(path, headers=headers)
@@ -109,7 +98,7 @@ def test_what_scripts_read_by_themselves_keeps_no_session_open(
 
 
 def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(service: Service, clock: SetClock):
-    with signed_in(service) as http:
+    with closing(person(service)) as http:
         clock.unix += 900
         assert http.post("/v1/participants", json={"code": "L9"}).status_code == 401
         shown = http.get("/locked", headers=HTML).text
@@ -134,20 +123,20 @@ def test_what_is_sent_from_a_locked_page_does_nothing_and_needs_its_own_token(se
 
 def test_guesses_at_the_lock_are_held_to_a_pace(service: Service, clock: SetClock) -> None:
     standing_still(service)
-    with signed_in(service, "Jörg Müller") as http:
+    with closing(person(service, "Jörg Müller")) as http:
         http.post("/v1/sessions/lock")
         tries = [http.post("/v1/sessions/unlock", json={"password": f"no {n}"}).status_code for n in range(6)]
         assert tries == [401] * 5 + [429]
         held = http.post("/v1/sessions/unlock", json={"password": PASSWORD})
         assert held.status_code == 429 and int(held.headers["retry-after"]) > 0 and locked(http)
-        with signed_in(service) as other:
+        with closing(person(service)) as other:
             other.post("/v1/sessions/lock")
             assert other.post("/v1/sessions/unlock", json={"password": PASSWORD}).status_code == 204, "others wait not"
 
 
 def test_the_red_button_works_on_a_locked_page(service: Service, clock: SetClock) -> None:
     service.rig.speed = 1.0
-    with signed_in(service) as http:
+    with closing(person(service)) as http:
         test = http.post("/v1/tests", json={"participant": "L1"}).json()
         http.post("/v1/sessions/lock")
         page = http.get("/locked", headers=HTML).text
@@ -179,7 +168,7 @@ def test_a_session_by_token_asks_for_the_token(service: Service, clock: SetClock
 
 
 def test_somebody_else_may_leave_for_the_one_who_is_gone(service: Service, clock: SetClock) -> None:
-    with signed_in(service) as http:
+    with closing(person(service)) as http:
         http.post("/v1/sessions/lock")
         assert press(http, "/locked", "DELETE /v1/sessions/current").status_code == 204
         assert http.get("/v1/rig").json()["type"] == "/problems/unauthorized"
@@ -188,9 +177,7 @@ def test_somebody_else_may_leave_for_the_one_who_is_gone(service: Service, clock
 def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
     cookies: Any = None
     for first in run_service(tmp_path, short_dir, STUB, idle_lock_min=10):
-        with first.client() as admin:
-            admin.post("/v1/users", json={"name": "Ada", "password": PASSWORD})
-        with signed_in(first) as http:
+        with closing(person(first)) as http:
             http.post("/v1/sessions/lock")
             cookies = dict(http.cookies)
     for second in run_service(tmp_path, short_dir, STUB, idle_lock_min=10):
@@ -200,7 +187,7 @@ def test_a_lock_holds_over_a_restart(tmp_path: Path, short_dir: Path) -> None:
 
 def test_an_action_is_written_down(service: Service, clock: SetClock) -> None:
     context = service.context
-    with signed_in(service) as http:
+    with closing(person(service)) as http:
         row = context.auth.cookie(http.cookies[context.auth.cookie_name]).page_session
         clock.unix += 500
         context.auth.idle.acted(row)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,17 +17,13 @@ from websockets.sync.client import ClientConnection
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import PageSession, Token
 from stimrig.api.web.routes.tests import _next
-from tests.api.browser import PASSWORD
-from tests.api.conftest import STUB, TOKEN, Service, run_service
-from tests.api.test_idle_lock import signed_in
+from tests.api.conftest import PASSWORD, STUB, TOKEN, Service, person, run_service
 
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
     for service in run_service(tmp_path_factory.mktemp("watch"), short_dir, STUB, speed=0.02, idle_lock_min=10):
         with service.client() as admin:
-            for name in ("Ada", "Grace"):
-                assert admin.post("/v1/users", json={"name": name, "password": PASSWORD}).status_code == 201
             admin.post("/v1/participants", json={"code": "P017"})
         yield service
 
@@ -84,7 +80,7 @@ def test_it_tells_nothing_to_whom_it_is_not_for(service: Service, test_id: str) 
             assert last(socket, 4000 + first["problem"]["status"]) == {}, "nor anything after it"
             return first["problem"]["type"], first["problem"]["status"]
 
-    with signed_in(service, "Ada") as http:
+    with closing(person(service, "Ada")) as http:
         assert said(**cookie(http), Origin="https://elsewhere.example") == ("/problems/forbidden", 403)
         assert said() == ("/problems/unauthorized", 401)
         assert said(Authorization="Bearer nobody") == ("/problems/unauthorized", 401)
@@ -119,8 +115,8 @@ def test_it_closes_with_its_session_and_with_no_other(
     service: Service, test_id: str, how: Callable[[httpx.Client, Service], None]
 ) -> None:
     with (
-        signed_in(service, "Grace") as hers,
-        signed_in(service, "Ada") as other,
+        closing(person(service, "Grace")) as hers,
+        closing(person(service, "Ada")) as other,
         watching(service, test_id, cookie(hers)) as socket,
         watching(service, test_id, cookie(other)) as others,
     ):

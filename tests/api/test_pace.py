@@ -23,8 +23,8 @@ from stimrig.api.people.pace import (
     place_of,
 )
 from stimrig.api.store.tables import User
-from tests.api.conftest import TOKEN, Service, SetClock
-from tests.api.test_people import PASSWORD, standing_still
+from tests.api.conftest import PASSWORD, TOKEN, Service, SetClock
+from tests.api.test_people import standing_still
 
 OWN, ELSEWHERE = "10.0.0.1", "10.9.9.9"
 KEY = ("token", "a")

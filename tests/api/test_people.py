@@ -22,9 +22,18 @@ from stimrig.api.services.context import build
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.web.server import configuration, loopback, refuse_open_door
-from tests.api.conftest import HTML, PATIENCE_S, TOKEN, Service, SetClock, run_test, signed_in, wait_done
-
-PASSWORD = "correct horse battery"
+from tests.api.conftest import (
+    HTML,
+    PASSWORD,
+    PATIENCE_S,
+    TOKEN,
+    Service,
+    SetClock,
+    person,
+    run_test,
+    signed_in,
+    wait_done,
+)
 
 
 def standing_still(service: Service) -> SetClock:
@@ -34,15 +43,8 @@ def standing_still(service: Service) -> SetClock:
 
 
 @pytest.fixture
-def clinician(service: Service, client: httpx.Client) -> httpx.Client:
-    assert client.post("/v1/users", json={"name": "Ada", "password": PASSWORD}).status_code == 201
-    browser = service.client(token=None)
-    answer = browser.post("/v1/sessions", json={"name": "Ada", "password": PASSWORD})
-    assert answer.status_code == 201, answer.text
-    cookie = answer.headers["set-cookie"]
-    assert "HttpOnly" in cookie and "SameSite=strict" in cookie
-    browser.headers["X-CSRF-Token"] = answer.json()["csrf"]
-    return browser
+def clinician(service: Service) -> httpx.Client:
+    return person(service)
 
 
 def test_a_password_costs_what_rfc_9106_asks_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,12 +126,7 @@ def test_changed_password_and_removal_end_sessions(client: httpx.Client, clinici
 
 
 def test_who_changes_their_own_password_stays_under_a_new_cookie(service: Service) -> None:
-    with service.client() as client:
-        client.post("/v1/users", json={"name": "Root", "password": PASSWORD, "scopes": ["administer"]})
-    own, other = service.client(token=None), service.client(token=None)
-    for browser in (own, other):
-        signed = browser.post("/v1/sessions", json={"name": "Root", "password": PASSWORD}).json()
-        browser.headers["X-CSRF-Token"] = signed["csrf"]
+    own, other = (person(service, "Root", scopes=["administer"]) for _ in range(2))
     old = dict(own.cookies)
     answer = own.put("/v1/users/Root/password", json={"password": "another passphrase"})
     assert answer.status_code == 204 and "HttpOnly" in answer.headers["set-cookie"]

@@ -19,26 +19,17 @@ from stimrig.api.clock import Clock
 from stimrig.api.people.auth import Scope
 from stimrig.api.sessions.stops import RIGHT_S, StopRights
 from tests.api import forms
-from tests.api.conftest import HTML, TOKEN, Service, SetClock, soon
-from tests.api.conftest import csrf as csrf_of
+from tests.api.conftest import HTML, PASSWORD, TOKEN, Service, SetClock, person, soon
 from tests.api.test_people import standing_still
 
-PASSWORD = "correct horse battery"
 CONFIRMED = "The rig confirms that stimulation is off"
 
 
-def person(service: Service, name: str = "Ada") -> httpx.Client:
-    """A browser in which a clinician has signed in."""
-    with service.client() as client:
-        client.post("/v1/users", json={"name": name, "password": PASSWORD})
-    browser = service.client(token=None, headers=HTML)
-    assert browser.post("/v1/sessions", data={"name": name, "password": PASSWORD}).status_code == 303
+def viewer(service: Service) -> httpx.Client:
+    """A browser in which a clinician has signed in and looks at pages."""
+    browser = person(service)
+    browser.headers.update(HTML)
     return browser
-
-
-def rest(browser: httpx.Client, method: str, path: str) -> httpx.Response:
-    """As the script of a page calls it."""
-    return browser.request(method, path, headers={"X-CSRF-Token": csrf_of(browser), "Accept": "application/json"})
 
 
 def cookie_name(service: Service) -> str:
@@ -68,7 +59,7 @@ def stops_noted(client: httpx.Client) -> list[dict[str, Any]]:
 
 
 def sign_out(browser: httpx.Client, _client: httpx.Client, _service: Service) -> None:
-    assert rest(browser, "DELETE", "/v1/sessions/current").status_code == 204
+    assert browser.delete("/v1/sessions/current").status_code == 204
 
 
 def run_out(_browser: httpx.Client, _client: httpx.Client, service: Service) -> None:
@@ -104,7 +95,7 @@ async def gone(*_: object, **__: object) -> None:
 def test_a_page_has_its_stop_button_while_the_database_does_not_answer(
     service: Service, client: httpx.Client, participant: str, database: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    browser, stranger = person(service), service.client(token=None, headers=HTML)
+    browser, stranger = viewer(service), service.client(token=None, headers=HTML)
     browser.get("/")
     running(service, participant)
     monkeypatch.setattr(service.context.auth, "authenticate", database)
@@ -118,7 +109,7 @@ def test_no_page_gives_a_right_to_a_key_or_to_who_was_told_no_since(
     service: Service, client: httpx.Client, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A right outlives what a key may do, and says more of a stop than a key is told."""
-    key, removed = service.token("ctl", "read-live"), person(service)
+    key, removed = service.token("ctl", "read-live"), viewer(service)
     by_key = service.client(key, headers=HTML)
     as_cookie = service.client(token=None, headers=HTML, cookies={cookie_name(service): f"Bearer {key}"})
     assert by_key.get("/v1/rig", headers={"Accept": "application/json"}).status_code == 200
@@ -137,7 +128,7 @@ def test_no_page_gives_a_right_to_a_key_or_to_who_was_told_no_since(
 def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
     service: Service, client: httpx.Client, participant: str, end: Callable[..., None], shown: str
 ) -> None:
-    browser = person(service)
+    browser = viewer(service)
     home = browser.get("/").text
     test_id = running(service, participant)
     right = right_on(browser.get(f"/tests/{test_id}").text if shown == "test" else home)
@@ -150,7 +141,7 @@ def test_a_page_that_shows_the_button_stops_whatever_became_of_its_session(
 
 
 def test_a_stop_waits_for_no_database(service: Service, participant: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    right = right_on(person(service).get("/").text)
+    right = right_on(viewer(service).get("/").text)
     running(service, participant)
     store = service.context.store
     with store.write():  # another writer does not let go
@@ -163,7 +154,7 @@ def test_a_stop_waits_for_no_database(service: Service, participant: str, monkey
 
 
 def test_the_answer_to_a_stop_that_is_not_confirmed_has_the_button_still(service: Service) -> None:
-    browser = person(service)
+    browser = viewer(service)
     right = right_on(browser.get("/").text)
     service.rig.confirms_stop = False
     answer = press(service, right)
@@ -263,7 +254,7 @@ def test_a_stop_that_is_allowed_anyway_waits_for_no_form(slow_form: Any, monkeyp
 def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
     service: Service, client: httpx.Client, participant: str
 ) -> None:
-    browser = person(service)
+    browser = viewer(service)
     assert press(service, right_on(browser.get("/").text)).status_code == 200
     most = [scope.value for scope in Scope if scope not in (Scope.REARM, Scope.ADMINISTER)]
     token = service.token("controller", *most)
@@ -273,7 +264,8 @@ def test_after_a_persons_stop_no_program_lets_the_rig_work_again(
         refused = program.post("/v1/rearm")
         assert refused.status_code == 403 and "rearm" in refused.json()["detail"]
         page.post("/v1/sessions", data={"token": token})
-        assert rest(page, "POST", "/v1/rearm").status_code == 403, "a token that signs in is no person"
+        head = {"X-CSRF-Token": forms.Page(page.get("/").text).meta, "Accept": "application/json"}
+        assert page.post("/v1/rearm", headers=head).status_code == 403, "a token that signs in is no person"
         assert "I have checked" not in page.get("/").text
         assert program.post("/v1/tests", json=start).status_code == 409
         assert program.post(calibration).status_code == 409
