@@ -131,13 +131,11 @@ class Grid:
         return [run for index in range(len(self.record.parts)) for run in runs(rows & (self.part == index))]
 
     def interval_means(self, drive_nm: np.ndarray, axis: int = 0) -> np.ndarray:
-        """The mean drive of each interval, with late pulses at their true time.
+        """The mean drive of each interval, with late pulses at their true time; `axis` is that of the intervals.
 
         If a pulse is late by less than `FUSED` of an interval, the drive before it lasts that much longer; if it is
         early, that much shorter. The silence after the last pulse of a train begins as late as that pulse. The drive of
         a pulse that is later is added to the intervals in which it came.
-
-        `drive_nm`: shape (K,); drive on even slots, N·m. `axis`: axis of the intervals.
         """
         if self._shifts is None:
             return drive_nm
@@ -149,7 +147,7 @@ class Grid:
             result[moved] = 0.0
         base = result[np.r_[rows, np.maximum(rows - 1, 0), np.minimum(rows + 1, self.size - 1)]]
         current, before, after = np.split(base, 3)
-        result[rows] = (1.0 - late - early)[lift] * current + late[lift] * before + early[lift] * after
+        result[rows] = current + late[lift] * (before - current) + early[lift] * (after - current)
         for target, part in zip(at, share, strict=True):
             inside = (target >= 0) & (target < self.size)
             np.add.at(result, target[inside], part[inside][lift] * drive[moved[inside]])
@@ -187,22 +185,11 @@ class Grid:
         return read_at(torque_nm, rate_nm_s, self.interval, place, offset.astype(np.int64), four)
 
     def mean_weights(self, delay_s: float = 0.0, core: Core | None = None) -> tuple[int, np.ndarray]:
-        """Weights that give each interval's mean from the boundary states, for a model with a delay.
+        """Weights that give each interval's mean from the boundary states, for a model with a delay, s.
 
-        Parameters
-        ----------
-        delay_s : float
-            Delay after the pulses, s.
-        core : (float, float) or None
-            T, s, and ζ of the dynamics: the curve between two states is then exact. None: a cubic.
-
-        Returns
-        -------
-        first : int
-            Offset of the earliest boundary used, relative to the interval (0 or negative).
-        weights : ndarray, shape (K, B, 2), or (1, B, 2) if all intervals have the same
-            Weights of (y, y') at boundaries first, first + 1, … relative to each interval: the mean of interval k is
-            sum over b of weights[k, b, 0] * y[k + first + b] + weights[k, b, 1] * y'[k + first + b].
+        `core` says that the curve between two states is exact, None that it is a cubic. Returns the offset of the
+        earliest boundary used, relative to the interval (0 or negative), and the weights of (y, y') at the boundaries
+        from there on, shape (K, B, 2), or (1, B, 2) if all intervals have the same.
         """
         if (delay_s, core) not in self._weights:
             if len(self._weights) >= 8:  # a fit needs the same weights several times, then never again
@@ -218,13 +205,16 @@ class Grid:
         return self._weights[delay_s, core]
 
     @cached_property
+    def _weights(self) -> dict[tuple[float, Core | None], tuple[int, np.ndarray]]:
+        return {}
+
+    @cached_property
     def _evenly_sampled(self) -> bool:
         """True if all intervals are sampled at the same places."""
         each = int(self.count[0])
         if not each or np.any(self.count != each):
             return False
-        places = self.fraction.reshape(-1, each)
-        return bool(np.max(np.abs(places - places[0])) < 1e-9)
+        return bool(np.max(np.ptp(self.fraction.reshape(-1, each), axis=0)) < 1e-9)
 
     @cached_property
     def _places(self) -> tuple[np.ndarray, np.ndarray]:
@@ -247,10 +237,6 @@ class Grid:
         quick_s = time_constant_s / (max(damping, 1.0) + np.sqrt(max(damping * damping - 1.0, 0.0)))
         return None if quick_s > LONG * self.step_s else core
 
-    @cached_property
-    def _weights(self) -> dict[tuple[float, Core | None], tuple[int, np.ndarray]]:
-        return {}
-
 
 def ends_of(parts: list[slice]) -> tuple[np.ndarray, np.ndarray]:
     """Starts and ends of some runs, as compiled functions take them."""
@@ -266,14 +252,11 @@ def runs(flags: np.ndarray) -> list[slice]:
 def make_grid(record: Record) -> Grid:
     """Put a record on the grid of its pulses.
 
-    Raises BadRecord: fewer than eight pulse intervals, or sampled more slowly than the pulses.
+    Raises BadRecord: fewer than eight pulse intervals, sampled more slowly than the pulses, not finite, negative
+    widths, time that does not rise, an impossible pulse rate, or longer than a day.
     """
-    check_arrays(record)
-    step_s = 1.0 / record.pulse_rate_hz
-    rate_hz = record.sample_rate_hz
-    if not rate_hz >= 0.999 * record.pulse_rate_hz:
-        fix = "Record at 40 Hz or faster."
-        raise BadRecord(f"sampled at {rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second", fix=fix)
+    _check(record)
+    step_s, rate_hz = 1.0 / record.pulse_rate_hz, record.sample_rate_hz
     start_s = record.time_s[0] + pulse_phase_s(record)
     # A small shift, so that a sample taken at the pulse itself falls into the interval that starts with the pulse.
     position = (record.time_s - start_s) / step_s + 1e-6 + 1e-3 * min(1.0, record.pulse_rate_hz / rate_hz)
@@ -291,10 +274,9 @@ def make_grid(record: Record) -> Grid:
         return np.where(count > 0, total, np.nan)
 
     first_of = np.searchsorted(interval, np.arange(size))
-    # The middle sample of an interval: a pulse one sample early or late does not change it.
-    middle = np.minimum(first_of + count // 2, record.time_s.size - 1)
-    # Where samples are missing, the last known width is assumed.
-    middle = np.where(count > 0, middle, np.maximum(first_of - 1, 0))
+    # The middle sample of an interval: a pulse one sample early or late does not change it. Where samples are missing,
+    # the last known width is assumed.
+    middle = np.where(count > 0, first_of + count // 2, np.maximum(first_of - 1, 0))
     following = record.part[np.minimum(first_of, record.time_s.size - 1)]
     part = record.part[middle]
     pause = (count == 0) & (following != part)
@@ -375,12 +357,8 @@ LONGEST_DELAY_S = 0.25
 """Longest time from a pulse to the first response; a longer memory is part of the state."""
 
 
-def check_arrays(record: Record) -> None:
-    """Refuse arrays that no measurement gives, wherever they come from.
-
-    Raises BadRecord: not finite, negative widths, time that does not rise, an impossible pulse rate, or longer than
-    a day.
-    """
+def _check(record: Record) -> None:
+    """Refuse arrays that no measurement gives, wherever they come from."""
     bounds.check_rate(record.pulse_rate_hz, "pulse_rate_hz")
     for name in ("time_s", "pulse_width_us", "torque_nm"):
         _refuse(name, ~np.isfinite(getattr(record, name)), "not finite", "Cut the record before this sample.")
@@ -392,6 +370,9 @@ def check_arrays(record: Record) -> None:
     _refuse("time_s", falling, "time does not rise", "Sort the samples by time; each time once.")
     if record.time_s[-1] - record.time_s[0] > bounds.LONGEST_S:
         raise BadRecord("longer than a day", place="time_s", fix="Give the time in seconds.")
+    if not record.sample_rate_hz >= 0.999 * record.pulse_rate_hz:
+        rates = f"{record.sample_rate_hz:.4g} Hz, below the {record.pulse_rate_hz:g} pulses a second"
+        raise BadRecord(f"sampled at {rates}", fix="Record at 40 Hz or faster.")
 
 
 def _refuse(name: str, wrong: np.ndarray, message: str, fix: str) -> None:

@@ -12,12 +12,12 @@ from stimrig.identify.effects.base import Effect, Form, Parameter, Scene, Values
 
 MAX_BUMPS = 6
 """Largest number of bumps: more of them could imitate any error."""
-Kernels = dict[float, tuple[np.ndarray, int]]
-"""Shapes by their duration, s, each with the place in it that its `centre` is."""
+Shape = Callable[[float, float], tuple[np.ndarray, int]]
+"""A shape of a duration, s, at steps, s: what is sought in a residual; and the place in it that its `centre` is."""
 
 
-class _Bumps(Form):
-    """A form of bumps in fitted rows: in other rows they could only repair errors in the rows beside them."""
+class _Bursts(Form):
+    """A form of bursts in fitted rows: in other rows they could only repair errors in the rows beside them."""
 
     def accepts(self, parameters: dict[str, float], scene: Scene) -> bool:
         if scene.fitted is None:
@@ -29,40 +29,41 @@ class _Bumps(Form):
 
 def _forms(
     name: str,
-    equation: Callable[[int], str],
+    equation: str,
     apply: Callable[[Values, Scene, int], np.ndarray],
+    shape: Shape,
+    durations_s: tuple[float, ...],
     shared: Parameter,
-    bump_parameters: tuple[Parameter, Parameter, Parameter],
-    kernels: Callable[[float], Kernels],
     sign: float = 1.0,
-    proposals: int = 1,
 ) -> list[Form]:
-    """A chain of forms: one bump, two bumps, …, each with parameters of its own beside a shared one.
+    """A chain of forms: one burst, two bursts, …, each with a centre, duration and height beside a shared parameter."""
+    kind = "width" if shared is _FLATNESS else "decay"
+    low, high = sorted((0.0, 0.9 * sign))
 
-    `bump_parameters` are the centre, the duration and the height of one bump; `kernels(step_s)` are the shapes to
-    search for in a residual, in the direction of `sign`.
-    """
-
-    def parts(i: int) -> tuple[Parameter, ...]:
-        return tuple(replace(p, name=p.name.format(i)) for p in bump_parameters)
+    def burst(i: int) -> tuple[Parameter, ...]:
+        return (
+            Parameter(f"centre_{i}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about=_CENTRE[kind]),
+            replace(_DURATION[kind], name=f"{kind}_{i}_s"),
+            Parameter(f"height_{i}_nm", "N·m", low, high, 0.0, (0.1 * sign,), relative="torque", about="peak torque"),
+        )
 
     def form(count: int) -> Form:
-        centre, duration, height = (p.name for p in parts(count - 1))
-
         def propose(residual_nm: np.ndarray, scene: Scene, previous: dict[str, float]) -> list[dict[str, float]]:
-            """The shapes that match the residual best."""
+            """The shapes that match the residual best: of bumps two."""
+            found = _matches(residual_nm, sign, {s: shape(s, scene.step_s) for s in durations_s})
+            names = [p.name for p in burst(count - 1)]
             return [
                 {shared.name: shared.start[0]}
-                | dict(previous)
-                | {centre: float(scene.time_s[at]), duration: duration_s, height: sign * height_nm}
-                for _, duration_s, at, height_nm in _matches(residual_nm, sign, kernels(scene.step_s))[:proposals]
+                | previous
+                | dict(zip(names, (float(scene.time_s[at]), duration_s, sign * height_nm), strict=True))
+                for _, duration_s, at, height_nm in found[: 2 if kind == "width" else 1]
             ]
 
-        return _Bumps(
+        return _Bursts(
             f"{name}_{count}",
             "additive",
-            equation(count),
-            (shared, *(p for i in range(count) for p in parts(i))),
+            equation.format(count=count),
+            (shared, *(p for i in range(count) for p in burst(i))),
             lambda _, p, scene: apply(p, scene, count),
             batched=True,
             propose=propose,
@@ -72,12 +73,14 @@ def _forms(
     return [form(count) for count in range(1, MAX_BUMPS + 1)]
 
 
-def _matches(residual_nm: np.ndarray, sign: float, kernels: Kernels) -> list[tuple[float, float, int, float]]:
+def _matches(
+    residual_nm: np.ndarray, sign: float, shapes: dict[float, tuple[np.ndarray, int]]
+) -> list[tuple[float, float, int, float]]:
     """Score, duration, s, interval and height, N·m, of shapes where each matches a residual best; the best first."""
     known = np.isfinite(residual_nm)
     value = sign * np.where(known, residual_nm, 0.0)
     matches = []
-    for duration_s, (kernel, place) in kernels.items():
+    for duration_s, (kernel, place) in shapes.items():
         after = kernel.size - 1 - place
         aligned = slice(after, after + known.size)  # not "same": of a record shorter than the kernel it is longer
         match = np.convolve(value, kernel[::-1])[aligned]
@@ -88,7 +91,17 @@ def _matches(residual_nm: np.ndarray, sign: float, kernels: Kernels) -> list[tup
     return [candidate for candidate in sorted(matches, reverse=True) if candidate[0] > 0.0]
 
 
+_CENTRE = {"width": "middle", "decay": "start"}
+_DURATION = {
+    "width": Parameter("", "s", 0.14, 3.0, 0.5, (0.5,), "log", about="half-width"),
+    "decay": Parameter("", "s", 0.15, 3.0, 0.6, (0.6,), "log", about="time constant of the decay"),
+}
+
+
 # ---- bumps ----
+
+_BUMP = "y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} bumps, "
+_FLATNESS = Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2: Gaussian; larger: flatter")
 
 
 @njit(cache=True, nogil=True)
@@ -116,33 +129,15 @@ def _bumps(p: Values, scene: Scene, count: int) -> np.ndarray:
     return _sum_of_bumps(scene.time_s, centre, width, height, p["flatness"][:, 0])
 
 
-def _bump_kernels(step_s: float) -> Kernels:
-    kernels = {}
-    for width_s in (0.2, 0.5, 1.2):
-        half = int(np.ceil(3 * width_s / step_s))
-        kernels[width_s] = np.exp(-0.5 * (np.arange(-half, half + 1) * step_s / width_s) ** 2), half
-    return kernels
-
-
-def _bump_forms(name: str, words: str, sign: float) -> list[Form]:
-    low, high = (0.0, 0.9) if sign > 0 else (-0.9, 0.0)
-    return _forms(
-        name,
-        lambda count: f"y + Σ height·exp(-|t - centre|^flatness/(2 width^flatness)), {count} bumps, {words}",
-        _bumps,
-        Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2: Gaussian; larger: flatter"),
-        (
-            Parameter("centre_{}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="middle"),
-            Parameter("width_{}_s", "s", 0.14, 3.0, 0.5, (0.5,), "log", about="half-width"),
-            Parameter("height_{}_nm", "N·m", low, high, 0.0, (0.1 * sign,), relative="torque", about="peak torque"),
-        ),
-        _bump_kernels,
-        sign,
-        proposals=2,
-    )
+def _bump_shape(width_s: float, step_s: float) -> tuple[np.ndarray, int]:
+    half = int(np.ceil(3 * width_s / step_s))
+    return np.exp(-0.5 * (np.arange(-half, half + 1) * step_s / width_s) ** 2), half
 
 
 # ---- spasms ----
+
+_SPASM = "y + Σ height·(exp(-t/decay) - exp(-t/rise)), t since its start, {count} bursts"
+_RISE = Parameter("rise_s", "s", 0.02, 0.14, 0.07, (0.07,), "log", about="time constant of the rise")
 
 
 def _spasms(p: Values, scene: Scene, count: int) -> np.ndarray:
@@ -158,33 +153,19 @@ def _spasms(p: Values, scene: Scene, count: int) -> np.ndarray:
     return total
 
 
-def _spasm_kernels(step_s: float) -> Kernels:
-    kernels = {}
-    for decay_s in (0.3, 0.8, 1.8):
-        age = np.arange(int(np.ceil(4 * decay_s / step_s))) * step_s
-        kernel = np.exp(-age / decay_s) - np.exp(-age / (0.1 * decay_s))
-        kernels[decay_s] = kernel / kernel.max(), 0
-    return kernels
+def _spasm_shape(decay_s: float, step_s: float) -> tuple[np.ndarray, int]:
+    age = np.arange(int(np.ceil(4 * decay_s / step_s))) * step_s
+    shape = np.exp(-age / decay_s) - np.exp(-age / (0.1 * decay_s))
+    return shape / shape.max(), 0
 
 
 EFFECT = Effect(
     id="voluntary_effort",
     name="Voluntary effort or spasm",
     forms=(
-        *_bump_forms("bumps", "in the direction of pull", 1.0),
-        *_bump_forms("resisting", "against it", -1.0),
-        *_forms(
-            "spasms",
-            lambda count: f"y + Σ height·(exp(-t/decay) - exp(-t/rise)), t since its start, {count} bursts",
-            _spasms,
-            Parameter("rise_s", "s", 0.02, 0.14, 0.07, (0.07,), "log", about="time constant of the rise"),
-            (
-                Parameter("centre_{}_s", "s", 0.0, 1.0, 0.0, (0.5,), relative="span", about="start"),
-                Parameter("decay_{}_s", "s", 0.15, 3.0, 0.6, (0.6,), "log", about="time constant of the decay"),
-                Parameter("height_{}_nm", "N·m", 0.0, 0.9, 0.0, (0.1,), relative="torque", about="peak torque"),
-            ),
-            _spasm_kernels,
-        ),
+        *_forms("bumps", _BUMP + "in the direction of pull", _bumps, _bump_shape, (0.2, 0.5, 1.2), _FLATNESS),
+        *_forms("resisting", _BUMP + "against it", _bumps, _bump_shape, (0.2, 0.5, 1.2), _FLATNESS, -1.0),
+        *_forms("spasms", _SPASM, _spasms, _spasm_shape, (0.3, 0.8, 1.8), _RISE),
     ),
     signature="Single bumps of torque, also at rest, at times that do not depend on the stimulation.",
     resembles=("threshold_drift", "recruitment_hysteresis", "catch_like", "baseline_drift"),
