@@ -127,9 +127,8 @@ class SigmoidBasis:
         """Shape (..., 1); derivatives by the closed form, up to the second."""
         decay = np.exp(-self.a2_per_us * np.maximum(np.asarray(pulse_width_us, float), 0.0))
         bottom = 1.0 + self.a3 * decay
-        if derivative == 0:
-            value = (1.0 - decay) / bottom
-        else:
+        value = (1.0 - decay) / bottom
+        if derivative > 0:
             value = self.a2_per_us * (1.0 + self.a3) * decay / bottom**2
         if derivative == 2:
             value = value * self.a2_per_us * (self.a3 * decay - 1.0) / bottom
