@@ -11,7 +11,7 @@ import pytest
 
 from stimrig.api.store.tables import Model, Test
 from stimrig.api.web.pages import next_view
-from stimrig.api.web.pages.next_view import Situation, next_step
+from stimrig.api.web.pages.next_view import next_step
 from tests.api.conftest import Service, run_test, signed_in, wait_done
 
 READY, POOR, REJECTED = {"undecided": "M1"}, {"last_model": "poor"}, {"last_model": "rejected"}
@@ -84,7 +84,7 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
 
 @pytest.mark.parametrize(("so", "kind", "words", "leads"), TABLE)
 def test_each_state_has_one_step(so: dict[str, Any], kind: str, words: str, leads: str) -> None:
-    step = next_step(Situation("P1", **so))
+    step = next_step("P1", **so)
     assert (step.kind, step.href) == (kind, "" if leads == "form" else leads)
     assert words in step.words
     assert bool(step.button) == bool(leads), "a line without a way on has no button"
@@ -95,12 +95,12 @@ def test_the_table_names_every_kind_and_every_state_of_the_rig() -> None:
 
     assert {kind for _, kind, _, _ in TABLE} == set(next_view.Kind.__args__)
     for state in WORDS:
-        assert next_step(Situation("P1", rig=state)).words
+        assert next_step("P1", rig=state).words
 
 
 def test_keys_change_with_what_is_shown_and_with_nothing_else() -> None:
     """A page that shows one line and hears of another key is out of date."""
-    steps = [next_step(Situation("P1", **so)) for so, *_ in TABLE]
+    steps = [next_step("P1", **so) for so, *_ in TABLE]
     shown = {(step.kind, step.words, step.button, step.href): step.key for step in steps}
     assert len(set(shown.values())) == len(shown) > 35
     assert all(step.key == shown[step.kind, step.words, step.button, step.href] for step in steps)

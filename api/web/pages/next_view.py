@@ -46,39 +46,6 @@ ENDED = {
 
 
 @dataclass(frozen=True)
-class Situation:
-    """What the next step of a participant depends on; a text is empty where there is nothing of the kind."""
-
-    code: str
-    rig: str = "ready"
-    """Its state, as the bar shows it."""
-    current: str = ""
-    """Of every pulse."""
-    calibration: Literal["none", "valid", "expired"] = "valid"
-    holder: str = ""
-    """Whose test or calibration the rig is busy with."""
-    test: str = ""
-    """Their newest test of today, or the one that goes on since yesterday."""
-    of: Literal["test", "trial", "joint"] = "test"
-    """What kind of test it is: one that gives a model, a controller's trial, one of a joint that moves."""
-    state: str = ""
-    """Its state."""
-    undecided: str = ""
-    """The newest model of today, where it may be approved and nobody has decided on it."""
-    last_model: Literal["", "poor", "rejected"] = ""
-    """Why none of today's models can be approved."""
-    served_until: str = ""
-    """Until when the controller has an approved model (time of day)."""
-    lacks_key: Literal["", "mine", "another's"] = ""
-    """No controller has a key for that model: whether who looks may make one."""
-    archived_since: str = ""
-    needs_test: bool = False
-    """The trials of the approved model ask for a new test."""
-    unstored: bool = False
-    """The rig keeps a finished calibration of theirs that the service could not store."""
-
-
-@dataclass(frozen=True)
 class Step:
     """The line. `href` empty: the button calls REST (`test`, `calibrate`, `archived`), or there is none."""
 
@@ -93,53 +60,70 @@ class Step:
         return f"{self.kind} {crc32(f'{self.words} {self.button} {self.href}'.encode()):08x}"
 
 
-def next_step(now: Situation) -> Step:
-    """Return the next step: what is under way first, then what waits for a person, then what can be begun."""
-    at, trial = f"/participants/{now.code}", now.of == "trial"
-    if now.state in OPEN_STATES:
-        kind: Kind = "running" if now.state in ("requested", "running") else "identifying"
-        words = PROGRESS.get(now.state) or ("The controller plays a trial." if trial else "The test is running.")
-        if now.state != "identifying" and now.rig in ("unreachable", "silent"):
+def next_step(
+    code: str,
+    rig: str = "ready",  # its state, as the bar shows it
+    current: str = "",  # of every pulse
+    calibration: Literal["none", "valid", "expired"] = "valid",
+    holder: str = "",  # whose test or calibration the rig is busy with
+    test: str = "",  # their newest test of today, or the one that goes on since yesterday
+    of: Literal["test", "trial", "joint"] = "test",  # it gives a model, is a controller's, or is of a joint that moves
+    state: str = "",  # its state
+    undecided: str = "",  # the newest model of today, where it may be approved and nobody has decided on it
+    last_model: Literal["", "poor", "rejected"] = "",  # why none of today's models can be approved
+    served_until: str = "",  # time of day until which the controller has an approved model
+    lacks_key: Literal["", "mine", "another's"] = "",  # no controller has a key for it: whether who looks may make one
+    archived_since: str = "",
+    needs_test: bool = False,  # the trials of the approved model ask for a new test
+    unstored: bool = False,  # the rig keeps a finished calibration of theirs that the service could not store
+) -> Step:
+    """Return the next step: what is under way first, then what waits for a person, then what can be begun.
+
+    A text is empty where there is nothing of the kind.
+    """
+    at, trial = f"/participants/{code}", of == "trial"
+    if state in OPEN_STATES:
+        kind: Kind = "running" if state in ("requested", "running") else "identifying"
+        words = PROGRESS.get(state) or ("The controller plays a trial." if trial else "The test is running.")
+        if state != "identifying" and rig in ("unreachable", "silent"):
             words = "A test was running when the rig was last heard of. Its state is not known."
-        elif now.rig == "stopping" and now.state not in PROGRESS:
+        elif rig == "stopping" and state not in PROGRESS:
             words = "The test is being stopped."
-        return Step(kind, words, "Go to the trial" if trial else "Go to the test", f"/tests/{now.test}")
-    if now.unstored or (now.rig == "calibrating" and now.holder == now.code):
-        words = "A calibration waits to be stored." if now.unstored else "The calibration has begun."
+        return Step(kind, words, "Go to the trial" if trial else "Go to the test", f"/tests/{test}")
+    if unstored or (rig == "calibrating" and holder == code):
+        words = "A calibration waits to be stored." if unstored else "The calibration has begun."
         return Step("calibrating", words, "Go on with the calibration", f"{at}/calibration")
-    if now.archived_since:
-        return Step(
-            "archived", f"In the archive since {now.archived_since}: no test starts.", "Take out of the archive"
-        )
-    ended = ENDED.get(now.state, "") if not trial or now.state != "failed" else "was not finished"
+    if archived_since:
+        return Step("archived", f"In the archive since {archived_since}: no test starts.", "Take out of the archive")
+    ended = ENDED.get(state, "") if not trial or state != "failed" else "was not finished"
     ended = ended and f"The last {'trial' if trial else 'test'} {ended}. "
-    if now.undecided:
+    if undecided:
         words = f"{ended}The model is ready. Look at it, then approve or reject it."
-        return Step("look", words, "Look at the model", f"/models/{now.undecided}")
-    served = f"The controller has today's model until {now.served_until}." if now.served_until else ""
-    if served and now.lacks_key:
-        served = f"Today's model is approved until {now.served_until}, but no controller has a key yet."
-    if advice := RIG_ADVICE.get(now.rig):
+        return Step("look", words, "Look at the model", f"/models/{undecided}")
+    served = f"The controller has today's model until {served_until}." if served_until else ""
+    if served and lacks_key:
+        served = f"Today's model is approved until {served_until}, but no controller has a key yet."
+    if advice := RIG_ADVICE.get(rig):
         return Step("rearm" if advice == REARM else "wait", f"{served} {advice}".strip())
-    if served and now.needs_test:
+    if served and needs_test:
         return Step("asked", "The trials say that a new test is needed.", "See why", f"{at}#trials")
-    if served and now.of != "joint":
-        if now.lacks_key == "mine":
+    if served and of != "joint":
+        if lacks_key == "mine":
             return Step("done", ended + served, "Make a controller key", f"{at}#keys")
-        return Step("done", (ended or ("" if now.lacks_key else "Done. ")) + served, "Back to the participants", "/")
-    if now.rig in BUSY or now.holder not in ("", now.code):
-        use = f"in use for {now.holder}. Wait until it is free." if now.holder not in ("", now.code) else ""
+        return Step("done", (ended or ("" if lacks_key else "Done. ")) + served, "Back to the participants", "/")
+    if rig in BUSY or holder not in ("", code):
+        use = f"in use for {holder}. Wait until it is free." if holder not in ("", code) else ""
         return Step("wait", f"The rig is {use or 'in use. Wait until it is free.'}")
-    before = ended if now.of == "joint" else LAST_MODEL[now.last_model] or ended
-    if now.calibration != "valid":
+    before = ended if of == "joint" else LAST_MODEL[last_model] or ended
+    if calibration != "valid":
         words = "Calibrate for today: find the pulse widths that are felt, move the limb and are comfortable."
-        if now.calibration == "expired":
+        if calibration == "expired":
             words = "The last calibration was for another day. Calibrate for today."
-        return Step("calibrate", before + words, f"Begin the calibration: {now.current}")
-    if now.of == "joint":
+        return Step("calibrate", before + words, f"Begin the calibration: {current}")
+    if of == "joint":
         words = "Go on with the tests of the joint, or make the model of them."
         return Step("joint", before + words, "To the tests of the joint", f"{at}/joint")
-    if before and now.of == "test":
+    if before and of == "test":
         return Step("again", before + "Test again.", "Start the pre-session test")
     return Step("test", before + "Calibrated. Start the pre-session test.", "Start the pre-session test")
 
@@ -180,8 +164,8 @@ def step(context: Context, row: Participant, principal: Principal) -> Step:
         of = "joint"  # it is one test among others once there is a model that was made after it
     # a trial of today was played by somebody's own token where there is no key
     keyless = served is not None and of != "trial" and not controllers.has_key(context.auth, row.code)
-    return next_step(Situation(
-        code=row.code,
+    return next_step(
+        row.code,
         rig=render.state_of(context),
         current=starting.current_words(row),
         calibration=starting.calibrated(context, row).state,
@@ -196,7 +180,7 @@ def step(context: Context, row: Participant, principal: Principal) -> Step:
         archived_since=local_time.when(row.archived_utc) if row.archived_utc else "",
         needs_test=served is not None and context.tracked.new_test_reason(served.id) is not None,
         unstored=unstored is not None and unstored.participant == row.code,
-    ))  # fmt: skip
+    )
 
 
 def _counts(version: dict[str, Any]) -> bool:
