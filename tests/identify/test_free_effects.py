@@ -190,7 +190,8 @@ def test_a_late_pulse_opens_a_gate_late_and_not_less():
 def test_where_nothing_is_missing_nothing_free_is_added():
     record = hidden_muscles.record(seed=3, rate_hz=100)
     with few_effects.only(*(effect.id for effect in FREE), "fatigue"):
-        assert identify.improve(record).steps[1:] == () and identify.diagnose(record).free == ()
+        diagnosis, improvement = identify.diagnose_and_improve(record)
+        assert improvement.steps[1:] == () and diagnosis.free == ()
         grid, raw = prepare(record)
         search = search_effects(grid, raw, fitted_rows(grid, None))
         assert free.explain_freely(search, (), False, silent).free == [], "nor where one is looked for"
@@ -213,17 +214,14 @@ def test_one_structure_is_one_model_whether_it_was_found_or_asked_for():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("idle", [False, pytest.param(True, marks=pytest.mark.campaign)])
+@pytest.mark.parametrize("idle", [False, True])
 def test_zero_sign_scale_start_and_idle_pulses_change_no_free_effect(idle: bool):
-    made, (_, improvement) = record_of_physics("physics", 0), found()
+    made = record_of_physics("physics", 0)
     other = {"torque_nm": 2.0 - 0.3 * made["torque_nm"], "time_s": made["time_s"] + 1000.0}
     if idle:
         other = {"pulse_width_us": np.maximum(made["pulse_width_us"], 1.0)}
-    with few_effects.only("free_gate", "free_level", "baseline_drift"):
-        again = identify.improve(as_record(made | other))
-    assert [step["added"] for step in again.steps[1:]] == ["free_gate"]
-    error_nm, scale, tolerance = improvement.steps[-1]["held_out_rms_nm"], *((1.0, 0.05) if idle else (0.3, 0.01))
-    assert again.steps[-1]["held_out_rms_nm"] / scale == pytest.approx(error_nm, rel=tolerance)
+    one, two = (identify.fit(as_record(made | changes), effects=["free_gate"]) for changes in ({}, other))
+    assert two.fit["held_out_rms_nm"] / (1.0 if idle else 0.3) == pytest.approx(one.fit["held_out_rms_nm"], rel=0.01)
 
 
 @pytest.mark.parametrize(
