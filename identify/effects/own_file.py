@@ -11,15 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw
 from stimrig.identify.effects.base import JOINT_COLUMNS, STAGES, Effect, Form, Parameter, Scene
 from stimrig.identify.errors import IdentifyError
 
 FIX = "See docs/add-an-effect.md."
 SCALES = ("linear", "log")
 RELATIVE = ("", "torque", "width", "span", "level")
-OWN_STAGES = tuple(stage for stage in STAGES if stage != "lags")
-"""Free lags belong to the free effects of the library."""
+OWN_STAGES = tuple(stage for stage in STAGES if stage not in ("speed", "lags"))
+"""The laws of the two others are compiled, and those of the library alone."""
 ID = r"[a-z][a-z0-9_]{0,63}"
 ROWS = 80
 """Pulse intervals on which a form is tried."""
@@ -71,7 +70,7 @@ def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
         _refuse(where, _form_faults(form))
         for parameter in form.parameters:
             _refuse(f"{where}, parameter {parameter.name!r}", _parameter_faults(parameter))
-        if form.apply is not None and form.stage not in ("branch", "filter"):
+        if form.stage not in ("branch", "filter"):
             _try_out(form, where, path)
     return effect
 
@@ -108,14 +107,7 @@ def _form_faults(form: Form) -> Faults:
         yield f"a name that is {wrong[0]!r}", "Give a text."
     if twice := _repeated(names):
         yield f"two parameters are called {twice[0]!r}", "Name each parameter once."
-    if form.stage == "speed":
-        fix = "Give law={(Lag, SpeedLaw): parameter}, both of stimrig.identify.dynamics.variable_speed."
-        laws = form.law.items() if isinstance(form.law, dict) else [(form.law, None)]
-        for column, name in laws if form.law else [("none", None)]:
-            kinds = [*map(type, column)] if isinstance(column, tuple) else []
-            if kinds != [Lag, SpeedLaw] or name not in names:
-                yield f"law {column!r}: {name!r}", fix
-    elif form.apply is None:
+    if form.apply is None:
         yield "no apply", "Give apply=, a function of (x, p, scene)."
 
 

@@ -29,34 +29,21 @@ _RESONANCE = (
 _STIFFENING = Parameter("stiffening", "1", 0.0, 12.0, 0.0, (1.0,), about="rise of stiffness to full torque")
 
 
-@njit(cache=True, nogil=True, inline="always")
-def _moved(phi, gamma, z, v, a, b, c, d):  # pragma: no cover
-    return phi[0] * z + phi[1] * v + gamma[0] * a + gamma[1] * b + gamma[2] * c + gamma[3] * d
-
-
 @njit(cache=True, nogil=True)
-def _follow(
-    torque: np.ndarray, slope: np.ndarray, phi: np.ndarray, gamma: np.ndarray, step_s: float
-) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """Response of a second-order system to the cubic through boundary states; (M, K + 1) to (M, K + 1).
-
-    `slope` is the rate times the step; `phi` (M, 2, 2) and `gamma` (M, 2, 4) act on (z, z'·step), (x0, x0', x1, x1').
-    """
-    rows, size = torque.shape
-    out = np.zeros((rows, size))
-    rate = np.zeros((rows, size))
+def _follow(state: np.ndarray, phi: np.ndarray, forced: np.ndarray) -> np.ndarray:  # pragma: no cover
+    """States of x[k + 1] = phi x[k] + forced[k]; shapes (M, 2), (M, 2, 2), (M, K, 2); to (2, M, K + 1)."""
+    rows, size = forced.shape[:2]
+    out = np.empty((2, rows, size + 1))
     for m in range(rows):
-        z, v = torque[m, 0], 0.0
-        out[m, 0] = z
-        for k in range(size - 1):
-            a, b, c, d = torque[m, k], slope[m, k], torque[m, k + 1], slope[m, k + 1]
+        z, v = state[m]
+        out[0, m, 0], out[1, m, 0] = z, v
+        for k in range(size):
             z, v = (
-                _moved(phi[m, 0], gamma[m, 0], z, v, a, b, c, d),
-                _moved(phi[m, 1], gamma[m, 1], z, v, a, b, c, d),
+                phi[m, 0, 0] * z + phi[m, 0, 1] * v + forced[m, k, 0],
+                phi[m, 1, 0] * z + phi[m, 1, 1] * v + forced[m, k, 1],
             )
-            out[m, k + 1] = z
-            rate[m, k + 1] = v / step_s
-    return out, rate
+            out[0, m, k + 1], out[1, m, k + 1] = z, v
+    return out
 
 
 def _steps(frequency_hz: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:
@@ -83,7 +70,11 @@ def series(x: Motion, p: Values, scene: Scene) -> Motion:
     pairs = list(zip(frequency.tolist(), damping.tolist(), strict=True))
     known = {pair: _steps(*pair, scene.step_s) for pair in set(pairs)}
     phi, gamma = (np.stack(matrices) for matrices in zip(*(known[pair] for pair in pairs), strict=True))
-    return _follow(torque, rate * scene.step_s, phi, gamma, scene.step_s)
+    slope = rate * scene.step_s
+    ends = np.stack([torque[:, :-1], slope[:, :-1], torque[:, 1:], slope[:, 1:]], axis=2)
+    begin = np.stack([torque[:, 0], np.zeros(len(torque))], axis=1)
+    z, v = _follow(begin, phi, ends @ gamma.transpose(0, 2, 1))
+    return z, v / scene.step_s
 
 
 @form(

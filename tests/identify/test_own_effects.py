@@ -104,7 +104,7 @@ def told(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> str:
 @pytest.mark.parametrize(
     ("old", "new", "says"),
     [
-        ('stage="output"', 'stage="outputs"', "no stage is called 'outputs'. Give one of pulse_width, gain, speed"),
+        ('stage="output"', 'stage="outputs"', "no stage is called 'outputs'. Give one of pulse_width, gain, branch"),
         ('"log", about="period"', '"logarithmic", about="period"', "scale 'logarithmic'"),
         ("1.5, 30.0, 10.0", "30.0, 1.5, 10.0", "bounds 30.0 to 1.5"),
         ("1.5, 30.0, 10.0", "1.5, 30.0, None", "a bound or a start that is no number"),
@@ -115,11 +115,6 @@ def told(folder: Path, monkeypatch: pytest.MonkeyPatch, text: str) -> str:
         ("EFFECT = Effect(", "EFFECT = dict(", "EFFECT is a dict, not an Effect"),
         ("        apply=swing,\n", "", "no apply"),
         ("    return torque_nm * (1", "    return torque_nm, (1", "apply gives 160 numbers, not one for each of 80"),
-        (
-            'stage="output"',
-            'stage="speed", law={5: "period_s"}',
-            "law 5: 'period_s'. Give law={(Lag, SpeedLaw): parameter}",
-        ),
     ],
 )
 def test_what_cannot_be_an_effect_is_told_with_its_file(tmp_path, monkeypatch, old: str, new: str, says: str) -> None:
