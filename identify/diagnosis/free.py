@@ -31,7 +31,6 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, find_effect, registry
 from stimrig.identify.effects.base import replaced_by
 from stimrig.identify.estimation.candidates import trusted
-from stimrig.identify.estimation.effect_fit import WORTHLESS
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.left_out import Difference, LeftOut, difference, leave_out
 from stimrig.identify.estimation.samples import Raw, fitted_rows
@@ -202,7 +201,7 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
     for effect in registry().values():
         if _applicable(effect, base):
             listed += [replace(effect, forms=(form,)) for form in effect.forms] if effect.shape else [effect]
-    tried = scan(base, listed, WORTHLESS, [], partial(_within, progress, 0.0, 0.6))
+    tried = scan(base, listed, [], partial(_within, progress, 0.0, 0.6))
     gains = {candidate.effect.id: candidate.gain for candidate in tried}
     promising = [
         candidate

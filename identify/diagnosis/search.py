@@ -21,8 +21,6 @@ from stimrig.identify.effects.base import replaced_by
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import (
     BAND_COST,
-    TOLERANCE,
-    WORTHLESS,
     Candidate,
     add_effects,
     detected_effects,
@@ -44,8 +42,6 @@ MAX_EFFECTS = 3
 """Effects at most."""
 FORMS = 3
 """Forms of an effect that are tried beside another effect."""
-NO_RIVAL = 0.4
-"""Share of the best effect's gain below which another is no rival of it."""
 
 Progress = Callable[[float, str], None]
 """Called with the share done, 0 to 1, and a line of text. It may raise `Cancelled`."""
@@ -149,8 +145,11 @@ def _add_detected(search: EffectSearch) -> Fitted:
 def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tuple[Candidate, LeftOut] | None:
     """The likeliest candidate of a round that predicts left-out blocks better; None if none does."""
     before = search.rounds[0] if search.rounds else []
-    listed, min_gain = _worth_a_fit(search)
-    tried = scan(search.last, listed, min_gain, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
+    present = effect_names(search.last)
+    listed = [effect for effect in registry().values() if _applicable(effect, search.last, present)]
+    # Slow ones first, so that all processes end at about the same time.
+    listed.sort(key=lambda effect: -len(effect.forms))
+    tried = scan(search.last, listed, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
     candidates = sorted((_discounted(search, c) for c in tried), key=_by_gain)
     search.rounds.append(candidates)
     if not number and (lawless := try_effect(FREE_GAIN, search.last)) is not None:
@@ -160,8 +159,6 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
     for place, candidate in enumerate(candidates[: thresholds.JUDGED]):
         if candidate.gain < search.margins[-1]:
             break
-        if candidate.gain < min_gain:
-            candidate = candidates[place] = _fitted_to_its_end(candidate)
         unseen = leave_out(candidate.fitted)
         comparison, required = difference(search.left_out[-1], unseen), required_errors(search, candidate)
         if not comparison.errors >= required:
@@ -170,7 +167,6 @@ def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tup
         accepted.append((comparison.gain, candidate, unseen))
         if not search.last.distrusted:
             break
-    candidates.sort(key=_by_gain)  # a fit that was continued gains more
     if not accepted:
         return None
     _, candidate, unseen = max(accepted, key=lambda entry: entry[0])
@@ -221,41 +217,14 @@ def released(fitted: Fitted) -> Fitted:
 # ---- one round: every effect of the library tried on a model -----------------------------------------------------
 
 
-def _worth_a_fit(search: EffectSearch) -> tuple[list[Effect], float]:
-    """Effects that can be tried on the last model, and the gain below which a fit need not be continued to its end.
-
-    One step of each effect's first form shows what the best one gains at least. What gains far less is no rival of it.
-    Where none can gain enough, that is not asked.
-    """
-    base = search.last
-    present = effect_names(base)
-    listed = [effect for effect in registry().values() if _applicable(effect, base, present)]
-    # Slow ones first, so that all processes end at about the same time.
-    listed.sort(key=lambda effect: -len(effect.forms))
-    if _exhausted(search):
-        return listed, WORTHLESS
-    firsts = [fit_form(e, e.forms[0], base, base.residual_nm, {}, np.inf) for e in listed if not e.band]
-    gains = [fitted.log_evidence - base.log_evidence for fitted in firsts if fitted is not None]
-    return listed, max(WORTHLESS, NO_RIVAL * max(gains, default=0.0))
-
-
-def _fitted_to_its_end(candidate: Candidate) -> Candidate:
-    """A candidate whose fit may have been stopped."""
-    begun = candidate.fitted
-    fitted = solve(begun.problem, begun.theta, begun.noise, tolerance=TOLERANCE)
-    return replace(candidate, fitted=fitted, gain=candidate.gain + fitted.log_evidence - begun.log_evidence)
-
-
-def scan(
-    base: Fitted, listed: list[Effect], min_gain: float, before: list[Candidate], progress: Progress
-) -> list[Candidate]:
+def scan(base: Fitted, listed: list[Effect], before: list[Candidate], progress: Progress) -> list[Candidate]:
     """Add each of some effects to a model; best first. `before` holds the candidates of an earlier round."""
     earlier = {candidate.effect.id: candidate for candidate in before}
 
     def tried(number: int) -> tuple[str, Fitted, float, dict[str, float]] | None:
         """Without the problem: it holds functions, which cannot be sent between processes."""
         effect = listed[number]
-        candidate = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)), min_gain)
+        candidate = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)))
         if candidate is None:
             return None
         return candidate.form.name, replace(candidate.fitted, problem=None), candidate.gain, candidate.forms  # type: ignore

@@ -107,9 +107,10 @@ def try_band(effect: Effect, base: Fitted) -> Candidate | None:
 def fit_form(
     effect: Effect, form: Form, base: Fitted, residual: np.ndarray, previous: dict[str, float], floor: float = -np.inf
 ) -> Fitted | None:
-    """Add one form to a model, from each of its starting values, and return the best fit.
+    """Add one form to a model and fit it from the most promising of its starting values.
 
-    A fit that will not reach the log evidence `floor` is stopped early.
+    A fit that will not reach the log evidence `floor` is stopped early. Where the form does not accept the result, the
+    next start is tried.
     """
     setup = base.problem.setup
     scene: Scene = setup.scene
@@ -117,19 +118,30 @@ def fit_form(
     starts = form.starts(scene)
     if form.propose is not None:
         starts = form.propose(np.where(setup.fitted, residual, np.nan), scene, previous)
-    best: Fitted | None = None
+    thetas = []
     for start in starts:
         apart = start.get("base.damping")
         if apart is not None and "base.time_constant_s" not in start and base.physical[1] >= apart:
             continue  # the lags of the base model already differ
-        theta = start_from(problem, base, {len(base.effects): start})
+        thetas.append(start_from(problem, base, {len(base.effects): start}))
+    if len(thetas) > 1:
+        thetas.sort(key=lambda theta: -_promise(base, problem, theta))
+    for theta in thetas:
         fitted = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor)
-        if not form.accepts(fitted.parameters_of(effect.id), scene):
-            continue
-        if best is None or fitted.log_evidence > best.log_evidence:
-            best = fitted
-            floor = max(floor, fitted.log_evidence)
-    return best
+        if form.accepts(fitted.parameters_of(effect.id), scene):
+            return fitted
+    return None
+
+
+def _promise(base: Fitted, problem: Problem, theta: np.ndarray) -> float:
+    """Log likelihood of a start, up to a constant, after a linear step of the parameters that the base model has."""
+    residual_nm = problem.setup.target_nm - problem.run(theta)[0]
+    white = problem.setup.whitened(residual_nm[None, :], base.noise)[0]
+    if not np.all(np.isfinite(white)):
+        return -np.inf
+    rows, root = base.projector
+    part = np.linalg.solve(root, rows @ white)
+    return 0.5 * float(part @ part - white @ white)
 
 
 def effect_names(fitted: Fitted) -> list[str]:

@@ -71,6 +71,13 @@ class Fitted:
         white = self.problem.setup.whitened(self.residual_nm[None, :], self.noise)[0]
         return float(np.mean(white**4) / max(np.mean(white**2) ** 2, 1e-300) - 3.0)
 
+    @cached_property
+    def projector(self) -> tuple[np.ndarray, np.ndarray]:
+        """Whitened slopes, each over the root of its information, and the lower root of the scaled information."""
+        scale = 1.0 / np.sqrt(np.maximum(np.diag(self.hessian), 1e-300))
+        scaled = self.hessian * scale[:, None] * scale[None, :] + 1e-9 * np.eye(scale.size)
+        return self.problem.setup.whitened(self.slopes * scale[:, None], self.noise), np.linalg.cholesky(scaled)
+
     @property
     def heavy_tails(self) -> bool:
         """True if a few jumps hold most of the innovations' squares."""
@@ -156,8 +163,8 @@ def solve(
 ) -> Fitted:
     """Find the most probable parameters, from a start `theta` on the scale on which parameters are varied.
 
-    It stops after `max_steps` steps, when the log posterior rises by less than `tolerance`, or after the first step if
-    the log evidence `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on; else it
+    It stops after `max_steps` steps, when the log posterior rises by less than `tolerance`, or where the log evidence
+    `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on; else it
     stays as given.
     """
     start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
@@ -171,8 +178,7 @@ def solve(
         # The start of an effect may be a point where the gradient is zero at first.
         if (step > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             return None
-        # The first step predicts too little from a distant start: in a trial, a sixth of the final gain.
-        if floor is not None and step > 1 and at.log_evidence + OPTIMISM * (promised + 1.0) < floor:
+        if floor is not None and at.log_evidence + OPTIMISM * (promised + 1.0) < floor:
             return None
 
         def trial(damping: float) -> Point:
