@@ -7,18 +7,19 @@ without the library's effects of the muscle and on the one with them; left-out b
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.residual import residual_structure, vetoed
+from stimrig.identify.diagnosis.residual import vetoed
 from stimrig.identify.diagnosis.search import (
     MAX_EFFECTS,
     EffectSearch,
     Progress,
+    Step,
     helpful,
     scan,
     search_effects,
@@ -39,31 +40,8 @@ ZERO = {"free_zero": "baseline_drift"}
 """A free effect, and the one of the library that nothing foretells and that may look like it."""
 ANY = (thresholds.BETTER, 0.0)
 """As `FIRST_FREE`, against a model that names nothing."""
-
-
-@dataclass(frozen=True)
-class Chain:
-    """Models from a base on, each with one free effect more."""
-
-    models: tuple[Fitted, ...]
-    left_out: tuple[LeftOut, ...]
-    names: tuple[str, ...]  # of the effects of the library that were found and stay
-    added: tuple[str, ...] = ()
-
-    def with_(self, fitted: Fitted, unseen: LeftOut, effect: str) -> Chain:
-        """With one model more."""
-        return replace(
-            self, models=(*self.models, fitted), left_out=(*self.left_out, unseen), added=(*self.added, effect)
-        )
-
-    @property
-    def links(self) -> list[tuple[Fitted, Fitted]]:
-        """Each model with a free effect after the one before it."""
-        return list(pairwise(self.models[-len(self.added) - 1 :]))
-
-    def better(self, than: LeftOut) -> Difference:
-        """Compare the left-out error of its last model with another one."""
-        return difference(than, self.left_out[-1])
+Chain = tuple[Step, ...]
+"""Steps of a search from its base on, the last ones with free effects."""
 
 
 def searched(
@@ -88,25 +66,14 @@ def searched(
     verdict = judge(search)
     if max_effects == 0 or verdict.kind == "nothing_missing":
         return search, verdict
-    accepted = _accepted_effects(search)
-    named = verdict.kind == "effect_missing" and bool(accepted or not search.added)
-    if named and not _doubted(verdict, search.residuals[-1].significant):
-        return search, verdict
-    freely = explain_freely(search, accepted, named, lambda done, text: report(0.7 + 0.25 * done, text))
-    if not freely.free:
-        return search, verdict
-    return freely, judge_free(freely, verdict, named)
-
-
-def _accepted_effects(search: EffectSearch) -> list[str]:
-    """The effects that were added before the first against which held-out pulses speak."""
-    return search.added[: len(helpful(search)[0]) - 1 - len(search.detected)]
-
-
-def _doubted(verdict: Verdict, structure_left: bool) -> bool:
-    """Return True if free effects are to be tried beside named ones."""
+    supported = [str(step.added) for step in helpful(search)[0] if step.origin == "library"]
+    named = verdict.kind == "effect_missing" and bool(supported or not search.found)
     error = verdict.held_out_error
-    return structure_left or (error is not None and error.ratio > thresholds.NAMED_BUT)
+    doubted = search.residual.significant or (error is not None and error.ratio > thresholds.NAMED_BUT)
+    if named and not doubted:
+        return search, verdict
+    freely = explain_freely(search, supported, named, lambda done, text: report(0.7 + 0.25 * done, text))
+    return freely, judge_free(freely, verdict, named) if freely.names("free") else verdict
 
 
 def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, progress: Progress) -> EffectSearch:
@@ -116,28 +83,32 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     then they stay beside free effects. A free effect describes more than a name's own form, so it would often do better
     alone where the name is right.
     """
-    count = len(names)
-    whole = Chain(tuple(search.chain[: count + 1]), tuple(search.left_out[: count + 1]), tuple(names))
+    whole = tuple(step for step in search.steps if step.origin != "library" or step.added in names)
     unpredictable = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
-    alone = [] if named or unpredictable == names else [_with_only(search, unpredictable)]
-    stays = whole.left_out[-1]
+    alone = [] if named or unpredictable == [*names] else [_with_only(search, unpredictable)]
     first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
     chains = _extended([*alone, whole], progress, further if named else first)
-    chains = [chain for chain in chains if _predicts_better(stays, chain, further if named else ANY)]
-    return _with_chain(search, chains[-1]) if chains else search
+    chains = [chain for chain in chains if _predicts_better(whole, chain, further if named else ANY)]
+    if not chains:
+        return search
+    kept = sum(step.origin == "library" for step in chains[-1])
+    refused = search.refused if kept == len(search.found) else search.rounds[0]
+    return replace(search, steps=list(chains[-1]), refused=refused)
 
 
 def _with_only(search: EffectSearch, retained: Sequence[str]) -> Chain:
-    """The chain of models with only some of the effects that were added."""
+    """The steps with only some of the library's effects that were added."""
     last = search.last
-    for effect in search.added:
+    for effect in search.names("library"):
         if effect not in retained:
             last = without_effect(last, effect)
     models = [last]
     for effect in reversed(retained):
         models.append(without_effect(models[-1], effect))
-    models.reverse()
-    return Chain(tuple(models), tuple(leave_out(model) for model in models), tuple(retained))
+    given = [step for step in search.steps if step.origin != "library"]
+    given[-1] = replace(given[-1], searched=models.pop())
+    found = [step for _, step in search.found if step.added in retained]
+    return (*given, *(replace(step, searched=model) for step, model in zip(found, reversed(models), strict=True)))
 
 
 def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, float]) -> list[Chain]:
@@ -155,17 +126,17 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
             longer += _longer(chain, partial(_within, progress, share, part), first)
         if not longer:
             break
-        reference = bases[0].left_out[-1]
-        longer.sort(key=lambda chain: -chain.better(reference).gain)
+        longer.sort(key=lambda chain: -_better(bases[0], chain).gain)
         best = _likeliest(longer)
-        if best_chains and not _predicts_better(best_chains[-1].left_out[-1], best, thresholds.FURTHER_FREE):
+        if best_chains and not _predicts_better(best_chains[-1], best, thresholds.FURTHER_FREE):
             break
-        if any(vetoed(*link) for link in best.links):  # of the second best, extended, the first was not yet asked about
+        links = [pair for pair in pairwise(best) if pair[1].origin == "free"]
+        if any(vetoed(before.searched, step.searched) for before, step in links):
             break
         best_chains.append(best)
-        unlike: dict[str, Chain] = {}  # of each effect its best form
+        unlike: dict[str | None, Chain] = {}  # of each effect its best form
         for chain in longer:
-            unlike.setdefault(chain.added[-1], chain)
+            unlike.setdefault(chain[-1].added, chain)
         beam, first = [*unlike.values()][: thresholds.BEAM], thresholds.FURTHER_FREE
     return best_chains
 
@@ -175,28 +146,32 @@ def _likeliest(chains: Sequence[Chain]) -> Chain:
 
     Likelihoods are compared where the noise is of one kind.
     """
-    noise_is_fixed = chains[0].models[-1].noise.white_only
+    white_only = chains[0][-1].searched.noise.white_only
     near = [
         chain
         for chain in chains
-        if chain.models[-1].noise.white_only == noise_is_fixed
-        and chains[0].better(chain.left_out[-1]).errors < thresholds.BETTER
+        if chain[-1].searched.noise.white_only == white_only and _better(chain, chains[0]).errors < thresholds.BETTER
     ]
-    return min(near, key=lambda chain: (len(chain.names), -chain.models[-1].log_evidence))
+    return min(near, key=lambda chain: (len(chain), -chain[-1].searched.log_evidence))
 
 
 def _within(progress: Progress, begin: float, part: float, done: float, text: str) -> None:
     progress(begin + part * done, text)
 
 
-def _predicts_better(before: LeftOut, chain: Chain, required: tuple[float, float]) -> bool:
-    comparison = chain.better(before)
+def _better(before: Chain, after: Chain) -> Difference:
+    """Compare the left-out errors of the last models of two chains."""
+    return difference(before[-1].left_out, after[-1].left_out)
+
+
+def _predicts_better(before: Chain, after: Chain, required: tuple[float, float]) -> bool:
+    comparison = _better(before, after)
     return comparison.errors >= required[0] and comparison.gain >= required[1]
 
 
 def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> list[Chain]:
     """A chain with each free effect more that left-out blocks ask for."""
-    base, unseen = chain.models[-1], chain.left_out[-1]
+    base = chain[-1].searched
     listed: list[Effect] = []
     for effect in registry().values():
         if _applicable(effect, base):
@@ -220,9 +195,10 @@ def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> 
     for done, (number, (fitted, left_out)) in enumerate(side_by_side(judged, len(promising)), start=1):
         candidate = promising[number]
         progress(0.6 + 0.4 * done / len(promising), f"tried {candidate.effect.name.lower()}")
-        longer = chain.with_(replace(fitted, problem=candidate.fitted.problem), left_out, candidate.effect.id)
-        if _predicts_better(unseen, longer, required):
-            accepted[number] = longer
+        model = replace(fitted, problem=candidate.fitted.problem)
+        step = Step(candidate.effect.id, model, "free", renews=chain[0].renews, known=left_out)
+        if _predicts_better(chain, (*chain, step), required):
+            accepted[number] = (*chain, step)
     return [accepted[number] for number in sorted(accepted)]
 
 
@@ -234,20 +210,3 @@ def _applicable(effect: Effect, base: Fitted) -> bool:
     if effect.id in ZERO.values():
         return effect.id not in dict(base.effects)
     return bool(effect.shape) and effect.id not in dict(base.effects) and not replaced_by(base.effects, effect.forms)
-
-
-def _with_chain(search: EffectSearch, chain: Chain) -> EffectSearch:
-    """The search that ends with this chain. Where an effect is no longer there, round 1 says what was refused."""
-    kept_rounds = [search.added.index(name) for name in chain.names]
-    refused = slice(len(kept_rounds), None) if len(kept_rounds) == len(search.added) else slice(1)
-    return replace(
-        search,
-        added=[*chain.names, *chain.added],
-        chain=list(chain.models),
-        left_out=list(chain.left_out),
-        residuals=[residual_structure(fitted, search.quiet) for fitted in chain.models],
-        rounds=[*(search.rounds[place] for place in kept_rounds), *search.rounds[refused]],
-        margins=[*(search.margins[place] for place in kept_rounds), *search.margins[refused]],
-        losses={},
-        free=list(chain.added),
-    )

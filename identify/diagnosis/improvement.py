@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from stimrig.identify.criticism import compare
@@ -16,7 +16,6 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
-from stimrig.identify.estimation.fit_statistics import evaluate
 from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.model import Model
@@ -123,70 +122,76 @@ def diagnose_and_improve(
 def _improvement_of(
     search: EffectSearch, verdict: Verdict, max_effects: int | None = None, force: Sequence[str] = ()
 ) -> Improvement:
-    row, against = helpful(search)
-    if max_effects is not None:
-        row = row[: max_effects + 1]
-    supported_steps = len(row)
-    for effect in force:
-        step = _forced(row[-1], effect, search.raw)
-        if step is not None:
-            row.append(step)
-    models = _models(row)
-    reasons = [_reason(search, *three) for three in zip(row[:supported_steps], [row[0], *row], models, strict=False)]
-    reasons += ["Added on request. The evidence does not ask for it."] * (len(row) - supported_steps)
-    return Improvement(
-        noise_sd_nm=search.raw.noise_sd_nm,
-        verdict=verdict.kind,
-        steps=tuple(
+    supported, against = helpful(search)
+    steps = supported if max_effects is None else supported[: max_effects + 1]
+    models, rows = [], []
+    for number, step in enumerate(_with_forced(steps, force, search.raw)):
+        model = finish("maximum-likelihood", step.fitted, statistics=step.statistics)
+        parent = models[-1].model_id if models else None
+        models.append(model.with_(extra=model.extra | {"parent": parent, "added": step.added, "step": number}))
+        reason = _reason(search, steps[number - 1], step, models[-1]) if number < len(steps) else FORCED
+        rows.append(
             {"added": step.added}
             | {key: step.statistics.get(key) for key in COLUMNS}
             | {"model_id": model.model_id, "reason": reason, "ceiling_percent": step.statistics["ceiling_percent"]}
-            for step, model, reason in zip(row, models, reasons, strict=True)
-        ),
+        )
+    return Improvement(
+        noise_sd_nm=search.raw.noise_sd_nm,
+        verdict=verdict.kind,
+        steps=tuple(rows),
         models=tuple(models),
         refused=(*against, *refused(search)),
     )
 
 
 FREE = "A free effect: it describes what no effect of the library explains, and names no cause."
-_PLAIN = "The plain structure: recruitment curve and linear dynamics."
+FORCED = "Added on request. The evidence does not ask for it."
 
 
-def _reason(search: EffectSearch, step: Step, before: Step, model: Model) -> str:
+def _with_forced(steps: Sequence[Step], force: Sequence[str], raw: Raw) -> Iterator[Step]:
+    """The steps, and one more for each effect to be added whatever the evidence says."""
+    yield from steps
+    last = steps[-1].fitted
+    for effect in force:
+        if effect not in effect_names(last):
+            last = add_effect(last, find_effect(effect), "", raw)
+            yield Step(effect, last, "library")
+
+
+def _reason(search: EffectSearch, before: Step, step: Step, model: Model) -> str:
     if step.added is None:
-        base_names = ", ".join(find_effect(name).name.lower() for name in effect_names(search.base))
-        base = f"The given structure, with {base_names}." if base_names else _PLAIN
+        names = ", ".join(find_effect(name).name.lower() for name in search.base_effects)
+        base = (
+            f"The given structure, with {names}."
+            if names
+            else "The plain structure: recruitment curve and linear dynamics."
+        )
         return " ".join([base, *words(step.fitted, search.rows)])
-    if step.added in search.detected:
+    if step.origin == "detected":
         return "The samples show it directly, before any fit."
-    number = search.added.index(step.added)
-    comparison = difference(search.left_out[number], search.left_out[number + 1])
-    if step.added in search.free:
+    comparison = difference(before.left_out, step.left_out)
+    if step.origin == "free":
         description = next(effect["shape"]["words"] for effect in model.effects if effect["id"] == step.added)
         return " ".join([description, comparison.words_of_choice, FREE])
-    gain = next(c.gain for c in search.rounds[number] if c.effect.id == step.added)
-    reason = f"Log evidence rises by {gain:.0f}; at least {search.margins[number]:.3g} is required."
-    unasked = [] if find_effect(step.added).predictable else ["It cannot be foreseen: it need not predict."]
-    return " ".join([reason, comparison.words, *unasked, *_rising(before.statistics, step.statistics)])
-
-
-def _rising(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[str]:
-    """Return a sentence if the held-out error rises, but not enough to refuse the effect."""
-    rises = before["held_out_by"] == HELD_OUT and after["held_out_rms_nm"] > RISE * before["held_out_rms_nm"]
-    return ["On held-out pulses the error rises, but not by more than its standard error."] if rises else []
+    gain = next(candidate.gain for candidate in step.tried if candidate.effect.id == step.added)
+    margin = search.margin(search.names("library").index(step.added))
+    reasons = [f"Log evidence rises by {gain:.0f}; at least {margin:.3g} is required.", comparison.words]
+    if not find_effect(step.added).predictable:
+        reasons.append("It cannot be foreseen: it need not predict.")
+    old, new = before.statistics, step.statistics
+    if old["held_out_by"] == HELD_OUT and new["held_out_rms_nm"] > RISE * old["held_out_rms_nm"]:
+        reasons.append("On held-out pulses the error rises, but not by more than its standard error.")
+    return " ".join(reasons)
 
 
 def refused(search: EffectSearch) -> list[dict[str, Any]]:
-    """Effects that were tried on the last model and not added, best first, each with the reason."""
-    present = set(effect_names(search.last))
-    if not search.rounds:
-        return []
-    number = min(len(search.added), len(search.rounds) - 1)
-    margin = search.margins[number] if number < len(search.margins) else 0.0
+    """Effects that were tried last and not added, best first, each with the reason."""
+    margin = search.margin(max(len(search.rounds) - 1, 0))
     rows = []
-    for candidate in search.rounds[number]:
-        if candidate.effect.id in present:
+    for candidate in search.rounds[-1] if search.rounds else ():
+        if candidate.effect.id in effect_names(search.last):
             continue
+        reason = "Another effect explains the same error better."
         if candidate.refusal is not None:
             reason = candidate.refusal
         elif candidate.gain <= 0.0:
@@ -195,23 +200,5 @@ def refused(search: EffectSearch) -> list[dict[str, Any]]:
             reason = (
                 f"Too little evidence: log evidence rises by {candidate.gain:.1f}; at least {margin:g} is required."
             )
-        else:
-            reason = "Another effect explains the same error better."
         rows.append({"effect": candidate.effect.id, "log_evidence_gain": candidate.gain, "reason": reason})
     return rows
-
-
-def _forced(last: Step, effect: str, raw: Raw) -> Step | None:
-    if effect in effect_names(last.fitted):
-        return None
-    fitted = add_effect(last.fitted, find_effect(effect), "", raw)
-    return Step(effect, fitted, evaluate(fitted))
-
-
-def _models(row: list[Step]) -> list[Model]:
-    models: list[Model] = []
-    for number, step in enumerate(row):
-        parent = models[-1].model_id if models else None
-        model = finish("maximum-likelihood", step.fitted, statistics=step.statistics)
-        models.append(model.with_(extra=model.extra | {"parent": parent, "added": step.added, "step": number}))
-    return models

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
 from stimrig.identify.conclusion import conclude, only_open
 from stimrig.identify.criticism import worst_places
-from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful, steps
+from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful
 from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict
-from stimrig.identify.effects import find_effect
+from stimrig.identify.effects import Effect, find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters, finish
 from stimrig.identify.estimation.joint import predict_fitted
@@ -33,18 +35,13 @@ STATISTICS = (
 
 def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
     """The `Diagnosis` that a search and its verdict give."""
-    record, raw = search.record, search.raw
-    row = steps(search)
-    base = row[0].statistics
-    ranked = _ranked(search, verdict)
-    covariance = covariance_of(search.last.written) if ranked or search.free else np.zeros((0, 0))
-    missing = [_missing(search, verdict, effect, row, covariance) for effect in ranked]
-    free = [_free(search, effect, covariance) for effect in search.free]
-    final = row[-1].statistics
-    residual = record.torque_nm - predict_fitted(search.base)[0]
-    where = worst_places(record, residual, raw.noise_sd_nm, rows=search.base.problem.setup.grid.counted)
+    base, final = search.steps[0].statistics, search.steps[-1].statistics
+    missing, free = _effects(search, verdict)
+    residual = search.record.torque_nm - predict_fitted(search.base)[0]
+    counted = search.base.problem.setup.grid.counted
+    error = verdict.held_out_error
     fields: dict[str, Any] = {
-        "noise_sd_nm": raw.noise_sd_nm,
+        "noise_sd_nm": search.raw.noise_sd_nm,
         "slow_noise": {
             "sd_nm": search.last.noise.sd_nm * float(np.sqrt(min(search.last.noise.share, 1.0))),
             "ar1": search.last.noise.ar1,
@@ -55,63 +52,82 @@ def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
         "missing": tuple(missing),
         "free": tuple(free),
         "add": tuple(step.added for step in helpful(search)[0] if step.added),
-        "deciding_experiment": None,
-        "where": tuple(where),
+        "where": tuple(worst_places(search.record, residual, search.raw.noise_sd_nm, rows=counted)),
         "with_all": {key: final[key] for key in STATISTICS} | {"noise_sd_nm": final["noise_sd_nm"]},
         "residual_check": _is_noise(search) if verdict.kind == "nothing_missing" else None,
         "explained": verdict.explained,
         "structure_left": verdict.structure,
-        "unseen": None
-        if verdict.held_out_error is None
-        else {"rms_nm": verdict.held_out_error.rms_nm, "allowed_nm": verdict.held_out_error.allowed_nm},
+        "unseen": error and {"rms_nm": error.rms_nm, "allowed_nm": error.allowed_nm},
         "candidates": tuple([_candidate(candidate) for candidate in tried] for tried in search.rounds),
         "notes": tuple(verdict.notes),
     }
     fields["deciding_experiment"] = _deciding(search, verdict, fields)
-    return Diagnosis(**fields, plain=tuple(_plain(search, fields, row[-1 - len(free)].statistics)))
+    return Diagnosis(**fields, plain=tuple(_plain(search, fields)))
 
 
-def _ranked(search: EffectSearch, verdict: Verdict) -> list[str]:
-    """Effects by probability, those that the samples show first; then by the log evidence lost without each."""
-    return sorted(
-        verdict.probabilities,
-        key=lambda e: (e not in search.detected, -verdict.probabilities[e], -search.losses.get(e, 0.0)),
-    )
-
-
-def _missing(
-    search: EffectSearch, verdict: Verdict, effect: str, row: list[Step], covariance: np.ndarray
-) -> dict[str, Any]:
-    number = next(i for i, step in enumerate(row) if step.added == effect)
-    before, after = row[number - 1].statistics, row[number].statistics
+def _effects(search: EffectSearch, verdict: Verdict) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows of `missing`, most probable first and of equal ones the first found, and of `free`."""
     fitted = search.last.written
-    index = [e for e, _ in fitted.effects].index(effect)
-    parameters = describe_parameters(fitted, index, covariance)
-    rivals = verdict.rivals.get(effect, {})
-    named = _close(search, effect)
-    ranked = sorted((name for name in rivals if name and name != effect), key=lambda name: -rivals[name])
-    confused = [name for name in ranked if rivals[name] >= RIVAL or name in named]
-    described = find_effect(effect)
-    experiment = _experiment(search, effect, confused)
+    names = [name for name, _ in fitted.effects]
+    covariance = covariance_of(fitted) if len(search.steps) > 1 else np.zeros((0, 0))
+    missing, free = [], []
+    for before, step in pairwise(search.steps):
+        index = names.index(str(step.added))
+        described, form = find_effect(names[index]), fitted.effects[index][1]
+        row = {
+            "effect": described.id,
+            "name": described.name,
+            "form": form.name,
+            "equation": form.equation,
+            "parameters": dict(list(describe_parameters(fitted, index, covariance).items())[:MAX_PARAMETERS]),
+        }
+        if step.origin == "free":
+            shape = shape_of(fitted, index, covariance)
+            assert shape is not None
+            axes = {"axis" if key == "effect" else key: value for key, value in shape.items()}
+            free.append(row | {"left_out": difference(before.left_out, step.left_out).words_of_choice} | axes)
+        else:
+            missing.append(row | _named(search, verdict, before, step))
+    missing.sort(key=lambda row: (row["effect"] not in search.names("detected"), -row["probability"]))
+    return missing, free
+
+
+def _named(search: EffectSearch, verdict: Verdict, before: Step, step: Step) -> dict[str, Any]:
+    """What is said of an effect that is named, beside its form and its parameters."""
+    described = find_effect(str(step.added))
+    rivals = verdict.rivals.get(described.id, {})
+    tried = {candidate.effect.id: candidate for candidate in step.tried}
+    confused = sorted(
+        (name for name in rivals if name and name != described.id and _is_rival(tried, rivals, described, name)),
+        key=lambda name: -rivals[name],
+    )
+    experiment = None
+    if confused and not (described.band or find_effect(confused[0]).band):
+        fits = {name: tried[name].fitted for name in (described.id, confused[0])}
+        experiment = plan(search.record, fits)
     return {
-        "effect": effect,
-        "name": described.name,
         "part": described.part,
-        "probability": verdict.probabilities[effect],
-        "rms_before_nm": before["rms_nm"],
-        "rms_after_nm": after["rms_nm"],
-        "held_out_rms_before_nm": before["held_out_rms_nm"],
-        "held_out_rms_after_nm": after["held_out_rms_nm"],
+        "probability": verdict.probabilities[described.id],
+        "rms_before_nm": before.statistics["rms_nm"],
+        "rms_after_nm": step.statistics["rms_nm"],
+        "held_out_rms_before_nm": before.statistics["held_out_rms_nm"],
+        "held_out_rms_after_nm": step.statistics["held_out_rms_nm"],
         "confused_with": confused,
         "next_experiment": experiment.text if experiment else described.separated_by,
         "next_experiment_plan": experiment and _plan(experiment),
-        "form": fitted.effects[index][1].name,
-        "equation": fitted.effects[index][1].equation,
-        "parameters": dict(list(parameters.items())[:MAX_PARAMETERS]),
-        "objection": verdict.objections.get(effect),
+        "objection": verdict.objections.get(described.id),
         "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
         "plain": described.plain,
     }
+
+
+def _is_rival(tried: Mapping[str, Candidate], rivals: Mapping[str, float], best: Effect, name: str) -> bool:
+    """Return True if a record cannot separate an effect from the best one.
+
+    One that resembles it and gains nearly as much is a rival, too: in another form it might be better.
+    """
+    similar = name in best.resembles or best.id in find_effect(name).resembles
+    return rivals[name] >= RIVAL or (similar and tried[name].gain > CLOSE * tried[best.id].gain)
 
 
 def _plan(experiment: Experiment) -> dict[str, Any]:
@@ -142,45 +158,8 @@ def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
 
 def _is_noise(search: EffectSearch) -> bool:
     """Return True if the residual of the examined model passes the model's own check for noise."""
-    model = finish("maximum-likelihood", search.base, statistics=steps(search)[0].statistics)
+    model = finish("maximum-likelihood", search.base, statistics=search.steps[0].statistics)
     return bool(model.quality["gates"]["residual"]["passed"])
-
-
-def _free(search: EffectSearch, effect: str, covariance: np.ndarray) -> dict[str, Any]:
-    """Describe a free effect: its form, parameters and curves, and its left-out error."""
-    number = search.added.index(effect)
-    fitted = search.last.written
-    index = [name for name, _ in fitted.effects].index(effect)
-    shape = shape_of(fitted, index, covariance)
-    assert shape is not None
-    return {
-        "effect": effect,
-        "name": find_effect(effect).name,
-        "form": fitted.effects[index][1].name,
-        "equation": fitted.effects[index][1].equation,
-        "parameters": describe_parameters(fitted, index, covariance),
-        "left_out": difference(search.left_out[number], search.left_out[number + 1]).words_of_choice,
-        **{"axis" if key == "effect" else key: value for key, value in shape.items()},
-    }
-
-
-def _close(search: EffectSearch, effect: str) -> set[str]:
-    """Effects that resemble this one and gain nearly as much: in another form they might be better."""
-    if effect not in search.added:
-        return set()
-    round_ = search.rounds[search.added.index(effect)]
-    gains = {c.effect.id: c.gain for c in round_ if c.refused is None}
-    similar = {c.effect.id for c in round_ if effect in c.effect.resembles} | set(find_effect(effect).resembles)
-    return {name for name in similar if gains.get(name, 0.0) > CLOSE * gains.get(effect, 0.0)}
-
-
-def _experiment(search: EffectSearch, effect: str, confused: list[str]) -> Experiment | None:
-    """The shortest test that separates an effect from its first rival, both as fitted in the same round."""
-    if not confused or effect not in search.added:
-        return None
-    fits = {c.effect.id: c.fitted for c in search.rounds[search.added.index(effect)]}
-    rivals = {name: fits[name] for name in (effect, confused[0]) if name in fits and not find_effect(name).band}
-    return plan(search.record, rivals) if len(rivals) == 2 else None
 
 
 PARTS = {
@@ -203,8 +182,9 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
     }
 
 
-def _plain(search: EffectSearch, diagnosis: dict[str, Any], named: dict[str, Any]) -> list[str]:
+def _plain(search: EffectSearch, diagnosis: dict[str, Any]) -> list[str]:
     base, missing = diagnosis["base"], diagnosis["missing"]
+    named = search.steps[-1 - len(diagnosis["free"])].statistics
     base_names = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
     conclusion = conclude(diagnosis)
     lines = [

@@ -1,20 +1,21 @@
 """The search over structures: effects that a record asks for, one after the other.
 
-`search_effects` adds effects of the library to a model as long as the evidence is sufficient; `steps` are its models.
+`search_effects` adds effects of the library to a model as long as the evidence is sufficient. Its result is a list of
+steps, each a model with one effect more than the one before.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import ResidualStructure, quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.side_by_side import side_by_side
-from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, Form, Parameter, Scene, find_effect, form, registry
 from stimrig.identify.effects.base import replaced_by
@@ -25,7 +26,6 @@ from stimrig.identify.estimation.effect_fit import (
     add_effects,
     detected_effects,
     effect_names,
-    fit_form,
     fit_from,
     try_effect,
 )
@@ -51,44 +51,93 @@ def silent(_share: float, _text: str) -> None:
     """A `Progress` that reports nothing."""
 
 
+@dataclass(frozen=True, eq=False)
+class Step:
+    """A model of a search: the one before it with one effect more."""
+
+    added: str | None  # None for the base
+    searched: Fitted  # the model as the search compares it: all have the same curve's knots and smoothness
+    origin: Literal["base", "detected", "library", "free"]  # "detected": seen in the samples before any fit
+    tried: tuple[Candidate, ...] = ()  # all effects of the library tried in its round, best first
+    renews: bool = False  # whether the curve is chosen again with all rows once effects of the joint are there
+    known: LeftOut | None = None  # its errors on left-out blocks, where another process computed them
+
+    @property
+    def left_out(self) -> LeftOut:
+        """Its errors on left-out blocks."""
+        return self.known or leave_out(self.searched)
+
+    @cached_property
+    def fitted(self) -> Fitted:
+        """The model as it is used."""
+        return renewed_curve(self.searched) if self.renews else self.searched
+
+    @cached_property
+    def statistics(self) -> dict[str, Any]:
+        """As `evaluate` gives them."""
+        return evaluate(self.fitted)
+
+
 @dataclass
 class EffectSearch:
-    """Record of a search: candidates tried and models chosen. Round i starts from chain[i]."""
+    """Record of a search: the models chosen, and the effects tried."""
 
-    record: Record
     raw: Raw  # what the samples show before any fit
     rows: np.ndarray  # intervals that may be fitted, bool, shape (K,)
     plain: Fitted  # the model without effects
-    base: Fitted  # the model of the structure that is examined
-    detected: list[str] = field(default_factory=list)  # effects that the samples show before any fit
-    with_detected: list[Fitted] = field(default_factory=list)  # the base with the first of them, with the first two, …
-    rounds: list[list[Candidate]] = field(default_factory=list)  # candidates of each, best first
-    chain: list[Fitted] = field(default_factory=list)  # the base and what was detected, then one effect more each time
-    added: list[str] = field(default_factory=list)  # effects, in order
-    margins: list[float] = field(default_factory=list)  # log evidence required in each round
-    left_out: list[LeftOut] = field(default_factory=list)  # what each model of the chain predicts on left-out blocks
+    steps: list[Step]  # the model of the examined structure, then one effect more in each
+    quiet: np.ndarray  # intervals in which the muscle rests, bool, shape (K,)
+    refused: tuple[Candidate, ...] = ()  # effects of a last round in which none was chosen, best first
     free_gain: float = 0.0  # log evidence for a gain that varies without a law, beside the first model
-    losses: dict[str, float] = field(default_factory=dict)  # log evidence lost without each effect, if of several
-    quiet: np.ndarray = field(default_factory=lambda: np.zeros(0, bool))  # intervals in which the muscle rests
-    residuals: list[ResidualStructure] = field(default_factory=list)  # what that of each model of the chain shows
-    free: list[str] = field(default_factory=list)  # of `added` the last ones, which describe what no other explains
+
+    @property
+    def record(self) -> Record:
+        """The record."""
+        return self.plain.problem.setup.grid.record
+
+    @property
+    def base(self) -> Fitted:
+        """The model of the examined structure."""
+        return self.steps[0].searched
+
+    @property
+    def last(self) -> Fitted:
+        """The model with all effects found."""
+        return self.steps[-1].searched
 
     @property
     def base_effects(self) -> list[str]:
         """Effects of the structure that is examined."""
         return effect_names(self.base)
 
-    @property
-    def last(self) -> Fitted:
-        """The model with all effects found."""
-        return self.chain[-1]
+    def names(self, *origins: str) -> list[str]:
+        """Effects that were added, in order, by their origin."""
+        return [str(step.added) for step in self.steps if step.origin in origins]
 
-    def append(self, fitted: Fitted, effect: str = "", unseen: LeftOut | None = None) -> None:
-        """One model more, with an effect more than the last."""
-        self.added += [effect] if effect else []
-        self.chain.append(fitted)
-        self.left_out.append(unseen or leave_out(fitted))
-        self.residuals.append(residual_structure(fitted, self.quiet))
+    @property
+    def found(self) -> list[tuple[Step, Step]]:
+        """For each effect of the library that was added, the step before it and its own."""
+        pairs = zip(self.steps, self.steps[1:], strict=False)
+        return [(before, step) for before, step in pairs if step.origin == "library"]
+
+    @property
+    def start(self) -> Step:
+        """The step from which the search began: with all that the samples show."""
+        return self.steps[len(self.names("detected"))]
+
+    @property
+    def rounds(self) -> list[tuple[Candidate, ...]]:
+        """Effects tried in each round, best first."""
+        return [*(step.tried for _, step in self.found), *([self.refused] if self.refused else [])]
+
+    def margin(self, number: int) -> float:
+        """Log evidence that an effect must gain in a round."""
+        return thresholds.NEXT_MARGIN if number or self.base_effects else thresholds.FIRST_MARGIN
+
+    @property
+    def residual(self) -> ResidualStructure:
+        """What the residual of the last model shows."""
+        return residual_structure(self.last, self.quiet)
 
 
 def search_effects(
@@ -112,66 +161,54 @@ def search_effects(
     if count * grid.step_s < thresholds.LEAST_S:
         raise NotIdentifiable(f"only {count} pulse intervals may be fitted", fix="Give at least a few seconds of data.")
     plain = fit_plain(grid, rows)
-    search = EffectSearch(grid.record, raw, rows, plain, renewed_curve(add_effects(plain, structure, raw)))
-    start = _add_detected(search)
-    search.quiet = quiet_rows(start)
-    search.append(start)
+    base = renewed_curve(add_effects(plain, structure, raw))
+    steps = [Step(None, base, "base", renews=not knows_joint(base))]
+    for effect, detected_form, values in detected_effects(raw):
+        if effect not in effect_names(steps[-1].searched):
+            fitted = fit_from(steps[-1].searched, effect, detected_form, values)
+            steps.append(replace(steps[0], added=effect, searched=fitted, origin="detected"))
+    search = EffectSearch(raw, rows, plain, steps, quiet_rows(steps[-1].searched))
     for number in range(max_effects):
         if number and _exhausted(search):
             break
-        best = _best_of_round(search, progress or silent, number)
-        if best is None:
+        if not _add_best(search, progress or silent, number):
             break
-        search.append(best[0].fitted, best[0].effect.id, best[1])
-        if number:
-            _exchange(search)
-    if len(search.added) > 1:
-        for effect in search.added:
-            search.losses[effect] = search.last.log_evidence - without_effect(search.last, effect).log_evidence
     return search
 
 
-def _add_detected(search: EffectSearch) -> Fitted:
-    """The base model with the effects that the samples show beyond doubt."""
-    base = search.base
-    for effect, detected_form, values in detected_effects(search.raw):
-        if effect not in effect_names(base):
-            base = fit_from(base, effect, detected_form, values)
-            search.detected.append(effect)
-            search.with_detected.append(base)
-    return base
+def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
+    """Add the likeliest effect of a round that predicts left-out blocks better; return False if none does.
 
-
-def _best_of_round(search: EffectSearch, progress: Progress, number: int) -> tuple[Candidate, LeftOut] | None:
-    """The likeliest candidate of a round that predicts left-out blocks better; None if none does."""
-    before = search.rounds[0] if search.rounds else []
-    present = effect_names(search.last)
-    listed = [effect for effect in registry().values() if _applicable(effect, search.last, present)]
+    Where the likelihood cannot be trusted, the effect that predicts them best of those that are likely enough.
+    """
+    last, before = search.steps[-1], search.rounds[0] if number else ()
+    present = effect_names(last.searched)
+    listed = [effect for effect in registry().values() if _applicable(effect, last.searched, present)]
     # Slow ones first, so that all processes end at about the same time.
     listed.sort(key=lambda effect: -len(effect.forms))
-    tried = scan(search.last, listed, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
-    candidates = sorted((_discounted(search, c) for c in tried), key=_by_gain)
-    search.rounds.append(candidates)
-    if not number and (lawless := try_effect(FREE_GAIN, search.last)) is not None:
+    tried = scan(last.searched, listed, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
+    candidates = sorted((_discounted(search, candidate) for candidate in tried), key=_by_gain)
+    if not number and (lawless := try_effect(FREE_GAIN, last.searched)) is not None:
         search.free_gain = lawless.gain
-    search.margins.append(_margin(search, len(search.added)))
-    accepted = []
+    accepted: list[tuple[float, Candidate]] = []
     for place, candidate in enumerate(candidates[: thresholds.JUDGED]):
-        if candidate.gain < search.margins[-1]:
+        if candidate.gain < search.margin(number) or (accepted and not last.searched.distrusted):
             break
-        unseen = leave_out(candidate.fitted)
-        comparison, required = difference(search.left_out[-1], unseen), required_errors(search, candidate)
-        if not comparison.errors >= required:
+        comparison, required = (
+            difference(last.left_out, leave_out(candidate.fitted)),
+            required_errors(search, candidate),
+        )
+        if comparison.errors >= required:
+            accepted.append((comparison.gain, candidate))
+        else:
             candidates[place] = replace(candidate, refused=comparison, required=required)
-            continue
-        accepted.append((comparison.gain, candidate, unseen))
-        if not search.last.distrusted:
-            break
     if not accepted:
-        return None
-    _, candidate, unseen = max(accepted, key=lambda entry: entry[0])
-    free = released(candidate.fitted)
-    return (candidate, unseen) if free is candidate.fitted else (replace(candidate, fitted=free), leave_out(free))
+        search.refused = tuple(candidates)
+        return False
+    best = max(accepted, key=lambda entry: entry[0])[1]
+    added = {"added": best.effect.id, "searched": released(best.fitted), "tried": tuple(candidates)}
+    search.steps.append(replace(search.steps[0], origin="library", **added))
+    return True
 
 
 def required_errors(search: EffectSearch, candidate: Candidate) -> float:
@@ -186,7 +223,7 @@ def required_errors(search: EffectSearch, candidate: Candidate) -> float:
         return -np.inf
     if not effect.predictable:
         return 0.0 if search.last.distrusted else thresholds.NO_WORSE
-    if resembles_earlier(search.last, effect, candidate.form.stage, search.detected):
+    if resembles_earlier(search.last, effect, candidate.form.stage, search.names("detected")):
         return thresholds.BETTER_THAN_ALIKE
     return thresholds.BETTER_IF_WEAK if candidate.gain < thresholds.NEXT_MARGIN else thresholds.BETTER
 
@@ -217,27 +254,28 @@ def released(fitted: Fitted) -> Fitted:
 # ---- one round: every effect of the library tried on a model -----------------------------------------------------
 
 
-def scan(base: Fitted, listed: list[Effect], before: list[Candidate], progress: Progress) -> list[Candidate]:
+def scan(base: Fitted, listed: list[Effect], before: Sequence[Candidate], progress: Progress) -> list[Candidate]:
     """Add each of some effects to a model; best first. `before` holds the candidates of an earlier round."""
     earlier = {candidate.effect.id: candidate for candidate in before}
 
-    def tried(number: int) -> tuple[str, Fitted, float, dict[str, float]] | None:
+    def tried(number: int) -> Candidate | None:
         """Without the problem: it holds functions, which cannot be sent between processes."""
         effect = listed[number]
         candidate = try_effect(effect, base, _likeliest_forms(effect, earlier.get(effect.id)))
         if candidate is None:
             return None
-        return candidate.form.name, replace(candidate.fitted, problem=None), candidate.gain, candidate.forms  # type: ignore
+        fitted: Any = replace(candidate.fitted, problem=None)  # type: ignore
+        return replace(candidate, effect=None, form=candidate.form.name, fitted=fitted)  # type: ignore
 
     candidates: list[Candidate] = []
     for done, (number, result) in enumerate(side_by_side(tried, len(listed)), start=1):
         effect = listed[number]
         progress(done / len(listed), f"tried {effect.name.lower()}")
         if result is not None:
-            name, fitted, gain, forms = result
-            added = [] if effect.band else [(effect.id, effect.form(name))]
-            problem = Problem(base.problem.setup, [*base.effects, *added])
-            candidates.append(Candidate(effect, effect.form(name), replace(fitted, problem=problem), gain, forms))
+            chosen = effect.form(str(result.form))
+            problem = Problem(base.problem.setup, [*base.effects, *([] if effect.band else [(effect.id, chosen)])])
+            fitted = replace(result.fitted, problem=problem)
+            candidates.append(replace(result, effect=effect, form=chosen, fitted=fitted))
     return sorted(candidates, key=_by_gain)
 
 
@@ -303,26 +341,26 @@ def share_at_rest(quiet: np.ndarray, fitted: Fitted, effect: str) -> float:
     return float(np.sqrt(rest / max(work, 1e-30)))
 
 
+def only_at_work(quiet: np.ndarray, fitted: Fitted, effect: str) -> bool:
+    """Return True for efforts that do not appear at rest: the stimulation itself may cause them."""
+    added = dict(fitted.effects).get(effect)
+    sporadic = added is not None and added.stage == "additive" and find_effect(effect).sporadic
+    return sporadic and share_at_rest(quiet, fitted, effect) < thresholds.SHARE_AT_REST
+
+
 def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
     """The candidate with its gain reduced if it is an effort, and reduced more if it is only seen at work."""
     effect = candidate.effect
     if effect.band or not effect.sporadic:
         return candidate
-    at_rest = candidate.form.stage != "additive" or (
-        share_at_rest(search.quiet, candidate.fitted, effect.id) >= thresholds.SHARE_AT_REST
-    )
-    weight = thresholds.EFFORT_WEIGHT if at_rest else thresholds.EFFORT_WEIGHT_ONLY_AT_WORK
+    at_work = only_at_work(search.quiet, candidate.fitted, effect.id)
+    weight = thresholds.EFFORT_WEIGHT_ONLY_AT_WORK if at_work else thresholds.EFFORT_WEIGHT
     return replace(candidate, gain=weight * candidate.gain)
-
-
-def _margin(search: EffectSearch, number: int) -> float:
-    """Log evidence that an effect must gain in a round."""
-    return thresholds.NEXT_MARGIN if number or search.base_effects else FIRST_MARGIN
 
 
 def _exhausted(search: EffectSearch) -> bool:
     """Return True if no further effect can gain enough: the residual is nearly as small and white as noise can be."""
-    structure, last = search.residuals[-1], search.last
+    structure, last = search.residual, search.last
     if last.noise.ar1 > thresholds.SLOWEST_AR1 and structure.slow_nm > structure.white_nm:
         return False  # such slow noise may be a drift: the rests do not show how small the residual could be
     near = thresholds.NEAR_IDEAL if last.noise.is_white else thresholds.NEXT_MARGIN
@@ -332,65 +370,6 @@ def _exhausted(search: EffectSearch) -> bool:
 def prior(effect: Effect) -> float:
     """Term added to a gain of log evidence: the effect's prior odds, less the cost of a narrow band."""
     return effect.prior - (BAND_COST if effect.band else 0.0)
-
-
-# ---- effects replaced and left out ---------------------------------------------------------------------------------
-
-
-def _exchange(search: EffectSearch) -> None:
-    """After a further effect: replace an earlier one if its rival now does better, or drop it if it is not needed."""
-    last = search.last
-    for index, effect in enumerate(list(search.added[:-1])):
-        rivals = [c for c in search.rounds[index] if c.effect.id not in search.added][:2]
-        without = without_effect(last, effect)
-        if without.log_evidence > last.log_evidence - 1.0:
-            search.added.remove(effect)
-            _rebuild(search, without)
-            return
-        for rival in rivals:
-            if rival.gain < 0.5 * search.rounds[index][0].gain or rival.effect.band:
-                continue
-            refitted = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
-            if refitted is not None and refitted.log_evidence > last.log_evidence + 2.0:
-                search.added[index] = rival.effect.id
-                _rebuild(search, refitted, index, refitted.log_evidence - last.log_evidence)
-                return
-
-
-def _rebuild(search: EffectSearch, last: Fitted, index: int = -1, won: float = 0.0) -> None:
-    """Set chain, rounds and margins as if the effects of the last model had been added one after the other.
-
-    In round `index` an effect replaced one that had gained more alone; it is better by `won`, in log evidence.
-    """
-    wanted, tried = search.added, search.rounds[: len(search.added)]
-    search.added, search.chain, search.residuals = [], search.chain[:1], search.residuals[:1]
-    search.rounds, search.margins, search.left_out = [], [], search.left_out[:1]
-    for number, effect in enumerate(wanted):
-        before, described = search.last, find_effect(effect)
-        fitted = last if number == len(wanted) - 1 else _part(last, before, [*effect_names(before), effect])
-        known = next((c.forms for c in tried[number] if c.effect.id == effect), {})
-        gain = fitted.log_evidence - before.log_evidence + described.prior - (BAND_COST if described.band else 0.0)
-        added_form = dict(fitted.effects).get(effect, described.forms[0])
-        candidate = _discounted(search, Candidate(described, added_form, fitted, gain, known | {added_form.name: gain}))
-        unseen = leave_out(fitted)
-        comparison = difference(search.left_out[-1], unseen)
-        if candidate.gain < _margin(search, number) or not comparison.errors >= required_errors(search, candidate):
-            return  # beside the other effects it no longer gains enough
-        # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
-        highest_gain = candidate.gain - (won if number == index else 0.0)
-        rivals = [replace(c, gain=min(c.gain, highest_gain)) for c in tried[number] if c.effect.id != effect]
-        search.rounds.append(sorted([candidate, *rivals], key=_by_gain))
-        search.margins.append(_margin(search, number))
-        search.append(fitted, effect, unseen)
-
-
-def _part(last: Fitted, before: Fitted, retained: list[str]) -> Fitted:
-    """The last model with only some of its effects, fitted from their present values."""
-    problem = Problem(
-        last.problem.setup, [(effect, effect_form) for effect, effect_form in last.effects if effect in retained]
-    )
-    noise = last.noise if any(find_effect(name).band for name in retained) else before.noise
-    return solve(problem, start_from(problem, last, {}), noise)
 
 
 def without_effect(fitted: Fitted, effect: str) -> Fitted:
@@ -403,43 +382,18 @@ def without_effect(fitted: Fitted, effect: str) -> Fitted:
     return solve(problem, start_from(problem, fitted, {}), noise)
 
 
-# ---- the models of a search ----------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Step:
-    """One of the models of a search, each with one effect more than the one before."""
-
-    added: str | None  # None for the base
-    fitted: Fitted
-    statistics: dict[str, Any]  # see `evaluate`
-
-
-def steps(search: EffectSearch) -> list[Step]:
-    """The base, then the detected effects, then the effects found, in this order.
-
-    The search compares models with one and the same curve. Once it is over, those in which it found what the joint
-    does choose their curve with all rows; a base that knew of the joint has done so before.
-    """
-    models = [search.base, *search.with_detected, *search.chain[1:]]
-    if not knows_joint(search.base):
-        models = list(map(renewed_curve, models))
-    return [
-        Step(name, fitted, evaluate(fitted))
-        for name, fitted in zip([None, *search.detected, *search.added], models, strict=True)
-    ]
-
-
 def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
     """The steps up to the first that raises the error on held-out pulses, and the effects refused for that reason."""
-    row = steps(search)
-    for number in range(1 + len(search.detected), len(row)):
-        objection = vetoed(row[number - 1].fitted, row[number].fitted)
+    steps = search.steps
+    for number in range(1, len(steps)):
+        objection = (
+            None if steps[number].origin == "detected" else vetoed(steps[number - 1].fitted, steps[number].fitted)
+        )
         if objection is None:
             continue
-        first = find_effect(str(row[number].added)).name
+        first = find_effect(str(steps[number].added)).name
         reason = f"It was found beside another effect, against which held-out pulses speak: {first}."
-        against = [{"effect": step.added, "log_evidence_gain": None, "reason": reason} for step in row[number:]]
+        against = [{"effect": step.added, "log_evidence_gain": None, "reason": reason} for step in steps[number:]]
         against[0]["reason"] = objection
-        return row[:number], against
-    return row, []
+        return steps[:number], against
+    return steps, []

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, vetoed
-from stimrig.identify.diagnosis.search import EffectSearch, resembles_earlier, share_at_rest
+from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, residual_structure, vetoed
+from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work, resembles_earlier
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import likelihood_warnings
 from stimrig.identify.estimation.effect_fit import Candidate
@@ -30,7 +31,7 @@ class Verdict:
     objections: dict[str, str] = field(default_factory=dict)  # by effect: what held-out pulses say against it
 
 
-def shares(candidates: list[Candidate], max_gain: float = np.inf) -> dict[str, float]:
+def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[str, float]:
     """Probability of each candidate, and under the key "" that none of them is there.
 
     Gains are limited to `max_gain`, that of the effect which was added: where the likelihood decides nothing, a
@@ -47,41 +48,25 @@ def shares(candidates: list[Candidate], max_gain: float = np.inf) -> dict[str, f
     return {name: (1.0 - thresholds.UNKNOWN_FORM) * weight / total for name, weight in weights.items()}
 
 
-def _nothing(candidates: list[Candidate]) -> float:
+def _nothing(candidates: Sequence[Candidate]) -> float:
     """Probability that none of the candidates is there."""
     return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - thresholds.FIRST_MARGIN, 60.0))) for c in candidates))
 
 
-def _no_effort(search: EffectSearch, explained: float, structure: bool) -> bool:
+def _no_effort(search: EffectSearch, explained: float) -> bool:
     """Return True if apparent efforts are more likely caused by the stimulation."""
-    if explained < thresholds.LEAST_EXPLAINED_BY_EFFORTS and structure:
+    if explained < thresholds.LEAST_EXPLAINED_BY_EFFORTS and search.residual.significant:
         return True
-    effort = search.added[0]
-    holder = search.chain[1]
-    if share_at_rest(search.quiet, holder, effort) >= thresholds.SHARE_AT_REST:
-        return False
-    return (
-        "resisting" in dict(holder.effects)[effort].name
-        or _efforts(holder.parameters_of(effort)) >= thresholds.MANY_EFFORTS
-    )
-
-
-def _only_at_work(search: EffectSearch, number: int) -> bool:
-    """Return True if a sporadic added torque does not appear at rest."""
-    effect, holder = search.added[number], search.chain[number + 1]
-    form = dict(holder.effects).get(effect)
-    if form is None or form.stage != "additive" or not find_effect(effect).sporadic:
-        return False
-    return share_at_rest(search.quiet, holder, effect) < thresholds.SHARE_AT_REST
-
-
-def _everywhere(search: EffectSearch) -> bool:
-    """Return True if apparent efforts last for much of the test: true efforts are rare."""
-    effort = search.added[0]
-    holder = search.chain[1]
-    widths = [value for name, value in holder.parameters_of(effort).items() if name.startswith(("width_", "decay_"))]
+    step = search.found[0][1]
+    effort, holder = str(step.added), step.searched
+    parameters = holder.parameters_of(effort)
+    widths = [value for name, value in parameters.items() if name.startswith(("width_", "decay_"))]
     setup = holder.problem.setup
-    return 2.0 * sum(widths) > thresholds.EFFORTS_LAST * float(setup.fitted.sum()) * setup.grid.step_s
+    if 2.0 * sum(widths) > thresholds.EFFORTS_LAST * float(setup.fitted.sum()) * setup.grid.step_s:
+        return True  # true efforts are rare
+    if not only_at_work(search.quiet, holder, effort):
+        return False
+    return "resisting" in dict(holder.effects)[effort].name or _efforts(parameters) >= thresholds.MANY_EFFORTS
 
 
 def _efforts(parameters: dict[str, float]) -> int:
@@ -97,101 +82,82 @@ def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
     return before is None or after.excess_nm > thresholds.HELD_OUT_SHARE * before.excess_nm
 
 
-def _beyond(error: HeldOutError) -> str:
-    return (
-        f"On held-out pulses the error of the last model is {error.ratio:.1f} times what noise and its uncertainty "
-        "allow: something is still missing."
-    )
+def _held_out(search: EffectSearch, form: float, notes: list[str]) -> tuple[HeldOutError | None, bool]:
+    """The last model's error on held-out pulses, and whether it shows that structure is left; then with a note."""
+    before, after = (held_out_error(fitted, form, search.last) for fitted in (_first(search), search.last))
+    contradicted = after is not None and _contradicted(before, after)
+    if after is not None and contradicted:
+        notes.append(
+            f"On held-out pulses the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
+            "allow: something is still missing."
+        )
+    return after, contradicted
 
 
-def _explained(search: EffectSearch, first: Fitted) -> float:
+def _first(search: EffectSearch) -> Fitted:
+    """The model from which it is measured what effects explain."""
+    return search.plain if search.base_effects else search.start.searched
+
+
+def _explained(search: EffectSearch) -> float:
     """Share of the explainable log-likelihood that the effects explain."""
-    possible = search.residuals[-1].ideal - first.log_likelihood
+    first = _first(search)
+    possible = search.residual.ideal - first.log_likelihood
     return float((search.last.log_likelihood - first.log_likelihood) / max(possible, 1.0))
+
+
+def _notes(search: EffectSearch) -> list[str]:
+    readings = search.raw.readings
+    return [*([] if readings is None else [readings.words]), *likelihood_warnings(search.last)]
 
 
 def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
     """The verdict with free effects. They name nothing: what was `named` of the library's effects stays."""
-    first, last = search.plain if search.base_effects else search.chain[0], search.last
-    errors = [held_out_error(fitted, thresholds.FORM_ERROR_WITH_EFFECTS, last) for fitted in (first, last)]
-    readings = search.raw.readings
-    notes = [*([] if readings is None else [readings.words]), *likelihood_warnings(last)]
-    if errors[1] is not None and _contradicted(errors[0], errors[1]):
-        notes.append(_beyond(errors[1]))
+    notes, there = _notes(search), search.names("detected", "library")
+    error = _held_out(search, thresholds.FORM_ERROR_WITH_EFFECTS, notes)[0]
     return replace(
         before,
         kind=before.kind if named else "unexplained_structure",
-        probabilities={
-            effect: p for effect, p in before.probabilities.items() if effect in (*search.detected, *search.added)
-        },
-        explained=_explained(search, first),
-        structure=search.residuals[-1].ratio,
-        held_out_error=errors[1],
+        probabilities={effect: p for effect, p in before.probabilities.items() if effect in there},
+        explained=_explained(search),
+        structure=search.residual.ratio,
+        held_out_error=error,
         notes=notes,
     )
 
 
 def judge(search: EffectSearch) -> Verdict:
     """The verdict on a search for effects."""
-    first, last = search.plain if search.base_effects else search.chain[0], search.last
-    effects = [*search.base_effects, *search.added]
-    residual = search.residuals[-1]
-    explained = _explained(search, first) if effects else 0.0
-    readings = search.raw.readings
-    notes = [*([] if readings is None else [readings.words]), *likelihood_warnings(last)]
-    probabilities: dict[str, float] = dict.fromkeys(search.detected, 0.99)
+    last, residual, notes = search.last, search.residual, _notes(search)
+    effects = [*search.base_effects, *search.names("detected", "library")]
+    probabilities: dict[str, float] = dict.fromkeys(search.names("detected"), 0.99)
     rivals: dict[str, dict[str, float]] = {}
     objections: dict[str, str] = {}
-    rounds = [[c for c in tried if c.refused is None] for tried in search.rounds]
-    for number, effect in enumerate(search.added):
-        competitors = [c for c in rounds[number] if c.effect.id == effect or c.effect.id not in search.added]
-        rivals[effect] = shares(competitors, next((c.gain for c in competitors if c.effect.id == effect), np.inf))
-        # A later effect is at most as probable as those before it.
-        probabilities[effect] = min(
-            [rivals[effect].get(effect, 0.5), *(probabilities[e] for e in search.added[:number] if e in probabilities)]
-        )
-        stage = dict(search.chain[number + 1].effects).get(effect, find_effect(effect).forms[0]).stage
-        if resembles_earlier(search.chain[number], find_effect(effect), stage, search.detected):
-            probabilities[effect] = min(probabilities[effect], thresholds.REPAIR_PROBABILITY)
-        if _only_at_work(search, number):
-            probabilities[effect] = min(probabilities[effect], thresholds.ONLY_AT_WORK_PROBABILITY)
-        if objection := vetoed(search.chain[number], search.chain[number + 1]):
+    largest = 1.0  # a later effect is at most as probable as those before it
+    for before, step in search.found:
+        effect = str(step.added)
+        rivals[effect] = _rivals(search, step)
+        if resembles_earlier(before.searched, find_effect(effect), _stage(step), search.names("detected")):
+            largest = min(largest, thresholds.REPAIR_PROBABILITY)
+        if only_at_work(search.quiet, step.searched, effect):
+            largest = min(largest, thresholds.ONLY_AT_WORK_PROBABILITY)
+        if objection := vetoed(before.searched, step.searched):
             objections[effect] = objection
-            probabilities[effect] = min(probabilities[effect], thresholds.DOUBTED)
+            largest = min(largest, thresholds.DOUBTED)
             notes.append(f"The error on held-out pulses rises with this effect: {find_effect(effect).name}.")
-    structure = residual.ratio
+        probabilities[effect] = largest = min(largest, rivals[effect][effect])
+    explained = _explained(search) if effects else 0.0
     if last.noise.band > 0.0:
         # The narrow band itself is not structure: what counts is what remains beside it.
-        before = max(search.residuals[0].busy_nm ** 2 - residual.white_nm**2, 1e-12)
-        explained = 1.0 - max(residual.busy_nm**2 - residual.white_nm**2, 0.0) / before
-    strange = readings is not None and readings.held_s > thresholds.LONGEST_HELD_S
-    if effects:
-        strange = strange or (explained < thresholds.LEAST_EXPLAINED and residual.significant)
-        lawless = any(
-            search.free_gain > first_round[0].gain + thresholds.FREE_GAIN_MARGIN
-            for first_round in search.rounds[:1]
-            if first_round
-        )
-        strange = strange or (lawless and explained < thresholds.EXPLAINED_BY_LAWS)
-        if find_effect(effects[0]).band:
-            strange = strange or (
-                explained < thresholds.LEAST_EXPLAINED_BY_BAND and structure > thresholds.STRUCTURE_BESIDE_BAND
-            )
-        elif search.added and find_effect(search.added[0]).sporadic:
-            strange = strange or _everywhere(search) or _no_effort(search, explained, residual.significant)
-    else:
-        refused = max((c.gain for tried in search.rounds for c in tried if c.refused), default=0.0)
-        strange = strange or residual.significant or (refused > thresholds.REFUSED and not last.heavy_tails)
+        first = residual_structure(search.start.searched, search.quiet)
+        power = max(first.busy_nm**2 - residual.white_nm**2, 1e-12)
+        explained = 1.0 - max(residual.busy_nm**2 - residual.white_nm**2, 0.0) / power
     # Naming an effect claims more than naming none, so less error is allowed.
     form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR
-    before, after = (held_out_error(fitted, form, last) for fitted in (first, last))
-    if after is not None and _contradicted(before, after):
-        strange = True
-        notes.append(_beyond(after))
-    if strange:
+    error, contradicted = _held_out(search, form, notes)
+    if contradicted or _strange(search, effects, explained):
         probabilities = {effect: min(p, thresholds.DOUBTED) for effect, p in probabilities.items()}
-        kind = "unexplained_structure"
-        probability = 0.9
+        kind, probability = "unexplained_structure", 0.9
     elif probabilities:
         kind, probability = "effect_missing", max(probabilities.values())
     else:
@@ -200,10 +166,42 @@ def judge(search: EffectSearch) -> Verdict:
         kind,
         probabilities,
         rivals,
-        explained=float(explained),
-        structure=float(structure),
-        probability=float(probability),
-        held_out_error=after,
-        notes=notes,
-        objections=objections,
+        float(explained),
+        float(residual.ratio),
+        float(probability),
+        error,
+        notes,
+        objections,
     )
+
+
+def _rivals(search: EffectSearch, step: Step) -> dict[str, float]:
+    """Probabilities of the effects tried in the round of a step, without those of other rounds."""
+    others = {*search.names("library")} - {step.added}
+    competitors = [c for c in step.tried if c.refused is None and c.effect.id not in others]
+    return shares(competitors, next(c.gain for c in competitors if c.effect.id == step.added))
+
+
+def _stage(step: Step) -> str:
+    """The stage of the form that was added; of a narrow band, the first form's."""
+    added = find_effect(str(step.added))
+    return dict(step.searched.effects).get(added.id, added.forms[0]).stage
+
+
+def _strange(search: EffectSearch, effects: list[str], explained: float) -> bool:
+    """Return True if the fitted rows show that structure is left."""
+    residual, readings = search.residual, search.raw.readings
+    if readings is not None and readings.held_s > thresholds.LONGEST_HELD_S:
+        return True
+    if not effects:
+        refused = max((c.gain for c in search.refused if c.refused), default=0.0)
+        return residual.significant or (refused > thresholds.REFUSED and not search.last.heavy_tails)
+    if explained < thresholds.LEAST_EXPLAINED and residual.significant:
+        return True
+    gain = search.rounds[0][0].gain if search.rounds else np.inf
+    if search.free_gain > gain + thresholds.FREE_GAIN_MARGIN and explained < thresholds.EXPLAINED_BY_LAWS:
+        return True
+    if find_effect(effects[0]).band:
+        little = explained < thresholds.LEAST_EXPLAINED_BY_BAND
+        return little and residual.ratio > thresholds.STRUCTURE_BESIDE_BAND
+    return bool(search.found) and find_effect(str(search.found[0][1].added)).sporadic and _no_effort(search, explained)

@@ -14,7 +14,7 @@ import pytest
 from bench.muscles.arm_patient import ArmPatient, arm_patient
 from bench.muscles.arm_records import changed, record
 from stimrig import identify
-from stimrig.identify.diagnosis.search import search_effects, steps
+from stimrig.identify.diagnosis.search import search_effects
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects.passive_torque import relaxed
 from stimrig.identify.errors import BadModel, BadRequest
@@ -281,7 +281,7 @@ def test_what_a_search_finds_is_shown_with_a_renewed_curve():
     with few_effects.only("passive_torque"):
         grid, raw = prepare(whole())
         search = search_effects(grid, raw, fitted_rows(grid, None), max_effects=1)
-        plain, found = steps(search)
+        plain, found = search.steps
     assert plain.fitted is search.base and found.added == "passive_torque"
     assert found.fitted.log_evidence > search.last.log_evidence
     assert found.fitted.problem.setup.basis is not search.last.problem.setup.basis
