@@ -194,7 +194,7 @@ def test_where_nothing_is_missing_nothing_free_is_added():
         assert improvement.steps[1:] == () and diagnosis.free == ()
         grid, raw = prepare(record)
         search = search_effects(grid, raw, fitted_rows(grid, None))
-        assert free.explain_freely(search, (), False, silent).free == [], "nor where one is looked for"
+        assert free.explain_freely(search, (), False, silent).names("free") == [], "nor where one is looked for"
 
 
 def test_beside_a_free_effect_a_name_may_only_repair_its_form():

@@ -122,15 +122,14 @@ def test_efforts_that_only_a_doubtful_likelihood_asks_for_must_not_predict_worse
     fitted = fitted_with(plain_record, [])
     effort = Candidate(find_effect("voluntary_effort"), find_effect("voluntary_effort").forms[0], fitted, 30.0, {})
     slow = replace(fitted, noise=replace(fitted.noise, ar1=0.994, share=1.0))
-    asked = [required_errors(SimpleNamespace(last=one, detected=[]), effort) for one in (fitted, slow)]
+    asked = [required_errors(SimpleNamespace(last=one, names=lambda _origin: []), effort) for one in (fitted, slow)]
     assert asked == [thresholds.NO_WORSE, 0.0]
 
 
 def test_effects_found_after_one_that_held_out_rows_speak_against_are_told(monkeypatch):
-    row = [search.Step(name, None, {}) for name in (None, "fatigue", "tremor")]
-    monkeypatch.setattr(search, "steps", lambda _found: row)
+    row = [search.Step(name, None, "library" if name else "base") for name in (None, "fatigue", "tremor")]
     monkeypatch.setattr(search, "vetoed", lambda _before, _after: "the error would rise")
-    left, against = search.helpful(SimpleNamespace(detected=[]))
+    left, against = search.helpful(SimpleNamespace(steps=row))
     assert left == row[:1] and [entry["effect"] for entry in against] == ["fatigue", "tremor"]
     assert against[0]["reason"] == "the error would rise" and "Fatigue" in against[1]["reason"]
 

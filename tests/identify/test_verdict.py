@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from stimrig.identify.diagnosis import verdict
+from stimrig.identify.diagnosis import search, verdict
 from stimrig.identify.diagnosis.residual import HeldOutError, ResidualStructure
-from stimrig.identify.diagnosis.search import EffectSearch
+from stimrig.identify.diagnosis.search import EffectSearch, Step
 from stimrig.identify.diagnosis.verdict import Verdict, judge, shares
 from stimrig.identify.effects import find_effect
 from stimrig.identify.records.readings import Readings
@@ -44,7 +45,7 @@ def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters
 
 
 class Made:
-    """An analysis in which nothing is missing, to be changed; what the record says stands beside it."""
+    """A search in which nothing is missing, to be changed; what the record says stands beside it."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
         self.at_rest = 1.0
@@ -53,11 +54,14 @@ class Made:
         self.forms: list[float] = []
         base = fitted(0.0)
         self.raw = SimpleNamespace(readings=None)
-        self.work = EffectSearch(
-            record=object(), raw=self.raw, rows=np.ones(4000, bool), plain=base, base=base,
-            rounds=[[candidate(FIRST, 1.0)]], chain=[base], free_gain=0.0, residuals=[self.left()],
+        self.left_by_first = self.left_by_last = self.left()
+        self.search = EffectSearch(
+            raw=self.raw, rows=np.ones(4000, bool), plain=base, steps=[Step(None, base, "base")],
+            quiet=np.zeros(4000, bool), refused=(candidate(FIRST, 1.0),),
         )  # fmt: skip
-        monkeypatch.setattr(verdict, "share_at_rest", self._share_at_rest)
+        monkeypatch.setattr(search, "share_at_rest", self._share_at_rest)
+        for module in (search, verdict):
+            monkeypatch.setattr(module, "residual_structure", self._residual)
         monkeypatch.setattr(verdict, "vetoed", self._rise)
         monkeypatch.setattr(verdict, "held_out_error", self._unseen)
 
@@ -73,43 +77,50 @@ class Made:
 
     def add(self, effect: str, gain: float, log_likelihood: float, rival: float = 0.0, **parameters: float) -> Made:
         """One effect more, that took the log-likelihood so far."""
-        work = self.work
-        rounds = [candidate(effect, gain), candidate("potentiation", rival)]
-        work.rounds[len(work.added) :] = [rounds]
-        work.added.append(effect)
-        work.chain.append(fitted(log_likelihood, *work.added, **parameters))
+        names = [str(step.added) for step in self.search.steps[1:]]
+        tried = (candidate(effect, gain), candidate("potentiation", rival))
+        model = fitted(log_likelihood, *names, effect, **parameters)
+        self.search.steps.append(Step(effect, model, "library", tried))
+        self.search.refused = ()
         return self
+
+    def detect(self, effect: str, log_likelihood: float = 0.0) -> None:
+        self.search.steps.append(Step(effect, fitted(log_likelihood, effect), "detected"))
 
     def leaves(self, **left: float) -> Made:
-        self.work.residuals = [self.work.residuals[0], self.left(**left)]
+        self.left_by_last = self.left(**left)
         return self
 
-    def leaves_first(self, **left: float) -> None:
-        """Where nothing was added."""
-        self.work.residuals = [self.left(**left)]
+    @property
+    def last(self) -> Any:
+        return self.search.last
 
     def judged(self) -> Verdict:
-        return judge(self.work)
+        return judge(self.search)
 
     def held(self, held_s: float) -> Made:
         """A recorder that holds each reading so long, at 400 samples a second."""
         self.raw.readings = Readings("held", np.arange(9), 400.0 * held_s, held_s=held_s)
         return self
 
+    def _residual(self, fit: Any, quiet: Any) -> ResidualStructure:
+        assert quiet is self.search.quiet
+        return self.left_by_last if fit is self.last else self.left_by_first
+
     def _share_at_rest(self, quiet: Any, holder: Any, effect: str) -> float:
-        assert quiet is self.work.quiet
-        assert holder is self.work.chain[self.work.added.index(effect) + 1]
+        assert quiet is self.search.quiet
+        assert holder is next(step.searched for step in self.search.steps if step.added == effect)
         return self.at_rest
 
     def _rise(self, before: Any, after: Any) -> str | None:
-        number = self.work.chain.index(before)
-        assert after is self.work.chain[number + 1]
+        number = [step.searched for step in self.search.steps].index(before)
+        assert after is self.search.steps[number + 1].searched
         return "the error would rise" if number in self.rises else None
 
     def _unseen(self, fit: Any, form: float, beside: Any) -> HeldOutError | None:
-        assert beside is self.work.last
+        assert beside is self.last
         self.forms.append(form)
-        return self.unseen[0 if fit is self.work.plain and len(self.forms) == 1 else 1]
+        return self.unseen[0 if fit is self.search.plain and len(self.forms) == 1 else 1]
 
 
 @pytest.fixture
@@ -123,11 +134,11 @@ def test_nothing_missing(made: Made):
     assert (found.explained, found.structure) == (0.0, 0.0)
     assert found.held_out_error is None
     assert found.probability == pytest.approx(1 / (1 + np.exp(1.0 - 4.5)))
-    made.work.rounds = [[candidate(FIRST, 4.5), candidate(SECOND, 3.5)]]
+    made.search.refused = (candidate(FIRST, 4.5), candidate(SECOND, 3.5))
     assert made.judged().probability == pytest.approx(1 / (1 + 1 + np.exp(-1.0)))
-    made.work.rounds = []
+    made.search.refused = ()
     assert made.judged().probability == 1.0
-    made.work.rounds = [[candidate(FIRST, 1e6)]]
+    made.search.refused = (candidate(FIRST, 1e6),)
     assert made.judged().probability == pytest.approx(1 / (1 + np.exp(60.0)), rel=1e-9, abs=0)
 
 
@@ -157,7 +168,8 @@ def test_an_effect_missing(made: Made):
 
 def test_what_was_added_later_stands_on_what_was_added_before(made: Made):
     made.add(FIRST, 50.0, 40.0, rival=50.0).add(SECOND, 90.0, 90.0)
-    made.work.rounds[0].append(candidate(SECOND, 49.0))  # taken in another round, so no rival in this one
+    first = made.search.steps[1]
+    made.search.steps[1] = replace(first, tried=(*first.tried, candidate(SECOND, 49.0)))  # no rival in this round
     found = made.judged()
     assert found.rivals[SECOND][SECOND] > 0.9
     assert found.probabilities[SECOND] == found.probabilities[FIRST] == found.rivals[FIRST][FIRST] < 0.5
@@ -165,17 +177,10 @@ def test_what_was_added_later_stands_on_what_was_added_before(made: Made):
     assert found.probability == found.probabilities[FIRST]
 
 
-def test_an_effect_that_was_exchanged_counts_as_half(made: Made):
-    made.add(FIRST, 50.0, 90.0)
-    made.work.rounds[0] = [candidate("potentiation", 20.0)]
-    assert made.judged().probabilities[FIRST] == 0.5
-
-
 def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
-    made.work.detected = ["mains_hum"]
+    made.detect("mains_hum", 30.0)
     found = made.judged()
     assert (found.kind, found.probabilities, found.probability) == ("effect_missing", {"mains_hum": 0.99}, 0.99)
-    made.work.chain = [fitted(30.0, "mains_hum")]
     made.add(FIRST, 50.0, 65.0)
     assert made.judged().explained == pytest.approx(35.0 / 70.0), "what was given counts as known"
 
@@ -191,17 +196,17 @@ def apart(made: Made, count: int, apart_s: float) -> None:
 
 def trembling(made: Made, busy_nm: float, ratio: float) -> None:
     """Explained is what it took of the power above the white noise, 0.2 N·m here, of 0.3 N·m before."""
-    made.work.residuals = [made.left(busy_nm=0.3, white_nm=0.2)]
+    made.left_by_first = made.left(busy_nm=0.3, white_nm=0.2)
     made.add(TREMOR, 50.0, 90.0).leaves(ratio=ratio, busy_nm=busy_nm, white_nm=0.2)
-    made.work.chain[-1].noise.band = 0.5
+    made.last.noise.band = 0.5
     assert made.judged().explained == pytest.approx(1 - (busy_nm**2 - 0.04) / 0.05)
 
 
 RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any, ...]]]] = {
-    "structure that no effect explains": (lambda made, ratio: made.leaves_first(ratio=ratio), [(12.1,)], [(12.0,)]),
+    "structure that no effect explains": (lambda made, ratio: made.leaves(ratio=ratio), [(12.1,)], [(12.0,)]),
     # 0.4 N·m are 0.15 % of 266.7. A record of many samples shows every trifle, as a pulse a millisecond late.
     "an error too small to matter": (
-        lambda made, busy_nm, white_nm, scale_nm: made.leaves_first(
+        lambda made, busy_nm, white_nm, scale_nm: made.leaves(
             ratio=100.0, busy_nm=busy_nm, white_nm=white_nm, scale_nm=scale_nm
         ),
         [(0.5, 0.3, 266.0)],
@@ -213,7 +218,7 @@ RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any
         [(68.0, 12.1), (67.0, 12.0)],
     ),
     "a gain without a law explains more": (
-        lambda made, nameless, likelihood: setattr(made.add(FIRST, 50.0, likelihood).work, "free_gain", nameless),
+        lambda made, nameless, likelihood: setattr(made.add(FIRST, 50.0, likelihood).search, "free_gain", nameless),
         [(58.1, 89.0)],
         [(58.0, 89.0), (58.1, 90.0)],
     ),
@@ -248,7 +253,7 @@ def test_every_rule_at_both_sides(made: Made, rule: str, values: tuple[Any, ...]
 
 def test_what_is_left_is_told(made: Made):
     for ratio in (12.0, 12.1):
-        made.leaves_first(ratio=ratio)
+        made.leaves(ratio=ratio)
         assert made.judged().structure == ratio
     assert made.judged().notes == []
     assert made.held(0.0125).judged().notes == [
@@ -314,7 +319,7 @@ def test_efforts_seen_nowhere_at_rest_are_less_certain(
     made: Made, at_rest: float, name: str, kind: str, probability: float | None
 ):
     made.at_rest = at_rest
-    made.add(EFFORT, 50.0, 90.0, **EFFORTS).work.chain[1].effects[0][1].name = name
+    made.add(EFFORT, 50.0, 90.0, **EFFORTS).last.effects[0][1].name = name
     found = made.judged()
     assert found.kind == kind
     if probability == 0.85:
@@ -329,19 +334,13 @@ def test_efforts_are_looked_for_in_the_model_to_which_they_were_added(made: Made
     assert found.probabilities == {EFFORT: 0.85, FIRST: 0.85}
 
 
-def test_an_effort_that_was_exchanged_is_looked_for_nowhere(made: Made):
-    made.add(EFFORT, 50.0, 90.0)
-    made.work.chain[1].effects = ()
-    assert made.judged().probabilities[EFFORT] > 0.9
-
-
 def test_a_law_that_shows_nothing_at_rest_is_as_certain_as_ever(made: Made):
     made.at_rest = 0.0
     assert made.add("baseline_drift", 50.0, 90.0).judged().probabilities["baseline_drift"] > 0.9
 
 
 def test_a_structure_that_holds_effects_is_measured_from_the_plain_one(made: Made):
-    made.work.base = made.work.chain[0] = fitted(60.0, FIRST)
+    made.search.steps = [Step(None, fitted(60.0, FIRST), "base")]
     found = made.judged()
     assert found.explained == pytest.approx(0.6)
     assert found.kind == "nothing_missing"
