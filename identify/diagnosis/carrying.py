@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 from stimrig.identify.diagnosis.residual import quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.search import Progress, prior, silent, without_effect
 from stimrig.identify.diagnosis.thresholds import FIRST_MARGIN
-from stimrig.identify.effects import Effect, find_effect, registry
+from stimrig.identify.effects import find_effect, registry
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import add_effect, detected_effects, effect_names, try_effect
 from stimrig.identify.estimation.finish import finish
@@ -24,6 +24,17 @@ METHOD = "maximum-likelihood"
 LAST = "fitting last session's structure"
 FIGURES = ("fit_percent", "ceiling_percent", "held_out_fit_percent", "rms_nm", "held_out_rms_nm", "held_out_by")
 UNUSABLE = "not usable"
+Reason = tuple[str, str]
+"""Why something is so: as a word for programs, and as a sentence."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """Verdict on one carried effect; `needed` is None if the record cannot tell, `gain` if it was not compared."""
+
+    needed: bool | None
+    because: Reason
+    gain: float | None = None
 
 
 def carry(record: Record, model: Model, progress: Progress | None = None) -> Carried:
@@ -57,22 +68,27 @@ def carry(record: Record, model: Model, progress: Progress | None = None) -> Car
     report(0.05, LAST)
     grid, raw = prepare(record)
     plain = fit_plain(grid, fitted_rows(grid, None))
-    plain_model = finish(METHOD, plain)
+    models, judged = [finish(METHOD, plain)], dict[str, Judged]()
     refused = _refused(model)
     if refused is not None:
-        return _result(model, [plain_model], [], False, refused)
-    last, judged = still_needed(plain, model, raw, lambda share, text: report(0.2 + 0.65 * share, text))
-    rows = [judged[str(entry["id"])] for entry in model.effects]
+        return _result(model, models, judged, False, refused)
+    last = _still_needed(plain, model, raw, judged, lambda share, text: report(0.2 + 0.65 * share, text))
     if not effect_names(last):
-        return _result(model, [plain_model], rows, False, _nothing(rows))
+        because = ("nothing-needed", "The plain structure is enough for this record.")
+        if any(verdict.needed is None for verdict in judged.values()):
+            words = "Something else than the effects of the earlier model is missing in this record."
+            because = ("undecided", words)
+        return _result(model, models, judged, False, because)
     report(0.85, f"{LAST}: bands and tests of the residual")
     last = renewed_curve(last)
-    carried_model = finish(METHOD, last, [f"effects carried over: {', '.join(effect_names(last))}"])
-    better, because = _verdict(plain, last, raw)
-    if better and (against := _less_usable(plain_model, carried_model)):
-        better, because = False, against
+    models.append(finish(METHOD, last, [f"effects carried over: {', '.join(effect_names(last))}"]))
+    better, because = _compared(plain, last, raw)
+    verdicts = [fitted.quality.get("verdict") for fitted in models]
+    if better and verdicts[1] == UNUSABLE != verdicts[0]:
+        words = f"The model with the carried effects is not usable. {models[1].quality.get('words') or ''}".strip()
+        better, because = False, ("not-usable", words)
     report(1.0, "done")
-    return _result(model, [plain_model, carried_model], rows, better, because)
+    return _result(model, models, judged, better, because)
 
 
 def _refused(model: Model) -> Reason | None:
@@ -83,46 +99,27 @@ def _refused(model: Model) -> Reason | None:
             f"The earlier model holds {' and '.join(unknown)}, which is not installed here. Put its file back into the "
             "folder of the site's own effects (STIMRIG_EFFECTS_DIR), then fit again."
         )
-        return Reason("not-installed", text)
+        return "not-installed", text
     if model.method != METHOD:
-        text = f"The earlier model was made by {model.method}, which gives no log evidence to compare."
-        return Reason("other-method", text)
-    return None if model.effects else Reason("plain-before", "The earlier model has the plain structure as well.")
+        return "other-method", f"The earlier model was made by {model.method}, which gives no log evidence to compare."
+    return None if model.effects else ("plain-before", "The earlier model has the plain structure as well.")
 
 
 # ---- effects of an earlier model -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Reason:
-    """Why something is so: as a word for programs, and as a sentence."""
-
-    why: str
-    reason: str
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Verdict on one carried effect; `needed` is None if the record cannot tell, `gain` if it was not compared."""
-
-    effect: Effect
-    needed: bool | None
-    because: Reason
-    gain: float | None = None
-
-
-def still_needed(plain: Fitted, model: Model, raw: Raw, report: Progress) -> tuple[Fitted, dict[str, Judged]]:
-    """The plain model with those effects of an earlier one that the record asks for, and the verdict on each.
-
-    `plain` is the plain structure on the new record, `raw` what its samples show before any fit; `model`, the earlier
-    one, lends its effects and their forms.
-    """
-    judged: dict[str, Judged] = {}
+def _still_needed(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], report: Progress) -> Fitted:
+    """The plain model with those effects of an earlier one that the record asks for; the verdicts go into `judged`."""
     full = _add_all(plain, model, raw, judged, lambda share, text: report(0.6 * share, text))
     last = _reduced(full, raw, judged, lambda share, text: report(0.6 + 0.4 * share, text))
     if residual_structure(last, quiet_rows(last)).significant:
-        judged = {name: _undecided(verdict) for name, verdict in judged.items()}
-    return last, judged
+        for name, verdict in judged.items():
+            if not verdict.needed and verdict.gain is not None:  # what else is missing may hide what it explains
+                text = (
+                    f"{verdict.because[1]} But something else is missing in the model, so this record cannot tell yet."
+                )
+                judged[name] = replace(verdict, needed=None, because=("undecided", text))
+    return last
 
 
 def _add_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], report: Progress) -> Fitted:
@@ -140,8 +137,7 @@ def _add_all(plain: Fitted, model: Model, raw: Raw, judged: dict[str, Judged], r
             try:
                 fits[name] = add_effect(fitted, find_effect(name), _form_of(entry), raw)
             except NotIdentifiable as error:
-                reason = Reason("not-seen", f"{error.message[:1].upper()}{error.message[1:]}.")
-                judged[name] = Judged(find_effect(name), False, reason)
+                judged[name] = Judged(False, ("not-seen", f"{error.message[:1].upper()}{error.message[1:]}."))
         if not fits:
             return fitted
         strongest = max(fits, key=lambda name: (fits[name].log_evidence, name))
@@ -158,114 +154,92 @@ def _form_of(entry: Mapping[str, Any]) -> str:
 
 def _reduced(full: Fitted, raw: Raw, judged: dict[str, Judged], report: Progress) -> Fitted:
     """The model without the effects that are not needed: the weakest is dropped, then the others are judged anew."""
-    detected = {effect for effect, _, _ in detected_effects(raw)}
     last, first_count, tried = full, len(effect_names(full)), set[str]()
     while present := effect_names(last):
         report(1.0 - len(present) / (first_count + 1), f"{LAST}: which of its effects are still needed")
-        verdicts = [_judged(find_effect(name), last, name in detected) for name in present]
-        judged.update({verdict.effect.id: verdict for verdict, _ in verdicts})
-        weak = [pair for pair in verdicts if not pair[0].needed]
+        verdicts = {name: _judge(name, last, raw) for name in present}
+        judged.update({name: verdict for name, (verdict, _) in verdicts.items()})
+        weak = [name for name, (verdict, _) in verdicts.items() if not verdict.needed]
         if not weak:
             break
-        worst, last = min(weak, key=lambda pair: pair[0].gain or 0.0)
-        if worst.effect.id not in tried:
-            tried.add(worst.effect.id)
-            other = try_effect(worst.effect, last)  # in its most likely form, if the evidence asks for that form
+        worst = min(weak, key=lambda name: verdicts[name][0].gain or 0.0)
+        last = verdicts[worst][1]
+        if worst not in tried:
+            tried.add(worst)
+            other = try_effect(find_effect(worst), last)  # in its most likely form, if the evidence asks for that form
             last = other.fitted if other is not None and other.gain >= FIRST_MARGIN else last
     return last
 
 
-def _judged(effect: Effect, fitted: Fitted, detected: bool) -> tuple[Judged, Fitted]:
+def _judge(name: str, fitted: Fitted, raw: Raw) -> tuple[Judged, Fitted]:
     """Judge one effect of a model; return the verdict and the model without the effect."""
-    if detected:
-        return Judged(effect, True, Reason("in-samples", "The samples show it directly, before any fit.")), fitted
-    without = without_effect(fitted, effect.id)
-    gain = fitted.log_evidence - without.log_evidence + prior(effect)
+    if name in _in_samples(raw):
+        return Judged(True, ("in-samples", "The samples show it directly, before any fit.")), fitted
+    without = without_effect(fitted, name)
+    gain = fitted.log_evidence - without.log_evidence + prior(find_effect(name))
     if gain < FIRST_MARGIN:
         why, words = ("against", "The evidence is against it") if gain <= 0.0 else ("weak", "Too little evidence")
         text = f"{words}: log evidence changes by {gain:+.1f} with it; at least {FIRST_MARGIN:g} is required."
-        return Judged(effect, False, Reason(why, text), gain), without
-    risen = rise(without, fitted)
+        return Judged(False, (why, text), gain), without
+    objection = vetoed(without, fitted)
     text = f"Log evidence is higher by {gain:.0f} with it; at least {FIRST_MARGIN:g} is required."
-    return Judged(effect, risen is None, risen or Reason("asked-for", text), gain), without
+    return Judged(not objection, ("held-out-error", objection) if objection else ("asked-for", text), gain), without
 
 
-def rise(before: Fitted, after: Fitted) -> Reason | None:
-    """The error on held-out pulses as a reason if it rises; else None."""
-    objection = vetoed(before, after)
-    return Reason("held-out-error", objection) if objection else None
-
-
-def _undecided(verdict: Judged) -> Judged:
-    """The verdict on an effect if something else is missing in the model: it may hide what the effect explains."""
-    if verdict.needed or verdict.gain is None:
-        return verdict
-    text = f"{verdict.because.reason} But something else is missing in the model, so this record cannot tell yet."
-    return replace(verdict, needed=None, because=Reason("undecided", text))
+def _in_samples(raw: Raw) -> set[str]:
+    return {effect for effect, _, _ in detected_effects(raw)}
 
 
 # ---- which model is offered ---------------------------------------------------------------------------------
 
 
-def _nothing(judged: list[Judged]) -> Reason:
-    """Why no effect is left."""
-    if any(verdict.needed is None for verdict in judged):
-        return Reason("undecided", "Something else than the effects of the earlier model is missing in this record.")
-    return Reason("nothing-needed", "The plain structure is enough for this record.")
-
-
-def _verdict(plain: Fitted, last: Fitted, raw: Raw) -> tuple[bool, Reason]:
+def _compared(plain: Fitted, last: Fitted, raw: Raw) -> tuple[bool, Reason]:
     """Compare the carried structure as a whole with the plain one: True if it is better, with the reason."""
-    carried_effects = effect_names(last)
-    # The log evidence says little of an effect that the samples show.
-    in_samples = any(effect in carried_effects for effect, _, _ in detected_effects(raw))
-    total = last.log_evidence - plain.log_evidence + sum(prior(find_effect(name)) for name in carried_effects)
+    effects = effect_names(last)
+    in_samples = not _in_samples(raw).isdisjoint(effects)  # the log evidence says little of an effect that samples show
+    total = last.log_evidence - plain.log_evidence + sum(prior(find_effect(name)) for name in effects)
     if total < FIRST_MARGIN and not in_samples:
         text = f"Together the effects change the log evidence by {total:+.1f}; at least {FIRST_MARGIN:g} is required."
-        return False, Reason("no-gain", text)
-    risen = rise(plain, last)
-    if risen is not None:
-        return False, risen
-    names = "; ".join(find_effect(name).name.lower() for name in carried_effects)
-    if in_samples:
-        return True, Reason("better", f"This record asks for: {names}.")
-    text = f"This record asks for: {names}. Log evidence is higher by {total:.0f} than without effects."
-    return True, Reason("better", text)
+        return False, ("no-gain", text)
+    if objection := vetoed(plain, last):
+        return False, ("held-out-error", objection)
+    words = f"This record asks for: {'; '.join(find_effect(name).name.lower() for name in effects)}."
+    return True, (
+        "better",
+        words if in_samples else f"{words} Log evidence is higher by {total:.0f} than without effects.",
+    )
 
 
-def _less_usable(plain: Model, carried: Model) -> Reason | None:
-    """The reason if the carried model may not be used while the plain one may."""
-    if carried.quality.get("verdict") != UNUSABLE or plain.quality.get("verdict") == UNUSABLE:
-        return None
-    words = str(carried.quality.get("words") or "")
-    return Reason("not-usable", f"The model with the carried effects is not usable. {words}".strip())
-
-
-def _result(model: Model, models: list[Model], judged: list[Judged], better: bool, because: Reason) -> Carried:
+def _result(
+    model: Model, models: Sequence[Model], judged: Mapping[str, Judged], better: bool, because: Reason
+) -> Carried:
     forms = {str(entry["id"]): entry.get("form") for entry in models[-1].effects}
-    models[1:] = [later.with_(extra=later.extra | {"parent": models[0].model_id}) for later in models[1:]]
+    verdicts = {str(entry["id"]): judged[str(entry["id"])] for entry in model.effects if judged}
     rows = [
         {
-            "effect": verdict.effect.id,
-            "name": verdict.effect.name,
-            "form": forms.get(verdict.effect.id),
+            "effect": name,
+            "name": find_effect(name).name,
+            "form": forms.get(name),
             "needed": verdict.needed,
             "log_evidence_gain": verdict.gain,
             "required": FIRST_MARGIN,
-            "why": verdict.because.why,
-            "reason": verdict.because.reason,
+            "why": verdict.because[0],
+            "reason": verdict.because[1],
         }
-        for verdict in judged
+        for name, verdict in verdicts.items()
     ]
+    needed, gone, undecided = (
+        tuple(name for name, verdict in verdicts.items() if verdict.needed is answer) for answer in (True, False, None)
+    )
     return Carried(
         carried_from=model.model_id,
         offered="carried" if better else "plain",
-        why=because.why,
-        reason=because.reason,
-        still_needed=tuple(verdict.effect.id for verdict in judged if verdict.needed),
-        no_longer_needed=tuple(verdict.effect.id for verdict in judged if verdict.needed is False),
-        undecided=tuple(verdict.effect.id for verdict in judged if verdict.needed is None),
+        why=because[0],
+        reason=because[1],
+        still_needed=needed,
+        no_longer_needed=gone,
+        undecided=undecided,
         effects=tuple(rows),
         figures=tuple({key: fitted.fit.get(key) for key in FIGURES} for fitted in models),
-        models=tuple(models),
+        models=(models[0], *(later.with_(extra=later.extra | {"parent": models[0].model_id}) for later in models[1:])),
     )

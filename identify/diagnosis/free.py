@@ -38,8 +38,8 @@ from stimrig.identify.estimation.samples import Raw, fitted_rows
 
 ZERO = {"free_zero": "baseline_drift"}
 """A free effect, and the one of the library that nothing foretells and that may look like it."""
-ANY = (thresholds.BETTER, 0.0)
-"""As `FIRST_FREE`, against a model that names nothing."""
+MAX_FREE, BEAM = 2, 2
+"""Free effects at most; and so many chains of each length, the best on left-out blocks, are extended by a second."""
 Chain = tuple[Step, ...]
 """Steps of a search from its base on, the last ones with free effects."""
 
@@ -86,9 +86,10 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     whole = tuple(step for step in search.steps if step.origin != "library" or step.added in names)
     unpredictable = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
     alone = [] if named or unpredictable == [*names] else [_with_only(search, unpredictable)]
-    first, further = thresholds.FIRST_FREE, thresholds.FURTHER_FREE
-    chains = _extended([*alone, whole], progress, further if named else first)
-    chains = [chain for chain in chains if _predicts_better(whole, chain, further if named else ANY)]
+    first = thresholds.BETTER_THAN_ALIKE if named else thresholds.BETTER_IF_FREE
+    chains = _extended([*alone, whole], progress, first)
+    if not named:  # against a model that names nothing it need only be better
+        chains = [chain for chain in chains if _better(whole, chain).errors >= thresholds.BETTER]
     if not chains:
         return search
     kept = sum(step.origin == "library" for step in chains[-1])
@@ -111,7 +112,7 @@ def _with_only(search: EffectSearch, retained: Sequence[str]) -> Chain:
     return (*given, *(replace(step, searched=model) for step, model in zip(found, reversed(models), strict=True)))
 
 
-def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, float]) -> list[Chain]:
+def _extended(bases: Sequence[Chain], progress: Progress, first: float) -> list[Chain]:
     """The best chain with one free effect, with two, …, as far as left-out blocks ask for more.
 
     The likeliest few of each length are extended: which effect is best alone does not say which is best beside others.
@@ -119,16 +120,16 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
     """
     best_chains: list[Chain] = []
     beam = list(bases)
-    for number in range(thresholds.MAX_FREE):
+    for number in range(MAX_FREE):
         longer: list[Chain] = []
         for at, chain in enumerate(beam):
-            share, part = (number + at / len(beam)) / thresholds.MAX_FREE, 1.0 / len(beam) / thresholds.MAX_FREE
+            share, part = (number + at / len(beam)) / MAX_FREE, 1.0 / len(beam) / MAX_FREE
             longer += _longer(chain, partial(_within, progress, share, part), first)
         if not longer:
             break
         longer.sort(key=lambda chain: -_better(bases[0], chain).gain)
         best = _likeliest(longer)
-        if best_chains and not _predicts_better(best_chains[-1], best, thresholds.FURTHER_FREE):
+        if best_chains and not _predicts_better(best_chains[-1], best, thresholds.BETTER_THAN_ALIKE):
             break
         links = [pair for pair in pairwise(best) if pair[1].origin == "free"]
         if any(vetoed(before.searched, step.searched) for before, step in links):
@@ -137,7 +138,7 @@ def _extended(bases: Sequence[Chain], progress: Progress, first: tuple[float, fl
         unlike: dict[str | None, Chain] = {}  # of each effect its best form
         for chain in longer:
             unlike.setdefault(chain[-1].added, chain)
-        beam, first = [*unlike.values()][: thresholds.BEAM], thresholds.FURTHER_FREE
+        beam, first = [*unlike.values()][:BEAM], thresholds.BETTER_THAN_ALIKE
     return best_chains
 
 
@@ -164,12 +165,13 @@ def _better(before: Chain, after: Chain) -> Difference:
     return difference(before[-1].left_out, after[-1].left_out)
 
 
-def _predicts_better(before: Chain, after: Chain, required: tuple[float, float]) -> bool:
+def _predicts_better(before: Chain, after: Chain, required: float) -> bool:
+    """Return True if the left-out error falls by so many standard errors, and by what is worth a free effect."""
     comparison = _better(before, after)
-    return comparison.errors >= required[0] and comparison.gain >= required[1]
+    return comparison.errors >= required and comparison.gain >= thresholds.FREE_FALL
 
 
-def _longer(chain: Chain, progress: Progress, required: tuple[float, float]) -> list[Chain]:
+def _longer(chain: Chain, progress: Progress, required: float) -> list[Chain]:
     """A chain with each free effect more that left-out blocks ask for."""
     base = chain[-1].searched
     listed: list[Effect] = []

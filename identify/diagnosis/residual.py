@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.thresholds import FORM_ERROR, LEAST_HELD_OUT_ROWS, QUIET, STRUCTURE, STRUCTURE_SHARE
+from stimrig.identify.diagnosis.thresholds import FORM_ERROR, LEAST_HELD_OUT_ROWS, QUIET, STRUCTURE
 from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
-from stimrig.identify.estimation.left_out import difference, hold_out
+from stimrig.identify.estimation.left_out import FLOOR_SHARE, difference, hold_out
 from stimrig.identify.noise import UNKNOWN, band_part, profile
 
 MEDIAN = 0.6745
@@ -34,7 +34,7 @@ class ResidualStructure:
         """True if work and rest differ statistically and by an amount that matters: in a long record every trifle is
         significant."""
         excess_nm = max(self.busy_nm**2 - self.white_nm**2, 0.0) ** 0.5
-        return self.ratio > STRUCTURE and excess_nm > STRUCTURE_SHARE * self.scale_nm
+        return self.ratio > STRUCTURE and excess_nm > FLOOR_SHARE * self.scale_nm
 
 
 def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
@@ -153,7 +153,7 @@ def vetoed(before: Fitted, after: Fitted) -> str | None:
     never speak for one.
     """
     old, new = hold_out(before), hold_out(after)
-    if difference(old, new).errors > thresholds.VETO or not new.rms_nm > thresholds.RISE * old.rms_nm:
+    if difference(old, new).errors > -thresholds.BETTER or not new.rms_nm > thresholds.RISE * old.rms_nm:
         return None
     errors = f"{old.rms_nm:.3g}", f"{new.rms_nm:.3g}"
     return f"Held out, the error of a pulse interval's mean torque would rise from {errors[0]} to {errors[1]} N·m."

@@ -11,7 +11,7 @@ import numpy as np
 from stimrig.identify.conclusion import conclude, only_open
 from stimrig.identify.criticism import worst_places
 from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful
-from stimrig.identify.diagnosis.thresholds import CLOSE, RIVAL
+from stimrig.identify.diagnosis.thresholds import CLOSE, UNKNOWN_FORM
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import Effect, find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
@@ -127,7 +127,7 @@ def _is_rival(tried: Mapping[str, Candidate], rivals: Mapping[str, float], best:
     One that resembles it and gains nearly as much is a rival, too: in another form it might be better.
     """
     similar = name in best.resembles or best.id in find_effect(name).resembles
-    return rivals[name] >= RIVAL or (similar and tried[name].gain > CLOSE * tried[best.id].gain)
+    return rivals[name] >= UNKNOWN_FORM or (similar and tried[name].gain > CLOSE * tried[best.id].gain)
 
 
 def _plan(experiment: Experiment) -> dict[str, Any]:

@@ -38,8 +38,13 @@ from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.simulation.problem import Problem
 
+LEAST_S = 3.0
+"""Fitted time, s, below which no effect is looked for: a train of a calibration, 2 s and its rests at most, is of one
+width, and its curve and dynamics explain whatever happens in it."""
 MAX_EFFECTS = 3
 """Effects at most."""
+DYNAMIC = {"speed", "lags", "branch", "delay", "filter"}
+"""Stages that change how quickly the torque follows."""
 FORMS = 3
 """Forms of an effect that are tried beside another effect."""
 
@@ -65,7 +70,7 @@ class Step:
     @property
     def left_out(self) -> LeftOut:
         """Its errors on left-out blocks."""
-        return self.known or leave_out(self.searched)
+        return leave_out(self.searched) if self.known is None else self.known
 
     @cached_property
     def fitted(self) -> Fitted:
@@ -155,10 +160,10 @@ def search_effects(
     added. `structure`: effects, "id" or "id:form", that the examined model already has. `progress` may raise
     `Cancelled`.
 
-    Raises NotIdentifiable: less than `thresholds.LEAST_S` may be fitted, or as `fit_plain`.
+    Raises NotIdentifiable: less than `LEAST_S` may be fitted, or as `fit_plain`.
     """
     count = int(rows.sum())
-    if count * grid.step_s < thresholds.LEAST_S:
+    if count * grid.step_s < LEAST_S:
         raise NotIdentifiable(f"only {count} pulse intervals may be fitted", fix="Give at least a few seconds of data.")
     plain = fit_plain(grid, rows)
     base = renewed_curve(add_effects(plain, structure, raw))
@@ -191,7 +196,7 @@ def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
     if not number and (lawless := try_effect(FREE_GAIN, last.searched)) is not None:
         search.free_gain = lawless.gain
     accepted: list[tuple[float, Candidate]] = []
-    for place, candidate in enumerate(candidates[: thresholds.JUDGED]):
+    for place, candidate in enumerate(candidates):
         if candidate.gain < search.margin(number) or (accepted and not last.searched.distrusted):
             break
         comparison, required = (
@@ -222,7 +227,7 @@ def required_errors(search: EffectSearch, candidate: Candidate) -> float:
     if effect.band:
         return -np.inf
     if not effect.predictable:
-        return 0.0 if search.last.distrusted else thresholds.NO_WORSE
+        return 0.0 if search.last.distrusted else -thresholds.BETTER
     if resembles_earlier(search.last, effect, candidate.form.stage, search.names("detected")):
         return thresholds.BETTER_THAN_ALIKE
     return thresholds.BETTER_IF_WEAK if candidate.gain < thresholds.NEXT_MARGIN else thresholds.BETTER
@@ -237,7 +242,7 @@ def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iter
         find_effect(name).shape
         or name in effect.resembles
         or effect.id in find_effect(name).resembles
-        or (stage in thresholds.DYNAMIC and present_form.stage in thresholds.DYNAMIC)
+        or (stage in DYNAMIC and present_form.stage in DYNAMIC)
         for name, present_form in before.effects
         if name not in detected
     )

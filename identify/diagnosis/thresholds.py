@@ -7,9 +7,6 @@ law, as efforts and tremor do. The muscle is "at work" in the intervals in which
 
 from __future__ import annotations
 
-LEAST_S = 3.0
-"""Fitted time, s, below which no effect is looked for. Not calibrated: a train of a calibration, 2 s and its rests at
-most, is of one width, and its curve and dynamics explain whatever happens in it."""
 FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
@@ -17,29 +14,27 @@ NEXT_MARGIN = 10.0
 NEAR_IDEAL = 30.0
 """Log-likelihood that the last model may fall short of the ideal by, where its residual is white: the size of the noise
 is known no better. Nothing further is then looked for."""
-JUDGED = 8
-"""So many candidates of a round, the likeliest first, are judged by left-out blocks."""
 BETTER = 1.0
-"""Standard errors by which the error on left-out blocks must fall with an effect."""
+"""Standard errors by which the error on left-out blocks must fall with an effect, and by which it may rise with one that
+cannot be foreseen: such an effect need not predict, but it must not spoil what the muscle does."""
 BETTER_IF_WEAK = 1.5
 """The same for a first effect that gains less log evidence than a further one must."""
 BETTER_THAN_ALIKE = 3.0
 """The same if it resembles an effect that is there, both change the dynamics, or that one is free: one effect in an
 inexact form looks like two."""
-NO_WORSE = -1.0
-"""The same for effects that cannot be foreseen: they need not predict, but they must not spoil what the muscle does."""
+BETTER_IF_FREE = 2.0
+"""The same for a free effect beside which nothing is named."""
+FREE_FALL = 0.2
+"""Logarithm by which that error must fall with a free effect, too: it is chosen among many."""
 EFFORT_WEIGHT = 0.92
 """Weight of the evidence for efforts. Where a law explains as much, the law is preferred, since it can be tested."""
 EFFORT_WEIGHT_ONLY_AT_WORK = 0.85
 """Weight of the evidence for efforts that do not appear at rest: true efforts do not wait for the stimulation."""
-ONLY_AT_WORK_PROBABILITY = 0.85
-"""Largest probability of efforts that do not appear at rest: the stimulation itself may cause them."""
-REPAIR_PROBABILITY = 0.85
-"""Largest probability of an effect that may only repair the inexact form of an earlier one."""
+UNSURE = 0.85
+"""Largest probability of an effect that may only repair the inexact form of an earlier one, and of efforts that do not
+appear at rest: the stimulation itself may cause them."""
 SHARE_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
-DYNAMIC = {"speed", "lags", "branch", "delay", "filter"}
-"""Stages that change how quickly the torque follows."""
 SLOWEST_AR1 = 0.97
 """Correlation of neighbours above which slow noise may also be a drift."""
 TEMPERATURE = 2.0
@@ -62,10 +57,8 @@ STRUCTURE_BESIDE_BAND = 60.0
 """Log-likelihood by which work and rest must differ beside a tremor for structure to be left."""
 STRUCTURE = 12.0
 """Log-likelihood by which work and rest must differ for structure to be left."""
-STRUCTURE_SHARE = 0.0015
-"""Error at work above that of white noise, as a share of the largest torque, below which it does not matter."""
 UNKNOWN_FORM = 0.04
-"""Probability that is kept for what no form in the library describes."""
+"""Probability that is kept for what no form in the library describes; a rival that is less probable is not named."""
 FREE_GAIN_MARGIN = 8.0
 """If a gain without a law beats the best effect by this log evidence, the cause is not in the library."""
 EXPLAINED_BY_LAWS = 0.9
@@ -74,32 +67,22 @@ HELD_OUT_RATIO = 2.5
 """Error on held-out pulses, divided by what is allowed there, above which structure may be left."""
 HELD_OUT_SHARE = 0.5
 """The same as a share of the plain structure's error there: a law close to the true one takes most of it, not all."""
-VETO, RISE = -1.0, 1.02
-"""Standard errors from which, and the factor by which, a held-out error must rise to speak against an effect:
-`improve` stops there."""
 REFUSED = 20.0
 """Log evidence from which something is there that no effect can predict, if left-out blocks refuse what explains it."""
+RISE = 1.02
+"""Factor by which a held-out error must rise, and by more than `BETTER` of its standard errors, to speak against an
+effect: `improve` stops there."""
 DOUBTED = 0.45
 """Largest probability of an effect that something speaks against."""
-LONGEST_HELD_S = 0.05
-"""A reading that is held for longer than two pulses hides how the torque rises and falls. Not calibrated."""
 QUIET = 0.025
 """Share of the largest torque below which the muscle counts as resting."""
 CLOSE = 0.8
 """An effect that resembles the best one is named beside it from this share of its gain."""
-RIVAL = 0.04
-"""Probability from which an effect is named as one that this record cannot separate from the best."""
 FORM_ERROR = 0.01
 """Error, as a share of the largest torque, that a curve of few knots may leave on held-out pulses with no effect."""
 FORM_ERROR_WITH_EFFECTS = 0.003
 """The same if an effect is named: its law must also hold on held-out pulses."""
 LEAST_HELD_OUT_ROWS = 40
 """With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""
-MAX_FREE = 2
-"""Free effects at most."""
-BEAM = 2
-"""So many chains of each length, the best on left-out blocks, are extended by a further free effect."""
-FIRST_FREE, FURTHER_FREE = (2.0, 0.2), (3.0, 0.2)
-"""Standard errors, and share as a logarithm, by which the error on left-out blocks must fall with a free effect."""
 NAMED_BUT = 1.3
 """Error on held-out pulses, divided by what is allowed there, from which free effects are tried beside named ones."""

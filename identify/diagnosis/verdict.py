@@ -15,6 +15,9 @@ from stimrig.identify.estimation.candidates import likelihood_warnings
 from stimrig.identify.estimation.effect_fit import Candidate
 from stimrig.identify.estimation.joint import Fitted
 
+LONGEST_HELD_S = 0.05
+"""A reading that is held for longer than two pulses hides how the torque rises and falls."""
+
 
 @dataclass(frozen=True)
 class Verdict:
@@ -137,10 +140,9 @@ def judge(search: EffectSearch) -> Verdict:
     for before, step in search.found:
         effect = str(step.added)
         rivals[effect] = _rivals(search, step)
-        if resembles_earlier(before.searched, find_effect(effect), _stage(step), search.names("detected")):
-            largest = min(largest, thresholds.REPAIR_PROBABILITY)
-        if only_at_work(search.quiet, step.searched, effect):
-            largest = min(largest, thresholds.ONLY_AT_WORK_PROBABILITY)
+        repairs = resembles_earlier(before.searched, find_effect(effect), _stage(step), search.names("detected"))
+        if repairs or only_at_work(search.quiet, step.searched, effect):
+            largest = min(largest, thresholds.UNSURE)
         if objection := vetoed(before.searched, step.searched):
             objections[effect] = objection
             largest = min(largest, thresholds.DOUBTED)
@@ -191,7 +193,7 @@ def _stage(step: Step) -> str:
 def _strange(search: EffectSearch, effects: list[str], explained: float) -> bool:
     """Return True if the fitted rows show that structure is left."""
     residual, readings = search.residual, search.raw.readings
-    if readings is not None and readings.held_s > thresholds.LONGEST_HELD_S:
+    if readings is not None and readings.held_s > LONGEST_HELD_S:
         return True
     if not effects:
         refused = max((c.gain for c in search.refused if c.refused), default=0.0)

@@ -102,7 +102,7 @@ def test_held_out_rows_end_the_search_and_never_choose_another(monkeypatch: pyte
     with few_effects.only("free_gate", "free_level"):
         search, verdict = free.searched(*prepare(as_record(record_of_physics("physics", 0))))
     assert asked == ["free_gate"]
-    assert not search.free and verdict.kind == "unexplained_structure"
+    assert not search.names("free") and verdict.kind == "unexplained_structure"
 
 
 def test_held_out_rows_may_object_to_any_link_of_a_chain(monkeypatch: pytest.MonkeyPatch):
@@ -112,14 +112,14 @@ def test_held_out_rows_may_object_to_any_link_of_a_chain(monkeypatch: pytest.Mon
         return SimpleNamespace(name=name, noise=SimpleNamespace(white_only=False), log_evidence=0.0)
 
     def longer(chain: free.Chain, *_: object) -> list[free.Chain]:
-        further = {(): {"A": 1.0, "B": 0.8}, ("B",): {"C": 3.0}}.get(chain.added, {})
-        return [chain.with_(model(name), error, name) for name, error in further.items()]
+        further = {(): {"A": 1.0, "B": 0.8}, ("B",): {"C": 3.0}}.get(tuple(step.added for step in chain[1:]), {})
+        return [(*chain, free.Step(name, model(name), "free", known=error)) for name, error in further.items()]
 
     monkeypatch.setattr(free, "_longer", longer)
     monkeypatch.setattr(free, "vetoed", lambda old, new: "no" if (old.name, new.name) == ("base", "B") else None)
     monkeypatch.setattr(free, "difference", lambda old, new: SimpleNamespace(gain=new - old, errors=10.0 * (new - old)))
-    found = free._extended([free.Chain((model("base"),), (0.0,), ())], silent, (0.0, 0.0))
-    assert [chain.added for chain in found] == [("A",)]
+    found = free._extended([(free.Step(None, model("base"), "base", known=0.0),)], silent, 0.0)
+    assert [[step.added for step in chain[1:]] for chain in found] == [["A"]]
 
 
 @cache

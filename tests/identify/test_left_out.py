@@ -123,7 +123,7 @@ def test_efforts_that_only_a_doubtful_likelihood_asks_for_must_not_predict_worse
     effort = Candidate(find_effect("voluntary_effort"), find_effect("voluntary_effort").forms[0], fitted, 30.0, {})
     slow = replace(fitted, noise=replace(fitted.noise, ar1=0.994, share=1.0))
     asked = [required_errors(SimpleNamespace(last=one, names=lambda _origin: []), effort) for one in (fitted, slow)]
-    assert asked == [thresholds.NO_WORSE, 0.0]
+    assert asked == [-thresholds.BETTER, 0.0]
 
 
 def test_effects_found_after_one_that_held_out_rows_speak_against_are_told(monkeypatch):
