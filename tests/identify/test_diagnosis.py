@@ -161,6 +161,6 @@ def test_a_gain_that_swings_is_no_effect_of_the_library():
     record = hidden_muscles.record(seed=91)
     clean = hidden_muscles.muscle(hidden_muscles.protocol(np.random.default_rng(91))[0])[::5]
     swing = 0.12 * np.sin(2.1 * record.time_s) * clean
-    result = diagnose(record.with_torque(record.torque_nm + swing))
+    result = diagnosed_with(FEW, record.with_torque(record.torque_nm + swing))
     assert result.verdict == "unexplained_structure"
     assert all(entry["probability"] < 0.5 for entry in result.missing)
