@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from stimrig.identify.effects.base import Columns, Effect, Parameter, Scene, Values, basis
 
@@ -54,6 +53,8 @@ _KNOTS = tuple(_shift(f"knot_{i}_nm", 0.3, f"shift at {i}/{KNOTS} of the record"
 @basis("y + s(t), s: a natural cubic spline with six knots over the record", *_KNOTS)
 def wander(_p: Values, scene: Scene) -> Columns:
     """Evenly spaced knots, zero at the start."""
+    from scipy.interpolate import CubicSpline  # here: its import takes longer than a fit, which does not need it
+
     spline = CubicSpline(np.linspace(0.0, 1.0, KNOTS + 1), np.eye(KNOTS + 1)[:, 1:], bc_type="natural")
     return dict(zip((knot.name for knot in _KNOTS), spline(scene.share_of_span).T, strict=True))
 
