@@ -15,8 +15,8 @@ NEAR_IDEAL = 30.0
 """Log-likelihood that the last model may fall short of the ideal by, where its residual is white: the size of the noise
 is known no better. Nothing further is then looked for."""
 BETTER = 1.0
-"""Standard errors by which the error on left-out blocks must fall with an effect, and by which it may rise with one that
-cannot be foreseen: such an effect need not predict, but it must not spoil what the muscle does."""
+"""Standard errors by which the error on left-out blocks must fall with an effect, and by which it may rise with one
+that cannot be foreseen: such an effect need not predict, but it must not spoil what the muscle does."""
 BETTER_IF_WEAK = 1.5
 """The same for a first effect that gains less log evidence than a further one must."""
 BETTER_THAN_ALIKE = 3.0

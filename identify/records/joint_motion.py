@@ -220,8 +220,6 @@ def pace_of(time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: f
 
     if not jerk > 0.0 or at_s.size <= LEAST_BLOCKS:
         return jerk, STEADY
-    from scipy.optimize import minimize  # here: its import takes longer than a fit, which does not need it
-
     begins = [np.log([jerk, spring, drag]) for spring in PACES[0] for drag in PACES[1]]
     best_fit = min(
         (minimize(deviance, begin, method="Nelder-Mead", options=SETTLED) for begin in begins), key=lambda fit: fit.fun
