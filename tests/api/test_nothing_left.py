@@ -57,7 +57,8 @@ class Started:
 
     def __init__(self, name: str, *program: str) -> None:
         self.marker = f"/marker-{os.getpid()}-{name}-{time.monotonic_ns()}"
-        environment = {**os.environ, "PATH": f"{os.environ['PATH']}:{self.marker}", "STIMRIG_ADMIN_TOKEN": TOKEN}
+        given = {"PATH": f"{os.environ['PATH']}:{self.marker}", "STIMRIG_ADMIN_TOKEN": TOKEN, "STIMRIG_WORKERS": "1"}
+        environment = {**os.environ, **given}
         self.process = subprocess.Popen(
             [sys.executable, *program], env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
             start_new_session=True,

@@ -67,7 +67,7 @@ def test_a_service_whose_folder_was_replaced_ends(tmp_path: Path, monkeypatch: p
 
 
 def command(data: Path, **more: str) -> dict[str, Any]:
-    given = {"DATA_DIR": str(data), "PORT": "0", "ADMIN_TOKEN": TOKEN, **more}
+    given = {"DATA_DIR": str(data), "PORT": "0", "ADMIN_TOKEN": TOKEN, "WORKERS": "1", **more}
     environment = {**os.environ, **{f"STIMRIG_{name}": value for name, value in given.items()}}
     return {"args": [sys.executable, "-m", "tests.api.served"], "env": environment, "cwd": ROOT, "text": True}
 
