@@ -5,9 +5,9 @@ from __future__ import annotations
 import sys
 from functools import partial
 
+from stimrig.api.jobs.worker import Worker
 from stimrig.api.web import server
-from tests.api.thread_worker import PROCESS
 
 if __name__ == "__main__":
-    server.create_app = partial(server.create_app, worker=PROCESS)
+    server.create_app = partial(server.create_app, worker=partial(Worker, "tests.api.stub_worker"))
     sys.exit(server.main())
