@@ -121,11 +121,6 @@ def places(header: Sequence[str], column_map: ColumnMap) -> dict[str, list[int]]
     return {target: indices for target, indices in indices_of.items() if indices}
 
 
-def complete(indices_of: Mapping[str, list[int]]) -> bool:
-    """Return true if a header has all columns that a record needs."""
-    return all(target in indices_of for target in NEEDED)
-
-
 def columns(header: Sequence[str], column_map: ColumnMap, units_row: Sequence[str], place: str) -> dict[str, Column]:
     """The columns of a header with their units; `units_row` is a row of units below it, empty without one.
 

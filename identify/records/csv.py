@@ -107,7 +107,7 @@ class _Text:
         """The decimal sign, once one was met in a number that is not written plainly."""
         self.separator, self.header, self.line, self.skipped = self._find_header(column_map)
         self.units: list[str] = []
-        first = self.cells(next(self.rows(), ""))
+        first = _cells(next(self.rows(), ""), self.separator)
         known = {unit for units in columns.UNITS.values() for unit in units}
         if any(columns.plain_unit(cell) in known for cell in first) and not any(map(is_number, first)):
             self.units, self.skipped = first, self.lines[0]
@@ -119,10 +119,11 @@ class _Text:
         by_number = all(column_map.get(target, "").startswith("#") for target in columns.NEEDED)
         for number, line in islice(self._numbered_lines(), MOST_BEFORE):
             before.append(line)
+            names = line.strip().lstrip("#%").strip() if line.lstrip()[:1] in ("#", "%") else line
             for separator in SEPARATORS:
-                cells = _header_cells(line, separator)
+                cells = _cells(names, separator) if separator in names else []
                 indices_of = columns.places(cells, column_map)
-                if len(cells) >= len(columns.NEEDED) and columns.complete(indices_of):
+                if len(cells) >= len(columns.NEEDED) and indices_of.keys() >= set(columns.NEEDED):
                     if not by_number:
                         return separator, cells, number, number
                     if all(_looks_like_number(cells[indices_of[target][0]]) for target in columns.NEEDED):
@@ -149,10 +150,6 @@ class _Text:
         place = f"{self.name}, line {line or self.lines[-1]}" + (f", column {column}" if column else "")
         return BadRecord(message, place=place, fix=fix)
 
-    def cells(self, row: str) -> list[str]:
-        """The cells of a row."""
-        return row.split() if self.separator == BLANKS else next(csv.reader([row], delimiter=self.separator), [])
-
     def rows(self) -> Iterator[str]:
         """Rows with numbers, and their lines into `lines`; comments and empty rows are passed over.
 
@@ -173,7 +170,9 @@ class _Text:
             yield row
 
     def _check_width(self, row: str, number: int, least: int) -> None:
-        used = max((index for index, cell in enumerate(self.cells(row), start=1) if cell.strip()), default=0)
+        used = max(
+            (index for index, cell in enumerate(_cells(row, self.separator), start=1) if cell.strip()), default=0
+        )
         width = len(self.header)
         if least <= used <= width:
             return
@@ -194,37 +193,33 @@ class _Text:
         if first is None:
             raise self.bad("no row under the header", "Give a few seconds of data.", self.skipped + 1)
         self._check_width(first, self.lines[0], least=len(self.header) if self.separator == BLANKS else 2)
-        try:
-            return self._load(known, by_cell=("segment", "pulse_rate_hz"))
-        except ValueError:
-            pass
-        try:
-            return self._load(known, by_cell=tuple(known))
-        except ValueError as error:
-            if isinstance(error.__cause__, BadRecord):
-                raise error.__cause__ from None
-            last = next(row for number, row in self._numbered_lines() if number == self.lines[-1])
-            width = len(self.cells(last))
-            short = next((target for target, column in known.items() if column.index >= width), "")
-            raise self.bad(f"only {width} cells", CUT, column=short) from error
-
-    def _load(self, known: Mapping[str, Column], by_cell: tuple[str, ...]) -> dict[str, np.ndarray]:
-        self.segment_names, self.segment_codes = [], {}
-        converters: dict[int | str, Callable[[str], float]] = {
-            known[target].index: self._code if target == "segment" else partial(self._number, target)
-            for target in by_cell
-            if target in known
-        }
-        values = np.loadtxt(
-            self.rows(),
-            delimiter=None if self.separator == BLANKS else self.separator,
-            comments=None,
-            quotechar='"',
-            usecols=[column.index for column in known.values()],
-            converters=converters,
-            ndmin=2,
-        )
-        return dict(zip(known, values.T.copy(), strict=True))
+        failure = None
+        for by_cell in (("segment", "pulse_rate_hz"), tuple(known)):
+            self.segment_names, self.segment_codes = [], {}
+            converters: dict[int | str, Callable[[str], float]] = {
+                known[target].index: self._code if target == "segment" else partial(self._number, target)
+                for target in by_cell
+                if target in known
+            }
+            try:
+                values = np.loadtxt(
+                    self.rows(),
+                    delimiter=None if self.separator == BLANKS else self.separator,
+                    comments=None,
+                    quotechar='"',
+                    usecols=[column.index for column in known.values()],
+                    converters=converters,
+                    ndmin=2,
+                )
+                return dict(zip(known, values.T.copy(), strict=True))
+            except ValueError as error:
+                failure = error
+        if failure is not None and isinstance(failure.__cause__, BadRecord):
+            raise failure.__cause__
+        last = next(row for number, row in self._numbered_lines() if number == self.lines[-1])
+        width = len(_cells(last, self.separator))
+        short = next((target for target, column in known.items() if column.index >= width), "")
+        raise self.bad(f"only {width} cells", CUT, column=short) from failure
 
     def _code(self, cell: str) -> int:
         """The code of a segment's name."""
@@ -261,18 +256,20 @@ class _Text:
         if firsts.size > bounds.MOST_PARTS:
             raise self.bad("too many parts", f"At most {bounds.MOST_PARTS} in one record.", self.lines[firsts[-1]])
         row_of = {self.lines[row]: row for row in firsts.tolist()}
-        lines = ((row_of[number], self.cells(line)) for number, line in self._numbered_lines() if number in row_of)
+        lines = (
+            (row_of[number], _cells(line, self.separator))
+            for number, line in self._numbered_lines()
+            if number in row_of
+        )
         return {row: dict(zip(self.header, map(as_written, cells), strict=False)) for row, cells in lines}
 
 
-def _header_cells(line: str, separator: str) -> list[str]:
-    text = line.strip().lstrip("#%").strip() if line.lstrip()[:1] in ("#", "%") else line.strip("\r\n")
+def _cells(row: str, separator: str) -> list[str]:
+    """The cells of a row; a unit in brackets behind a blank is of the cell before."""
     if separator == BLANKS:
-        return re.sub(r"[ \t]+([\[(][^\[\]()]{0,40}[\])])", r"\1", text).split()
-    if separator not in text:
-        return []
+        return re.sub(r"[ \t]+([\[(][^\[\]()]{0,40}[\])])", r"\1", row).split()
     try:
-        return [cell.strip() for cell in next(csv.reader([text], delimiter=separator), [])]
+        return [cell.strip() for cell in next(csv.reader([row.strip("\r\n")], delimiter=separator), [])]
     except csv.Error:
         return []
 

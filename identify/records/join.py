@@ -135,22 +135,23 @@ class _Piece(NamedTuple):
         begun_s = self.record.parts[0].begun_s
         return None if begun_s is None else begun_s + float(self.record.time_s[0])
 
-    def interval(self, index: int, rate_hz: float) -> int:
-        """The pulse interval of a sample, counted from the slot; a hair early, as on the grid."""
-        intervals = (float(self.record.time_s[index]) - self.slot_s) * rate_hz
-        return math.floor(intervals + _hair(self.record, rate_hz))
+    def intervals(self) -> np.ndarray:
+        """Pulse intervals from the slot to each sample, in which times may be early by a hair, as on the grid."""
+        rate_hz = self.record.pulse_rate_hz
+        hair = 1e-6 + 1e-3 * min(1.0, rate_hz / self.record.sample_rate_hz)
+        return (self.record.time_s - self.slot_s) * rate_hz + hair
 
-
-def _hair(record: Record, rate_hz: float) -> float:
-    """What times may be early by rounding, in pulse intervals."""
-    return 1e-6 + 1e-3 * min(1.0, rate_hz / record.sample_rate_hz)
+    def order(self) -> tuple[float | None, str, str, bytes]:
+        """By when it began; and by what it is, so that either order of arguments gives the same record."""
+        source = self.record.source
+        return self.begin_s, source.sha256, source.recording_id, self.record.torque_nm.tobytes()
 
 
 def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
     """Put records one behind the other as the parts of one.
 
-    Where all begins are known the parts are in their order, else as given; either order of the arguments then gives
-    the same record. A record that was joined before is taken apart: its parts stand beside the others'.
+    `begun_s`: Unix time at which each record's clock was 0; None where it is not known, and for a joined record, which
+    is taken apart and knows it of its parts. Where all begins are known the parts are in their order, else as given.
 
     Parts sampled faster than the slowest are brought down by block means, whole blocks to a pulse interval. Those
     that differ by less than 1 % stay as they are. The slots of the pulses fall on one grid. A pause is kept in whole
@@ -158,19 +159,8 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
     parts overlap. An angle or velocity is dropped unless all parts have it; so are the pulses in the gaps, which are
     doubted then. In a part without `late_s` or `doubted` they are 0.
 
-    Parameters
-    ----------
-    records : sequence of Record
-        At least one.
-    begun_s : sequence of float or None
-        Unix time at which each record's clock was 0; None where it is not known, and for a joined record, which knows
-        it of its parts.
-
-    Raises
-    ------
-    BadRecord
-        Pulse rates differ, too little in one or too much together, fewer than two samples a pulse in a slow part.
-        The same measurement twice: its noise would count as that of two.
+    Raises BadRecord: pulse rates differ, too little in one or too much together, fewer than two samples a pulse in a
+    slow part; the same measurement twice, whose noise would count as that of two.
     """
     if len(records) != len(begun_s) or not records:
         raise BadRecord(f"{len(records)} records with {len(begun_s)} begins", fix="Give one for each.")
@@ -195,13 +185,8 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
     if len(pieces) > bounds.MOST_PARTS:
         raise BadRecord(f"{len(pieces)} parts", fix=f"Join at most {bounds.MOST_PARTS}.")
     if all(piece.begin_s is not None for piece in pieces):
-        pieces.sort(key=_order)
+        pieces.sort(key=_Piece.order)
     return _joined(_at_one_rate(pieces, rate_hz), rate_hz)
-
-
-def _order(piece: _Piece) -> tuple[float | None, str, str, bytes]:
-    source = piece.record.source
-    return piece.begin_s, source.sha256, source.recording_id, piece.record.torque_nm.tobytes()
 
 
 def _pieces(record: Record, begun_s: float | None) -> list[_Piece]:
@@ -236,19 +221,19 @@ def _at_one_rate(pieces: list[_Piece], rate_hz: float) -> list[_Piece]:
         fix = f"Recordings of different rates are joined from {LEAST_SAMPLES * rate_hz:g} Hz on."
         raise BadRecord(f"sampled at {min(rates_hz):.4g} and {max(rates_hz):.4g} Hz", fix=fix)
     return [
-        piece._replace(record=_block_means(piece, each, rate_hz)) if own_hz > same_hz else piece
+        piece._replace(record=_block_means(piece, each)) if own_hz > same_hz else piece
         for piece, own_hz in zip(pieces, rates_hz, strict=True)
     ]
 
 
-def _block_means(piece: _Piece, each: int, rate_hz: float) -> Record:
+def _block_means(piece: _Piece, each: int) -> Record:
     """A piece with `each` samples a pulse interval, at the mean time of what each one is the mean of.
 
     A block at an edge or a gap, with less than half of its samples, is left out: it would be noisier than the rest.
     A block with any held-out sample is held out.
     """
     record, held_out = piece.record, piece.record.held_out
-    block = np.floor(((record.time_s - piece.slot_s) * rate_hz + _hair(record, rate_hz)) * each).astype(np.int64)
+    block = np.floor(piece.intervals() * each).astype(np.int64)
     starts = np.flatnonzero(np.r_[True, np.diff(block) > 0])
     count = np.diff(np.r_[starts, block.size])
     whole = 2 * count >= np.median(count)
@@ -278,20 +263,28 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     first, ended, slot_s = 0, 0, pieces[0].slot_s
     for index, piece in enumerate(pieces):
         time_s, pulses = piece.record.time_s, piece.record.pulses
-        first_interval = piece.interval(0, rate_hz)
+        first_interval, last_interval = np.floor(piece.intervals()[[0, -1]]).astype(int).tolist()
         pause = _pause(pieces[index - 1], piece, rate_hz) if index else 0
         folded = min(pause, round(PAUSE_S * rate_hz))
         start = ended + 1 + folded if index else first_interval
         shift_s = slot_s + (start - first_interval) / rate_hz - piece.slot_s
-        ended = start + piece.interval(-1, rate_hz) - first_interval
+        ended = start + last_interval - first_interval
         pulses = None if pulses is None else _pulses(pulses, shift_s, float(time_s[0]), float(time_s[-1]))
         moved.append(replace(piece.record, time_s=time_s + shift_s, pulses=pulses))
         parts.append(Part(first, float(time_s[0]), piece.record.parts[0].begun_s, pause / rate_hz, folded / rate_hz))
         first += time_s.size
     columns: dict[str, np.ndarray] = {}
     for name in (*NEEDED, *OPTIONAL):
-        each = [column for record in moved if (column := _column(record, name)) is not None]
-        if len(each) == len(moved) and (name not in ONLY_IF_SET or any(column.any() for column in each)):
+        each = [getattr(record, name) for record in moved]
+        if name in ONLY_IF_SET and any(column is not None and column.any() for column in each):
+            kind = bool if name == "doubted" else float
+            columns[name] = np.concatenate(
+                [
+                    np.zeros(record.time_s.size, kind) if column is None else column
+                    for record, column in zip(moved, each, strict=True)
+                ]
+            )
+        elif name not in ONLY_IF_SET and all(column is not None for column in each):
             columns[name] = np.concatenate(each)
     bounds.check_span(columns["time_s"], "the joined record")
     pulses = [record.pulses for record in moved if record.pulses is not None]
@@ -308,13 +301,6 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
         parts=tuple(parts),
         **columns,  # type: ignore
     )
-
-
-def _column(record: Record, name: str) -> np.ndarray | None:
-    column = getattr(record, name)
-    if column is None and name in ONLY_IF_SET:
-        return np.zeros(record.time_s.size, bool if name == "doubted" else float)
-    return column
 
 
 def _pulses(known: Pulses, shift_s: float, first_s: float, last_s: float) -> Pulses:

@@ -241,7 +241,7 @@ Scope = tuple[str, dict[str, Variable], ColumnMap]
 
 def _find_columns(top: dict[str, Variable], column_map: ColumnMap, name: str) -> Scope:
     """The variables themselves, or the struct whose fields, of whatever depth, are the columns."""
-    if columns.complete(columns.places(list(top), column_map)):
+    if columns.places(list(top), column_map).keys() >= set(columns.NEEDED):
         return "", top, column_map
     waiting, named, left = list(top.items()), {}, LARGEST_FILE_BYTES
     while waiting:
@@ -259,7 +259,7 @@ def _find_columns(top: dict[str, Variable], column_map: ColumnMap, name: str) ->
     for prefix in dict.fromkeys(["", *(title.rpartition(".")[0] + "." for title in named if "." in title)]):
         inside = {title.removeprefix(prefix): variable for title, variable in named.items() if title.startswith(prefix)}
         relative = {target: text.removeprefix(prefix) for target, text in column_map.items()}
-        if columns.complete(columns.places(list(inside), relative)):
+        if columns.places(list(inside), relative).keys() >= set(columns.NEEDED):
             scopes.append((prefix, inside, relative))
     if len(scopes) > 1 and scopes[0][0]:
         both = " and ".join(prefix.rstrip(".") for prefix, *_ in scopes)

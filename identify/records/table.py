@@ -102,8 +102,14 @@ def checked(table: Table) -> Table:
     Raises BadRecord: infinite, or beyond what is measured; too many rows lack a number; a record of days.
     """
     for name, values in table.columns.items():
-        if name != "segment":
-            _check_numbers(table, name, values)
+        largest = bounds.LARGEST | {"time_s": bounds.LARGEST_CALENDAR_S, "segment": np.inf}
+        wrong = ~(np.abs(values) <= largest[name]) & ~(np.isnan(values) & (name in bounds.MAY_LACK))
+        if wrong.any():
+            row = int(np.argmax(wrong))
+            message = "no number" if np.isnan(values[row]) else f"{values[row]:g} is no measurement"
+            fix = "Remove the row's cause, or cut the record before it; values must be finite."
+            fix = DEGREES if name == "angle_rad" and np.isfinite(values[wrong]).all() else fix
+            raise BadRecord(message, place=table.at(row, name), fix=fix)
     table = _without_holes(table)
     _check_widths(table)
     time_s = table.columns["time_s"]
@@ -112,20 +118,6 @@ def checked(table: Table) -> Table:
         table = table.noting(note, columns={"time_s": time_s - time_s[0]})
     bounds.check_span(time_s, table.at(time_s.size - 1))
     return table
-
-
-def _check_numbers(table: Table, name: str, values: np.ndarray) -> None:
-    largest = bounds.LARGEST_CALENDAR_S if name == "time_s" else bounds.LARGEST[name]
-    wrong = ~(np.abs(values) <= largest)
-    if name in bounds.MAY_LACK:
-        wrong &= ~np.isnan(values)
-    if wrong.any():
-        row = int(np.argmax(wrong))
-        message = "no number" if np.isnan(values[row]) else f"{values[row]:g} is no measurement"
-        is_finite = np.isfinite(values[wrong]).all()
-        fix = "Remove the row's cause, or cut the record before it; values must be finite."
-        fix = DEGREES if name == "angle_rad" and is_finite else fix
-        raise BadRecord(message, place=table.at(row, name), fix=fix)
 
 
 def _first_thousand(values: np.ndarray) -> int:

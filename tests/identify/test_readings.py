@@ -55,7 +55,7 @@ def found_in(record: Record) -> tuple[float, Readings]:
     return raw.noise_sd_nm, raw.readings
 
 
-@pytest.mark.parametrize("rate_hz", [40, 400, 2000])
+@pytest.mark.parametrize("rate_hz", [40, 400])
 def test_an_ordinary_record_has_a_reading_in_each_sample(rate_hz: float):
     record = made(71, rate_hz)
     raw = inspect(record)
@@ -65,9 +65,8 @@ def test_an_ordinary_record_has_a_reading_in_each_sample(rate_hz: float):
     assert raw.noise_sd_nm == pytest.approx(SD_NM, rel=0.1)
 
 
-@pytest.mark.parametrize("sd_nm", [0.02, 0.1])
 @pytest.mark.parametrize(
-    ("rate_hz", "each"), [(40, 2), (100, 2), (100, 5), (400, 2), (400, 5), (400, 20), (2000, 5), (2000, 20)]
+    ("rate_hz", "each", "sd_nm"), [(40, 2, 0.1), (100, 5, 0.02), (400, 2, 0.1), (400, 20, 0.02), (1000, 10, 0.02)]
 )
 def test_the_noise_of_held_readings(rate_hz: float, each: int, sd_nm: float):
     noise_nm, readings = found_in(made(73, rate_hz, sd_nm, held(each)))
@@ -78,13 +77,12 @@ def test_the_noise_of_held_readings(rate_hz: float, each: int, sd_nm: float):
     assert 0.75 < noise_nm / sd_nm < most
 
 
-@pytest.mark.parametrize("share", [0.5, 0.8])
-def test_readings_held_at_random(share: float):
-    noise_nm, _ = found_in(made(75, change=held_at_random(share)))
+def test_readings_held_at_random():
+    noise_nm, _ = found_in(made(75, change=held_at_random(0.8)))
     assert noise_nm == pytest.approx(SD_NM, rel=0.12)
 
 
-@pytest.mark.parametrize("times", [1.0, 2.0, 4.0])
+@pytest.mark.parametrize("times", [1.0, 4.0])
 def test_rounding_is_part_of_the_noise(times: float):
     noise_nm, readings = found_in(made(76, change=rounded(times * SD_NM)))
     assert noise_nm == pytest.approx(np.hypot(SD_NM, times * SD_NM / 12**0.5), rel=0.15)
@@ -100,14 +98,14 @@ def test_held_and_coarse():
     assert noise_nm == pytest.approx(np.hypot(SD_NM, SD_NM / 12**0.5), rel=0.12)
 
 
-@pytest.mark.parametrize(("rate_hz", "each"), [(400, 2), (400, 4), (1000, 10), (2000, 20)])
+@pytest.mark.parametrize(("rate_hz", "each"), [(400, 2), (1000, 10)])
 def test_interpolated_readings(rate_hz: float, each: int):
     noise_nm, readings = found_in(made(78, rate_hz, change=lines(each)))
     assert readings.kind == "interpolated"
     assert noise_nm == pytest.approx(SD_NM, rel=0.2)
 
 
-@pytest.mark.parametrize(("rate_hz", "cut_hz"), [(400, 20), (400, 50), (1000, 50), (2000, 20)])
+@pytest.mark.parametrize(("rate_hz", "cut_hz"), [(400, 20), (1000, 50)])
 def test_smoothed_noise_is_told(rate_hz: float, cut_hz: float):
     low = np.asarray(butter(2, cut_hz, fs=rate_hz, output="sos"))
     noise_nm, readings = found_in(made(79, rate_hz, change=lambda torque, _rng: np.asarray(sosfilt(low, torque))))
@@ -127,15 +125,15 @@ def test_units_sign_offset_and_scale_change_nothing():
 
 def test_a_white_residual_far_above_the_noise_of_the_samples_is_not_noise():
     """Readings held for two pulses: what that spoils is white, too, and was taken for the noise that it is not."""
-    record = made(82, rate_hz=200.0, change=held(10))
+    record = made(82, rate_hz=80.0, change=held(4))
     found = identify.fit(record)
     with few_effects.only("fatigue"):  # the noise does not depend on how many are tried
         assert found.fit["noise_sd_nm"] == pytest.approx(identify.diagnose(record).noise_sd_nm, rel=0.25)
 
 
 def test_a_held_record_has_a_ceiling_and_nothing_missing():
-    record = made(81, change=held(5))
-    with few_effects.only("fatigue", "mains_hum", "recruitment_hysteresis", "tremor"):
+    record = made(81, rate_hz=200.0, change=held(5))
+    with few_effects.only("mains_hum", "recruitment_hysteresis"):
         found = identify.diagnose(record)
     assert found.noise_sd_nm == pytest.approx(SD_NM, rel=0.1)
     assert found.verdict == "nothing_missing"
