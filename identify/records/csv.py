@@ -12,7 +12,7 @@ import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 
 import numpy as np
@@ -159,12 +159,16 @@ class _Text:
         source, nothing, width = self._numbered_lines(), f"{self.separator} \t\r\n", len(self.header)
         for number, row in islice(source, self.skipped, None):
             if row[0] not in PLAIN or '"' in row or row.count(self.separator) >= width:
-                while row.count('"') % 2 and (more := next(source, None)):  # a cell of several lines
-                    row += more[1]
-                    if len(row) > LONGEST_LINE:
-                        raise self.bad(f"more than {LONGEST_LINE} characters", "Is a quote not closed?", number)
                 if not row.strip(nothing) or row.lstrip().startswith(COMMENTS):
                     continue
+                if '"' in row and self.separator != BLANKS:  # a cell may have several lines
+                    taken: list[str] = []
+                    lines = (taken.append(line) or line for line in chain([row], (more for _, more in source)))
+                    try:
+                        next(csv.reader(lines, delimiter=self.separator), [])
+                    except csv.Error as error:
+                        raise self.bad(f"not CSV ({error})", "Is a quote not closed?", number) from error
+                    row = "".join(taken)
                 self._check_width(row, number, least=1)
             self.lines.append(number)
             yield row

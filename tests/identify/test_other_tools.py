@@ -59,6 +59,12 @@ READ: dict[str, tuple[str | bytes, str]] = {
     "byte order mark": ("\ufeff" + table(cells()), ""),
     "UTF-16": (table(cells()).encode("utf-16"), ""),
     "a row of units": (table([["[s]", "[µs]", "[Nm]", ""], *cells()]), ""),
+    "quotes within cells, and cells of two lines": (
+        table(
+            [[*row, '5" left' if k % 2 else '"one\ntwo, ""3"""'] for k, row in enumerate(cells())], (*HEADER, "note")
+        ),
+        "",
+    ),
     "a separator at each row's end": (table([[*row, ""] for row in cells()]), ""),
     "no segments": (table([row[:3] for row in cells()], HEADER[:3]), ""),
     "Excel's sep=": ("sep=;\r\n" + table(COMMAS, between=";", end="\r\n"), "header in line 2"),
