@@ -19,7 +19,7 @@ from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.sampling import take_in_order
-from stimrig.hardware_sim.settings import Settings, pick
+from stimrig.hardware_sim.settings import Settings
 from stimrig.hardware_sim.stimulators import STIMULATORS
 from stimrig.hardware_sim.stimulators.board import Board, Electrodes, Firmware
 from stimrig.hardware_sim.timeline import Timeline
@@ -28,27 +28,11 @@ from stimrig.hardware_sim.timeline import Timeline
 class Devices:
     """All devices and their two cables; `faults` act on them.
 
-    How often time is advanced changes nothing about what the devices do. Without an arm the joint is held still and
-    nobody measures its angle.
-
-    Parameters
-    ----------
-    muscle : Muscle
-        At rest.
-    settings : Settings
-        `speed` and `transport` are the owner's affair.
-    arm : Arm, optional
-        What holds or moves the joint.
-    epoch_us : int
-        What the sensors' clocks show at the emulated time 0, µs.
-
-    Attributes
-    ----------
-    unread_bytes : callable
-        How many bytes that it was given the host has not read; the owner may set it.
-    on_stimulator_cable, on_cell_cable : callable
-        Called after a cable is plugged (True) or unplugged (False); the owner may set them. What was sent before is
-        still to be taken.
+    How often time is advanced changes nothing about what the devices do. The muscle is at rest. Without an arm the
+    joint is held still and nobody measures its angle. `epoch_us` is what the sensors' clocks show at the emulated time
+    0, µs. The owner may set `unread_bytes`, how many bytes that it was given the host has not read, and
+    `on_stimulator_cable` and `on_cell_cable`, called after a cable is plugged (True) or unplugged (False): what was
+    sent before is still to be taken.
     """
 
     def __init__(self, muscle: Muscle, settings: Settings, arm: Arm | None = None, epoch_us: int = 0) -> None:
@@ -72,7 +56,7 @@ class Devices:
         self._bytes: list[tuple[float, bytes]] = []
         self._frames: list[Frame] = []
         self.board = Board(self.timeline, self.electrodes, self._write, self._count_unread_bytes)
-        self.firmware: Firmware = pick(STIMULATORS, "stimulator", settings.stimulator)(self.board)
+        self.firmware: Firmware = STIMULATORS[settings.stimulator](self.board)
         self.faults = Faults(self)
 
     def received(self, time_s: float, data: bytes) -> None:
@@ -134,14 +118,11 @@ class Devices:
 
     def state(self) -> dict[str, Any]:
         """The present state, as plain values."""
-        log = self.electrodes.log
         return {
             **self.firmware.state(),
             "time_s": self.timeline.now_s,
-            "pulses_received": len(log),
-            "pulses_delivered": self.electrodes.delivered_pulses,
+            "pulses_received": len(self.electrodes.log),
             "unbalanced_pulses": self.electrodes.unbalanced_pulses,
-            "last_pulse_time_s": log[-1].time_s if log else None,
             "torque_nm": self.load_cell.torque_nm,
             "samples": self.load_cell.clock.samples,
             **(self.limb.state() if self.limb else {}),

@@ -15,7 +15,6 @@ from stimrig.hardware_sim.control import Control
 from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.load_cells import TRANSPORTS
 from stimrig.hardware_sim.ports import PseudoTerminal, Reactor
-from stimrig.hardware_sim.settings import pick
 from stimrig.hardware_sim.timeline import WallClock
 
 TICK_S = 0.0025
@@ -32,17 +31,18 @@ class Emulator:
 
     def __init__(self, devices: Devices) -> None:
         self.devices = devices
-        self._transport_class = pick(TRANSPORTS, "transport", devices.settings.transport)
+        self._transport_class = TRANSPORTS[devices.settings.transport]
         self._reactor = Reactor()
         self._folder = Path(tempfile.mkdtemp(prefix="stimrig-emulator-"))
+        self._link = self._folder / "stimulator"
         devices.unread_bytes = lambda: self.port.unread_bytes()
         devices.on_stimulator_cable = self._plug_stimulator
         devices.on_cell_cable = self._plug_cell
         self._plug_stimulator(True)
         self._plug_cell(True)
         self.clock = WallClock(devices.settings.speed)
-        path = self._folder / "control"
-        self._control = Control(self._reactor, path, devices, self.clock, self.catch_up, self.state)
+        control = self._folder / "control"
+        self._control = Control(self._reactor, control, devices, self.clock, self.catch_up, self.state)
 
     def ready(self) -> dict[str, Any]:
         """Return the facts that the host needs: the line printed once the devices answer."""
@@ -101,30 +101,21 @@ class Emulator:
 
     def state(self) -> dict[str, Any]:
         """The present state, for the control line."""
-        state = self.devices.state()
-        last_s = state["last_pulse_time_s"]
-        return {
-            **state,
-            "monotonic_s": self.clock.monotonic_s(state["time_s"]),
-            "last_pulse_monotonic_s": None if last_s is None else self.clock.monotonic_s(last_s),
-            "frames_overrun": self.transport.overruns,
-            "stimulator": self.port.path if self.port.is_open else None,
-            "can": self.transport.can,
-        }
+        ports = {"stimulator": self.port.path if self.port.is_open else None, "can": self.transport.can}
+        return {**self.devices.state(), **ports}
 
     def _plug_stimulator(self, plugged: bool) -> None:
         """Make a port for the stimulator and a link to it, or remove it once what was written has gone through."""
         if plugged:
             self.port = PseudoTerminal()
             self._reactor.add(self.port, self._read)
-        else:
-            self._write()
-            if self.port.is_open:
-                self._reactor.unregister(self.port)
-                self.port.close()
-        self._link.unlink(missing_ok=True)
-        if plugged:
+            self._link.unlink(missing_ok=True)
             self._link.symlink_to(self.port.path)
+        elif self.port.is_open:
+            self._write()
+            self._reactor.unregister(self.port)
+            self.port.close()
+            self._link.unlink()
 
     def _plug_cell(self, plugged: bool) -> None:
         """Make the cell's adapter, on a new port, or remove it once the frames sent before have gone through."""
@@ -133,10 +124,6 @@ class Emulator:
         else:
             self._deliver()
             self.transport.close()
-
-    @property
-    def _link(self) -> Path:
-        return self._folder / "stimulator"
 
     def _read(self) -> None:
         data = self.port.read()

@@ -16,6 +16,7 @@ from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.settings import Settings
 
 DESIGN = "design"
+LONGEST_NAME = 256  # of a file; the system refuses to look for far longer ones
 HIDDEN = "hidden:"
 
 
@@ -30,28 +31,18 @@ def make_devices(
 
     Raises HardwareSimError: patient, arm or a setting cannot be used.
     """
-    seed = _hidden_seed(settings.patient)
-    if seed is not None and seed < 0:
-        raise HardwareSimError(f"patient '{settings.patient}': give a seed of 0 or above")
-    muscle = _muscle(settings.patient) if seed is None else hidden.make(seed, moving=arm is not None)
+    patient, file, seed = settings.patient, Path(settings.patient), None
+    if patient.startswith(HIDDEN):
+        digits = patient.removeprefix(HIDDEN)
+        if not digits.isdecimal():
+            raise HardwareSimError(f"patient '{patient}': give a seed of 0 or above")
+        seed = int(digits)
+        muscle: Muscle = hidden.make(seed, moving=arm is not None)
+    elif file.suffix.lower() == ".toml" or (len(patient) < LONGEST_NAME and file.is_file()):
+        muscle = patients.from_file(file)
+    else:
+        muscle = patients.make(patient)
     return Devices(muscle, settings, None if arm is None else _arm(arm, arm_laws, seed), epoch_us)
-
-
-LONGEST_NAME = 256
-"""Longest name of a file; the system refuses to look for far longer ones."""
-
-
-def _hidden_seed(patient: str) -> int | None:
-    try:
-        return int(patient.removeprefix(HIDDEN)) if patient.startswith(HIDDEN) else None
-    except ValueError:
-        return None
-
-
-def _muscle(patient: str) -> Muscle:
-    file = Path(patient)
-    is_file = file.suffix.lower() == ".toml" or (len(patient) < LONGEST_NAME and file.is_file())
-    return patients.from_file(file) if is_file and patient not in patients.PATIENTS else patients.make(patient)
 
 
 def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:

@@ -4,20 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from typing import Any
 
 from stimrig.hardware_sim.errors import HardwareSimError
-
-Kind = TypeVar("Kind")
-
-
-def pick(kinds: Mapping[str, Kind], what: str, name: str) -> Kind:
-    """The one of this name. Raises HardwareSimError: there is none; the message lists all."""
-    if name not in kinds:
-        raise HardwareSimError(f"unknown {what} '{name}'; there are {', '.join(kinds)}")
-    return kinds[name]
 
 
 def number(default: float, span: tuple[float, float] | None, metavar: str, what: str) -> Any:

@@ -21,7 +21,7 @@ from bench.muscles.arm_patient import ArmPatient, arm_patient
 from stimrig.hardware_sim.arm.laws import Floats
 from stimrig.hardware_sim.arm.motion import Begin, Motion, Quintic, lasting_s
 from stimrig.hardware_sim.arm.movers import make_mover
-from stimrig.hardware_sim.hidden.design import PULSES_PER_S, levels, make_design, staircase
+from stimrig.hardware_sim.hidden.design import PULSES_PER_S, levels, make_design
 from stimrig.hardware_sim.hidden.scenario import rng_of
 
 __all__ = ["KINDS", "arm_patient", "changed", "record"]
@@ -86,6 +86,12 @@ class ArmDesign:
     def fine_width_us(self) -> Floats:
         """Pulse widths at the simulation's rate."""
         return _fine(self.parts)
+
+
+def staircase(top: float, steps: int, held_s: float) -> Floats:
+    """Up in equal steps, each held so long, down again, and a rest."""
+    up = np.arange(1, steps + 1) / steps
+    return np.repeat(np.concatenate([up, up[-2::-1], [0.0]]) * top, round(held_s * PULSES_PER_S))
 
 
 def _rest(seconds: float) -> tuple[str, Floats]:

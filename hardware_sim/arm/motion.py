@@ -101,7 +101,7 @@ def lasting_s(from_rad: float, to_rad: float, peak_rad_s: float) -> float:
     return max(SHORTEST_S, PEAK_OVER_MEAN * abs(to_rad - from_rad) / peak_rad_s)
 
 
-GRID_S = 0.001
+GRID_S, DAMPING = 0.001, 0.9
 
 
 class Leg(NamedTuple):
@@ -112,26 +112,21 @@ class Leg(NamedTuple):
     pause_s: float
 
 
-class Path:
-    """The reference made of legs, one after another, from `start_rad` at `begin_s`; asked at rising times."""
+def path(begin_s: float, start_rad: float, legs: Iterator[Leg]) -> Callable[[float], float]:
+    """The reference, rad, made of legs, one after another; asked at rising times."""
+    from_s, from_rad, leg = begin_s, start_rad, next(legs)
 
-    def __init__(self, begin_s: float, start_rad: float, legs: Iterator[Leg]) -> None:
-        self._legs = legs
-        self._from_s, self._from_rad = begin_s, start_rad
-        self._next()
+    def at(time_s: float) -> float:
+        nonlocal from_s, from_rad, leg
+        while True:
+            moves_s = abs(leg.to_rad - from_rad) / leg.rad_s
+            end_s = from_s + max(moves_s + leg.pause_s, GRID_S)
+            if time_s < end_s:
+                gone = min((time_s - from_s) / moves_s, 1.0) if moves_s > 0.0 else 1.0
+                return from_rad + gone * (leg.to_rad - from_rad)
+            from_s, from_rad, leg = end_s, leg.to_rad, next(legs)
 
-    def at(self, time_s: float) -> float:
-        """The reference, rad."""
-        while time_s >= self._end_s:
-            self._from_s, self._from_rad = self._end_s, self._leg.to_rad
-            self._next()
-        gone = min((time_s - self._from_s) / self._moves_s, 1.0) if self._moves_s > 0.0 else 1.0
-        return self._from_rad + gone * (self._leg.to_rad - self._from_rad)
-
-    def _next(self) -> None:
-        self._leg = leg = next(self._legs)
-        self._moves_s = abs(leg.to_rad - self._from_rad) / leg.rad_s
-        self._end_s = self._from_s + max(self._moves_s + leg.pause_s, GRID_S)
+    return at
 
 
 class Servo:
@@ -142,16 +137,11 @@ class Servo:
     """
 
     def __init__(
-        self,
-        begin: Begin,
-        reference: Callable[[float], float],
-        bandwidth_hz: float,
-        damping: float = 0.9,
-        limit_rad_s: float = math.inf,
+        self, begin: Begin, reference: Callable[[float], float], bandwidth_hz: float, limit_rad_s: float = math.inf
     ) -> None:
         self._reference, self._limit_rad_s = reference, limit_rad_s
         omega = 2.0 * math.pi * bandwidth_hz
-        self._stiffness, self._damping = omega * omega, 2.0 * damping * omega
+        self._stiffness, self._damping = omega * omega, 2.0 * DAMPING * omega
         self._begin_s, self._steps = begin.time_s, 0
         self._last = self._now = (begin.motion.angle_rad, begin.motion.velocity_rad_s)
 

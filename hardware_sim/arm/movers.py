@@ -16,17 +16,19 @@ from stimrig.hardware_sim.arm.motion import (
     Begin,
     Leg,
     Motion,
-    Path,
     Quintic,
     Servo,
     lasting_s,
+    path,
     radians,
     radians_per_s,
     within,
 )
 from stimrig.hardware_sim.errors import HardwareSimError
 
-HAND_HZ = 3.0
+HAND_HZ, ROBOT_HZ = 3.0, 2.5
+ROBOT_LIMIT_RAD_S = math.radians(180.0)
+WANDER_RAD, TREMOR_RAD = math.radians(0.6), math.radians(0.003)
 PIECES = 5
 """A hand's sweep is made of so many pieces, each at its own speed."""
 
@@ -53,9 +55,6 @@ def robot(
     to_deg: float = 120.0,
     deg_s: float = 30.0,
     pause_s: float = 0.5,
-    bandwidth_hz: float = 2.5,
-    damping: float = 0.9,
-    limit_deg_s: float = 180.0,
 ) -> MotionAt:
     """A robot sweeps the forearm between `from_deg` and `to_deg` at `deg_s`, with a rest of `pause_s` at both.
 
@@ -69,13 +68,7 @@ def robot(
             for end_rad in ends_rad:
                 yield Leg(end_rad, rad_s, rest_s)
 
-    return Servo(
-        begin,
-        Path(begin.time_s, begin.motion.angle_rad, legs()).at,
-        within("bandwidth_hz", bandwidth_hz, 0.2, 30.0),
-        within("damping", damping, 0.3, 3.0),
-        radians_per_s("limit_deg_s", limit_deg_s),
-    ).at
+    return Servo(begin, path(begin.time_s, begin.motion.angle_rad, legs()), ROBOT_HZ, ROBOT_LIMIT_RAD_S).at
 
 
 def hand(
@@ -84,48 +77,41 @@ def hand(
     to_deg: float | None = None,
     deg_s: float = 30.0,
     pause_s: float = 0.6,
-    wander_deg: float = 0.6,
-    tremor_deg: float = 0.003,
-    unsteady: float = 1.0,
 ) -> MotionAt:
     """A therapist's hand sweeps between `from_deg` and `to_deg` at about `deg_s`; with one of them, or none, it holds.
 
     It is not quite steady: each sweep has a speed, a turning point and a pause of its own; the speed within it goes up
     and down. It wanders by slow waves (0.1 to 0.6 Hz) and trembles at 8 to 12 Hz (physiological tremor), so little
-    that the cell feels some mN·m of the forearm's inertia. `unsteady` scales everything that is random about it; 0 is
-    a steady hand.
+    that the cell feels some mN·m of the forearm's inertia.
     """
     rng = np.random.default_rng([begin.seed, 0xA4D])
     first_rad = begin.motion.angle_rad if from_deg is None else radians("from_deg", from_deg)
     last_rad = first_rad if to_deg is None else radians("to_deg", to_deg)
     rad_s = radians_per_s("deg_s", deg_s)
     pause_s = within("pause_s", pause_s, 0.0, 3600.0)
-    uneven = within("unsteady", unsteady, 0.0, 3.0)
-    legs = _uneven_legs(rng, begin.motion.angle_rad, (first_rad, last_rad), rad_s, pause_s, uneven)
-    path = Path(begin.time_s, begin.motion.angle_rad, legs)
-    wander_rad = uneven * radians("wander_deg", wander_deg, 0.0, 10.0)
-    tremor_rad = uneven * radians("tremor_deg", tremor_deg, 0.0, 1.0)
+    legs = _uneven_legs(rng, begin.motion.angle_rad, (first_rad, last_rad), rad_s, pause_s)
+    sweep = path(begin.time_s, begin.motion.angle_rad, legs)
     # slow waves whose sum has this standard deviation
-    waves = [_wave(rng, 0.1, 0.6, lambda _hz: wander_rad * math.sqrt(2.0 / 4)) for _ in range(4)]
-    # two close lines that beat; larger than asked by what the arm's own inertia takes off them
-    waves += [_wave(rng, 8.0, 12.0, lambda hz: tremor_rad * (hz / HAND_HZ) ** 2) for _ in range(2)]
+    waves = [_wave(rng, 0.1, 0.6, lambda _hz: WANDER_RAD * math.sqrt(2.0 / 4)) for _ in range(4)]
+    # two close lines that beat; larger by what the arm's own inertia takes off them
+    waves += [_wave(rng, 8.0, 12.0, lambda hz: TREMOR_RAD * (hz / HAND_HZ) ** 2) for _ in range(2)]
 
     def reference_rad(time_s: float) -> float:
         since_s = time_s - begin.time_s
-        return path.at(time_s) + sum(a * math.sin(w * since_s + phase) for a, w, phase in waves)
+        return sweep(time_s) + sum(a * math.sin(w * since_s + phase) for a, w, phase in waves)
 
     return Servo(begin, reference_rad, HAND_HZ).at
 
 
 def _uneven_legs(
-    rng: np.random.Generator, at_rad: float, ends_rad: tuple[float, float], rad_s: float, pause_s: float, uneven: float
+    rng: np.random.Generator, at_rad: float, ends_rad: tuple[float, float], rad_s: float, pause_s: float
 ) -> Iterator[Leg]:
     def factor(sd: float) -> float:
-        return math.exp(sd * uneven * float(rng.standard_normal()))
+        return math.exp(sd * float(rng.standard_normal()))
 
     while True:
         for end_rad in ends_rad:
-            miss_rad = uneven * math.radians(2.0) * float(rng.standard_normal())
+            miss_rad = math.radians(2.0) * float(rng.standard_normal())
             goal_rad = end_rad + (miss_rad if ends_rad[0] != ends_rad[1] else 0.0)
             speed = rad_s * factor(0.15)
             way_rad = (goal_rad - at_rad) / PIECES
@@ -143,15 +129,8 @@ def _wave(
     return amplitude_rad(hz), 2.0 * math.pi * hz, float(rng.uniform(0.0, 2.0 * math.pi))
 
 
-def waves(
-    begin: Begin,
-    hz: Any = (0.1,),
-    deg: Any = (20.0,),
-    phase_rad: Any = (0.0,),
-    middle_deg: float = 90.0,
-    deg_s: float = 60.0,
-) -> MotionAt:
-    """Slow waves added up, as offline records of hidden patients move: middle + Σ deg_i sin(2π hz_i t + phase_i).
+def waves(begin: Begin, hz: Any = (0.1,), deg: Any = (20.0,), phase_rad: Any = (0.0,), deg_s: float = 60.0) -> MotionAt:
+    """Slow waves added up, as offline records of hidden patients move: 90° + Σ deg_i sin(2π hz_i t + phase_i).
 
     Lists of equal length: frequencies, amplitudes, and phases in rad at the time when it takes over. It is first
     brought into the movement with a peak speed of about `deg_s`.
@@ -169,11 +148,11 @@ def waves(
         )
         for each, size, phase in zip(hz, deg, phase_rad, strict=True)
     ]
-    middle_rad, peak_rad_s = radians("middle_deg", middle_deg), radians_per_s("deg_s", deg_s)
+    peak_rad_s = radians_per_s("deg_s", deg_s)
 
     def wave(time_s: float) -> Motion:
         since_s = time_s - begin.time_s
-        angle_rad, velocity_rad_s, acceleration_rad_s2 = middle_rad, 0.0, 0.0
+        angle_rad, velocity_rad_s, acceleration_rad_s2 = 0.5 * math.pi, 0.0, 0.0
         for size_rad, omega, phase in parts:
             turn = omega * since_s + phase
             angle_rad += size_rad * math.sin(turn)

@@ -13,41 +13,17 @@ import importlib
 import inspect
 import math
 import pkgutil
-import random
 from collections.abc import Callable
 from functools import wraps
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
-from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
 from stimrig.hardware_sim.errors import HardwareSimError
-from stimrig.hardware_sim.load_cells.sampler import LoadCell
-from stimrig.hardware_sim.stimulators.board import Board, Firmware
-from stimrig.hardware_sim.timeline import Timeline
 
 Undo = Callable[[], None]
 Make = TypeVar("Make", bound=Callable[..., Any])
+Target = Any
+"""The emulated devices (`Devices`); their `random` gives every random number that a fault needs."""
 _FAULTS: dict[str, Callable[..., Undo]] = {}
-
-
-class Target(Protocol):
-    """The emulated devices and their cables; `random` gives every random number that a fault needs.
-
-    The encoder is there where the rig has an arm, the angle sensor where the angle comes in frames of its own.
-    """
-
-    random: random.Random
-    timeline: Timeline
-    board: Board
-    firmware: Firmware
-    load_cell: LoadCell
-    encoder: Encoder | None
-    angle_sensor: AngleSensor | None
-
-    def plug_stimulator(self, plugged: bool = True) -> None:
-        """Connect the stimulator, or pull its cable."""
-
-    def plug_cell(self, plugged: bool = True) -> None:
-        """Connect the load cell's adapter, or pull it."""
 
 
 Place = Callable[[Target], list[Any]]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterable
+from operator import attrgetter
 from typing import Any
 
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
@@ -24,19 +25,13 @@ STATUS_BYTE, FAULT_BIT = 6, 0x80
 FrameHook = Callable[[Frame], Iterable[Frame]]
 
 
-def torque(target: Target) -> list[Any]:
-    """Hooks of the cell's readings."""
-    return target.load_cell.torque_hooks
+torque, frames = attrgetter("load_cell.torque_hooks"), attrgetter("load_cell.frame_hooks")
+"""Hooks of the cell's readings and of its frames."""
 
 
 def angle(target: Target) -> list[Any]:
     """Hooks of the encoder's readings."""
     return _encoder(target).hooks
-
-
-def frames(target: Target) -> list[Any]:
-    """Hooks of the cell's frames."""
-    return target.load_cell.frame_hooks
 
 
 def angle_frames(target: Target) -> list[Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from operator import attrgetter
 from typing import Any
 
 from stimrig.hardware_sim.faults import Target, Undo, fault, hook, replaced
@@ -9,16 +10,8 @@ from stimrig.hardware_sim.faults import Target, Undo, fault, hook, replaced
 HALF_A_FRAME = bytes.fromhex("f0815581")
 STOPS = 4, 34
 """Commands that stop stimulation, of ScienceMode 4's low level and of ScienceMode 2."""
-
-
-def answers(target: Target) -> list[Any]:
-    """Hooks of the frames to the host."""
-    return target.board.outgoing
-
-
-def commands(target: Target) -> list[Any]:
-    """Hooks of the bytes from the host."""
-    return target.board.incoming
+answers, commands = attrgetter("board.outgoing"), attrgetter("board.incoming")
+"""Hooks of the frames to the host, and of the bytes from it."""
 
 
 @fault

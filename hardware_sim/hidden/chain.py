@@ -10,7 +10,7 @@ import numpy as np
 from stimrig.hardware_sim.hidden import kernels
 from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.design import Design
-from stimrig.hardware_sim.hidden.forms import Formulation
+from stimrig.hardware_sim.hidden.forms import Form
 from stimrig.hardware_sim.hidden.kernels import CONTEXT_SIZE, ROW, SLOTS, Floats, NotSuited, Stage
 
 _call: Any = kernels.call_kernel  # to a type checker, an intrinsic still has its typing context
@@ -59,9 +59,10 @@ class Chain:
         ordered = sorted(stages, key=lambda stage: SLOTS.index(stage.kernel.slot))
         slots = [stage.kernel.slot for stage in ordered]
         addresses = np.array([stage.kernel.compiled.address for stage in ordered], dtype=np.int64)
-        rows = [stage.rows() for stage in ordered]
-        parameters = np.array([p for p, _ in rows]).reshape(-1, ROW)
-        self._s = np.array([s for _, s in rows]).reshape(-1, ROW)
+        parameters, self._s = np.zeros((2, len(ordered), ROW))
+        for row, stage in enumerate(ordered):
+            parameters[row, : len(stage.parameters)] = stage.parameters
+            self._s[row, : len(stage.state)] = stage.state
         self._c = np.zeros(CONTEXT_SIZE)
         self._c[kernels.STEP_S] = step_s
         self._c[kernels.SINCE_S] = 10.0
@@ -109,9 +110,9 @@ class Chain:
         self._s[:], self._c[:] = saved
 
 
-def combine(base: Base, hidden: list[tuple[Formulation, float]]) -> list[Stage]:
+def combine(base: Base, hidden: list[tuple[Form, float]]) -> list[Stage]:
     """The base's stages together with those of the effects. Raises NotSuited: two effects replace the same stage."""
-    stages = [stage for formulation, magnitude in hidden if magnitude for stage in formulation.build(magnitude)]
+    stages = [stage for form, magnitude in hidden if magnitude for stage in form.build(magnitude)]
     replaced_slots = [stage.kernel.slot for stage in stages if stage.kernel.slot in _REPLACED]
     if len(set(replaced_slots)) < len(replaced_slots):
         raise NotSuited("both effects replace the same stage")

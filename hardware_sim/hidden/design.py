@@ -90,11 +90,6 @@ def levels(rng: Generator, top: float, duration_s: float) -> Floats:
     return np.concatenate(out)[:n]
 
 
-def staircase(top: float, steps: int, held_s: float) -> Floats:
-    up = np.arange(1, steps + 1) / steps
-    return np.repeat(np.concatenate([up, up[-2::-1], [0.0]]) * top, round(held_s * PULSES_PER_S))
-
-
 def make_design(
     name: str,
     rng: Generator,

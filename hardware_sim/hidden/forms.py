@@ -7,8 +7,8 @@ effect's `form` (or `held_back`) what it is and whose it is::
     @draws("gain", 0.25, "alpha_per_s", tau_s=(40.0, 150.0))
     def _force_driven(x, p, s, c): ...
 
-A draw is `(low, high)`: uniform; a list: one of it; a number: that number; or a function of generator and base, which
-may give several numbers.
+The kernel's p[0] is the magnitude, p[1:] are the drawn numbers in their order. A draw is `(low, high)`: uniform; a
+list: one of it; a number: that number; or a function of generator and base, which may give several numbers.
 """
 
 from __future__ import annotations
@@ -77,28 +77,14 @@ def recruitment_table(_rng: Generator, base: Base) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class Formulation:
-    """A form whose numbers are drawn.
-
-    `build(magnitude)` gives its stages. A stage in the slot `recruitment` or `dynamics` replaces the base's own.
-    `magnitude_name` says what the magnitude is, with its unit.
-    """
-
-    name: str
-    source: str
-    build: Callable[[float], list[Stage]]
-    largest_magnitude: float
-    magnitude_name: str
-    parameters: dict[str, Any]
-
-
-@dataclass(frozen=True)
 class Form:
-    """A form before its numbers are drawn; a call draws them.
+    """A form of an effect; a call draws its numbers.
 
-    `build(magnitude, *numbers, state=…)` gives its stages. A name in `draws` that begins with `_` is not revealed. A
-    `Sign` is no number: the magnitude is multiplied by it. `seed_at` is the place of a random generator's seed in the
-    stage's state; it is drawn last. The name may be a function of what is revealed.
+    `build(magnitude)` gives the stages of a drawn one, `build(magnitude, *numbers, state=…)` of one that is not. A
+    stage in the slot `recruitment` or `dynamics` replaces the base's own. `magnitude_name` says what the magnitude is,
+    with its unit. A name in `draws` that begins with `_` is not revealed. A `Sign` is no number: the magnitude is
+    multiplied by it. `seed_at` is the place of a random generator's seed in the stage's state; it is drawn last. The
+    name may be a function of what is revealed, `parameters`.
     """
 
     build: Callable[..., list[Stage]]
@@ -108,8 +94,9 @@ class Form:
     seed_at: int | None = None
     name: str | Callable[[dict[str, Any]], str] = ""
     source: str = ""
+    parameters: dict[str, Any] = field(default_factory=dict)
 
-    def __call__(self, rng: Generator, base: Base) -> Formulation:
+    def __call__(self, rng: Generator, base: Base) -> Form:
         """The form with numbers drawn for this base; `NotSuited` where it does not suit it."""
         sign, numbers, revealed = 1.0, [], {}
         for name, draw in self.draws.items():
@@ -129,13 +116,11 @@ class Form:
             if not name.startswith("_"):
                 revealed[name] = value
         state = () if self.seed_at is None else (*[0.0] * self.seed_at, int(rng.integers(1, 2**31)))
-        return Formulation(
-            self.name(revealed) if callable(self.name) else self.name,
-            self.source,
-            lambda magnitude: self.build(sign * magnitude, *numbers, state=state),
-            self.largest_magnitude,
-            self.magnitude_name,
-            revealed,
+        return replace(
+            self,
+            name=self.name(revealed) if callable(self.name) else self.name,
+            build=lambda magnitude: self.build(sign * magnitude, *numbers, state=state),
+            parameters=revealed,
         )
 
 

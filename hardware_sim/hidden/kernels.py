@@ -129,18 +129,11 @@ def smooth_table(p: Any, first: int, count: int, position: float) -> float:
 
 @dataclass(frozen=True)
 class Stage:
-    """A kernel with its parameters."""
+    """A kernel with its parameters and its state at the start."""
 
     kernel: Kernel
     parameters: Any = ()
     state: Any = ()
-
-    def rows(self) -> tuple[Floats, Floats]:
-        """Parameters and starting state, padded to full rows."""
-        parameters, state = np.zeros(ROW), np.zeros(ROW)
-        parameters[: len(self.parameters)] = self.parameters
-        state[: len(self.state)] = self.state
-        return parameters, state
 
 
 class NotSuited(Exception):

@@ -228,7 +228,6 @@ def _residual(x, p, s, c):
 @OUTSIDERS["sensor_gain_swing"].form("sensitivity swings in time", "heating cycle; made to be foreign")
 @draws("sensor", 0.8, "depth", period_s=(3.0, 9.0), _phase=(0.0, 2.0 * math.pi), sharpness=(0.2, 4.0))
 def _swing(x, p, s, c):
-    """p: depth, period s, phase, sharpness."""
     wave = math.sin(2.0 * math.pi * c[TIME_S] / p[1] + p[2])
     return x * (1.0 + p[0] * math.tanh(p[3] * wave) / math.tanh(p[3]))
 
@@ -245,14 +244,12 @@ def _moment(rng, _base):
 @OUTSIDERS["slipped_electrode"].form("the gain steps once", "electrode slip")
 @draws("gain", 0.7, "size", moment_s=_moment, sign=Sign(weighted(0.7, 0.3)))
 def _gain_step(x, p, s, c):
-    """p: size with its sign, moment s."""
     return x * max(1.0 + p[0], 0.0) if c[TIME_S] >= p[1] else x
 
 
 @OUTSIDERS["slipped_electrode"].form("the threshold steps once", "electrode slip")
 @draws("electrode", 90.0, "size_us", moment_s=_moment, sign=Sign(weighted(0.3, 0.7)))
 def _threshold_step(x, p, s, c):
-    """p: size with its sign µs, moment s."""
     return max(x - p[0], 0.0) if x > 0.0 and c[TIME_S] >= p[1] else x
 
 
@@ -280,7 +277,6 @@ def _sample_and_hold(x, p, s, c):
 @OUTSIDERS["slow_converter"].form("coarse steps", "quantiser")
 @draws("converter", 0.6, "step_share")
 def _coarse(x, p, s, c):
-    """p: step as a share of the largest torque."""
     step = p[0] * c[LARGEST_NM]
     return round(x / step) * step
 

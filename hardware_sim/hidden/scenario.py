@@ -12,7 +12,7 @@ from numpy.random import Generator
 from stimrig.hardware_sim.hidden.base import Base, draw_base
 from stimrig.hardware_sim.hidden.chain import combine
 from stimrig.hardware_sim.hidden.design import Design, make_design
-from stimrig.hardware_sim.hidden.forms import Effect, Formulation
+from stimrig.hardware_sim.hidden.forms import Effect, Form
 from stimrig.hardware_sim.hidden.kernels import NotSuited, Stage
 from stimrig.hardware_sim.hidden.library import EFFECTS, MOVING, STILL, find_effect, find_forms
 from stimrig.hardware_sim.hidden.strength import find_magnitude
@@ -24,10 +24,10 @@ ATTEMPTS = 40
 
 @dataclass(frozen=True)
 class HiddenEffect:
-    """One effect: its formulation, its magnitude, and the error that a fit without it leaves."""
+    """One effect: its form, its magnitude, and the error that a fit without it leaves."""
 
     effect: str
-    formulation: Formulation
+    form: Form
     magnitude: float
     strength: str
     excess: dict[str, float]
@@ -43,11 +43,11 @@ class Scenario:
 
     def stages(self) -> list[Stage]:
         """All stages of the muscle."""
-        return combine(self.base, [(effect.formulation, effect.magnitude) for effect in self.hidden])
+        return combine(self.base, [(effect.form, effect.magnitude) for effect in self.hidden])
 
     def truth(self, noise_sd_nm: float) -> dict[str, Any]:
         """Return the hidden effects and their parameters as plain values."""
-        forms = [(effect, effect.formulation) for effect in self.hidden]
+        forms = [(effect, effect.form) for effect in self.hidden]
         return jsonable(
             {
                 "effects": [effect.effect for effect in self.hidden],
@@ -84,7 +84,7 @@ def draw_scenario(
 ) -> Scenario:
     """A scenario with the effects `names`, each of the given strength on its own.
 
-    Bases, formulations and magnitudes are drawn until the strength's band is reached.
+    Bases, forms and magnitudes are drawn until the strength's band is reached.
 
     Raises ValueError: unknown effect, strength or design; or no muscle found that shows the effect this strongly.
     """
@@ -96,11 +96,11 @@ def draw_scenario(
     def hide(name: str, effect: Effect) -> HiddenEffect:
         """The effect with this strength on this base, in one of the forms that the seed allows."""
         forms = find_forms(effect, seed)
-        formulation = forms[int(rng.integers(len(forms)))](rng, base)
+        form = forms[int(rng.integers(len(forms)))](rng, base)
         target_nm = noise_sd_nm * float(np.exp(rng.uniform(np.log(low * 1.08), np.log(min(high, 20.0) * 0.92))))
         band_nm = noise_sd_nm * low, noise_sd_nm * high
-        magnitude, excess = find_magnitude(effect.counted, formulation, base, sequence, target_nm, band_nm)
-        return HiddenEffect(name, formulation, magnitude, strength, excess)
+        magnitude, excess = find_magnitude(effect.counted, form, base, sequence, target_nm, band_nm)
+        return HiddenEffect(name, form, magnitude, strength, excess)
 
     for attempt in range(ATTEMPTS):
         rng = rng_of(seed, *names, strength, str(attempt))

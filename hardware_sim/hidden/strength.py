@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.chain import combine, simulate
 from stimrig.hardware_sim.hidden.design import Design
-from stimrig.hardware_sim.hidden.forms import Counted, Formulation
+from stimrig.hardware_sim.hidden.forms import Counted, Form
 from stimrig.hardware_sim.hidden.kernels import Floats, NotSuited, Stage, helper
 
 PULSE_RATE_HZ = 40.0
@@ -143,7 +143,7 @@ def excess_nm(counted: Counted, residual_nm: Floats, held_out: np.ndarray) -> di
 
 def find_magnitude(
     counted: Counted,
-    formulation: Formulation,
+    form: Form,
     base: Base,
     design: Design,
     target_nm: float,
@@ -166,7 +166,7 @@ def find_magnitude(
 
     def excess_at(magnitude: float) -> dict[str, float]:
         """Excess in N·m; the error without the effect is taken out of `counted_nm`."""
-        torque, fit = residual(combine(base, [(formulation, magnitude)]))
+        torque, fit = residual(combine(base, [(form, magnitude)]))
         left_nm = float(np.sqrt(max(fit["counted_nm"] ** 2 - own_nm**2, 1e-18)))
         return fit | {"counted_nm": float(np.std(torque - without)) if counted == "added" else left_nm}
 
@@ -174,7 +174,7 @@ def find_magnitude(
     own_nm = fit["counted_nm"]  # what the fit leaves without any effect
     if own_nm > 0.5 * target_nm:
         raise NotSuited("the effect-free fit follows this base too poorly")
-    high = formulation.largest_magnitude
+    high = form.largest_magnitude
     at_high = excess_at(high)["counted_nm"]
     if at_high < target_nm:
         raise NotSuited("too small even at its largest magnitude")

@@ -10,7 +10,7 @@ from stimrig.hardware_sim.load_cells.cells import CELLS, Cell
 from stimrig.hardware_sim.load_cells.frames import AngleReading, Frame, Sample
 from stimrig.hardware_sim.patients.muscle import Muscle
 from stimrig.hardware_sim.sampling import Noise, SampleClock
-from stimrig.hardware_sim.settings import Settings, pick
+from stimrig.hardware_sim.settings import Settings
 
 TorqueHook = Callable[[float, float], float]
 FrameHook = Callable[[Frame], Iterable[Frame]]
@@ -115,7 +115,7 @@ class LoadCell:
 
 def _make_cell(settings: Settings) -> Cell:
     """The cell's electronics. Raises HardwareSimError: it has no frame of so many samples."""
-    kind = pick(CELLS, "load cell", settings.cell)
+    kind = CELLS[settings.cell]
     if settings.samples_per_frame not in kind.layouts:
         allowed = " or ".join(map(str, kind.layouts))
         raise HardwareSimError(

@@ -26,11 +26,6 @@ class Slcan:
         reactor.add(self._port, self._read)
         self.can: dict[str, Any] = {"interface": "slcan", "channel": self._port.path, "sleep_after_open": 0}
 
-    @property
-    def overruns(self) -> int:
-        """Frames dropped because the host did not read."""
-        return self._port.dropped_messages
-
     def send(self, frames: Sequence[Frame]) -> None:
         """Frames to the port while the channel is open; the protocol cannot report bus errors."""
         if self._open:

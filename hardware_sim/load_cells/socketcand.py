@@ -29,7 +29,6 @@ class Socketcand(Server):
         listener = socket.create_server(("127.0.0.1", 0))
         super().__init__(reactor, listener, self._obey)
         self._on_frame = on_frame
-        self.overruns = 0
         host, port = listener.getsockname()
         self.can: dict[str, Any] = {"interface": "socketcand", "host": host, "port": port, "channel": CHANNEL}
 
@@ -45,11 +44,10 @@ class Socketcand(Server):
         message = b"".join(map(_text, frames)) if self.clients else b""
         now_s = time.monotonic()
         for client in self.clients:
-            if client.state <= now_s:
-                if len(client.backlog) > LARGEST_BACKLOG_BYTES:
-                    self.overruns += len(frames)
-                else:
-                    client.backlog += message
+            if (
+                client.state <= now_s and len(client.backlog) < LARGEST_BACKLOG_BYTES
+            ):  # one that does not read loses them
+                client.backlog += message
         self.flush()
 
     def _obey(self, client: Client) -> None:

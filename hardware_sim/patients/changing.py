@@ -22,7 +22,7 @@ import math
 from dataclasses import dataclass
 
 from stimrig.hardware_sim.errors import HardwareSimError
-from stimrig.hardware_sim.patients.muscle import HeldPulses
+from stimrig.hardware_sim.patients.muscle import NOMINAL_CURRENT_MA, HeldPulses
 
 PAUSE_S = 5.0
 """A pause as long begins a new contraction."""
@@ -41,9 +41,6 @@ class Parameters:
     shape: float = 2.0
     natural_period_s: float = 0.25
     damping_ratio: float = 0.8
-    nominal_current_ma: float = 20.0
-    pulse_period_s: float = 0.025
-    late_periods: float = 1.2
     fatigue_share: float = 0.0
     fatigue_recovery_s: float = 200.0
     potentiation_share: float = 0.0
@@ -66,8 +63,7 @@ class Store:
     """Fills with use and empties at rest; `share` after the usual session, negative for the opposite effect."""
 
     def __init__(self, share: float, recovery_s: float) -> None:
-        self._sign = math.copysign(1.0, share)
-        self._empties_per_s = 1.0 / recovery_s
+        self._sign, self._empties_per_s = math.copysign(1.0, share), 1.0 / recovery_s
         self._fills_per_s = _rate(abs(share), recovery_s)
         self.level = 0.0
 
@@ -90,24 +86,24 @@ def _filled(level: float, dt: float, fills_per_s: float, empties_per_s: float) -
 
 def _rate(share: float, recovery_s: float) -> float:
     """The rate r at which the usual session ends with this share, per s, by bisection."""
+
+    def after_session(rate: float) -> float:
+        level = 0.0
+        for _ in range(SESSION):
+            level = _filled(level * math.exp(-REST_S / recovery_s), CONTRACTION_S, rate * _use(SHARE), 1.0 / recovery_s)
+        return level
+
     if share == 0.0:
         return 0.0
     if not share < 1.0:
         raise HardwareSimError(f"a share must lie between -1 and 1, not at {share:g}")
     low, high = 0.0, 1.0
-    while _after_session(high, recovery_s) < share:
+    while after_session(high) < share:
         low, high = high, 2.0 * high
     for _ in range(60):
         middle = 0.5 * (low + high)
-        low, high = (middle, high) if _after_session(middle, recovery_s) < share else (low, middle)
+        low, high = (middle, high) if after_session(middle) < share else (low, middle)
     return high
-
-
-def _after_session(rate: float, recovery_s: float) -> float:
-    level = 0.0
-    for _ in range(SESSION):
-        level = _filled(level * math.exp(-REST_S / recovery_s), CONTRACTION_S, rate * _use(SHARE), 1.0 / recovery_s)
-    return level
 
 
 def _use(recruited: float) -> float:
@@ -119,10 +115,11 @@ class ChangingMuscle(HeldPulses):
 
     def __init__(self, parameters: Parameters | None = None) -> None:
         self.parameters = p = parameters or Parameters()
-        super().__init__(p.natural_period_s, p.damping_ratio, p.pulse_period_s, p.late_periods)
+        super().__init__(p.natural_period_s, p.damping_ratio)
         self._fatigue = Store(p.fatigue_share, p.fatigue_recovery_s)
         self._potentiation = Store(p.potentiation_share, p.potentiation_recovery_s)
         self._slowing = Store(p.slowing_share, p.slowing_recovery_s)
+        self._stores = self._fatigue, self._potentiation, self._slowing
         self._recruited = 0.0
         self._first_pulse_s, self._last_pulse_s = math.inf, -math.inf
         self._begun_s = 0.0
@@ -143,55 +140,47 @@ class ChangingMuscle(HeldPulses):
         since_s = max(time_s - self._first_pulse_s, 0.0)
         return -self.parameters.drift_us * math.expm1(-since_s / self.parameters.drift_settling_s)
 
-    def recruited(self, width_us: float, current_ma: float, shift_us: float = 0.0) -> float:
-        """Share of the fibres that such a pulse excites."""
-        p = self.parameters
-        above_us = width_us * current_ma / p.nominal_current_ma - p.threshold_us - shift_us
-        return -math.expm1(-((above_us / p.spread_us) ** p.shape)) if above_us > 0.0 else 0.0
-
     def drive_nm(self, time_s: float, width_us: float, current_ma: float) -> float:
         """Steady torque of a train of such pulses by the muscle as it is now, N·m."""
+        p = self.parameters
         if time_s - self._last_pulse_s >= PAUSE_S:
             self.contractions += 1
             self._begun_s = time_s
         self._first_pulse_s = min(self._first_pulse_s, time_s)
         self._last_pulse_s = time_s
-        if self.parameters.slowing_share:
-            self._set_period(self.parameters.natural_period_s * self.time_scale)
-        self._recruited = self.recruited(width_us, current_ma, self.shift_us(time_s))
-        return self.parameters.largest_nm * self.gain * self._recruited
+        if p.slowing_share:
+            self._set_period(p.natural_period_s * self.time_scale)
+        above_us = width_us * current_ma / NOMINAL_CURRENT_MA - p.threshold_us - self.shift_us(time_s)
+        self._recruited = -math.expm1(-((above_us / p.spread_us) ** p.shape)) if above_us > 0.0 else 0.0
+        return p.largest_nm * self.gain * self._recruited
 
     def torque_nm(self, time_s: float) -> float:
         """Advance to `time_s` and give the elbow torque there, N·m."""
-        return super().torque_nm(time_s) + self._added_nm(time_s)
-
-    def _added_nm(self, time_s: float) -> float:
-        p, since_s = self.parameters, time_s - self._begun_s
-        added_nm = 0.0
+        p, torque_nm, since_s = self.parameters, super().torque_nm(time_s), time_s - self._begun_s
         if self.contractions and self.contractions == p.spasm_contraction:
-            added_nm += p.spasm_nm * _burst((since_s - p.spasm_begins_s) / p.spasm_lasts_s)
+            torque_nm += p.spasm_nm * _burst((since_s - p.spasm_begins_s) / p.spasm_lasts_s)
         if self.contractions and self.contractions == p.effort_contraction:
-            added_nm += p.effort_nm * _bump((since_s - p.effort_begins_s) / p.effort_lasts_s)
-        return added_nm
+            torque_nm += p.effort_nm * _bump((since_s - p.effort_begins_s) / p.effort_lasts_s)
+        return torque_nm
 
     def _state(self) -> tuple[float, ...]:
-        stores = self._fatigue.level, self._potentiation.level, self._slowing.level
-        return (self._y, self._dy, *stores)
+        return (self._y, self._dy, *(store.level for store in self._stores))
 
     def _return_to(self, state: tuple[float, ...]) -> None:
-        self._y, self._dy, self._fatigue.level, self._potentiation.level, self._slowing.level = state
+        self._y, self._dy, *levels = state
+        for store, level in zip(self._stores, levels, strict=True):
+            store.level = level
 
     def _step_to(self, time_s: float, input_nm: float) -> None:
         dt, use = max(time_s - self._time_s, 0.0), _use(self._recruited) if input_nm else 0.0
-        for store in (self._fatigue, self._potentiation, self._slowing):
+        for store in self._stores:
             store.step(dt, use)
         super()._step_to(time_s, input_nm)
 
 
 def _burst(share: float) -> float:
     """0 to 1 within the first tenth of its time, 1, and back within the last three tenths."""
-    rise, fall = min(share / 0.1, 1.0), min((1.0 - share) / 0.3, 1.0)
-    return _smooth(min(rise, fall))
+    return _smooth(min(share / 0.1, 1.0, (1.0 - share) / 0.3))
 
 
 def _bump(share: float) -> float:

@@ -6,6 +6,9 @@ import math
 from functools import lru_cache
 from typing import Any, Protocol
 
+NOMINAL_CURRENT_MA = 20.0
+PULSE_PERIOD_S, LATE_PERIODS = 0.025, 1.2
+
 
 class Muscle(Protocol):
     """A muscle with its joint held still, stimulated by single pulses.
@@ -27,17 +30,15 @@ class HeldPulses:
 
     G: T² y'' + 2 ζ T y' + y = w, unit gain at DC. A pulse's recruitment w is held for one pulse period. Jitter of the
     pulses must leave no gap, and a missing pulse must leave one; no causal rule does both. So when a hold ends, the
-    state there is saved and the torque goes on without input. If a pulse comes within `late_periods` of the one before,
+    state there is saved and the torque goes on without input. If a pulse comes within `LATE_PERIODS` of the one before,
     the time since is integrated again with the hold extended to it. Readings taken in between are off by w dt² / (2
     T²): 1e-5 N·m for a pulse 1 ms late.
 
     A patient overrides `drive_nm`; one with further states `_state`, `_return_to` and `_step_to`.
     """
 
-    def __init__(self, natural_period_s: float, damping_ratio: float, pulse_period_s: float, late_periods: float):
+    def __init__(self, natural_period_s: float, damping_ratio: float) -> None:
         self._damping_ratio = damping_ratio
-        self._pulse_period_s = pulse_period_s
-        self._longest_gap_s = (late_periods - 1.0) * pulse_period_s
         self._set_period(natural_period_s)
         self._time_s = 0.0
         self._y = self._dy = 0.0
@@ -52,12 +53,12 @@ class HeldPulses:
     def pulse(self, time_s: float, width_us: float, current_ma: float) -> None:
         """A pulse of `width_us` a phase and `current_ma` reaches the electrodes at `time_s`."""
         self._advance(time_s)
-        if self._at_hold_end is not None and time_s - self._hold_end_s <= self._longest_gap_s:
+        if self._at_hold_end is not None and time_s - self._hold_end_s <= (LATE_PERIODS - 1.0) * PULSE_PERIOD_S:
             self._return_to(self._at_hold_end)
             self._time_s = self._hold_end_s
             self._step_to(time_s, self._held_nm)
         self._held_nm = self.drive_nm(time_s, width_us, current_ma)
-        self._hold_end_s = time_s + self._pulse_period_s
+        self._hold_end_s = time_s + PULSE_PERIOD_S
         self._at_hold_end = None
 
     def torque_nm(self, time_s: float) -> float:

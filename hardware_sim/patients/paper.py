@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from stimrig.hardware_sim.patients.muscle import HeldPulses
+from stimrig.hardware_sim.patients.muscle import NOMINAL_CURRENT_MA, HeldPulses
 
 
 @dataclass(frozen=True)
@@ -23,9 +23,6 @@ class Parameters:
     a3: float = 2.3897e3
     natural_period_s: float = 0.5284
     damping_ratio: float = 0.6369
-    nominal_current_ma: float = 20.0
-    pulse_period_s: float = 0.025
-    late_periods: float = 1.2
 
 
 class PaperMuscle(HeldPulses):
@@ -33,12 +30,12 @@ class PaperMuscle(HeldPulses):
 
     def __init__(self, parameters: Parameters | None = None) -> None:
         self.parameters = p = parameters or Parameters()
-        super().__init__(p.natural_period_s, p.damping_ratio, p.pulse_period_s, p.late_periods)
+        super().__init__(p.natural_period_s, p.damping_ratio)
 
     def drive_nm(self, time_s: float, width_us: float, current_ma: float) -> float:  # noqa: ARG002
         """Steady torque of a train of such pulses, N·m; eq. (35)."""
         p = self.parameters
-        exponent = p.a2 * width_us * current_ma / p.nominal_current_ma
+        exponent = p.a2 * width_us * current_ma / NOMINAL_CURRENT_MA
         if exponent <= 0.0:
             return 0.0
         decay = math.exp(-exponent)  # divided through by exp(a2 u): no overflow at 4095 µs

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -45,7 +44,6 @@ class Electrodes:
         self.attached = True
         self.cut = False
         self.unbalanced_pulses = 0
-        self.delivered_pulses = 0
         self.log: list[FiredPulse] = []
         self._muscle = muscle
         self._raise_sync = raise_sync
@@ -58,7 +56,6 @@ class Electrodes:
         if not balanced:
             self.unbalanced_pulses += 1
         if flows:
-            self.delivered_pulses += 1
             self._muscle.pulse(time_s, width_us, current_ma)
             self._raise_sync()
         return flows
@@ -114,7 +111,7 @@ class Board:
             self.write(sent)
 
 
-class Firmware(ABC):
+class Firmware:
     """Base of the stimulators' firmwares: commands in, packets out."""
 
     device: ClassVar[str]
@@ -126,22 +123,21 @@ class Firmware(ABC):
         self.commands: Counter[int] = Counter()
         """Count of each command received."""
 
-    @abstractmethod
     def received(self, data: bytes) -> None:
         """Bytes from the host, at the timeline's time."""
+        raise NotImplementedError
 
-    @abstractmethod
     def reset(self) -> None:
         """Power lost and back: no stimulation, nothing initialised, commands forgotten."""
+        raise NotImplementedError
 
-    @abstractmethod
+    def mode(self) -> tuple[str, bool]:
+        """What it is ready for, and whether high voltage is on."""
+        raise NotImplementedError
+
     def state(self) -> dict[str, Any]:
-        """For the control line: at least `mode` and `high_voltage_on`."""
-
-    def _send(self, number: int, command: int, data: bytes) -> None:
-        self._board.send(self._wire.encode(Packet(number, command, data)))
-
-    def _describe(self, mode: str, high_voltage_on: bool) -> dict[str, Any]:
+        """For the control line."""
+        mode, high_voltage_on = self.mode()
         return {
             "device": self.device,
             "mode": mode,
@@ -149,3 +145,6 @@ class Firmware(ABC):
             "corrupt_frames": self._wire.corrupt_frames,
             "commands": {str(command): count for command, count in sorted(self.commands.items())},
         }
+
+    def _send(self, number: int, command: int, data: bytes) -> None:
+        self._board.send(self._wire.encode(Packet(number, command, data)))

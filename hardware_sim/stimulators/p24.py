@@ -12,7 +12,6 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 from stimrig.hardware_sim.stimulators.board import Board, Firmware, Point
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode4
@@ -53,84 +52,11 @@ def duration_s(points: list[Point]) -> float:
 
 @dataclass
 class Channel:
-    """One running channel."""
+    """A channel that runs at mid level."""
 
     period_s: float
     points: list[Point]
     next_pulse: Event | None = None
-
-
-class MidLevel:
-    """The running channels and their watchdog."""
-
-    def __init__(self, board: Board) -> None:
-        self._board = board
-        self._channels: dict[int, Channel] = {}
-        self._errors: dict[int, int] = {}
-        self._silence: Event | None = None
-
-    @property
-    def running(self) -> bool:
-        """True while any channel pulses."""
-        return bool(self._channels)
-
-    def start(self) -> None:
-        """Ready, with no channel running."""
-        self.stop()
-        self._errors.clear()
-
-    def stop(self) -> None:
-        """No pulse after this."""
-        cancel(self._silence, *(channel.next_pulse for channel in self._channels.values()))
-        self._channels.clear()
-        self._silence = None
-
-    def update(self, data: bytes) -> int:
-        """MLUpdate: set each channel in the mask, stop the others; returns the result code."""
-        wanted = _parse_update(data)
-        if wanted is None:
-            return PARAMETER
-        for number in self._channels.keys() - wanted:
-            self._end(number)
-        for number, channel in wanted.items():
-            if running := self._channels.get(number):  # it keeps its timing
-                running.period_s, running.points = channel.period_s, channel.points
-            else:
-                self._errors.pop(number, None)
-                self._channels[number] = channel
-                self._schedule(number, channel, self._board.timeline.now_s)
-        if self.running and self._silence is None:
-            self._alive()
-        return OK
-
-    def current_data(self, data: bytes) -> bytes:
-        """MLGetCurrentData, which is the sign of life; its answer: result, selection, active mask, errors."""
-        if data != bytes((ALL_ERRORS,)):
-            return bytes((PARAMETER, *data[:1])).ljust(7, b"\0")
-        if self.running:
-            self._alive()
-        active = sum(1 << number for number in self._channels)
-        nibbles = sum(error << 4 * number for number, error in self._errors.items())
-        return bytes((ELECTRODE if self._errors else OK, ALL_ERRORS, active)) + nibbles.to_bytes(4, "little")
-
-    def _alive(self) -> None:
-        cancel(self._silence)
-        self._silence = self._board.timeline.after(SILENCE_S, self.stop)
-
-    def _schedule(self, number: int, channel: Channel, time_s: float) -> None:
-        channel.next_pulse = self._board.timeline.at(time_s, lambda: self._fire(number, channel, time_s))
-
-    def _fire(self, number: int, channel: Channel, time_s: float) -> None:
-        board = self._board
-        flowed = board.high_voltage_works and board.electrodes.fire(time_s, channel.points, (number >> 2, number & 3))
-        if not flowed and largest_ma(channel.points) >= ELECTRODE_DETECTION_MA:
-            self._errors[number] = ELECTRODE_NIBBLE
-            self._end(number)
-        else:
-            self._schedule(number, channel, time_s + channel.period_s)
-
-    def _end(self, number: int) -> None:
-        cancel(self._channels.pop(number).next_pulse)
 
 
 def _parse_update(data: bytes) -> dict[int, Channel] | None:
@@ -172,7 +98,9 @@ class P24(Firmware):
         self._queue: deque[Packet] = deque()
         self._doing: Event | None = None
         self._level = NO_LEVEL
-        self._mid_level = MidLevel(board)
+        self._channels: dict[int, Channel] = {}
+        self._errors: dict[int, int] = {}
+        self._silence: Event | None = None
         self._handlers: dict[int, Callable[[Packet], None]] = {
             LL_INIT: lambda p: self._init(p, LOW_LEVEL),
             LL_CHANNEL_CONFIG: self._ll_channel_config,
@@ -191,7 +119,7 @@ class P24(Firmware):
     @property
     def level(self) -> int:
         """Stimulation status as the protocol counts it: 0 none, 1 low, 2 mid, 3 mid running."""
-        return MID_LEVEL_RUNNING if self._mid_level.running else self._level
+        return MID_LEVEL_RUNNING if self._channels else self._level
 
     @property
     def high_voltage_on(self) -> bool:
@@ -214,9 +142,9 @@ class P24(Firmware):
         self._doing = None
         self._end_levels()
 
-    def state(self) -> dict[str, Any]:
-        """For the control line."""
-        return self._describe(MODES[self.level], self.high_voltage_on)
+    def mode(self) -> tuple[str, bool]:
+        """Its level, and whether the source is on."""
+        return MODES[self.level], self.high_voltage_on
 
     def _work(self) -> None:
         while self._queue and self._doing is None:
@@ -238,8 +166,9 @@ class P24(Firmware):
         self._send(packet.number, packet.command + 1, bytes(data))
 
     def _end_levels(self) -> None:
-        self._mid_level.stop()
-        self._level = NO_LEVEL
+        cancel(self._silence, *(channel.next_pulse for channel in self._channels.values()))
+        self._channels.clear()
+        self._level, self._silence = NO_LEVEL, None
 
     def _unknown(self, packet: Packet) -> None:
         self._send(packet.number, UNKNOWN_COMMAND, bytes((INVALID_COMMAND,)))
@@ -258,9 +187,8 @@ class P24(Firmware):
 
         def finish() -> None:
             works = self._board.high_voltage_works
-            if works:
-                self._level = level
-                self._mid_level.start()
+            self._level = level if works else NO_LEVEL
+            self._errors.clear()
             self._ack(packet, OK if works else HIGH_VOLTAGE)
 
         self._later(SWITCH_TIME_S, finish)
@@ -292,9 +220,61 @@ class P24(Firmware):
             answer()
 
     def _ml_update(self, packet: Packet) -> None:
-        ready = self._level == MID_LEVEL_READY
-        self._ack(packet, self._mid_level.update(packet.data) if ready else NOT_INITIALISED)
+        """Set each channel in the mask, stop the others."""
+        if self._level != MID_LEVEL_READY:
+            self._ack(packet, NOT_INITIALISED)
+            return
+        wanted = _parse_update(packet.data)
+        if wanted is None:
+            self._ack(packet, PARAMETER)
+            return
+        for number in self._channels.keys() - wanted:
+            self._end(number)
+        for number, channel in wanted.items():
+            if running := self._channels.get(number):  # it keeps its timing
+                running.period_s, running.points = channel.period_s, channel.points
+            else:
+                self._errors.pop(number, None)
+                self._channels[number] = channel
+                self._schedule(number, channel, self._board.timeline.now_s)
+        if self._channels and self._silence is None:
+            self._alive()
+        self._ack(packet, OK)
 
     def _ml_get_current_data(self, packet: Packet) -> None:
-        ready = self._level == MID_LEVEL_READY
-        self._ack(packet, *(self._mid_level.current_data(packet.data) if ready else (NOT_INITIALISED, 4, *bytes(5))))
+        """The sign of life; its answer: result, selection, active mask, errors."""
+        if self._level != MID_LEVEL_READY:
+            self._ack(packet, NOT_INITIALISED, ALL_ERRORS, *bytes(5))
+        elif packet.data != bytes((ALL_ERRORS,)):
+            self._ack(packet, *bytes((PARAMETER, *packet.data[:1])).ljust(7, b"\0"))
+        else:
+            if self._channels:
+                self._alive()
+            active = sum(1 << number for number in self._channels)
+            nibbles = sum(error << 4 * number for number, error in self._errors.items())
+            result = ELECTRODE if self._errors else OK
+            self._ack(packet, result, ALL_ERRORS, active, *nibbles.to_bytes(4, "little"))
+
+    def _alive(self) -> None:
+        cancel(self._silence)
+        self._silence = self._board.timeline.after(SILENCE_S, self._silent)
+
+    def _silent(self) -> None:
+        for number in list(self._channels):
+            self._end(number)
+        self._silence = None
+
+    def _schedule(self, number: int, channel: Channel, time_s: float) -> None:
+        channel.next_pulse = self._board.timeline.at(time_s, lambda: self._fire(number, channel, time_s))
+
+    def _fire(self, number: int, channel: Channel, time_s: float) -> None:
+        board = self._board
+        flowed = board.high_voltage_works and board.electrodes.fire(time_s, channel.points, (number >> 2, number & 3))
+        if not flowed and largest_ma(channel.points) >= ELECTRODE_DETECTION_MA:
+            self._errors[number] = ELECTRODE_NIBBLE
+            self._end(number)
+        else:
+            self._schedule(number, channel, time_s + channel.period_s)
+
+    def _end(self, number: int) -> None:
+        cancel(self._channels.pop(number).next_pulse)

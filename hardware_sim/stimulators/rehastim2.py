@@ -13,7 +13,7 @@ doublets, triplets and lists that play once are refused.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from stimrig.hardware_sim.stimulators.board import Board, Firmware
 from stimrig.hardware_sim.stimulators.sciencemode import Packet, ScienceMode2
@@ -77,41 +77,6 @@ def fire(board: Board, time_s: float, channel: int, pulse: Pulse) -> int:
     return NO_ERROR if board.electrodes.fire(time_s, points, (channel >> 2, channel & 3)) else ELECTRODE
 
 
-class ChannelList:
-    """The running channels; `failed` is called with the error of a pulse that did not flow."""
-
-    def __init__(self, board: Board, failed: Callable[[int], None]) -> None:
-        self._board, self._failed = board, failed
-        self.channels: tuple[int, ...] = ()
-        self._period_s = SHORTEST_INTERVAL_S
-        self._pulses: dict[int, Pulse] = {}
-        self._next_group: Event | None = None
-
-    def set_up(self, channels: tuple[int, ...], period_s: float) -> None:
-        """Use these settings; nothing runs."""
-        self.stop()
-        self.channels, self._period_s = channels, period_s
-
-    def start(self, pulses: dict[int, Pulse]) -> None:
-        """Fire the first group at once. If the list runs already, the pulses apply from the next group on."""
-        self._pulses = pulses
-        if self._next_group is None:
-            self._fire_group(self._board.timeline.now_s)
-
-    def stop(self) -> None:
-        """No pulse after this."""
-        cancel(self._next_group)
-        self._next_group = None
-
-    def _fire_group(self, time_s: float) -> None:
-        next_s = time_s + self._period_s
-        self._next_group = self._board.timeline.at(next_s, lambda: self._fire_group(next_s))
-        for channel, pulse in self._pulses.items():
-            if error := fire(self._board, time_s, channel, pulse):
-                self._failed(error)  # it stops the list
-                return
-
-
 INIT, INIT_ACK, UNKNOWN_COMMAND, WATCHDOG = 1, 2, 3, 4
 GET_MODE, INIT_CHANNEL_LIST, START, STOP, SINGLE_PULSE, STIMULATION_ERROR = 10, 30, 32, 34, 36, 38
 TRANSFER, WRONG_MODE, BUSY = -1, -3, -8
@@ -129,7 +94,10 @@ class RehaStim2(Firmware):
 
     def __init__(self, board: Board) -> None:
         super().__init__(board)
-        self._channels = ChannelList(board, self._stimulation_failed)
+        self._channels: tuple[int, ...] = ()
+        self._period_s = SHORTEST_INTERVAL_S
+        self._pulses: dict[int, Pulse] = {}
+        self._next_group: Event | None = None
         self._handlers: dict[int, Callable[[Packet], None]] = {
             WATCHDOG: lambda _packet: None,
             GET_MODE: lambda packet: self._ack(packet, OK, bytes((self._mode,))),
@@ -161,9 +129,9 @@ class RehaStim2(Firmware):
         self._single_ends_s = 0.0
         self._disconnect()
 
-    def state(self) -> dict[str, Any]:
-        """For the control line."""
-        return self._describe(MODES[self._mode], self._mode == STARTED)
+    def mode(self) -> tuple[str, bool]:
+        """Its mode, and whether the channel list runs."""
+        return MODES[self._mode], self._mode == STARTED
 
     def _connect(self, packet: Packet) -> None:
         """Accept an InitAck if it answers an Init that was sent since the connection was lost."""
@@ -174,7 +142,7 @@ class RehaStim2(Firmware):
         self._alive()
 
     def _disconnect(self) -> None:
-        self._channels.stop()
+        self._end_list()
         self._mode = NOT_CONNECTED
         self._offered: set[int] = set()
         cancel(self._offer, self._watchdog)
@@ -208,7 +176,7 @@ class RehaStim2(Firmware):
 
     def _stimulation_failed(self, error: int) -> None:
         """Stop, go back to start mode and report the error."""
-        self._channels.stop()
+        self._end_list()
         self._mode = START_MODE
         self._send_event(STIMULATION_ERROR, bytes((error & 0xFF,)))
 
@@ -219,7 +187,8 @@ class RehaStim2(Firmware):
         elif wanted is None:
             self._ack(packet, PARAMETER)
         else:
-            self._channels.set_up(*wanted)
+            self._end_list()
+            self._channels, self._period_s = wanted
             self._mode = INITIALISED
             self._ack(packet, OK)
 
@@ -228,16 +197,30 @@ class RehaStim2(Firmware):
         if self._mode == START_MODE:
             self._ack(packet, WRONG_MODE)
             return
-        pulses = parse_start(packet.data, self._channels.channels)
+        pulses = parse_start(packet.data, self._channels)
         if pulses is None:
             self._ack(packet, PARAMETER)
         else:
             self._mode = STARTED
             self._ack(packet, OK)
-            self._channels.start(pulses)
+            self._pulses = pulses  # of the next group on, if the list runs already
+            if self._next_group is None:
+                self._fire_group(self._board.timeline.now_s)
+
+    def _fire_group(self, time_s: float) -> None:
+        next_s = time_s + self._period_s
+        self._next_group = self._board.timeline.at(next_s, lambda: self._fire_group(next_s))
+        for channel, pulse in self._pulses.items():
+            if error := fire(self._board, time_s, channel, pulse):
+                self._stimulation_failed(error)  # it ends the list
+                return
+
+    def _end_list(self) -> None:
+        cancel(self._next_group)
+        self._next_group = None
 
     def _stop(self, packet: Packet) -> None:
-        self._channels.stop()
+        self._end_list()
         self._mode = START_MODE
         self._ack(packet, OK)
 

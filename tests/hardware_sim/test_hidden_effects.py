@@ -10,7 +10,7 @@ import pytest
 from stimrig.hardware_sim.hidden.base import Base, draw_base
 from stimrig.hardware_sim.hidden.chain import Chain, combine, simulate
 from stimrig.hardware_sim.hidden.design import make_design
-from stimrig.hardware_sim.hidden.forms import Formulation
+from stimrig.hardware_sim.hidden.forms import Form
 from stimrig.hardware_sim.hidden.kernels import NotSuited
 from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS, find_forms
 from stimrig.hardware_sim.hidden.scenario import BANDS, draw_scenario, rng_of
@@ -32,7 +32,7 @@ RANDOM_BY_STEP = {
 BY_STEP = {"tremor", "delay_jitter", "stick_slip", "slow_converter", "clonus"}
 
 
-def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Formulation]:
+def written(effect: str, index: int, seed: int = 3) -> tuple[Base, Form]:
     """A base muscle on which this formulation can be written."""
     for attempt in range(30):
         rng = rng_of(seed, effect, str(index), str(attempt))

@@ -35,7 +35,6 @@ def _warm_up(x, p, s, c):
 @EFFECT.form("linear", "temperature ramp")
 @draws("additive", 0.2, "nm_per_s", sign=Sign())
 def _linear(x, p, s, c):
-    """p: N·m per s."""
     return x + p[0] * c[TIME_S]
 
 
@@ -49,7 +48,6 @@ def _wander(x, p, s, c):
 @EFFECT.held_back("creep with the logarithm of time", "load-cell creep")
 @draws("additive", 4.0, "nm_per_decade", first_s=(1.0, 8.0), sign=Sign())
 def _logarithmic(x, p, s, c):
-    """p: N·m a decade, first time s."""
     return x + p[0] * math.log10(1.0 + c[TIME_S] / p[1])
 
 

@@ -13,7 +13,6 @@ EFFECT = Effect()
 @EFFECT.form("gain of the first pulses", "Binder-Macleod and Kesar 2005; Bickel, Slade and Dudley 2004")
 @draws("gain", 2.5, "first_gain", lasts_pulses=(3.0, 12.0), recovery_s=(0.1, 0.6))
 def _first_pulses(x, p, s, c):
-    """p: gain of the first pulse, pulses it lasts, recovery s."""
     rested = 1.0 - math.exp(-c[PAUSE_S] / p[2])
     return x * (1.0 + p[0] * rested * math.exp(-(max(c[COUNT], 1.0) - 1.0) / p[1]))
 

@@ -13,7 +13,6 @@ EFFECT = Effect()
 @EFFECT.form("tanh", "textbook")
 @draws("structure", 4.0, "largest_over_knee")
 def _tanh(x, p, s, c):
-    """p: largest torque over the knee."""
     knee = c[LARGEST_NM] / p[0]
     return knee * math.tanh(x / knee)
 
@@ -48,7 +47,6 @@ def _knee(x, p, s, c):
 @EFFECT.held_back("hyperbola", "Hill 1910")
 @draws("structure", 5.0, "largest_over_half")
 def _hyperbola(x, p, s, c):
-    """p: largest torque over the half-saturation torque."""
     if x <= 0.0:
         return x
     return x / (1.0 + p[0] * x / c[LARGEST_NM])
@@ -57,6 +55,5 @@ def _hyperbola(x, p, s, c):
 @EFFECT.held_back("arctangent", "textbook")
 @draws("structure", 5.0, "largest_over_knee")
 def _arctangent(x, p, s, c):
-    """p: largest torque over the knee."""
     knee = c[LARGEST_NM] / p[0]
     return knee * math.atan(x / knee)

@@ -46,7 +46,6 @@ def _two_ends(x, p, s, c):
 @EFFECT.form("spring, dashpot and some dry friction", "Ashworth-like stiffness, linear")
 @draws("additive", 5.0, "size_nm", stiffness=(0.6, 1.4), viscosity_s=(0.2, 0.8), dry=(0.0, 0.25))
 def _friction(x, p, s, c):
-    """p: size, stiffness, viscosity and dry friction as shares."""
     v = c[VELOCITY_RAD_S]
     return x - p[0] * (p[1] * (c[ANGLE_RAD] - 0.5 * math.pi) + p[2] * v + p[3] * math.tanh(v / 0.05))
 
@@ -65,7 +64,6 @@ def _relaxing(x, p, s, c):
 @EFFECT.held_back("tangent of the angle and a power of the velocity", "stiffening towards both ends")
 @draws("additive", 4.0, "size_nm", range_rad=(1.1, 1.6), viscous_share=(0.1, 1.0), velocity_exponent=(0.7, 1.2))
 def _tangent(x, p, s, c):
-    """p: size N·m, range rad, viscous share, exponent of the velocity."""
     d = min(max((c[ANGLE_RAD] - 0.5 * math.pi) / p[1], -0.95), 0.95)
     v = c[VELOCITY_RAD_S]
     return x - p[0] * (math.tan(0.5 * math.pi * d) + p[2] * math.copysign(abs(v) ** p[3], v))

@@ -11,14 +11,12 @@ EFFECT = Effect()
 @EFFECT.form("upper rail", "textbook")
 @draws("converter", 0.8, "share_cut_off")
 def _rail(x, p, s, c):
-    """p: share of the largest torque that is cut off."""
     return min(x, (1.0 - p[0]) * c[LARGEST_NM])
 
 
 @EFFECT.form("upper and lower rail", "textbook")
 @draws("converter", 0.8, "share_cut_off", lower_rail_share=(0.05, 0.3))
 def _both_rails(x, p, s, c):
-    """p: share cut off, lower rail as a share of the largest torque."""
     return max(min(x, (1.0 - p[0]) * c[LARGEST_NM]), -p[1] * c[LARGEST_NM])
 
 

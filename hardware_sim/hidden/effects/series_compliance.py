@@ -52,7 +52,6 @@ EFFECT.form("mass on a spring that stiffens", "tendon toe region, Zajac 1989", z
 @EFFECT.form("part of the torque goes through the mode", "two-mode fixture")
 @draws("structure", 1.0, "share", frequency_hz=(1.5, 6.0), zeta=(0.03, 0.2))
 def _parallel_mode(x, p, s, c):
-    """p: share that goes through the mode, its Hz, ζ."""
     return x + p[0] * (_resonate(x, 2.0 * math.pi * p[1], p[2], 0.0, s, c[STEP_S]) - x)
 
 

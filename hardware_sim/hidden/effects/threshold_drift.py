@@ -60,7 +60,6 @@ def _wander(x, p, s, c):
 @EFFECT.form("linear, then settled", "sim")
 @draws("electrode", 2.0, "us_per_s", sign=MOSTLY_UP, until_s=(60.0, 200.0))
 def _linear(x, p, s, c):
-    """p: µs per s, until (s)."""
     return max(x - p[0] * min(c[TIME_S], p[1]), 0.0) if x > 0.0 else 0.0
 
 

@@ -21,7 +21,6 @@ SHORTENING = Sign(MOSTLY_EXTENSION, "extension", "flexion")
     "joint", 1.0, "inverse_largest_velocity_s", shortening=SHORTENING, shape=(0.2, 0.6), eccentric_plateau=(1.3, 1.8)
 )
 def _hill(x, p, s, c):
-    """p: inverse of the largest velocity s/rad (signed: shortening positive), shape, eccentric plateau."""
     v = p[0] * c[VELOCITY_RAD_S]
     if v >= 0.0:
         return x * max(1.0 - v, 0.0) / (1.0 + v / p[1])
@@ -51,6 +50,5 @@ def _angle_times_velocity(x, p, s, c):
 @EFFECT.held_back("logistic curve", "smooth stand-in for Hill's hyperbola")
 @draws("joint", 0.8, "steepness_s", sign=Sign(MOSTLY_EXTENSION), plateau=(1.4, 1.9))
 def _logistic(x, p, s, c):
-    """p: steepness s/rad (signed), plateau of the stretched muscle."""
     e = math.exp(-4.0 * p[0] * c[VELOCITY_RAD_S])
     return x * p[1] * e / (p[1] - 1.0 + e)
