@@ -237,7 +237,7 @@ class VirtualRig:
     ) -> None:
         self.machine = VirtualMachine()
         self.clock = self.machine.clock
-        self.sensor = FakeSensor(self.clock)
+        self.sensor = FakeSensor(self.machine)
         self.angle = AngleReceiver(self.sensor, self.machine.tasks) if has_sensor else None
         self.stimulator = FakeStimulator(self.clock)
         self.cell = FakeCell(self.clock, self.stimulator)
@@ -273,7 +273,7 @@ class VirtualRig:
 
     def execute(self) -> RunResult:
         if self.angle is not None:
-            self.sensor.feed(self.angle, self.clock.now_s() + self.test.longest_s + 8)
+            self.angle.start()
         self.machine.run(self.receiver.open())
         return self.machine.run(self.run.execute())
 
@@ -349,7 +349,6 @@ def widths_sent(rig: VirtualRig) -> list[int]:
 
 
 ANGLE_HZ = 200.0
-PER_BLOCK = 2
 
 
 def still(_: float) -> float:
@@ -358,7 +357,7 @@ def still(_: float) -> float:
 
 
 class FakeSensor:
-    """Blocks of two samples with a 16-bit counter, degrees with an offset and reversed; faults are attributes."""
+    """Blocks with a 16-bit counter while it is open, degrees with an offset and reversed; faults are attributes."""
 
     sample_rate_hz = ANGLE_HZ
     counter_modulus = 65536
@@ -366,26 +365,37 @@ class FakeSensor:
     of_the_cell = False
     on_the_cells_bus = True
 
-    def __init__(self, clock: VirtualClock, angle_rad: Callable[[float], float] = still) -> None:
-        self.clock, self.angle_rad = clock, angle_rad
-        self.silent = self.nan = self.repeating = False
+    def __init__(self, machine: VirtualMachine, angle_rad: Callable[[float], float] = still) -> None:
+        self.tasks, self.clock, self.angle_rad = machine.tasks, machine.clock, angle_rad
+        self.silent = self.nan = self.repeating = self.gone = False
         self.fault: int = 0
         self.add_deg = 0.0
         self.rate = 1.0
         self.skip = 0
-        self.late_s = 0.0
+        self.opens_s = self.closes_s = self.late_s = 0.0
         self.noise_deg = 0.02
+        self.per_block = 2
         self.counter = 65400
+        self.done: list[str] = []
+        self._opened = 0
         self._rng = np.random.default_rng(3)
 
-    async def open(self, *_: Callable[..., None]) -> dict[str, Any]:
-        if self.silent:
-            raise DeviceError("angle_sensor.bus: it is not there")
-        return {"device": "fake"}
+    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
+        await self.tasks.sleep(self.opens_s)
+        if self.gone:
+            raise DeviceError("angle sensor: no adapter")
+        self.done.append("opened")
+        self.on_lost, self._opened = on_lost, len(self.done)
+        first_s = self.clock.now_s() + 0.0003  # between two blocks of the cell
+        self.clock.call_at(first_s, lambda: self._beat(on_block, self._opened))
+        return {"device": "here"}
 
-    async def close(self) -> None: ...
+    async def close(self) -> None:
+        self._opened = 0
+        await self.tasks.sleep(self.closes_s)
+        self.done.append("closed")
 
-    def block(self, n: int = PER_BLOCK) -> Block:
+    def block(self, n: int) -> Block:
         """The next samples; the last one is taken now."""
         now_s = self.clock.now_s()
         if not self.repeating:
@@ -401,58 +411,18 @@ class FakeSensor:
         samples["fault"] = self.fault
         return Block(samples)
 
-    def feed(self, receiver: AngleReceiver, until_s: float) -> None:
-        """Schedule blocks for the receiver until a time."""
-        period_s = PER_BLOCK / ANGLE_HZ / self.rate
-        first_s = self.clock.now_s() + 0.0003  # between two blocks of the cell
-        for i in range(1, math.ceil((until_s - first_s) / period_s)):
-            self.clock.call_at(first_s + i * period_s, lambda: self._send(receiver))
-
-    def _send(self, receiver: AngleReceiver) -> None:
-        if self.silent:
-            self.counter += PER_BLOCK
-            return
-        block = self.block()
-        if self.late_s:
-            self.clock.call_at(self.clock.now_s() + self.late_s, lambda: self._arrive(receiver, block))
-        else:
-            receiver.add(block)
-
-    def _arrive(self, receiver: AngleReceiver, block: Block) -> None:
-        block.samples["host_time_s"] = self.clock.now_s()
-        receiver.add(block)
-
-
-class OpenedSensor(FakeSensor):
-    """Its samples come while it is open; its adapter may be missing or slow."""
-
-    def __init__(self, machine: VirtualMachine, angle_rad: Callable[[float], float] = still) -> None:
-        super().__init__(machine.clock, angle_rad)
-        self.tasks = machine.tasks
-        self.gone, self.opens_s, self.closes_s, self.per_block = False, 0.0, 0.0, PER_BLOCK
-        self.done: list[str] = []
-        self._opened = 0
-
-    async def open(self, on_block: Callable[[Block], None], on_lost: Callable[[str], None]) -> dict[str, Any]:
-        await self.tasks.sleep(self.opens_s)
-        if self.gone:
-            raise DeviceError("angle sensor: no adapter")
-        self.done.append("opened")
-        self.on_lost, self._opened = on_lost, len(self.done)
-        self._beat(on_block, self._opened)
-        return {"device": "here"}
-
-    async def close(self) -> None:
-        self._opened = 0
-        await self.tasks.sleep(self.closes_s)
-        self.done.append("closed")
-
     def _beat(self, on_block: Callable[[Block], None], opened: int) -> None:
         if self._opened != opened:
             return
         if self.gone:
             self.on_lost("angle sensor on x: the bus was lost: gone")
             return
+        now_s, block = self.clock.now_s(), self.block(self.per_block)
+
+        def arrive() -> None:
+            block.samples["host_time_s"] = self.clock.now_s()
+            on_block(block)
+
         if not self.silent:
-            on_block(self.block(self.per_block))
-        self.clock.call_at(self.clock.now_s() + self.per_block / ANGLE_HZ, lambda: self._beat(on_block, opened))
+            self.clock.call_at(now_s + self.late_s, arrive) if self.late_s else arrive()
+        self.clock.call_at(now_s + self.per_block / ANGLE_HZ / self.rate, lambda: self._beat(on_block, opened))

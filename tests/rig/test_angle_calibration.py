@@ -23,7 +23,7 @@ from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.messages import AngleCalibration, AnglePlan, Profile, Status
 from stimrig.rig.phase import Phase
 from stimrig.rig.requests import AnglePoseRequest
-from tests.rig.fakes import FakeSensor, OpenedSensor, rest
+from tests.rig.fakes import FakeSensor, rest
 from tests.rig.live import SPEED, LiveRig
 from tests.simulator.virtual_time import VirtualMachine
 
@@ -36,15 +36,15 @@ class Posed:
         self.folder, self.machine, self.degrees = folder, VirtualMachine(), 20.0
         self.moving_deg_s = 0.0
         at = lambda t: math.radians(self.degrees + self.moving_deg_s * (t - 1000.0))  # noqa: E731
-        self.sensor = FakeSensor(self.machine.clock, at)
+        self.sensor = FakeSensor(self.machine, at)
         self.receiver = AngleReceiver(self.sensor, self.machine.tasks)
+        self.receiver.start()
         config: Any = SimpleNamespace(data_dir=folder, angle_sensor=settings, require_calibration=False)
         pair: Any = SimpleNamespace(angle=self.receiver, rescale=self.receiver.rescale)
         self.joint = Joint(config, self.machine, pair, BOUND)
 
     def hold(self, degrees: float, duration_s: float = 1.5) -> None:
         self.degrees = degrees
-        self.sensor.feed(self.receiver, self.machine.clock.now_s() + duration_s)
         self.machine.wait(duration_s)
 
     def pose(self, told_deg: float, first: bool = False) -> bool:
@@ -215,7 +215,7 @@ class AngledRig(LiveRig):
     degrees = 60.0
 
     def devices(self) -> dict[str, Any]:
-        self.sensor = OpenedSensor(self.machine, lambda _: math.radians(self.degrees))
+        self.sensor = FakeSensor(self.machine, lambda _: math.radians(self.degrees))
         return {**super().devices(), "angle_sensor": self.sensor}
 
     def hold(self, degrees: float) -> None:

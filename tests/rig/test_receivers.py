@@ -15,7 +15,7 @@ from stimrig.rig.acquire.angle_receiver import REOPEN_S, AngleReceiver
 from stimrig.rig.acquire.receiver import Receiver
 from stimrig.rig.acquire.stream import LONGEST_READ_S, LOOK_AT, LOOK_S, SILENCE_S, CounterUnwrapper
 from stimrig.rig.signals import SAMPLE, AngleScale, Block
-from tests.rig.fakes import RATE_HZ, FakeCell, FakeStimulator, OpenedSensor, journal_at
+from tests.rig.fakes import RATE_HZ, FakeCell, FakeSensor, FakeStimulator, journal_at
 from tests.simulator.virtual_time import VirtualMachine
 
 
@@ -113,13 +113,14 @@ class HeardAngle:
     def __init__(self) -> None:
         self.machine = VirtualMachine()
         self.clock, self.wait = self.machine.clock, self.machine.wait
-        self.sensor = OpenedSensor(self.machine, swinging)
+        self.sensor = FakeSensor(self.machine, swinging)
         self.sensor.noise_deg, self.sensor.per_block = 0.0, 1
         self.receiver = AngleReceiver(self.sensor, self.machine.tasks)
 
     def feed(self, duration_s: float) -> AngleReceiver:
-        """Samples for so long, of a sensor that nobody opened."""
-        self.sensor.feed(self.receiver, self.clock.now_s() + duration_s)
+        """Samples for so long."""
+        if not self.receiver.living:
+            self.receiver.start()
         self.wait(duration_s)
         return self.receiver
 
