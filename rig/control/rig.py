@@ -38,6 +38,7 @@ from stimrig.rig.messages import (
 )
 from stimrig.rig.phase import Phase
 from stimrig.rig.requests import AnglePoseRequest, PreviewRequest, Request
+from stimrig.rig.tasks import Turn
 
 log = logging.getLogger("rig")
 
@@ -64,7 +65,7 @@ class Rig:
         self._publish, self.speed = publish, machine.tasks.clock.speed
         self.table = config.limits.table()
         """Hard limits, narrowed by the rig file."""
-        self._born_s, self._previews = self._clock.now_s(), 0
+        self._born_s, self._previews, self._preview_turn = self._clock.now_s(), 0, Turn(machine.tasks)
         self.state = State(
             LatchFile(config.data_dir, machine), machine.tasks, machine.new_id()[:8], self._publish_status
         )
@@ -223,7 +224,7 @@ class Rig:
             raise BusyError(f"previews: {self._previews} requests are waiting; try again in a moment")
         self._previews += 1
         try:
-            async with self.state.in_turn():
+            async with self._preview_turn, self.state.in_turn():  # a start waits for one of them, not for all
                 if self.state.phase.state in ("arming", "running", "stopping"):
                     raise BusyError(f"test {self.state.phase.test_id} is in progress; look at the plan afterwards")
                 check_range(request.plan, self.joint.set_at_utc)

@@ -16,8 +16,9 @@ from stimrig.rig.control.calibration import end_of_day_s
 from stimrig.rig.control.replies import refusal
 from stimrig.rig.control.rig import MOST_PREVIEWS
 from stimrig.rig.errors import BusyError, DeviceError, PlanError, RefusedError, RestError, UncertainError
-from stimrig.rig.messages import Profile, SegmentPlan
+from stimrig.rig.messages import Preview, Profile, SegmentPlan
 from stimrig.rig.requests import CalibrateFinishRequest, CalibrateStartRequest, PreviewRequest
+from stimrig.rig.tasks import Task
 from tests.rig.live import SPEED, WORK_S, LiveRig
 
 Make = Callable[..., LiveRig]
@@ -62,14 +63,19 @@ def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
 
 
 def test_no_plan_is_previewed_beside_a_test_and_only_so_many_wait(make: Make):
-    """The next one is built once the one before is; a start waits for neither longer than that."""
+    """The next one is built once the one before is; a start waits for one, and those behind it are refused."""
     live = make()
-    asked = [live.begin(live.rig.preview(PreviewRequest(plan=live.plan("p")))) for _ in range(2 * MOST_PREVIEWS)]
+
+    def previews(count: int) -> list[Task[Preview]]:
+        return [live.begin(live.rig.preview(PreviewRequest(plan=live.plan("p")))) for _ in range(count)]
+
+    asked = previews(2 * MOST_PREVIEWS)
     live.until(lambda: all(task.done.is_set() for task in asked))
     assert [type(task.error) for task in asked] == [NoneType] * MOST_PREVIEWS + [BusyError] * MOST_PREVIEWS
-    waiting = live.begin(live.rig.preview(PreviewRequest(plan=live.plan("p"))))
+    waiting = previews(3)
     live.start(live.plan("one"))
-    assert waiting.result.duration_s == 3.0
+    live.until(lambda: all(task.done.is_set() for task in waiting))
+    assert [type(task.error) for task in waiting] == [NoneType, BusyError, BusyError]
     with pytest.raises(BusyError, match="test one is in progress; look at the plan afterwards"):
         live.preview(live.plan("p"))
     live.wait("ready")
