@@ -97,8 +97,15 @@ class Child:
                 )  # fmt: skip
             finally:
                 signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+        end_s, line, stdout = time.monotonic() + READY_S, b"", self.process.stdout
+        assert stdout is not None
+        while not line.endswith(b"\n") and select.select([stdout], [], [], max(0.0, end_s - time.monotonic()))[0]:
+            piece = os.read(stdout.fileno(), 65536)
+            if not piece:
+                break
+            line += piece
         try:
-            self.ready = json.loads(_first_line(self.process))
+            self.ready = json.loads(line.partition(b"\n")[0])
         except ValueError:
             raise self.failure() from None
         return self.ready
@@ -154,17 +161,6 @@ class Child:
         self.end()
         self.start()
         return f"{self.name} had ended ({words or 'without a message'}) and was started again"
-
-
-def _first_line(process: subprocess.Popen[bytes]) -> str:
-    assert process.stdout is not None
-    end_s, text = time.monotonic() + READY_S, b""
-    while not text.endswith(b"\n") and select.select([process.stdout], [], [], max(0.0, end_s - time.monotonic()))[0]:
-        piece = os.read(process.stdout.fileno(), 65536)
-        if not piece:
-            break
-        text += piece
-    return text.decode(errors="replace").partition("\n")[0]
 
 
 class Services:

@@ -10,6 +10,7 @@ import sqlite3
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import date
+from functools import cache
 from typing import Any, Literal
 
 from stimrig.api.cohort.errors import CohortError
@@ -60,8 +61,6 @@ class Selection:
         if len(self.text) > MAX_CHARACTERS:
             raise CohortError(f"--select: more than {MAX_CHARACTERS} characters. Give a folder of the records instead.")
         self._named = [name for name in FIELDS if re.search(rf"\b{name}\b", self.text)]
-        self._database = sqlite3.connect(":memory:")
-        self._database.set_authorizer(_authorize)
         try:
             self(dict.fromkeys(FIELDS))
         except (sqlite3.Error, UnicodeEncodeError, ValueError) as error:
@@ -75,7 +74,15 @@ class Selection:
         values = {name: fields.get(name) for name in FIELDS}
         values = {name: value.isoformat() if isinstance(value, date) else value for name, value in values.items()}
         statement = f"SELECT ({self.text}) FROM (SELECT {COLUMNS})" if self.text else "SELECT 1"
-        return bool(self._database.execute(statement, values).fetchone()[0])
+        return bool(_database().execute(statement, values).fetchone()[0])
+
+
+@cache
+def _database() -> sqlite3.Connection:
+    """Return the process's connection to an empty database, which evaluates conditions."""
+    database = sqlite3.connect(":memory:", check_same_thread=False)
+    database.set_authorizer(_authorize)
+    return database
 
 
 def _authorize(action: int, _argument: str | None, name: str | None, *_: str | None) -> int:

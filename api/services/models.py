@@ -1,4 +1,4 @@
-"""Predictions of a model for a trial: the torque of given pulse widths, and the widths for a reference torque."""
+"""A model diagnosed; its predictions for a trial: the torque of pulse widths, and the widths for a reference torque."""
 
 from __future__ import annotations
 
@@ -7,9 +7,10 @@ from typing import Annotated, Any
 
 from pydantic import Field, FiniteFloat, StrictBool, model_validator
 
+from stimrig.api.jobs.job import Job
 from stimrig.api.services.context import Context
 from stimrig.api.sessions.requests import Body
-from stimrig.api.store.tables import Participant
+from stimrig.api.store.tables import Model, Participant
 
 RISE = "width_rise_us"
 REST_S = 1.0
@@ -63,6 +64,16 @@ class ReferenceIn(Body):
         if (self.reference_torque_nm is None) == (self.table is None):
             raise ValueError("give reference_torque_nm, or the text of a table")
         return self
+
+
+def begin_diagnosis(context: Context, model: Model) -> Job:
+    """Diagnose as a job that a person looks on at."""
+
+    async def work(job: Job) -> str:
+        await context.analyses.diagnosis(model, job.follow)
+        return f"/v1/models/{model.id}/diagnosis"
+
+    return context.jobs.start("diagnosis", model.id, work)
 
 
 async def predict(context: Context, model_id: str, body: WidthsIn) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from stimrig.api.models import advice, explanation, stored_model, trend
 from stimrig.api.models.registry import POOR, WHAT_TO_WRITE
 from stimrig.api.models.tracking import Limits, limits_words
 from stimrig.api.people.auth import Scope
-from stimrig.api.services import jobs, participants
+from stimrig.api.services import models, participants
 from stimrig.api.sessions import controllers
 from stimrig.api.store.tables import Model
 from stimrig.api.web.dependencies import Context, Ctx, ModelReader, Version
@@ -86,7 +86,7 @@ async def diagnosis_job(context: Context, row: Model, diagnose: int) -> Job | No
         return None
     begun = [job for job in context.jobs.all.values() if (job.kind, job.subject) == ("diagnosis", row.id)]
     if diagnose == 1 or (not begun and diagnose != 0):
-        begun.append(jobs.begin_diagnosis(context, row))
+        begun.append(models.begin_diagnosis(context, row))
         await asyncio.sleep(0.05)
     return begun[-1] if begun else None
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query, Response
 from fastapi.responses import JSONResponse
 
 from stimrig.api.jobs.job import Job
-from stimrig.api.services import jobs
+from stimrig.api.services import models
 from stimrig.api.sessions.requests import EffectsIn
 from stimrig.api.web.dependencies import PROBLEM, Ctx, ModelReader, Tester, Version
 from stimrig.api.web.responses.base import describe_answer, published
@@ -42,7 +43,7 @@ async def diagnosis(context: Ctx, _principal: ModelReader, row: Version, wait: W
     """Rank the missing effects; or report that none is missing, or that the library has none for what is left."""
     if wait or await asyncio.to_thread(context.analyses.known_diagnosis, row) is not None:
         return await context.analyses.diagnosis(row)
-    return later(jobs.begin_diagnosis(context, row))
+    return later(models.begin_diagnosis(context, row))
 
 
 @router.post("/models/{model_id}/effects", status_code=201, response_model=VersionOut, responses=LATER)
@@ -55,9 +56,14 @@ async def add_effects(
     all the same.
     """
     row = await asyncio.to_thread(context.versions.get, model_id)
+    add = partial(context.analyses.add_effects, row, body.effects, principal.name, force=body.force, reason=body.reason)
+
+    async def work(job: Job) -> str:
+        return f"/v1/models/{(await add(on_call=job.follow)).id}"
+
     if not wait:
-        return later(jobs.begin_adding(context, row, body, principal.name))
-    new = await context.analyses.add_effects(row, body.effects, principal.name, force=body.force, reason=body.reason)
+        return later(context.jobs.start("add-effects", row.id, work, (body.model_dump(), principal.name)))
+    new = await add()
     response.headers["Location"] = f"/v1/models/{new.id}"
     return await asyncio.to_thread(context.versions.document, new)
 
@@ -65,8 +71,13 @@ async def add_effects(
 @router.post("/models/{model_id}/improve", status_code=201, response_model=ImprovementOut, responses=LATER)
 async def improve(context: Ctx, principal: Tester, row: Version, response: Response, wait: Wait = True) -> Any:
     """Add effects one by one while the evidence lasts; each step is a version."""
+
+    async def work(job: Job) -> str:
+        _, rows = await context.analyses.improve(row, principal.name, job.follow)
+        return f"/v1/models/{rows[-1].id}"
+
     if not wait:
-        return later(jobs.begin_improving(context, row, principal.name))
+        return later(context.jobs.start("improve", row.id, work))
     job, rows = await context.analyses.improve(row, principal.name)
     response.headers["Location"] = f"/v1/models/{rows[-1].id}"
     versions = await asyncio.to_thread(lambda: [context.versions.document(new) for new in rows])
