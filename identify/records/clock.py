@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from stimrig.identify.errors import BadRecord
 from stimrig.identify.records import bounds
 from stimrig.identify.records.record import Record
 from stimrig.identify.records.table import Table
@@ -101,7 +100,7 @@ def regular(table: Table) -> Table:
         bounds.check_sampling(1 / part.step_s, table.at(edge))
         if abs(part.step_s - step_s) > SAME_RATE * step_s:
             message = f"sampled at {1 / part.step_s:.4g} Hz after a pause, {1 / step_s:.4g} Hz before it"
-            raise BadRecord(message, place=table.at(edge), fix="Resample to one rate.")
+            raise table.bad(message, "Resample to one rate.", edge)
     even = [part.even_s for part in parts if part.even_s is not None]
     if len(even) < len(parts):
         return _resampled(table, step_s)
@@ -126,7 +125,7 @@ def check_rising(table: Table) -> None:
         if gaps[row - 1] == 0:
             verb = "stands still"
             fix += " Where times are rounded, give more digits, or the row's number divided by the sampling rate."
-        raise BadRecord(f"time {verb} at {time_s[row]:g} s", place=table.at(row), fix=fix)
+        raise table.bad(f"time {verb} at {time_s[row]:g} s", fix, row)
 
 
 def _with_finer_times(table: Table) -> Table:
@@ -151,8 +150,7 @@ def _pauses(table: Table) -> list[int]:
     least_s = max(PAUSE_S, 20 * float(np.median(steps)))
     jumps = np.flatnonzero((steps >= least_s) & (width_us[:-1] == 0) & (width_us[1:] == 0)) + 1
     if jumps.size > MOST_PAUSES:
-        fix = "Give a record without holes."
-        raise BadRecord(f"more than {MOST_PAUSES} pauses", place=table.at(int(jumps[MOST_PAUSES])), fix=fix)
+        raise table.bad(f"more than {MOST_PAUSES} pauses", "Give a record without holes.", int(jumps[MOST_PAUSES]))
     return [0, *jumps.tolist(), time_s.size]
 
 
@@ -201,8 +199,8 @@ def _lost_note(table: Table, time_s: np.ndarray, rows: np.ndarray) -> str:
     if not rows.size:
         return ""
     if rows.size > max(MOST_PAUSES, MOST_GAPS * time_s.size):
-        place = table.at(int(rows[MOST_PAUSES]))
-        raise BadRecord(f"{rows.size} gaps in {time_s.size} samples", place=place, fix="Give a record without holes.")
+        message = f"{rows.size} gaps in {time_s.size} samples"
+        raise table.bad(message, "Give a record without holes.", int(rows[MOST_PAUSES]))
     longest_s = float(np.max(time_s[rows] - time_s[rows - 1]))
     number = "1 place" if rows.size == 1 else f"{rows.size} places"
     first = table.cell(int(rows[0]), "time_s")

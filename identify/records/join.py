@@ -83,7 +83,7 @@ def record_of_parts(table: Table) -> Record:
     parts, sources = [], []
     for number, (row, end) in enumerate(zip(firsts, [*firsts[1:], time_s.size], strict=True)):
         if end - row < 2:
-            raise BadRecord("a part of one sample", place=table.at(row), fix=FIX)
+            raise table.bad("a part of one sample", FIX, row)
         bounds.check_sampling(1 / float(np.median(np.diff(time_s[row:end]))), table.at(row))
         part, source = _part(table, number, row, table.part_cells[row])
         parts.append(part)
@@ -100,23 +100,22 @@ def _part(table: Table, number: int, row: int, cells: Mapping[str, str]) -> tupl
         text = cells.get(column, "")
         value = float(text) if is_number(text) else np.nan
         if not lowest <= value <= highest:
-            message = f"{text[:40]!r} is not {lowest:g} to {highest:g}"
-            raise BadRecord(message, place=table.at(row, column), fix=FIX)
+            raise table.bad(f"{text[:40]!r} is not {lowest:g} to {highest:g}", FIX, row, column)
         return value
 
     def text(column: str) -> str:
         cell = cells.get(column, "")
         if len(cell) > LONGEST_TEXT or not cell.isprintable():
-            raise BadRecord("a name that cannot be", place=table.at(row, column), fix=FIX)
+            raise table.bad("a name that cannot be", FIX, row, column)
         return cell
 
     time_s, part = table.columns["time_s"], table.columns["part"]
     if part[row] != number:
-        raise BadRecord(f"{part[row]:g} where part {number} begins", place=table.at(row, "part"), fix=FIX)
+        raise table.bad(f"{part[row]:g} where part {number} begins", FIX, row, "part")
     pause_s = figure("pause_s", 0.0, bounds.LONGEST_S)
     folded_s, latest_s = figure("folded_s", 0.0, pause_s), bounds.LARGEST["time_s"]
     if folded_s > (time_s[row] - time_s[row - 1] if number else 0.0) + 1e-6:
-        raise BadRecord("longer than the jump of the time", place=table.at(row, "folded_s"), fix=FIX)
+        raise table.bad("longer than the jump of the time", FIX, row, "folded_s")
     begun_s = figure("begun_s", 0.0, bounds.LARGEST_CALENDAR_S) if cells.get("begun_s") else None
     source = Source(text("name"), text("recording_id"), text("sha256"))
     return Part(row, figure("own_s", -latest_s, latest_s), begun_s, pause_s, folded_s), source

@@ -155,14 +155,11 @@ class Record(Summarised):
         size = time_s.size
         code, known, note = _coded(size, segment, segment_names)
         source = source or Source()
-        columns = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": code, "angle_rad": angle_rad}
-        columns |= {"velocity_rad_s": velocity_rad_s, "late_s": late_s, "doubted": doubted}
-        optional: dict[str, np.ndarray] = {}
-        for label, column in columns.items():
+        optional = dict(zip(OPTIONAL, (angle_rad, velocity_rad_s, late_s, doubted), strict=True))
+        given = {"pulse_width_us": pulse_width_us, "torque_nm": torque_nm, "segment": code, **optional}
+        for label, column in given.items():
             if column is not None and np.shape(column) != (size,):
                 raise BadRecord(f"{label} has shape {np.shape(column)}, time_s has ({size},)", place=label)
-            if column is not None and label in OPTIONAL:
-                optional[label] = _checked(label, column)
         if size == 0:
             raise BadRecord("the record holds no sample", fix="Give at least a few seconds of data.")
         changed = np.r_[True, code[1:] != code[:-1]]
@@ -177,7 +174,7 @@ class Record(Summarised):
             pulse_rate_hz=pulse_rate_hz,
             source=replace(source, notes=(*source.notes, note)) if note else source,
             parts=tuple(parts),
-            **optional,
+            **{label: _checked(label, column) for label, column in optional.items() if column is not None},
         )
 
     def _sheet(self) -> Sheet:
@@ -200,8 +197,7 @@ class Record(Summarised):
 
     def columns(self) -> dict[str, np.ndarray]:
         """The optional columns that this record has, by name."""
-        optional = {name: getattr(self, name) for name in OPTIONAL}
-        return {name: column for name, column in optional.items() if column is not None}
+        return {name: column for name in OPTIONAL if (column := getattr(self, name)) is not None}
 
     def samples(self) -> dict[str, np.ndarray]:
         """Times, pulse widths, torques and the optional columns, by name."""
@@ -287,15 +283,13 @@ class Record(Summarised):
 def _checked(label: str, column: np.ndarray) -> np.ndarray:
     """An optional column, finite; `doubted` as bool."""
     values = np.ascontiguousarray(column, float)
-    finite = np.isfinite(values)
-    if not finite.all():
-        raise BadRecord("not finite", place=f"{label}, sample {int(np.argmin(finite))}", fix="Leave the column out.")
-    if label != "doubted":
-        return values
-    if (bad := np.flatnonzero((values != 0) & (values != 1))).size:
-        place = f"{label}, sample {int(bad[0])}"
-        raise BadRecord(f"{values[bad[0]]:g} is neither 0 nor 1", place=place, fix="1 is doubted, 0 is not.")
-    return values > 0
+    is_flag = label == "doubted"
+    if (bad := np.flatnonzero((values != 0) & (values != 1) if is_flag else ~np.isfinite(values))).size:
+        message, fix = "not finite", "Leave the column out."
+        if is_flag:
+            message, fix = f"{values[bad[0]]:g} is neither 0 nor 1", "1 is doubted, 0 is not."
+        raise BadRecord(message, place=f"{label}, sample {int(bad[0])}", fix=fix)
+    return values > 0 if is_flag else values
 
 
 def _coded(

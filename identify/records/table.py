@@ -72,12 +72,16 @@ class Table:
             if row := _first_thousand(numbers[name]):
                 message = f"{numbers[name][row]:g} among whole numbers of some hundreds"
                 fix = "If points separate thousands, write numbers without signs between thousands."
-                raise BadRecord(message, place=table.at(row, name), fix=fix)
+                raise table.bad(message, fix, row, name)
         return table
 
     def at(self, row: int, column: str = "time_s") -> str:
         """Name a cell, with the file, in messages."""
         return f"{self.name}, {self.cell(row, column)}"
+
+    def bad(self, message: str, fix: str, row: int, column: str = "time_s") -> BadRecord:
+        """The error at a cell."""
+        return BadRecord(message, place=self.at(row, column), fix=fix)
 
     def noting(self, *notes: str, columns: dict[str, np.ndarray] | None = None) -> Table:
         """The same with other columns, and with more to say."""
@@ -104,12 +108,14 @@ def checked(table: Table) -> Table:
     for name, values in table.columns.items():
         largest = bounds.LARGEST | {"time_s": bounds.LARGEST_CALENDAR_S, "segment": np.inf}
         wrong = ~(np.abs(values) <= largest[name]) & ~(np.isnan(values) & (name in bounds.MAY_LACK))
+        wrong |= (name == "doubted") & (values != 0) & (values != 1)
         if wrong.any():
             row = int(np.argmax(wrong))
             message = "no number" if np.isnan(values[row]) else f"{values[row]:g} is no measurement"
             fix = "Remove the row's cause, or cut the record before it; values must be finite."
             fix = DEGREES if name == "angle_rad" and np.isfinite(values[wrong]).all() else fix
-            raise BadRecord(message, place=table.at(row, name), fix=fix)
+            fix = "1 is a row in which it is not known what was felt, 0 any other." if name == "doubted" else fix
+            raise table.bad(message, fix, row, name)
     table = _without_holes(table)
     _check_widths(table)
     time_s = table.columns["time_s"]
@@ -148,7 +154,7 @@ def _without_holes(table: Table) -> Table:
         fix = f"At most {100 * share:.0f} % of the rows may lack one."
         if column == "pulse_width_us":
             fix += " Fill the width down: each row needs the width in force."
-        raise BadRecord(message, place=table.at(first, column), fix=fix)
+        raise table.bad(message, fix, first, column)
     rows = np.flatnonzero(~is_hole)
     times = "1 row is" if count == 1 else f"{count} rows are"
     note = f"{times} left out for want of a number (first at {table.cell(first, column)})"
@@ -157,28 +163,18 @@ def _without_holes(table: Table) -> Table:
 
 
 def _check_widths(table: Table) -> None:
-    """Refuse negative widths, widths in another unit or in the samples of pulses only, and flags that are none."""
+    """Refuse negative widths, and widths in another unit or in the samples of pulses only."""
     width_us = table.columns["pulse_width_us"]
     largest_us = float(np.max(width_us, initial=0.0))
     if (negative := np.flatnonzero(width_us < 0)).size:
-        fix = "A pulse width is 0 (no pulse) or positive."
-        place = table.at(int(negative[0]), "pulse_width_us")
-        raise BadRecord(f"{width_us[negative[0]]:g} µs is negative", place=place, fix=fix)
+        fix, row = "A pulse width is 0 (no pulse) or positive.", int(negative[0])
+        raise table.bad(f"{width_us[row]:g} µs is negative", fix, row, "pulse_width_us")
     if 0.0 < largest_us < LEAST_LARGEST_US:
-        raise BadRecord(
-            f"the largest is {largest_us:g} µs, and no stimulator gives so little",
-            place=table.at(int(width_us.argmax()), "pulse_width_us"),
-            fix="Give µs: multiply seconds by 1000000, milliseconds by 1000; or say the unit, "
-            "for instance --map pulse_width_us=pulse_width_us:s.",
-        )
+        message = f"the largest is {largest_us:g} µs, and no stimulator gives so little"
+        fix = "Give µs: multiply seconds by 1000000, milliseconds by 1000; or say the unit, for instance --map "
+        raise table.bad(message, f"{fix}pulse_width_us=pulse_width_us:s.", int(width_us.argmax()), "pulse_width_us")
     pulses = np.flatnonzero(width_us)
     step_s = float(np.median(np.diff(table.columns["time_s"]))) if pulses.size > LEAST_ALONE else np.inf
     if step_s * table.pulse_rate_hz < 0.5 and np.all(np.diff(pulses) > 1):
-        fix = "Hold each width until the next pulse."
-        place = table.at(int(pulses[0]), "pulse_width_us")
-        raise BadRecord("widths stand only in the samples of the pulses", place=place, fix=fix)
-    doubted = table.columns.get("doubted", np.zeros(0))
-    if (bad := np.flatnonzero((doubted != 0) & (doubted != 1))).size:
-        fix = "1 is a row in which it is not known what was felt, 0 any other."
-        place = table.at(int(bad[0]), "doubted")
-        raise BadRecord(f"{doubted[bad[0]]:g} is neither 0 nor 1", place=place, fix=fix)
+        message = "widths stand only in the samples of the pulses"
+        raise table.bad(message, "Hold each width until the next pulse.", int(pulses[0]), "pulse_width_us")

@@ -274,7 +274,7 @@ def csv_of(path: Path, changes: dict[int, tuple[str, str]] | None = None) -> Pat
         (("soon", "0"), r"line 7, column late_s: 'soon' is no number\. Write"),
         (("12", "0"), r"line 7, column late_s: 12 is no measurement"),
         (("nan", "0"), r"line 7, column late_s: no number"),
-        (("0", "0.5"), r"line 7, column doubted: 0\.5 is neither 0 nor 1\. 1 is"),
+        (("0", "0.5"), r"line 7, column doubted: 0\.5 is no measurement\. 1 is"),
         (("0", ""), r"line 7, column doubted: no number"),
     ],
 )

@@ -29,16 +29,6 @@ def changed(line: int, column: int, value: str) -> list[str]:
     return [",".join(row) for row in rows]
 
 
-def test_reads_csv(tmp_path):
-    record = read(write(tmp_path, *ROWS))
-    assert record.time_s.size == 20
-    assert record.sample_rate_hz == pytest.approx(40)
-    assert record.segment_names == ("prbs",)
-    assert record.torque_nm[3] == 0.3
-    assert record.source.name == "data.csv"
-    assert len(record.source.sha256) == 64
-
-
 def test_rounded_times_become_even(tmp_path):
     rows = [f"{i / 1600:.4f},{100 * (i // 40 % 2)},0.5,prbs" for i in range(4000)]
     record = read(write(tmp_path, *rows))
@@ -57,6 +47,7 @@ def test_rounded_times_become_even(tmp_path):
         (changed(9, 0, "inf"), HEADER, r"line 9, column time_s: inf is no measurement"),
         (changed(5, 1, "-3"), HEADER, r"line 5, column pulse_width_us: -3 µs is negative"),
         (changed(12, 0, "0.1"), HEADER, r"line 12, column time_s: time runs backwards"),
+        ([*ROWS[:9], *ROWS[8:]], HEADER, r"line 11, column time_s: time stands still .* once each"),
         (changed(4, 3, " "), HEADER, r"line 4, column segment: empty"),
         (changed(5, 2, "1,5"), HEADER, r"line 5: 5 cells under a header of 4.*decimal commas"),
         ([*ROWS[:10], "0.25,1,2"], HEADER, r"line 12, column segment: only 3 cells"),

@@ -75,7 +75,8 @@ def ways(record: Record) -> dict[str, tuple[dict[str, Any], dict[str, str] | Non
 @pytest.mark.parametrize("way", range(6))
 def test_the_same_data_give_the_same_record(tmp_path: Path, record: Record, way: int) -> None:
     content, given, how = list(ways(record).values())[way]
-    found = identify.read(saved(tmp_path / "data.mat", content, **how), map=given)
+    found = identify.read(saved(tmp_path / "data.mat", content | {"pulse_rate_hz": 50.0}, **how), map=given)
+    assert found.pulse_rate_hz == (40.0 if "a struct" in list(ways(record))[way] else 50.0)
     assert found.segment_names == record.segment_names and np.array_equal(found.segment, record.segment)
     for name in ("time_s", "pulse_width_us", "torque_nm"):
         assert getattr(found, name) == pytest.approx(getattr(record, name), rel=1e-12, abs=1e-9), name
@@ -93,18 +94,6 @@ def test_numbers_of_every_kind_are_read_as_scipy_reads_them(tmp_path: Path) -> N
         found, theirs = variables(path.read_bytes(), "f"), loadmat(path)
         for name in content:
             assert np.array_equal(found[name].numbers(), np.ravel(theirs[name]).astype(float)), name
-
-
-def test_no_segments_a_pulse_rate_and_holes(tmp_path: Path, record: Record) -> None:
-    content = columns(record) | {"pulse_rate_hz": 40.0}
-    del content["segment"]
-    content["torque_nm"] = content["torque_nm"].copy()
-    content["torque_nm"][10] = np.nan
-    path = saved(tmp_path / "data.mat", content)
-    found = identify.read(path)
-    assert found.time_s.size == record.time_s.size - 1
-    assert "(first at torque_nm(11))" in found.notes[0]
-    assert "no segment column: found from the pulse widths" in found.notes[-1]
 
 
 # ---- what cannot be taken ------------------------------------------------------------------------------------
