@@ -147,7 +147,7 @@ class Running:
         self.decision = decision if decision.short is not None else self.decision
         document = decision.to_dict()
         for number, segment in enumerate(document["segments"], start=len(segments) + 1):  # not all laid are measured
-            segment["name"] = f"{segment['name'].rpartition(' ')[0]} {number}"
+            segment["name"] = f"{segment['name']} {number}"
         if (knowledge := decision.knowledge) is not None:
             curve, step = knowledge.curve, knowledge.step
             document["knowledge"] = rounded(document["knowledge"])

@@ -28,7 +28,7 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.estimation.short_record import Short, fit_short
-from stimrig.identify.experiments.designs import Piece, Segment, pieces
+from stimrig.identify.experiments.designs import Segment, pieces, played_widths
 from stimrig.identify.experiments.knowledge import Knowledge, Target, foresee, knowledge, require_number
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.near_shape import KNOTS
@@ -146,7 +146,7 @@ def _opening(goal: AdaptiveGoal) -> Decision:
     dose = 0.0 if earlier is None else float(np.sum(np.abs(earlier.model.recruitment(widths))) / rate)
     if widths.size / rate > goal.left_s or dose > goal.left_nm_s:
         return Decision("spent", words="The torque-time or the time that is left does not allow a first piece.")
-    return Decision("next", (Piece("opening", widths).segment(1),), "A first look at the whole range.", None, dose)
+    return Decision("next", (played_widths("opening", widths),), "A first look at the whole range.", None, dose)
 
 
 def _fitted(grid: Grid, raw: Raw, last: Earlier | None, before: Short | None) -> tuple[Short, str | None]:
@@ -198,7 +198,7 @@ def _settled(short: Short) -> bool:
 def _next(short: Short, known: Knowledge, played: np.ndarray, goal: AdaptiveGoal) -> Decision:
     candidates = pieces(_levels(short, known, goal.largest_us), 1.0 / short.grid.step_s)
     now, after, dose = foresee(short, played, goal.target, candidates)
-    seconds = np.array([piece.pulse_width_us.size for piece in candidates]) * short.grid.step_s
+    seconds = np.array([len(piece.settings["pulse_width_us"]) for piece in candidates]) * short.grid.step_s
     allowed = (dose <= goal.left_nm_s) & (seconds <= goal.left_s + 1e-9)
     if not allowed.any():
         words = f"The torque-time or the time is used up. {_state(known)}"
@@ -206,8 +206,7 @@ def _next(short: Short, known: Knowledge, played: np.ndarray, goal: AdaptiveGoal
     cost = dose / max(known.plateau_nm, 1e-9) + SECOND_COST * seconds
     score = np.where(allowed, np.log(np.maximum(now / after, 1.0)) / cost, -1.0)
     best = int(np.argmax(score))
-    segment = candidates[best].segment(len(short.grid.record.segment_names) + 1)
-    return Decision("next", (segment,), _state(known), known, float(max(dose[best], 0.0)), short)
+    return Decision("next", (candidates[best],), _state(known), known, float(max(dose[best], 0.0)), short)
 
 
 def _levels(short: Short, known: Knowledge, largest_us: float) -> np.ndarray:

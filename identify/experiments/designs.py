@@ -164,28 +164,16 @@ CHIPS = (1, 0, 0, 1, 1, 0, 1, 0, 1, 1)
 """Signs of a random piece: runs of different lengths, as often high as low or nearly so."""
 
 
-@dataclass(frozen=True)
-class Piece:
-    """A candidate for the next segment."""
-
-    kind: str  # hold, step, ramp or prbs
-    pulse_width_us: np.ndarray  # one for each pulse, shape (P,)
-
-    def segment(self, number: int) -> Segment:
-        """As the rig plays it."""
-        return played_widths(f"{self.kind} {number}", self.pulse_width_us)
-
-
-def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Piece]:
-    """All pieces between some levels, 0 among them."""
+def pieces(levels_us: np.ndarray, pulse_rate_hz: float) -> list[Segment]:
+    """All pieces of an adaptive test between some levels, 0 among them; named hold, step, ramp or prbs."""
     levels = np.unique(np.round(np.floor(10.0 * levels_us) / 10.0, 1))
     full, half, long = (max(round(s * pulse_rate_hz), 2) for s in (PIECE_S, HALF_S, LONG_S))
     chip = max(round(CHIP_S * pulse_rate_hz), 1)
-    candidates = [Piece("hold", np.full(full, level)) for level in levels]
+    candidates = [played_widths("hold", np.full(full, level)) for level in levels]
     for first, second in permutations(levels, 2):
-        candidates.append(Piece("step", np.repeat([first, second], half)))
-        ramps = [first + (second - first) * np.arange(1, size + 1) / size for size in (full, long)]
-        candidates += [Piece("ramp", ramp) for ramp in ramps]
+        candidates.append(played_widths("step", np.repeat([first, second], half)))
+        ramps = (first + (second - first) * np.arange(1, size + 1) / size for size in (full, long))
+        candidates += [played_widths("ramp", ramp) for ramp in ramps]
         if first > second:
-            candidates.append(Piece("prbs", np.repeat(np.where(CHIPS, first, second), chip)))
+            candidates.append(played_widths("prbs", np.repeat(np.where(CHIPS, first, second), chip)))
     return candidates

@@ -16,7 +16,7 @@ from stimrig.identify.dynamics.linear import step_responses
 from stimrig.identify.dynamics.second_order import FROM_START, held_states, step_matrix
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.short_record import Short
-from stimrig.identify.experiments.designs import Piece
+from stimrig.identify.experiments.designs import Segment
 
 POINTS = 61
 LONGEST_S = 12.0
@@ -134,7 +134,7 @@ def whole_band(at: np.ndarray, draws: np.ndarray, factor: float = 1.0) -> Band:
 
 
 def foresee(
-    short: Short, played_us: np.ndarray, target: Target, candidates: list[Piece]
+    short: Short, played_us: np.ndarray, target: Target, candidates: list[Segment]
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Width of the bands now and after each candidate, in the norm of this module; and the candidate's dose, N·m·s.
 
@@ -168,7 +168,7 @@ def foresee(
     drive = np.ascontiguousarray(curves @ short.basis.design(played_us).T)
     torque, rate = held_states(drive, even, FROM_START, np.zeros((len(cores), 1, 2)))
     states = np.c_[torque[:, -1], rate[:, -1]]
-    widths = [piece.pulse_width_us for piece in candidates]
+    widths = [np.array(piece.settings["pulse_width_us"]) for piece in candidates]
     places = np.cumsum([0, *(w.size for w in widths)]).astype(np.int64)
     levels, index = np.unique(np.concatenate(widths), return_inverse=True)
     level_nm = np.ascontiguousarray(curves @ short.basis.design(levels).T)

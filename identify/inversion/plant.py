@@ -13,7 +13,6 @@ from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.model import Model
 from stimrig.identify.simulation.joint_surface import Surfaces
-from stimrig.identify.simulation.predict import LARGEST_RATE_CHANGE
 from stimrig.identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest
 
 OWED = 0.05
@@ -51,10 +50,6 @@ class Plant:
         if not isinstance(model.linear, SecondOrder):
             fix = "Fit with maximum-likelihood."
             raise BadModel(f"{model.method} has no second-order dynamics", place="linear", fix=fix)
-        if not abs(rate_hz / model.pulse_rate_hz - 1.0) <= LARGEST_RATE_CHANGE:
-            message = f"the model holds for {model.pulse_rate_hz:g} pulses a second, the reference has {rate_hz:g}"
-            fix = f"Give it at {model.pulse_rate_hz:g} pulses a second, or fit a model at that rate."
-            raise BadModel(message, place="pulse_rate_hz", fix=fix)
         for name, limit in (("largest_us", largest_us), ("rise_us", rise_us)):
             if limit is not None and not 0.0 < limit < np.inf:
                 raise BadRequest(f"{limit:g} µs", place=name, fix="Give a positive number, or leave it out.")

@@ -172,30 +172,6 @@ def test_a_muscle_that_tires_is_followed() -> None:
     assert last["untracked"] > 2 * last["tracked"], last
 
 
-def test_what_a_muscle_did_of_its_own_is_not_learnt() -> None:
-    """A spasm in the third trial: told of it, the controller plays the fourth as if it had not been."""
-    reference, after = ilc.Reference.reach(3.0), []
-    for told in (True, False):
-        muscle = Tiring(0.0, 0.0, 0.0)
-        play, followed = muscle.play, muscle.fetch_followed
-
-        def with_spasm(widths_us: np.ndarray, muscle: Any = muscle, play: Any = play) -> tuple[np.ndarray, np.ndarray]:
-            torque_nm, sent_us = play(widths_us)
-            torque_nm[200:220] += 2.0 * (muscle.trials == 3)
-            return torque_nm, sent_us
-
-        def with_stretch(muscle: Any = muscle, followed: Any = followed, told: bool = told) -> dict[str, Any]:
-            document = followed()
-            if told and muscle.trials == 3:
-                document["tracking"]["disturbed_s"] = [[6.0, 6.5]]
-            return document
-
-        muscle.play, muscle.fetch_followed = with_spasm, with_stretch
-        trials = ilc.learn(muscle, model_of(*MODEL), reference, "norm-optimal", 4, tracked=True)
-        after.append(trials[3].error_percent / trials[1].error_percent)
-    assert after[0] < 1.3 and after[1] > 5, after
-
-
 def test_a_followed_model_is_waited_for() -> None:
     class Slow:
         asked = 0

@@ -17,6 +17,7 @@ import h5py
 import numpy as np
 import pytest
 
+from stimrig import Client
 from tests.examples.test_ilc_controller import MODEL, UNLIKE_THE_MODEL, felt, model_of, patient_of
 
 pytestmark = pytest.mark.slow
@@ -135,6 +136,11 @@ def service(ilc: ModuleType, client: Answers, begun: Callable[[], None] = lambda
     return ilc.MovingService(client, "P", begun)
 
 
+def test_the_client_that_is_made_up_has_no_method_that_the_real_one_lacks() -> None:
+    made_up = {name for name in vars(Answers) if not name.startswith("_")}
+    assert [name for name in made_up if not hasattr(Client, name)] == []
+
+
 def test_the_movement_is_started_once_when_the_first_pulse_is_due(ilc: ModuleType) -> None:
     client, begun = Answers(recording()), []
     torque_nm, sent_us, angle_rad = service(ilc, client, lambda: begun.append(list(client.asked))).play_moving(
@@ -143,22 +149,6 @@ def test_the_movement_is_started_once_when_the_first_pulse_is_due(ilc: ModuleTyp
     assert begun == [[None, 0.6]], "not in the rest before it, and not again"
     assert sent_us.tolist() == [90.0] * SIZE and np.abs(torque_nm).max() < 1e-9
     np.testing.assert_allclose(angle_rad, 1.1 + 0.1 * (np.arange(SIZE) + 0.5) / RATE_HZ, atol=1e-6)
-
-
-def test_another_version_is_asked_for_by_its_id(
-    ilc: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    client = Answers(recording())
-    movement = tmp_path / "angles.csv"
-    np.savetxt(movement, np.full(SIZE, 1.0))
-    assert ilc.movement_of(str(movement)).tolist() == [1.0] * SIZE
-    monkeypatch.setattr(ilc, "Client", lambda *_: client)
-    monkeypatch.setenv("STIMRIG_TOKEN", "a token")
-    given = ["ilc", "--participant", "P", "--movement", str(movement), "--trials", "1"]
-    for more, says in (([], "model M of a joint at rest"), (["--model", "other"], "model other with g and h")):
-        monkeypatch.setattr("sys.argv", [*given, *more])
-        ilc.main()
-        assert capsys.readouterr().out.startswith(says)
 
 
 @pytest.mark.parametrize(

@@ -277,6 +277,7 @@ def test_a_curve_that_is_no_smoothed_spline_stays_of_its_kind():
     assert renewed_curve(base) is base
 
 
+@pytest.mark.campaign
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():
     with few_effects.only("passive_torque"):
         grid, raw = prepare(whole())
