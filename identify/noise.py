@@ -183,11 +183,15 @@ def _gains(length, ar1, slow, turn, decay, band):  # pragma: no cover
             gains[k, 0], variances[k], last = ar1 * p / s, s, p
             p = ar1 * ar1 * (p - p * p / s) + fresh
             k += 1
-    gains[k:], variances[k:] = gains[k - 1], variances[k - 1]
-    half = np.empty(length)
-    for i in range(length):
-        half[i] = 0.5 * np.log(variances[i]) if i < k else half[k - 1]
-    return gains, 1.0 / np.sqrt(variances), half
+    scale, half = np.empty(length), np.empty(length)
+    for i in range(length):  # single values: numba compiles a row that is written to a slice for seconds
+        if i < k:
+            scale[i], half[i] = 1.0 / np.sqrt(variances[i]), 0.5 * np.log(variances[i])
+        else:
+            scale[i], half[i] = scale[k - 1], half[k - 1]
+            for j in range(3):
+                gains[i, j] = gains[k - 1, j]
+    return gains, scale, half
 
 
 @njit(cache=True, nogil=True)
@@ -195,7 +199,7 @@ def _band_gains(gains, variances, ar1, slow, turn, decay, band):  # pragma: no c
     """Gains and variances as in `_gains`, with an oscillator; the number of steps until they settle."""
     c, s = decay * np.cos(turn), decay * np.sin(turn)
     f = np.array(((ar1, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
-    p = np.diag(np.array((slow, band, band)))
+    p = np.array(((slow, 0.0, 0.0), (0.0, band, 0.0), (0.0, 0.0, band)))
     q = np.array((slow * (1 - ar1 * ar1), band * (1 - decay * decay), band * (1 - decay * decay)))
     h, after = np.empty(3), np.empty((3, 3))
     for k in range(variances.size):
@@ -212,7 +216,7 @@ def _band_gains(gains, variances, ar1, slow, turn, decay, band):  # pragma: no c
                 for a in range(3):
                     for b in range(3):
                         after[i, j] += f[i, a] * p[a, b] * f[j, b]
-        p[:] = after
+        p, after = after, p
         if k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11:
             return k + 1
     return variances.size
@@ -221,9 +225,12 @@ def _band_gains(gains, variances, ar1, slow, turn, decay, band):  # pragma: no c
 @njit(cache=True, nogil=True)
 def _whiten(rows, start, stop, ar1, slow, turn, decay, band):  # pragma: no cover
     """Innovations of rows, (M, K), scaled to equal variance, (M, F), and half the log determinant of a row."""
-    gains, scale, half = _gains(np.max(stop - start), ar1, slow, turn, decay, band)
+    longest, total = 0, 0
+    for i in range(start.size):
+        longest, total = max(longest, stop[i] - start[i]), total + stop[i] - start[i]
+    gains, scale, half = _gains(longest, ar1, slow, turn, decay, band)
     c, s = decay * np.cos(turn), decay * np.sin(turn)
-    white, log_det = np.empty((rows.shape[0], np.sum(stop - start))), 0.0
+    white, log_det = np.empty((rows.shape[0], total)), 0.0
     for m in range(rows.shape[0]):
         f = 0
         for i in range(start.size):
@@ -236,7 +243,8 @@ def _whiten(rows, start, stop, ar1, slow, turn, decay, band):  # pragma: no cove
                     u, v = c * u - s * v + gains[k, 1] * e, s * u + c * v + gains[k, 2] * e
                 f += 1
     for i in range(start.size):
-        log_det += np.sum(half[: stop[i] - start[i]])
+        for k in range(stop[i] - start[i]):
+            log_det += half[k]
     return white, log_det
 
 
@@ -280,8 +288,8 @@ def _search(row, start, stop, starts, bounds, step, directions, smallest_step, s
 @njit(cache=True, nogil=True)
 def _smooth_band(row, start, stop, ar1, slow, turn, decay, band):  # pragma: no cover
     """The oscillator's part of a residual y, given all of it: its covariance times the inverse one of y times y."""
-    gains, scale, _ = _gains(np.max(stop - start), ar1, slow, turn, decay, band)
     white, _ = _whiten(row.reshape(1, row.size), start, stop, ar1, slow, turn, decay, band)
+    gains, scale, _ = _gains(white.shape[1], ar1, slow, turn, decay, band)
     c, s, last = decay * np.cos(turn), decay * np.sin(turn), white.shape[1]
     out = np.zeros(row.size)
     for i in range(start.size - 1, -1, -1):

@@ -181,7 +181,12 @@ def run_core(drive, time_constant_s, damping, law, begins, initial, scale_nm, st
             torque[m, k + 1] = y
             rate[m, k + 1] = v
     for kind in range(2):
-        through(drive, torque, rate, np.flatnonzero(kinds == kind), even, first if kind else none, begins, initial)
+        alike, count = np.empty(rows, np.int64), 0
+        for m in range(rows):
+            if kinds[m] == kind:
+                alike[count] = m
+                count += 1
+        through(drive, torque, rate, alike[:count], even, first if kind else none, begins, initial)
     return torque, rate
 
 
