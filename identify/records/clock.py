@@ -72,7 +72,7 @@ def _likeliest_phase(latest_s: np.ndarray, often: np.ndarray, before_s: np.ndarr
     # From the anchor the earliest 'latest' time is the bound; take it exactly, free of the trial's spacing.
     offset_s = np.mod(latest_s - anchor + hair, step_s)
     inside = offset_s < 1.002 * before_s
-    phase = float(np.mod(anchor + np.min((offset_s - hair)[inside]), step_s))
+    phase = float(np.mod(np.min((anchor + offset_s - hair)[inside]), step_s))
     return 0.0 if step_s - phase < 1e-9 else phase, int(explained.max())
 
 
