@@ -53,8 +53,8 @@ class NoiseLevel:
 
 WHITE = NoiseLevel(0.0, 0.0, 1.0, white_only=True)
 """White noise of any size."""
-UNKNOWN = NoiseLevel(0.5, 0.5, 1.0)
-"""Where a wide search begins."""
+WHITE_AND_SLOW = NoiseLevel(0.5, 0.5, 1.0)
+"""White and slow noise of any size."""
 SLOW_STEPS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [1, 1], [1, -1], [-1, 1], [-1, -1]]) @ np.eye(2, 5)
 SLOW_GUESSES = np.array([[0.3, 0.9], [0.03, 0.3], [0.03, 1.0], [0.5, 0.02], [0.3, 1.7]]) @ np.eye(2, 5)
 """Share that is forgotten in a step, and share of the slow part."""
@@ -88,7 +88,7 @@ def profile(
 
 def correlation(residual: np.ndarray, stretches: Stretches) -> float:
     """Correlation of neighbours of the slow part of a residual, N·m, shape (K,); 0 where it is white."""
-    return profile(residual, stretches, NoiseLevel(0.0, 0.5, 1.0))[0].correlation
+    return profile(residual, stretches, WHITE_AND_SLOW)[0].correlation
 
 
 def _profile_band(
@@ -160,10 +160,10 @@ def _parts(noise: NoiseLevel) -> tuple[float, float, float, float, float]:
 
 @njit(cache=True, nogil=True)
 def _gains(length, ar1, slow, turn, decay, band):  # pragma: no cover
-    """What an innovation adds to the next state (slow, cos, sin), (length, 3), its scale, and half its log variance.
+    """What an innovation adds to the next state (slow, cos, sin), (S, 3), its scale, and half its log variance.
 
     Of an exact Kalman filter of `length` steps from the stationary state, total variance 1; of means of slow noise
-    (`slow` above 1) by the innovations algorithm. The last values hold once the filter has settled.
+    (`slow` above 1) by the innovations algorithm. The last values hold on: the filter has settled after S steps.
     """
     gains, variances, k = np.zeros((length, 3)), np.empty(length), 0
     if band > 0.0:
@@ -183,14 +183,9 @@ def _gains(length, ar1, slow, turn, decay, band):  # pragma: no cover
             gains[k, 0], variances[k], last = ar1 * p / s, s, p
             p = ar1 * ar1 * (p - p * p / s) + fresh
             k += 1
-    scale, half = np.empty(length), np.empty(length)
-    for i in range(length):  # single values: numba compiles a row that is written to a slice for seconds
-        if i < k:
-            scale[i], half[i] = 1.0 / np.sqrt(variances[i]), 0.5 * np.log(variances[i])
-        else:
-            scale[i], half[i] = scale[k - 1], half[k - 1]
-            for j in range(3):
-                gains[i, j] = gains[k - 1, j]
+    scale, half = np.empty(k), np.empty(k)
+    for i in range(k):  # single values: numba compiles a row that is written to a slice for seconds
+        scale[i], half[i] = 1.0 / np.sqrt(variances[i]), 0.5 * np.log(variances[i])
     return gains, scale, half
 
 
@@ -230,21 +225,24 @@ def _whiten(rows, start, stop, ar1, slow, turn, decay, band):  # pragma: no cove
         longest, total = max(longest, stop[i] - start[i]), total + stop[i] - start[i]
     gains, scale, half = _gains(longest, ar1, slow, turn, decay, band)
     c, s = decay * np.cos(turn), decay * np.sin(turn)
-    white, log_det = np.empty((rows.shape[0], total)), 0.0
+    white, log_det, settled = np.empty((rows.shape[0], total)), 0.0, scale.size
     for m in range(rows.shape[0]):
         f = 0
         for i in range(start.size):
             x, u, v = 0.0, 0.0, 0.0
+            g, by_cos, by_sin, size = gains[0, 0], gains[0, 1], gains[0, 2], scale[0]
             for k in range(stop[i] - start[i]):
+                if k < settled:
+                    g, by_cos, by_sin, size = gains[k, 0], gains[k, 1], gains[k, 2], scale[k]
                 e = rows[m, start[i] + k] - x - u
-                white[m, f] = e * scale[k]
-                x = ar1 * x + gains[k, 0] * e
+                white[m, f] = e * size
+                x = ar1 * x + g * e
                 if band > 0.0:
-                    u, v = c * u - s * v + gains[k, 1] * e, s * u + c * v + gains[k, 2] * e
+                    u, v = c * u - s * v + by_cos * e, s * u + c * v + by_sin * e
                 f += 1
     for i in range(start.size):
         for k in range(stop[i] - start[i]):
-            log_det += half[k]
+            log_det += half[min(k, settled - 1)]
     return white, log_det
 
 
@@ -298,7 +296,8 @@ def _smooth_band(row, start, stop, ar1, slow, turn, decay, band):  # pragma: no 
         weights = np.empty(length)
         x, u, v, ahead, turned = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(length - 1, -1, -1):  # the adjoint of the filter gives the inverse covariance times y
-            weights[k] = white[0, last + k] * scale[k] - gains[k, 0] * x - gains[k, 1] * u - gains[k, 2] * v
+            j = min(k, scale.size - 1)
+            weights[k] = white[0, last + k] * scale[j] - gains[j, 0] * x - gains[j, 1] * u - gains[j, 2] * v
             x, u, v = ar1 * x + weights[k], c * u + s * v + weights[k], c * v - s * u
             out[start[i] + k] = band * ahead
             ahead, turned = c * (ahead + weights[k]) - s * turned, s * (ahead + weights[k]) + c * turned

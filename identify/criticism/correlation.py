@@ -13,7 +13,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.estimation.samples import block_means
-from stimrig.identify.noise import UNKNOWN, profile
+from stimrig.identify.noise import WHITE_AND_SLOW, profile
 
 LAGS = 25
 DRAWS = 1500
@@ -68,7 +68,7 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
 
 def _innovations(residual: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, float]:
     """The residual without slow noise: cross-correlations of coloured noise become large by chance."""
-    noise, _ = profile(residual, ends_of(runs(known)), UNKNOWN)
+    noise, _ = profile(residual, ends_of(runs(known)), WHITE_AND_SLOW)
     lag_one = noise.ar1 * noise.share
     if abs(lag_one) < 0.08:
         return residual, 0.0

@@ -12,7 +12,7 @@ from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.left_out import FLOOR_SHARE, difference, hold_out
-from stimrig.identify.noise import UNKNOWN, band_part, profile
+from stimrig.identify.noise import WHITE_AND_SLOW, band_part, profile
 
 MEDIAN = 0.6745
 """Median of the size of normal errors over their standard deviation."""
@@ -72,7 +72,7 @@ def _long(flags: np.ndarray, min_rows: int) -> list[slice]:
 def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, float, float]:
     if not parts:
         return (0.0, 0.0, 0.0, 0.0)
-    noise, log_likelihood = profile(residual, ends_of(parts), UNKNOWN)
+    noise, log_likelihood = profile(residual, ends_of(parts), WHITE_AND_SLOW)
     return noise.ar1, noise.share, noise.sd_nm, log_likelihood
 
 

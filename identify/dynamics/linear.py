@@ -46,7 +46,9 @@ class SecondOrder:
         """Interval means of the response from rest to a drive given on even slots, shape (K,) or (K, M), N·m."""
         drive = grid.interval_means(np.atleast_2d(drive_nm.T), axis=1)
         weights = grid.mean_weights(self.delay_s, grid.curve(self.core))
-        mean = read_means(*boundary_states(self.core, grid.step_s, drive), *weights)
+        rows = np.arange(len(drive))
+        states = boundary_states(self.core, grid.step_s, drive)
+        mean = read_means(*states, *weights, rows, np.empty(drive.shape), rows)
         return mean[0] if drive_nm.ndim == 1 else mean.T
 
     def discrete(self, sample_rate_hz: float) -> tuple[np.ndarray, np.ndarray, int]:

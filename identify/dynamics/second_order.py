@@ -169,29 +169,31 @@ def mean_weights(four, offset, place, interval, count):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def read_means(torque, rate, first, weights):  # pragma: no cover
-    """Means over intervals, shape (M, K), from boundary states; constant before the first and after the last state.
+def read_means(torque, rate, first, weights, states, out, rows):  # pragma: no cover
+    """Means over intervals from boundary states; constant before the first and after the last state.
 
-    `first` and `weights` are as `mean_weights` gives them; a single row of weights holds for all intervals.
+    Row `rows[m]` of `out`, (., K), becomes that of row `states[m]` of the states. `first` and `weights` are as
+    `mean_weights` gives them; a single row of weights holds for all intervals.
     """
-    rows, size = torque.shape[0], torque.shape[1] - 1
+    size = torque.shape[1] - 1
     even = weights.shape[0] == 1 and size > 1
-    out = np.zeros((rows, size))
-    for m in range(rows):
+    for m in range(rows.size):
+        mean, y, v = out[rows[m]], torque[states[m]], rate[states[m]]
+        mean[:] = 0.0
         for b in range(weights.shape[1]):
             at = first + b
             low, high = min(max(0, -at), size), max(min(size, size + 1 - at), 0)
             if even:
                 w0, w1 = weights[0, b, 0], weights[0, b, 1]
                 for k in range(low, high):
-                    out[m, k] += w0 * torque[m, k + at] + w1 * rate[m, k + at]
+                    mean[k] += w0 * y[k + at] + w1 * v[k + at]
             else:
                 for k in range(low, high):
-                    out[m, k] += weights[k, b, 0] * torque[m, k + at] + weights[k, b, 1] * rate[m, k + at]
+                    mean[k] += weights[k, b, 0] * y[k + at] + weights[k, b, 1] * v[k + at]
             for k in range(low):
-                out[m, k] += weights[0 if even else k, b, 0] * torque[m, 0]
+                mean[k] += weights[0 if even else k, b, 0] * y[0]
             for k in range(high, size):
-                out[m, k] += weights[0 if even else k, b, 0] * torque[m, size]
+                mean[k] += weights[0 if even else k, b, 0] * y[size]
     return out
 
 

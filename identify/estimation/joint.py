@@ -38,6 +38,8 @@ LARGEST_FIRST = 1e-3
 HEAVY_TAILS = 10.0
 """Excess kurtosis above which a likelihood of normal innovations decides nothing: one row in a hundred may hold
 a sixth of the squares."""
+NEGLIGIBLE = 0.5
+"""Gain of log posterior by the linear parameters below which the slopes by the others are as good as at the optimum."""
 OPTIMISM = 3.0
 """A run is stopped only if it stays below the floor even with this many times the gain that a parabola predicts."""
 
@@ -246,15 +248,41 @@ def log_posterior(problem: Problem, theta: np.ndarray, residual_nm: np.ndarray, 
 def _at(
     problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = False, profiled: bool = True
 ) -> Point | None:
-    mean, slopes = problem.run(theta, derivatives=True)
-    if slopes is None or not np.all(np.isfinite(mean)):
-        return None
-    residual = problem.setup.target_nm - mean
+    """The point with these parameters. Without effects the linear ones are solved for, given all others."""
+    for _ in range(2):
+        mean, slopes = problem.run(theta, derivatives=True)
+        if slopes is None or not np.all(np.isfinite(mean)):
+            return None
+        residual = problem.setup.target_nm - mean
+        if problem.chosen:
+            break
+        if wide and profiled:
+            noise = profile(residual / problem.setup.spread, problem.setup.stretches, noise)[0]
+        change, gained = _linear_step(problem, theta, residual, slopes, noise)
+        theta = theta.copy()
+        theta[problem.linear] += change
+        residual = residual - change @ slopes[problem.linear]
+        if gained < NEGLIGIBLE:
+            break
     if not profiled:
         value = log_posterior(problem, theta, residual, noise)
         return Point(problem, theta, residual, slopes, noise, value, value)
     level, log_likelihood = profile(residual / problem.setup.spread, problem.setup.stretches, noise, wide)
     return Point(problem, theta, residual, slopes, level, log_likelihood, log_likelihood - _penalty(problem, theta))
+
+
+def _linear_step(
+    problem: Problem, theta: np.ndarray, residual: np.ndarray, slopes: np.ndarray, noise: NoiseLevel
+) -> tuple[np.ndarray, float]:
+    """Change of the linear parameters to their best values, given all others, and the log posterior that it gains."""
+    free = problem.linear
+    mean, precision = problem.prior
+    part = precision[np.ix_(free, free)]
+    products = gram(problem.setup.whitened(np.vstack([residual, slopes[free]]), noise))
+    gradient = products[0, 1:] - part @ (theta[free] - mean[free])
+    best = theta[free] + solve_scaled(products[1:, 1:] + part, gradient)
+    change = np.clip(best, problem.lower[free], problem.upper[free]) - theta[free]
+    return change, 0.5 * float(gradient @ change)
 
 
 def newton_step(at: Point, damping: float) -> tuple[np.ndarray, float]:
@@ -283,6 +311,12 @@ def newton_step(at: Point, damping: float) -> tuple[np.ndarray, float]:
     return step / shortened, shortened
 
 
+def solve_scaled(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Solve a symmetric system, scaled to a unit diagonal; a very small ridge holds what nothing shows."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    return scale * np.linalg.solve(matrix * scale[:, None] * scale + 1e-12 * np.eye(scale.size), scale * right)
+
+
 def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:
     """A start for a larger problem: the solution `base` of a smaller one, and values for the additional effects.
 
@@ -309,17 +343,11 @@ def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float
 
 def linear_start(problem: Problem, theta: np.ndarray, noise: NoiseLevel) -> np.ndarray:
     """Solve for coefficients and baseline, with all other parameters given."""
-    mean, jacobian = problem.run(theta, derivatives=True)
-    assert jacobian is not None
-    free = np.arange(problem.baselines.start, problem.coefficients.stop)
-    white = problem.setup.whitened(np.vstack([problem.setup.target_nm - mean, jacobian[free]]), noise)
-    prior_mean, precision = problem.prior
-    part = precision[np.ix_(free, free)]
-    products = gram(white)
-    gradient = products[0, 1:] - part @ (theta[free] - prior_mean[free])
+    mean, slopes = problem.run(theta, derivatives=True)
+    assert slopes is not None
     result = theta.copy()
-    result[free] += np.linalg.solve(products[1:, 1:] + part, gradient)
-    return np.clip(result, problem.lower, problem.upper)
+    result[problem.linear] += _linear_step(problem, theta, problem.setup.target_nm - mean, slopes, noise)[0]
+    return result
 
 
 def band_as_effect(fitted: Fitted) -> Fitted:

@@ -6,6 +6,7 @@ the curve is chosen again with all rows once effects of the joint are there. The
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import replace
 
 import numpy as np
 
@@ -13,11 +14,11 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.candidates import chosen
-from stimrig.identify.estimation.joint import Fitted, gram, knows_joint, solve
+from stimrig.identify.estimation.joint import Fitted, gram, knows_joint, solve, solve_scaled
 from stimrig.identify.estimation.rests import rest_levels
 from stimrig.identify.estimation.samples import white_noise
 from stimrig.identify.estimation.still import joint_of, still_rows
-from stimrig.identify.noise import WHITE, NoiseLevel
+from stimrig.identify.noise import WHITE, WHITE_AND_SLOW, NoiseLevel
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Basis, Curve
 from stimrig.identify.recruitment.bases import SplineBasis
@@ -42,6 +43,8 @@ PILOT_TOLERANCE = 0.1
 """A pilot ends when the log posterior rises by less: it is a start."""
 REWEIGHTED, SETTLED = 3, 0.1
 """The smoothness is chosen anew at the solution, so many times at most, until its logarithm changes by less."""
+STIFFEST = 1e12
+"""Largest precision of a curve's bending, for a curve of size 1: rounding leaves no prior of a stiffer one."""
 CURVE_POINTS = 201
 QUIET = 0.0015
 """If the noise of a sample is below this share of the largest torque, the spline gets more knots: its error at a bend
@@ -66,7 +69,7 @@ def fit_plain(grid: Grid, rows: np.ndarray, knots: int | None = None, delay_s: f
     """
 
     def fit(selected: np.ndarray, white: bool) -> Fitted:
-        return fit_spline(grid, selected, knots, delay_s, WHITE if white else None)
+        return fit_spline(grid, selected, knots, delay_s, WHITE if white else WHITE_AND_SLOW)
 
     return chosen(grid, rows, fit(rows, False), fit)
 
@@ -76,9 +79,9 @@ def fit_spline(
     rows: np.ndarray,
     knots: int | None = None,
     delay_s: float | None = None,
-    noise: NoiseLevel | None = None,
+    noise: NoiseLevel = WHITE_AND_SLOW,
 ) -> Fitted:
-    """The plain structure on all given rows, with a noise of the kind of `noise`, by default white and slow."""
+    """The plain structure on all given rows, with a noise of the kind of `noise`."""
     still = still_rows(grid, rows)
     first = pilot(grid, still, delay_s)
     count = knots or (QUIET_KNOTS if _is_quiet(first) else knots_for(_points(first.curve)))
@@ -94,7 +97,7 @@ def fit_spline(
         return fitted
     values[0] = np.sqrt(QUICK_S * slow_s)
     values[1:3] = 0.5 * (QUICK_S + slow_s) / values[0], 0.0
-    other = solve(fitted.problem, fitted.problem.from_physical(values), noise or fitted.noise)
+    other = solve(fitted.problem, fitted.problem.from_physical(values), noise)
     return max(fitted, other, key=lambda candidate: candidate.log_evidence)
 
 
@@ -116,8 +119,8 @@ def pilot(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Fitted:
 def fit_from(setup: Setup, starts_s: tuple[float, ...], roughness: np.ndarray, delay_s: float = 0.0) -> Fitted:
     """The plain structure with white noise, from the best of several starting values of the time constant."""
     starts = [start_at(setup, SecondOrder(t, 0.9, delay_s), roughness) for t in starts_s]
-    problem, theta, _ = min(starts, key=lambda start: start[2].sd_nm)
-    return solve(problem, theta, WHITE, tolerance=PILOT_TOLERANCE)
+    problem, theta, white = min(starts, key=lambda start: start[2].sd_nm)
+    return solve(problem, theta, white, tolerance=PILOT_TOLERANCE)
 
 
 def start_at(setup: Setup, linear: SecondOrder, roughness: np.ndarray) -> tuple[Problem, np.ndarray, NoiseLevel]:
@@ -142,8 +145,8 @@ def start_at(setup: Setup, linear: SecondOrder, roughness: np.ndarray) -> tuple[
     problem = _smoothed(problem, roughness, smoothness)
     part = problem.prior[1][np.ix_(free, free)]
     products = products / smoothness.variance
-    theta[free] = np.linalg.solve(products[1:, 1:] + part, products[0, 1:] + part @ prior_mean[free])
-    return problem, theta, NoiseLevel(0.0, 0.0, noise.sd_nm * float(np.sqrt(smoothness.variance)))
+    theta[free] = solve_scaled(products[1:, 1:] + part, products[0, 1:] + part @ prior_mean[free])
+    return problem, theta, replace(WHITE, sd_nm=noise.sd_nm * float(np.sqrt(smoothness.variance)))
 
 
 def plain_setup(
@@ -181,7 +184,7 @@ def plain_setup(
     )
 
 
-def _with_knots(first: Fitted, count: int, noise: NoiseLevel | None) -> Fitted:
+def _with_knots(first: Fitted, count: int, noise: NoiseLevel) -> Fitted:
     """The plain structure with its final spline, from a pilot."""
     setup, linear, curve = first.problem.setup, first.linear, first.curve
     torque_nm = _points(curve)[1]
@@ -190,8 +193,8 @@ def _with_knots(first: Fitted, count: int, noise: NoiseLevel | None) -> Fitted:
     delay_s = setup.delay_bounds_s[0] if np.ptp(setup.delay_bounds_s) == 0.0 else None
     setup = plain_setup(setup.grid, setup.fitted, setup.basis, zeros_nm, sign, delay_s)
     basis, roughness = final_spline(setup, linear, curve, count)
-    problem, theta, white = start_at(setup.without_penalty(basis), linear, roughness)
-    fitted = solve(problem, theta, noise or NoiseLevel(0.0, 0.5, white.sd_nm))
+    problem, theta, _ = start_at(setup.without_penalty(basis), linear, roughness)
+    fitted = solve(problem, theta, noise)
     for _ in range(REWEIGHTED):
         smoothed = with_smoothness(fitted, roughness)
         before, after = (np.trace(p.setup.roughness) for p in (fitted.problem, smoothed))
@@ -215,7 +218,9 @@ def with_smoothness(fitted: Fitted, roughness: np.ndarray) -> Problem:
 
 def _smoothed(problem: Problem, roughness: np.ndarray, choice: Choice) -> Problem:
     """The problem with the prior that a choice makes of the roughness."""
-    return Problem(problem.setup.with_(roughness=choice.weight / choice.variance * roughness), problem.effects)
+    stiffest = STIFFEST / max(float(np.trace(roughness)) * problem.setup.scale_nm**2, 1e-300)
+    weight = min(choice.weight / choice.variance, stiffest)
+    return Problem(problem.setup.with_(roughness=weight * roughness), problem.effects)
 
 
 def _smoothness(products: np.ndarray, precision: np.ndarray, roughness: np.ndarray, rows: int) -> Choice:

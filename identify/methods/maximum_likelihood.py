@@ -7,6 +7,7 @@ power series (6), sigmoid (30), a monotone spline, near-sigmoid."""
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.two_stage import general
 from stimrig.identify.model import Model
-from stimrig.identify.noise import WHITE, NoiseLevel
+from stimrig.identify.noise import WHITE_AND_SLOW
 from stimrig.identify.recruitment import Basis, basis_at
 from stimrig.identify.recruitment.bases import PowerBasis
 from stimrig.identify.recruitment.smoothing import KNOTS
@@ -33,8 +34,8 @@ HIGHEST_POWER = 9
 def with_basis(first: Fitted, basis: Basis) -> Fitted:
     """Joint estimate with a curve of another basis and white noise, from the dynamics of a first one."""
     none = np.zeros((basis.size, basis.size))
-    problem, theta, _ = start_at(first.problem.setup.without_penalty(basis), first.linear, none)
-    return solve(problem, theta, WHITE, tolerance=1e-6)
+    problem, theta, white = start_at(first.problem.setup.without_penalty(basis), first.linear, none)
+    return solve(problem, theta, white, tolerance=1e-6)
 
 
 def power_series(first: Fitted, order: int | None = None) -> tuple[Fitted, str]:
@@ -87,7 +88,9 @@ def monotone(fitted: Fitted) -> Fitted:
     steps[:extras, : 2 * extras] = np.kron(np.eye(extras), [1.0, -1.0])  # these may have either sign
     theta = fitted.theta.copy()
     theta[linear] = steps @ nnls(root @ steps, root @ theta[linear], maxiter=50 * steps.shape[1])[0]
-    return solve(problem, theta, fitted.noise, max_steps=0)
+    mean, slopes = problem.run(theta, derivatives=True)
+    assert slopes is not None
+    return replace(fitted, theta=theta, residual_nm=problem.setup.target_nm - mean, slopes=slopes)
 
 
 def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
@@ -126,7 +129,7 @@ def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fit
         fitted, reason = sigmoid(fitted), "sigmoid (30)"
     if rising:
         return monotone(fitted), [reason, "recruitment constrained to be monotone"]
-    return solve(fitted.problem, fitted.theta, NoiseLevel(0.0, 0.5, fitted.noise.sd_nm), max_steps=0), [reason]
+    return solve(fitted.problem, fitted.theta, WHITE_AND_SLOW, max_steps=0), [reason]
 
 
 def _spline_words(fitted: Fitted) -> str:

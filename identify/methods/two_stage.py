@@ -33,7 +33,7 @@ from stimrig.identify.estimation.plain import curve_at, final_spline, fit_from, 
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted, with_past
 from stimrig.identify.model import Model
-from stimrig.identify.noise import WHITE, NoiseLevel
+from stimrig.identify.noise import WHITE_AND_SLOW
 from stimrig.identify.recruitment import Curve, FixedShape
 from stimrig.identify.recruitment.bases import PowerBasis, SplineBasis
 from stimrig.identify.recruitment.smoothing import KNOTS, PILOT_KNOTS, adapted_knots, choose_weight, spline_roughness
@@ -256,13 +256,13 @@ def physical(
     both = plain_setup(grid, near_rest(grid, prbs) | rows, straight.basis)
     curve, roughness = _recruitment(grid, rows, linear, knots)
     for _ in range(iterations):
-        problem, theta, _ = start_at(both.without_penalty(FixedShape(curve)), linear, none)
-        linear = solve(problem, theta, WHITE).linear
+        problem, theta, white = start_at(both.without_penalty(FixedShape(curve)), linear, none)
+        linear = solve(problem, theta, white).linear
         curve, roughness = _recruitment(grid, rows, linear, knots)
     reasons.append(f"after stage two: T {linear.time_constant_s:.4g} s, damping {linear.damping:.3g}")
     # The last curve and the last dynamics; baseline and noise are estimated from both segments.
-    problem, theta, white = start_at(both.without_penalty(curve.basis), linear, roughness)
-    return solve(problem, theta, NoiseLevel(0.0, 0.5, white.sd_nm), max_steps=0), reasons
+    problem, theta, _ = start_at(both.without_penalty(curve.basis), linear, roughness)
+    return solve(problem, theta, WHITE_AND_SLOW, max_steps=0), reasons
 
 
 def _recruitment(grid: Grid, rows: np.ndarray, linear: SecondOrder, knots: int) -> tuple[Curve, np.ndarray]:

@@ -76,6 +76,8 @@ class Problem:
         self.initials = range(3 + parts, 3 + parts + 2 * states)
         self.coefficients = slice(len(table), len(table) + setup.basis.size)
         table += [Parameter(f"recruitment_{i}_nm", "N·m", -np.inf, np.inf) for i in range(setup.basis.size)]
+        self.linear = np.arange(self.baselines.start, self.coefficients.stop)
+        """Zeros, initial states and the curve: without effects the mean is linear in them."""
         self.chosen: list[Chosen] = []
         for effect, form in effects:
             parameters = tuple(p.on(setup.scene) for p in form.parameters)
@@ -153,8 +155,11 @@ class Problem:
         if not derivatives:
             return mean[0], None
         places, steps = zip(*stages.owners, strict=True)
+        change = mean[1:]
+        change -= mean[0]
+        change /= np.array(steps)[:, None]
         jacobian = np.zeros((self.size, mean.shape[1]))
-        jacobian[list(places)] = (mean[1:] - mean[0]) / np.array(steps)[:, None]
+        jacobian[list(places)] = change
         return mean[0], jacobian
 
     def states(self, theta: np.ndarray) -> dict[str, float]:
@@ -366,10 +371,7 @@ class _StagePass:
         for row, read in enumerate(zip(delay.tolist(), self.curves(), strict=True)):
             rows_by_reading.setdefault(read, []).append(row)
         for (lag, core), rows in rows_by_reading.items():
-            states = owned[rows]
-            if states[-1] - states[0] + 1 == states.size and np.all(np.diff(states) == 1):
-                states = slice(states[0], states[-1] + 1)
-            mean[rows] = read_means(torque[states], rate[states], *grid.mean_weights(lag, core))
+            read_means(torque, rate, *grid.mean_weights(lag, core), owned[rows], mean, np.array(rows))
         return mean
 
     def curves(self) -> list[Core | None]:
