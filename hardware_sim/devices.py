@@ -47,14 +47,13 @@ class Devices:
         self.angle_sensor: AngleSensor | None = None
         if self.encoder and not in_cell:
             self.angle_sensor = AngleSensor(self.encoder, self.load_cell.add_frame, settings, epoch_us)
-        self.timeline.followers.append(self._sample_until)
+        self.timeline.follow = self._sample_until
         self.electrodes = Electrodes(muscle, self.load_cell.raise_sync)
-        self.stimulator_plugged = self.cell_plugged = True
+        self.stimulator_plugged = True
         self.unread_bytes: Callable[[], int] = lambda: 0
         self.on_stimulator_cable: Callable[[bool], None] = lambda _plugged: None
         self.on_cell_cable: Callable[[bool], None] = lambda _plugged: None
         self._bytes: list[tuple[float, bytes]] = []
-        self._frames: list[Frame] = []
         self.board = Board(self.timeline, self.electrodes, self._write, self._count_unread_bytes)
         self.firmware: Firmware = STIMULATORS[settings.stimulator](self.board)
         self.faults = Faults(self)
@@ -71,7 +70,7 @@ class Devices:
     def frame_received(self, time_s: float, can_id: int, data: bytes) -> None:
         """A CAN frame from the host to the load cell at `time_s`, or now if that has passed."""
         self.advance(time_s)
-        if self.cell_plugged:
+        if self.load_cell.plugged:
             self.load_cell.cell.received(can_id, data)
 
     def advance(self, time_s: float) -> None:
@@ -89,9 +88,7 @@ class Devices:
 
     def take_frames(self) -> list[Frame]:
         """The frames of load cell and angle sensor since the last call, in the order in which they were sent."""
-        self._collect_frames()
-        frames, self._frames = self._frames, []
-        return frames
+        return self.load_cell.take_frames()
 
     def plug_stimulator(self, plugged: bool = True) -> None:
         """Connect the stimulator, or pull its cable; the device itself goes on."""
@@ -100,8 +97,7 @@ class Devices:
 
     def plug_cell(self, plugged: bool = True) -> None:
         """Connect the adapter of load cell and angle sensor, or pull it; the sensors go on."""
-        self._collect_frames()
-        self.cell_plugged = plugged
+        self.load_cell.plugged = plugged
         self.on_cell_cable(plugged)
 
     def power_cycle(self) -> None:
@@ -114,7 +110,6 @@ class Devices:
         if self.angle_sensor is not None:
             self.angle_sensor.counter = 0
         self._bytes.clear()
-        self._frames.clear()
 
     def state(self) -> dict[str, Any]:
         """The present state, as plain values."""
@@ -141,9 +136,3 @@ class Devices:
 
     def _count_unread_bytes(self) -> int:
         return self.unread_bytes() + sum(len(data) for _, data in self._bytes)
-
-    def _collect_frames(self) -> None:
-        """Frames that come while the adapter is pulled are lost."""
-        frames = self.load_cell.take_frames()
-        if self.cell_plugged:
-            self._frames += frames

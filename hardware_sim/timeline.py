@@ -31,13 +31,13 @@ def cancel(*events: Event | None) -> None:
 class Timeline:
     """Events in the order of their time, in seconds of the emulator's own clock.
 
-    `followers` are called with the new time before time advances to it, so that continuous processes (the sampled
-    muscle) are simulated up to an event before the event changes them.
+    `follow` is called with the new time before time advances to it, so that continuous processes (the sampled muscle)
+    are simulated up to an event before the event changes them.
     """
 
     def __init__(self) -> None:
         self.now_s = 0.0
-        self.followers: list[Callable[[float], None]] = []
+        self.follow: Callable[[float], None] = lambda _time_s: None
         self._events: list[tuple[float, int, Event]] = []
         self._order = itertools.count()
 
@@ -58,7 +58,7 @@ class Timeline:
         return self._events[0][0] if self._events else None
 
     def run_until(self, time_s: float) -> None:
-        """Advance time to `time_s`, with all events up to it, also those that followers plan on the way."""
+        """Advance time to `time_s`, with all events up to it, also those that `follow` plans on the way."""
         while True:
             while (event_s := self.next_s()) is not None and event_s <= time_s:
                 self._move(event_s)
@@ -71,8 +71,7 @@ class Timeline:
 
     def _move(self, time_s: float) -> None:
         if time_s > self.now_s:
-            for follow in self.followers:
-                follow(time_s)
+            self.follow(time_s)
             self.now_s = time_s
 
 

@@ -37,6 +37,8 @@ class LoadCell:
         self.frame_hooks: list[FrameHook] = []
         self.counter = 0
         self.torque_nm = 0.0
+        self.plugged = True
+        """Whether the adapter is there: frames that come while it is not are lost."""
         jitter_s = settings.clock_jitter_us * 1e-6
         self.clock = SampleClock(settings.rate_hz, settings.clock_ppm, jitter_s, JITTER_SEED, epoch_us)
         self.cell = _make_cell(settings)
@@ -72,8 +74,8 @@ class LoadCell:
         return frames
 
     def add_frame(self, frame: Frame) -> None:
-        """Send a frame that holds no new sample: a bus error, or one that a fault has delayed."""
-        self._frames.append(frame)
+        """Send a frame that holds no new sample of torque: an angle, a bus error, or one that a fault has delayed."""
+        self._frames += [frame] * self.plugged
 
     def sample(self) -> None:
         """Take the next sample."""
@@ -110,7 +112,7 @@ class LoadCell:
                 waiting.clear()
         for hook in self.frame_hooks:
             frames = [changed for frame in frames for changed in hook(frame)]
-        self._frames += frames
+        self._frames += frames * self.plugged
 
 
 def _make_cell(settings: Settings) -> Cell:

@@ -83,7 +83,7 @@ def test_nothing_passes_while_a_cable_is_unplugged() -> None:
     devices.frame_received(0.0, 0, b"\x01\x00")
     devices.faults.on("stimulator_unplugged", {"mid_frame": True}, for_s=1.0)
     devices.faults.on("cell_unplugged", {}, for_s=1.0)
-    assert (devices.stimulator_plugged, devices.cell_plugged) == (False, False)
+    assert (devices.stimulator_plugged, devices.load_cell.plugged) == (False, False)
     assert devices.take_bytes() == [(0.0, bytes.fromhex("f0815581"))]
     devices.received(0.5, ScienceMode4.encode(Packet(1, LL_INIT, b"\x00")))
     devices.frame_received(0.5, 0, b"\x02\x00")

@@ -122,7 +122,7 @@ class Wires:
         return SimulatedPort(self, process, path)
 
     def open_bus(self, process: Process, arguments: dict[str, Any], name: str) -> Bus:
-        if not self.devices.cell_plugged:
+        if not self.devices.load_cell.plugged:
             raise DeviceError(f"{name.replace(' ', '_')}.bus: the adapter is missing; plug it in")
         self._bus = _SimulatedBus(self, process, arguments)
         return self._bus

@@ -10,8 +10,6 @@ from stimrig.hardware_sim.hidden.forms import Effect, Numbers, Sign, draws, most
 from stimrig.hardware_sim.hidden.kernels import STEP_S, TIME_S, WIDTH_US, smooth_table
 
 EFFECT = Effect("larger")
-
-
 MOSTLY_UP = Sign(mostly(0.65))
 
 

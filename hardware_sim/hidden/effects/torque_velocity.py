@@ -8,11 +8,7 @@ from stimrig.hardware_sim.hidden.forms import Effect, Sign, draws, mostly
 from stimrig.hardware_sim.hidden.kernels import ANGLE_RAD, VELOCITY_RAD_S
 
 EFFECT = Effect(moving=True)
-
-
 MOSTLY_EXTENSION = mostly(0.7)
-
-
 SHORTENING = Sign(MOSTLY_EXTENSION, "extension", "flexion")
 
 

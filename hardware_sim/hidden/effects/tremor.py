@@ -11,8 +11,6 @@ from stimrig.hardware_sim.hidden.forms import Effect, Numbers, draws
 from stimrig.hardware_sim.hidden.kernels import FORCE, STEP_S, TIME_S, normal
 
 EFFECT = Effect("all")
-
-
 OSCILLATOR: dict[str, Any] = {"centre_hz": (3.0, 8.0), "spread_hz": (0.05, 0.35), "second_harmonic": (0.0, 0.3)}
 
 
