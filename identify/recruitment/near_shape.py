@@ -77,8 +77,7 @@ class NearShape:
 
     def log_steps(self, three: np.ndarray) -> np.ndarray:
         """Logarithms of the steps of the shape itself, shape (..., n), for (log gain, middle, log width)."""
-        share = self.shape((self.places_us - three[..., 1:2]) / np.exp(three[..., 2:3]))[0]
-        return three[..., :1] + np.log(share[..., 1:] - share[..., :-1] + LEAST_STEP)
+        return self.log_steps_and_slopes(three)[0]
 
     def log_steps_and_slopes(self, three: np.ndarray) -> tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]:
         """`log_steps`, and its derivatives by middle and log width, each of shape (..., n); that by log gain is 1."""
