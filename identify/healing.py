@@ -35,7 +35,12 @@ def healed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[d
     noise_nm = max(before["noise_sd_nm"], after["noise_sd_nm"])
     rows = []
     for place in before.get("where") or []:
-        errors = [_rms_within(comparison["series"], place["start_s"], place["end_s"]) for comparison in (before, after)]
+        errors = []
+        for series in (before["series"], after["series"]):
+            pairs = zip(series["time_s"], series["residual_nm"], strict=True)
+            start_s, end_s = place["start_s"], place["end_s"]
+            squares = [value * value for time_s, value in pairs if start_s <= time_s <= end_s and value is not None]
+            errors.append(math.sqrt(sum(squares) / max(len(squares), 1)))
         healed = errors[1] <= HEALED * noise_nm
         rows.append({**place, "before_nm": errors[0], "after_nm": errors[1], "noise_nm": noise_nm, "healed": healed})
     return rows
@@ -44,16 +49,9 @@ def healed_places(before: Mapping[str, Any], after: Mapping[str, Any]) -> list[d
 def place_words(place: Mapping[str, Any]) -> str:
     """Describe the change of the error at a place."""
     before, after, noise = (f"{place[name]:.3g}" for name in ("before_nm", "after_nm", "noise_nm"))
-    if before == after:
-        return f"the error there is {after} N·m, as before; the noise is {noise} N·m."
-    if place["after_nm"] > place["before_nm"]:
-        return f"the error there rose from {before} to {after} N·m; the noise is {noise} N·m."
-    if place["healed"]:
-        return f"the error there fell from {before} to {after} N·m; the noise is {noise} N·m."
-    return f"the error there fell from {before} to {after} N·m, which is more than the noise of {noise} N·m."
-
-
-def _rms_within(series: Mapping[str, Any], start_s: float, end_s: float) -> float:
-    pairs = zip(series["time_s"], series["residual_nm"], strict=True)
-    errors_nm = [value for time_s, value in pairs if start_s <= time_s <= end_s and value is not None]
-    return math.sqrt(sum(value * value for value in errors_nm) / len(errors_nm)) if errors_nm else 0.0
+    rose = place["after_nm"] > place["before_nm"]
+    change = f"{'rose' if rose else 'fell'} from {before} to {after} N·m"
+    if before == after or rose or place["healed"]:
+        change = f"is {after} N·m, as before" if before == after else change
+        return f"the error there {change}; the noise is {noise} N·m."
+    return f"the error there {change}, which is more than the noise of {noise} N·m."

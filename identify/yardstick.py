@@ -13,15 +13,11 @@ TOO_LARGE = "Beside the torque that is too much to tell a share that the model e
 
 def repetition_sentences(figures: Mapping[str, Any]) -> list[str]:
     """Describe the irreducible error and the share that the model explains; `figures`: fit statistics."""
-    return [*_repeating(figures.get("repetition")), *_unpredictable_sentence(figures.get("unforeseen_nm"))]
-
-
-def _unpredictable_sentence(left_nm: float | None) -> list[str]:
-    """Describe the part that a model explains in its own record and cannot predict."""
-    if not left_nm:
-        return []
-    causes = "hum, slow zero, tremor, efforts"
-    return [f"On held-out pulses {left_nm:.3g} N·m cannot be foreseen ({causes}): it is left out."]
+    sentences, left_nm = _repeating(figures.get("repetition")), figures.get("unforeseen_nm")
+    if left_nm:  # what a model explains in its own record and cannot predict
+        causes = "hum, slow zero, tremor, efforts"
+        sentences.append(f"On held-out pulses {left_nm:.3g} N·m cannot be foreseen ({causes}): it is left out.")
+    return sentences
 
 
 def _repeating(repetition: Mapping[str, Any] | None) -> list[str]:

@@ -65,7 +65,9 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     fits : mapping
         By effect id, or `NOTHING`.
     """
-    tests = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(_largest_us(record))]
+    tests = [
+        (design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(float(record.pulse_width_us.max()))
+    ]
     gains = [expected_log_evidence(width, record, fits) for _, width in tests]
     # the shortest of those that decide; if none does, the one with the largest gain for its length
     decides = max(gains) >= ENOUGH
@@ -104,7 +106,7 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
     tests, others = (
         [
             (design, design.pulse_widths(rate_hz))
-            for design in held_levels(_largest_us(record), threshold_us, rate_hz, seed)
+            for design in held_levels(float(record.pulse_width_us.max()), threshold_us, rate_hz, seed)
         ]
         for seed in (SEED, REFERENCE)
     )
@@ -152,10 +154,6 @@ def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[st
         gain = b @ np.linalg.lstsq(fits[rival].hessian + slopes @ slopes.T, b, rcond=None)[0]
         gains.append(max(0.5 * float(gap @ gap - gain), 0.0))
     return min(gains)
-
-
-def _largest_us(record: Record) -> float:
-    return float(record.pulse_width_us.max())
 
 
 def _steady_nm(fitted: Fitted, width_us: np.ndarray) -> np.ndarray:
