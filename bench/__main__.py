@@ -8,12 +8,6 @@ from __future__ import annotations
 import os
 import sys
 
-# Before numpy is loaded: one core, so that times mean something and don't depend on what else runs.
-for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
-    os.environ.setdefault(name, "1")
-os.environ.setdefault("XLA_FLAGS", "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1")
-os.environ.setdefault("JAX_PLATFORMS", "cpu")
-
 NAMES = ("table1", "rivals", "diagnosis")
 OPTIONS = {"diagnosis": [], "rivals": ["--write"]}
 
