@@ -52,6 +52,7 @@ NAMES = {
     "angle_rad": "angle joint_angle elbow_angle winkel gelenkwinkel",
     "velocity_rad_s": "velocity angular_velocity joint_velocity speed winkelgeschwindigkeit",
     "segment": "segment segments",
+    "pulse_rate_hz": "pulse_rate pulse_frequency stim_rate stim_freq stim_frequency stimulation_frequency",
 }
 """Names under which other tools write a column, in lower case."""
 _KNOWN = {name: target for target, names in NAMES.items() for name in names.split()}
@@ -162,7 +163,7 @@ def _in_unit(
     unit = wanted or written
     if not unit and cell == target:
         return Column(index)
-    if not unit and mapped:
+    if not unit and (mapped or target == "pulse_rate_hz"):
         return Column(
             index, note=f"{target} is {short(cell)!r}, taken in {COMMON_UNITS[target][0]} as no unit is given"
         )

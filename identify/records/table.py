@@ -62,6 +62,7 @@ class Table:
         scaled |= {"segment": numbers["segment"]} if "segment" in numbers else {}
         rates_hz = np.unique(scaled.pop("pulse_rate_hz", np.array([])))
         rates_hz = rates_hz[~np.isnan(rates_hz)]
+        rates_hz = rates_hz[rates_hz > 0] if np.any(rates_hz > 0) else rates_hz  # 0 while nothing is stimulated
         if rates_hz.size > 1:
             raise BadRecord("different pulse rates", place=f"{path}, pulse_rate_hz", fix="Give a record of one rate.")
         for rate_hz in rates_hz:
@@ -175,6 +176,6 @@ def _check_widths(table: Table) -> None:
         raise table.bad(message, f"{fix}pulse_width_us=pulse_width_us:s.", int(width_us.argmax()), "pulse_width_us")
     pulses = np.flatnonzero(width_us)
     step_s = float(np.median(np.diff(table.columns["time_s"]))) if pulses.size > LEAST_ALONE else np.inf
-    if step_s * table.pulse_rate_hz < 0.5 and np.all(np.diff(pulses) > 1):
+    if step_s * table.pulse_rate_hz < 0.6 and np.all(np.diff(pulses) > 1):
         message = "widths stand only in the samples of the pulses"
         raise table.bad(message, "Hold each width until the next pulse.", int(pulses[0]), "pulse_width_us")

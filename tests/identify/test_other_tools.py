@@ -360,6 +360,11 @@ def test_what_is_not_known_is_asked_for_in_one_line(tmp_path: Path, header: str,
 ALL = cells()
 UNSAID = {
     "a pulse rate in a column": (table([[*row, "25"] for row in ALL], (*HEADER, "pulse_rate_hz")), (), ""),
+    "a pulse rate under another name, 0 at rest": (
+        table([[*row, "25" if float(row[1]) else "0"] for row in ALL], (*HEADER, "Stim frequency")),
+        (),
+        "",
+    ),
     "days": (
         table([[f"{46158.5 + at / 86400:.12f}", *row[1:]] for at, row in zip(TIME_S, ALL, strict=True)]),
         ("time_s=time_s:d",),
