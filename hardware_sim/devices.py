@@ -12,8 +12,7 @@ from collections.abc import Callable
 from typing import Any
 
 from stimrig.hardware_sim.angle_sensor import AngleSensor, Encoder
-from stimrig.hardware_sim.arm.description import Arm
-from stimrig.hardware_sim.arm.limb import Limb
+from stimrig.hardware_sim.arm.limb import Arm, Limb
 from stimrig.hardware_sim.faults import Faults
 from stimrig.hardware_sim.load_cells.frames import Frame
 from stimrig.hardware_sim.load_cells.sampler import LoadCell

@@ -7,8 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from stimrig.hardware_sim import hidden, patients
-from stimrig.hardware_sim.arm import description as arms
-from stimrig.hardware_sim.arm.description import Arm
+from stimrig.hardware_sim.arm.limb import Arm, read_arm, set_laws
 from stimrig.hardware_sim.arm.tissue import bare
 from stimrig.hardware_sim.devices import Devices
 from stimrig.hardware_sim.errors import HardwareSimError
@@ -48,9 +47,9 @@ def make_devices(
 def _arm(text: str, laws: Sequence[str], hidden_seed: int | None) -> Arm:
     """The arm asked for; a hidden patient brings all that its joint does, and how it moves if asked for by `design`."""
     if hidden_seed is None:
-        return arms.set_laws(arms.read(text), laws)
+        return set_laws(read_arm(text), laws)
     if laws:
         raise HardwareSimError("--arm-law: what the arm of a hidden patient does is hidden, too")
     if text == DESIGN:
         return Arm("waves", hidden.movement(hidden_seed), bare())
-    return replace(arms.read(text), tissue=bare())
+    return replace(read_arm(text), tissue=bare())

@@ -10,10 +10,8 @@ import numpy as np
 import pytest
 
 from stimrig.hardware_sim import patients
-from stimrig.hardware_sim.arm import description
-from stimrig.hardware_sim.arm.description import Arm
 from stimrig.hardware_sim.arm.laws import LAWS, StandardLinearSolid
-from stimrig.hardware_sim.arm.limb import Limb
+from stimrig.hardware_sim.arm.limb import Arm, Limb, read_arm, set_laws
 from stimrig.hardware_sim.arm.motion import Begin, Motion
 from stimrig.hardware_sim.arm.movers import MOVERS, make_mover
 from stimrig.hardware_sim.arm.tissue import REFERENCE_RAD, Mechanics, Tissue, bare, law
@@ -229,9 +227,9 @@ class TestMovers:
 
 
 def test_the_command_lines_arm() -> None:
-    arm = description.read("robot,from_deg=50")
+    arm = read_arm("robot,from_deg=50")
     assert (arm.mode, arm.movement, arm.start_deg) == ("robot", {"from_deg": 50.0}, 50.0)
-    other = description.set_laws(arm, ["passive=linear_friction,dry_nm=0.3", "mechanics=forearm,weight_nm=2.5"])
+    other = set_laws(arm, ["passive=linear_friction,dry_nm=0.3", "mechanics=forearm,weight_nm=2.5"])
     assert other.tissue.mechanics.weight_nm == 2.5
     assert other.tissue.passive == law("passive", "linear_friction", {"dry_nm": 0.3})
     assert other.tissue.torque_angle == Tissue().torque_angle

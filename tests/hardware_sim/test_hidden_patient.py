@@ -11,8 +11,7 @@ import pytest
 
 from stimrig.hardware_sim import hidden
 from stimrig.hardware_sim.__main__ import main
-from stimrig.hardware_sim.arm.description import Arm
-from stimrig.hardware_sim.arm.limb import Limb
+from stimrig.hardware_sim.arm.limb import Arm, Limb
 from stimrig.hardware_sim.arm.tissue import bare
 from stimrig.hardware_sim.hidden.chain import simulate
 from stimrig.hardware_sim.hidden.library import MOVING
