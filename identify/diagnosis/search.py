@@ -26,6 +26,7 @@ from stimrig.identify.estimation.effect_fit import (
     add_effects,
     detected_effects,
     effect_names,
+    fit_form,
     fit_from,
     try_effect,
 )
@@ -178,6 +179,7 @@ def search_effects(
             break
         if not _add_best(search, progress or silent, number):
             break
+        _exchange(search)
     return search
 
 
@@ -214,6 +216,48 @@ def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
     added = {"added": best.effect.id, "searched": released(best.fitted), "tried": tuple(candidates)}
     search.steps.append(replace(search.steps[0], origin="library", **added))
     return True
+
+
+def _exchange(search: EffectSearch) -> None:
+    """Drop an earlier effect that is no longer needed beside the last one, or replace it if a rival now does better."""
+    last, found = search.last, [step for _, step in search.found]
+    for number, step in enumerate(found[:-1]):
+        without = without_effect(last, str(step.added))
+        if without.log_evidence > last.log_evidence - thresholds.TEMPERATURE:
+            _rebuild(search, without, [other for other in found if other is not step])
+            return
+        for rival in [c for c in step.tried if c.effect.id not in search.names("library") and not c.effect.band][:2]:
+            refitted = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
+            if refitted is not None and refitted.log_evidence > last.log_evidence + thresholds.TEMPERATURE:
+                replaced = replace(step, added=rival.effect.id)
+                _rebuild(search, refitted, [*found[:number], replaced, *found[number + 1 :]])
+                return
+
+
+def _rebuild(search: EffectSearch, last: Fitted, found: Sequence[Step]) -> None:
+    """Set the steps as if the effects of a model had been added in this order, as long as each gains enough."""
+    del search.steps[1 + len(search.names("detected")) :]
+    forms = dict(last.effects)
+    for number, step in enumerate(found):
+        before, effect = search.last, find_effect(str(step.added))
+        wanted = [name for name, _ in before.effects] + ([] if effect.band else [effect.id])
+        if number == len(found) - 1:
+            fitted = last
+        else:
+            problem = Problem(last.problem.setup, [(name, forms[name]) for name in wanted])
+            banded = any(find_effect(str(other.added)).band for other in found[: number + 1])
+            fitted = solve(problem, start_from(problem, last, {}), last.noise if banded else before.noise)
+        gain = fitted.log_evidence - before.log_evidence + prior(effect)
+        known = next((c.forms for c in step.tried if c.effect.id == effect.id), {})
+        chosen = forms.get(effect.id, effect.forms[0])
+        candidate = _discounted(search, Candidate(effect, chosen, fitted, gain, known | {chosen.name: gain}))
+        comparison = difference(search.steps[-1].left_out, leave_out(fitted))
+        if candidate.gain < search.margin(number) or not comparison.errors >= required_errors(search, candidate):
+            return  # beside the other effects it no longer gains enough
+        # The rivals were fitted beside another model: they are taken to gain at most what the added effect gained.
+        others = [replace(c, gain=min(c.gain, candidate.gain)) for c in step.tried if c.effect.id != effect.id]
+        tried = tuple(sorted([candidate, *others], key=_by_gain))
+        search.steps.append(replace(search.steps[0], added=effect.id, searched=fitted, origin="library", tried=tried))
 
 
 def required_errors(search: EffectSearch, candidate: Candidate) -> float:
