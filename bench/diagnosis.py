@@ -25,7 +25,7 @@ from bench.muscles.recorders import recorded
 from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS
 from stimrig.identify.diagnosis import diagnose
 from stimrig.identify.diagnosis import side_by_side as workers
-from stimrig.identify.diagnosis.thresholds import STRUCTURE
+from stimrig.identify.diagnosis.thresholds import NEXT_MARGIN
 from stimrig.identify.effects import registry
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
@@ -106,7 +106,7 @@ def diagnose_record(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any]
 def _reports_structure(result: dict[str, Any]) -> bool:
     """Return true where verdict, figure or words report structure that is left."""
     words = " ".join([*result["plain"], *result["notes"]]).lower()
-    unexplained = result["verdict"] == "unexplained_structure" or result["structure_left"] > STRUCTURE
+    unexplained = result["verdict"] == "unexplained_structure" or result["structure_left"] > NEXT_MARGIN
     return bool(unexplained or "structure left" in words)
 
 

@@ -86,7 +86,7 @@ def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, prog
     whole = tuple(step for step in search.steps if step.origin != "library" or step.added in names)
     unpredictable = [effect for effect in names if not find_effect(effect).predictable and not find_effect(effect).band]
     alone = [] if named or unpredictable == [*names] else [_with_only(search, unpredictable)]
-    first = thresholds.BETTER_THAN_ALIKE if named else thresholds.BETTER_IF_FREE
+    first = thresholds.BETTER_THAN_ALIKE if named else thresholds.BETTER_IF_DOUBTFUL
     chains = _extended([*alone, whole], progress, first)
     if not named:  # against a model that names nothing it need only be better
         chains = [chain for chain in chains if _better(whole, chain).errors >= thresholds.BETTER]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.thresholds import FORM_ERROR, LEAST_HELD_OUT_ROWS, QUIET, STRUCTURE
+from stimrig.identify.diagnosis.thresholds import FORM_ERROR, LEAST_HELD_OUT_ROWS, NEXT_MARGIN, QUIET
 from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.joint import Fitted
@@ -34,7 +34,7 @@ class ResidualStructure:
         """True if work and rest differ statistically and by an amount that matters: in a long record every trifle is
         significant."""
         excess_nm = max(self.busy_nm**2 - self.white_nm**2, 0.0) ** 0.5
-        return self.ratio > STRUCTURE and excess_nm > FLOOR_SHARE * self.scale_nm
+        return self.ratio > NEXT_MARGIN and excess_nm > FLOOR_SHARE * self.scale_nm
 
 
 def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:

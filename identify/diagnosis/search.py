@@ -194,7 +194,7 @@ def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
     # Slow ones first, so that all processes end at about the same time.
     listed.sort(key=lambda effect: -len(effect.forms))
     tried = scan(last.searched, listed, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
-    candidates = sorted((_discounted(search, candidate) for candidate in tried), key=_by_gain)
+    candidates = sorted(map(_discounted, tried), key=_by_gain)
     if not number and (lawless := try_effect(FREE_GAIN, last.searched)) is not None:
         search.free_gain = lawless.gain
     accepted: list[tuple[float, Candidate]] = []
@@ -250,7 +250,7 @@ def _rebuild(search: EffectSearch, last: Fitted, found: Sequence[Step]) -> None:
         gain = fitted.log_evidence - before.log_evidence + prior(effect)
         known = next((c.forms for c in step.tried if c.effect.id == effect.id), {})
         chosen = forms.get(effect.id, effect.forms[0])
-        candidate = _discounted(search, Candidate(effect, chosen, fitted, gain, known | {chosen.name: gain}))
+        candidate = _discounted(Candidate(effect, chosen, fitted, gain, known | {chosen.name: gain}))
         comparison = difference(search.steps[-1].left_out, leave_out(fitted))
         if candidate.gain < search.margin(number) or not comparison.errors >= required_errors(search, candidate):
             return  # beside the other effects it no longer gains enough
@@ -274,7 +274,7 @@ def required_errors(search: EffectSearch, candidate: Candidate) -> float:
         return 0.0 if search.last.distrusted else -thresholds.BETTER
     if resembles_earlier(search.last, effect, candidate.form.stage, search.names("detected")):
         return thresholds.BETTER_THAN_ALIKE
-    return thresholds.BETTER_IF_WEAK if candidate.gain < thresholds.NEXT_MARGIN else thresholds.BETTER
+    return thresholds.BETTER_IF_DOUBTFUL if candidate.gain < thresholds.NEXT_MARGIN else thresholds.BETTER
 
 
 def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iterable[str]) -> bool:
@@ -397,14 +397,10 @@ def only_at_work(quiet: np.ndarray, fitted: Fitted, effect: str) -> bool:
     return sporadic and share_at_rest(quiet, fitted, effect) < thresholds.SHARE_AT_REST
 
 
-def _discounted(search: EffectSearch, candidate: Candidate) -> Candidate:
-    """The candidate with its gain reduced if it is an effort, and reduced more if it is only seen at work."""
-    effect = candidate.effect
-    if effect.band or not effect.sporadic:
-        return candidate
-    at_work = only_at_work(search.quiet, candidate.fitted, effect.id)
-    weight = thresholds.EFFORT_WEIGHT_ONLY_AT_WORK if at_work else thresholds.EFFORT_WEIGHT
-    return replace(candidate, gain=weight * candidate.gain)
+def _discounted(candidate: Candidate) -> Candidate:
+    """The candidate with its gain reduced if it is an effort."""
+    effort = candidate.effect.sporadic and not candidate.effect.band
+    return replace(candidate, gain=thresholds.UNSURE * candidate.gain) if effort else candidate
 
 
 def _exhausted(search: EffectSearch) -> bool:

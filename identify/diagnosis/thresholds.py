@@ -10,29 +10,27 @@ from __future__ import annotations
 FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
-"""Log evidence that every further effect must gain, at least."""
+"""Log evidence that every further effect must gain, at least; log-likelihood by which work and rest must differ for
+structure to be left; and log evidence by which a gain without a law must beat the best effect, so that the cause is not
+in the library."""
 NEAR_IDEAL = 30.0
 """Log-likelihood that the last model may fall short of the ideal by, where its residual is white: the size of the noise
 is known no better. Nothing further is then looked for."""
 BETTER = 1.0
 """Standard errors by which the error on left-out blocks must fall with an effect, and by which it may rise with one
 that cannot be foreseen: such an effect need not predict, but it must not spoil what the muscle does."""
-BETTER_IF_WEAK = 1.5
-"""The same for a first effect that gains less log evidence than a further one must."""
+BETTER_IF_DOUBTFUL = 2.0
+"""The same for a first effect that gains less log evidence than a further one must, and for a free effect beside which
+nothing is named."""
 BETTER_THAN_ALIKE = 3.0
 """The same if it resembles an effect that is there, both change the dynamics, or that one is free: one effect in an
 inexact form looks like two."""
-BETTER_IF_FREE = 2.0
-"""The same for a free effect beside which nothing is named."""
 FREE_FALL = 0.2
 """Logarithm by which that error must fall with a free effect, too: it is chosen among many."""
-EFFORT_WEIGHT = 0.92
-"""Weight of the evidence for efforts. Where a law explains as much, the law is preferred, since it can be tested."""
-EFFORT_WEIGHT_ONLY_AT_WORK = 0.85
-"""Weight of the evidence for efforts that do not appear at rest: true efforts do not wait for the stimulation."""
 UNSURE = 0.85
-"""Largest probability of an effect that may only repair the inexact form of an earlier one, and of efforts that do not
-appear at rest: the stimulation itself may cause them."""
+"""Weight of the evidence for efforts: where a law explains as much, the law is preferred, since it can be tested. It is
+also the largest probability of an effect that may only repair the inexact form of an earlier one, and of efforts that
+do not appear at rest: the stimulation itself may cause them."""
 SHARE_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
 SLOWEST_AR1 = 0.97
@@ -51,16 +49,10 @@ MANY_EFFORTS = 4
 """This many efforts, none of them at rest, are more likely caused by the stimulation."""
 EFFORTS_LAST = 0.33
 """Share of the test above which efforts last too long to be efforts."""
-APART_S = 1.2
-"""Two bumps whose middles are farther apart are two efforts."""
 STRUCTURE_BESIDE_BAND = 60.0
 """Log-likelihood by which work and rest must differ beside a tremor for structure to be left."""
-STRUCTURE = 12.0
-"""Log-likelihood by which work and rest must differ for structure to be left."""
 UNKNOWN_FORM = 0.04
 """Probability that is kept for what no form in the library describes; a rival that is less probable is not named."""
-FREE_GAIN_MARGIN = 8.0
-"""If a gain without a law beats the best effect by this log evidence, the cause is not in the library."""
 EXPLAINED_BY_LAWS = 0.9
 """If the effects explain this share, a better gain without a law does not count."""
 HELD_OUT_RATIO = 2.5

@@ -69,13 +69,8 @@ def _no_effort(search: EffectSearch, explained: float) -> bool:
         return True  # true efforts are rare
     if not only_at_work(search.quiet, holder, effort):
         return False
-    return "resisting" in dict(holder.effects)[effort].name or _efforts(parameters) >= thresholds.MANY_EFFORTS
-
-
-def _efforts(parameters: dict[str, float]) -> int:
-    """Number of efforts: bumps close to one another count as one."""
-    centres = np.sort([value for name, value in parameters.items() if name.startswith("centre_")])
-    return int(np.sum(np.diff(centres) > thresholds.APART_S)) + 1 if centres.size else 0
+    count = sum(name.startswith("centre_") for name in parameters)
+    return "resisting" in dict(holder.effects)[effort].name or count >= thresholds.MANY_EFFORTS
 
 
 def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
@@ -201,7 +196,7 @@ def _strange(search: EffectSearch, effects: list[str], explained: float) -> bool
     if explained < thresholds.LEAST_EXPLAINED and residual.significant:
         return True
     gain = search.rounds[0][0].gain if search.rounds else np.inf
-    if search.free_gain > gain + thresholds.FREE_GAIN_MARGIN and explained < thresholds.EXPLAINED_BY_LAWS:
+    if search.free_gain > gain + thresholds.NEXT_MARGIN and explained < thresholds.EXPLAINED_BY_LAWS:
         return True
     if find_effect(effects[0]).band:
         little = explained < thresholds.LEAST_EXPLAINED_BY_BAND
