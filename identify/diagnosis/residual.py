@@ -14,6 +14,8 @@ from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.left_out import FLOOR_SHARE, difference, hold_out
 from stimrig.identify.noise import WHITE_AND_SLOW, band_part, profile
 
+LEAST_RESTING = 40
+"""Fewer intervals at rest do not show how large the noise is."""
 MEDIAN = 0.6745
 """Median of the size of normal errors over their standard deviation."""
 
@@ -43,43 +45,29 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
     residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
     white = max(setup.grid.mean_noise_nm(setup.fitted), 1e-6 * setup.scale_nm)
     rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)
-    together = _profile(residual, rests + works)
-    resting, working = _profile(residual, rests), _profile(residual, works)
-    ratio = resting[3] + working[3] - together[3] if rests and works else 0.0
+    at_rest, at_work = _log_likelihood(residual, rests), _log_likelihood(residual, works)
+    total, resting = int(setup.fitted.sum()), sum(run.stop - run.start for run in rests)
+    ideal = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
+    if resting >= LEAST_RESTING:
+        ideal = min(ideal, at_rest / resting * total)
+    work = np.concatenate([residual[run] for run in works]) if works else np.zeros(1)
     return ResidualStructure(
         white_nm=white,
-        busy_nm=_rms(residual, works),
-        ratio=ratio,
-        ideal=_ideal(setup.fitted, resting, white, sum(r.stop - r.start for r in rests)),
+        busy_nm=float(np.sqrt(np.mean(work**2))),
+        ratio=at_rest + at_work - _log_likelihood(residual, rests + works) if rests and works else 0.0,
+        ideal=ideal,
         slow_nm=fitted.noise.sd_nm * float(np.sqrt(min(fitted.noise.share, 1.0))),
         scale_nm=setup.scale_nm,
     )
-
-
-def _ideal(fitted: np.ndarray, resting: tuple, white: float, size: int) -> float:
-    """Log-likelihood of a record of this length if its noise were everywhere as it is at rest."""
-    total = int(fitted.sum())
-    at_white = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
-    if size < 40:
-        return at_white
-    return min(at_white, resting[3] / size * total)
 
 
 def _long(flags: np.ndarray, min_rows: int) -> list[slice]:
     return [run for run in runs(flags) if run.stop - run.start >= min_rows]
 
 
-def _profile(residual: np.ndarray, parts: list[slice]) -> tuple[float, float, float, float]:
-    if not parts:
-        return (0.0, 0.0, 0.0, 0.0)
-    noise, log_likelihood = profile(residual, ends_of(parts), WHITE_AND_SLOW)
-    return noise.ar1, noise.share, noise.sd_nm, log_likelihood
-
-
-def _rms(residual: np.ndarray, parts: list[slice]) -> float:
-    if not parts:
-        return 0.0
-    return float(np.sqrt(np.mean(np.concatenate([residual[p] for p in parts]) ** 2)))
+def _log_likelihood(residual: np.ndarray, parts: list[slice]) -> float:
+    """Of some rows alone, with the noise that is most likely there."""
+    return profile(residual, ends_of(parts), WHITE_AND_SLOW)[1] if parts else 0.0
 
 
 def quiet_rows(fitted: Fitted) -> np.ndarray:
