@@ -86,6 +86,14 @@ def test_where_nothing_is_hidden_nothing_is_named(seed, ar1, library):
     assert result.probability > 0.5
 
 
+def test_two_effects_are_named_beside_each_other():
+    record = as_record(generate(("fatigue", "asymmetric_relaxation"), "middle", 9))
+    few = ("fatigue", "asymmetric_relaxation", "threshold_drift")
+    result = diagnosed_with(few, record.take(np.arange(record.time_s.size) % 4 == 0))
+    assert result.verdict == "effect_missing"
+    assert {row["effect"] for row in result.missing} == {"fatigue", "asymmetric_relaxation"}
+
+
 @both_libraries
 @pytest.mark.parametrize(
     ("slow_s", "quick_s", "noise_nm", "gaps_s"),
