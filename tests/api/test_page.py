@@ -138,12 +138,12 @@ def test_stop_during_a_fit_is_confirmed_and_the_model_still_comes(service: Servi
 
 
 def test_a_reader_sees_no_deeds_and_may_stop(service: Service, client: httpx.Client) -> None:
-    model = service.play_test("C4")["model_id"]
+    model = service.play_test("UNSEEN-4")["model_id"]
     body = {"name": "Rosa", "password": PASSWORD, "scopes": ["read-live", "read-model"]}
     assert client.post("/v1/users", json=body).status_code in (201, 409)
     with service.client(token=None, headers=HTML, follow_redirects=True) as page:
         home = page.post("/v1/sessions", data={"name": "Rosa", "password": PASSWORD}).text
-        assert "You may not see this list" in home and "C4" not in without_values(home)
+        assert "You may not see this list" in home and "UNSEEN-4" not in without_values(home)
         shown = page.get(f"/models/{model}").text
         assert "A clinician approves or rejects it." in shown
         buttons = re.sub(r"<[^>]*>", "", " ".join(re.findall(r"<button.*?</button>", shown, re.DOTALL)))
