@@ -70,7 +70,13 @@ def registry() -> dict[str, Effect]:
 
 
 def find_effect(effect_id: str) -> Effect:
-    """One effect by its id. Raises BadRequest: no effect has this id."""
+    """One effect by its id. Raises BadRequest: no effect has this id.
+
+    Parameters
+    ----------
+    effect_id : str
+        As in `Model.effects`.
+    """
     effects = registry()
     if effect_id not in effects:
         known = ", ".join(sorted(effects))
@@ -80,7 +86,13 @@ def find_effect(effect_id: str) -> Effect:
 
 
 def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
-    """The effect and the form of an entry of `Model.effects`; None if either is unknown here."""
+    """The effect and the form of an entry of `Model.effects`; None if either is unknown here.
+
+    Parameters
+    ----------
+    entry : mapping
+        One of `Model.effects`.
+    """
     try:
         effect = registry()[entry["id"]]
         return effect, effect.form(entry.get("form", ""))
@@ -89,12 +101,24 @@ def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
 
 
 def depend_on_joint(names: Iterable[str]) -> bool:
-    """Return True if one of the effects depends on the angle or the velocity of the joint."""
+    """Return True if one of the effects depends on the angle or the velocity of the joint.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Ids of effects.
+    """
     return any(find_effect(name).moves_with_joint for name in names)
 
 
 def any_free(names: Iterable[str]) -> bool:
-    """Return True if one of the effects is free: it describes the error and names no cause."""
+    """Return True if one of the effects is free: it describes the error and names no cause.
+
+    Parameters
+    ----------
+    names : iterable of str
+        Ids of effects.
+    """
     return any(find_effect(name).shape for name in names)
 
 

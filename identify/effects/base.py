@@ -189,7 +189,7 @@ class Form:
     equation: str  # the equation, for people
     parameters: tuple[Parameter, ...]
     """The parameters; their first starting values form the first run, their second ones the second, and so on."""
-    apply: Apply | None = None
+    apply: Apply | None = None  # the law, as above; None for the stages that `law` describes
     batched: bool = False
     """True if `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row."""
     law: Mapping[Any, str | float] = field(default_factory=dict)
@@ -343,7 +343,20 @@ def form(
 ) -> Callable[[Apply], Form]:
     """Decorator that makes a form of a function of all rows at once (`batched`); its name is the function's.
 
-    `more` are other fields of `Form`; `kind` is a subclass with starts of its own.
+    Parameters
+    ----------
+    stage : str
+        As `Form.stage`.
+    equation : str
+        For people.
+    parameters : tuple of Parameter
+        Of the law.
+    name : str, optional
+        In place of the function's.
+    kind : type, optional
+        A subclass of `Form` with starts of its own.
+    **more
+        Other fields of `Form`.
     """
     return lambda apply: kind(name or apply.__name__, stage, equation, parameters, apply, batched=True, **more)
 

@@ -86,7 +86,13 @@ Basis = SplineBasis | PowerBasis | SigmoidBasis | FixedShape
 
 
 def basis_from_dict(data: dict[str, Any]) -> Basis:
-    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to."""
+    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to.
+
+    Parameters
+    ----------
+    data : dict
+        What `to_dict` of a basis gave.
+    """
     match data["kind"]:
         case "cubic-spline":
             return SplineBasis(np.asarray(data["knots_us"], float))
@@ -105,6 +111,13 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
 
     A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients, N²·m².
     Where the curve falls, its plateau is below zero.
+
+    Parameters
+    ----------
+    curve : Curve
+        f(u).
+    covariance_nm2 : ndarray, optional
+        Of the coefficients, N²·m², shape (basis.size, basis.size).
     """
     width_us, torque_nm = curve.table()
     top = int(np.argmax(np.abs(torque_nm)))
@@ -137,7 +150,17 @@ def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:
 
 
 def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:
-    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search."""
+    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search.
+
+    Parameters
+    ----------
+    steepness_log : float
+        Log of the steepness.
+    middle_us : float
+        Of the sigmoid, µs.
+    largest_us : float
+        Largest pulse width, µs.
+    """
     a2 = float(np.exp(steepness_log))
     return SigmoidBasis(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
 
@@ -149,6 +172,15 @@ def fit_shape(
 
     `residual_of` gives the residual for a shape, with all linear parameters solved for. The widths that were applied,
     `seen_us`, bound the middle.
+
+    Parameters
+    ----------
+    residual_of : callable
+        Residual for a shape, with all linear parameters solved for.
+    largest_us : float
+        Largest pulse width, µs.
+    seen_us : ndarray
+        Widths that were applied, µs; they bound the middle.
     """
     from scipy.optimize import least_squares
 
@@ -169,7 +201,15 @@ def fit_shape(
 
 
 def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:
-    """The sigmoid fitted to points of a curve, µs and N·m, with its gain."""
+    """The sigmoid fitted to points of a curve, µs and N·m, with its gain.
+
+    Parameters
+    ----------
+    width_us : ndarray
+        Pulse widths, µs.
+    torque_nm : ndarray
+        Torques, N·m.
+    """
 
     def gain(basis: SigmoidBasis) -> float:
         column = basis.design(width_us)[:, 0]

@@ -69,6 +69,15 @@ def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) 
     Raises BadModel: the pulse rate differs too much, an effect or its form is unknown here, the record lacks a column
     it needs, or the torque grows without limit. Raises BadRequest: in the earlier trial no joint moves, or it is
     several recordings.
+
+    Parameters
+    ----------
+    model : Model
+        The model.
+    record : Record
+        Its pulse widths and, for a joint that moves, its angle.
+    earlier_trial : Record, optional
+        The same movement before.
     """
     refuse_rate(model, record)
     grid = make_grid(record)
