@@ -188,7 +188,7 @@ def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
 
     Where the likelihood cannot be trusted, the effect that predicts them best of those that are likely enough.
     """
-    last, before = search.steps[-1], search.rounds[0] if number else ()
+    last, before = search.steps[-1], next(iter(search.rounds), ())  # none also where an exchange left no effect
     present = effect_names(last.searched)
     listed = [effect for effect in registry().values() if _applicable(effect, last.searched, present)]
     # Slow ones first, so that all processes end at about the same time.
