@@ -18,7 +18,7 @@ def held_by(model: Any | None, record: Any) -> list[str]:
     Raises IdentifyError: the model holds for another pulse rate, or effects do not stand on it.
     """
     from stimrig.identify.diagnosis import structure_of
-    from stimrig.identify.simulation.predict import refuse_rate
+    from stimrig.identify.problem.predict import refuse_rate
 
     if model is not None:
         refuse_rate(model, record)

@@ -20,7 +20,7 @@ from bench.muscles.arm_patient import ArmPatient, arm_patient
 from bench.muscles.arm_records import record
 from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
-from stimrig.identify.simulation.pulses import Motion, above_rest
+from stimrig.identify.problem.pulses import Motion, above_rest
 
 sys.path.insert(0, str(ROOT / "examples"))
 from ilc_controller import Reference

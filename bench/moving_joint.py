@@ -21,9 +21,9 @@ from bench.muscles.arm_records import record
 from stimrig.api.sessions import joint_plan
 from stimrig.identify.fitting import MOVING_JOINT, fit
 from stimrig.identify.model import Model
+from stimrig.identify.problem.predict import predict
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.predict import predict
 from tests.harness.carried_sessions import as_record
 
 PASSIVE_S, UNSEEN_S, RATE_HZ = 66.0, 30.0, 40.0

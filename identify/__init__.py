@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from stimrig.identify.experiments import Experiment
     from stimrig.identify.fitting import fit
     from stimrig.identify.model import Model
+    from stimrig.identify.problem.predict import predict
     from stimrig.identify.records import read
     from stimrig.identify.records.record import Record
     from stimrig.identify.results import Carried, Comparison, Diagnosis, Explanation, Improvement
-    from stimrig.identify.simulation.predict import predict
 
 __all__ = [
     "BadModel", "BadRecord", "BadRequest", "Cancelled", "Carried", "Comparison", "Diagnosis", "Experiment",
@@ -39,7 +39,7 @@ _PLACES = {
     "records": ("read",),
     "records.record": ("Record",),
     "results": ("Carried", "Comparison", "Diagnosis", "Explanation", "Improvement"),
-    "simulation.predict": ("predict",),
+    "problem.predict": ("predict",),
 }
 
 

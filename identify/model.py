@@ -86,7 +86,7 @@ class Model(Summarised):
     bands: dict[str, Any] = field(default_factory=dict)  # of both curves, 95 %
     data: dict[str, Any] = field(default_factory=dict)  # the recording: its name, id and SHA-256
     joint: dict[str, Any] = field(default_factory=dict)
-    """g(x, ẋ) and h(x, ẋ) as tables with bands (`simulation.joint_surface`); empty where the joint was held."""
+    """g(x, ẋ) and h(x, ẋ) as tables with bands (`problem.joint_surface`); empty where the joint was held."""
     reasons: tuple[str, ...] = ()  # for the structure, the number of knots and the noise model
     extra: dict[str, Any] = field(default_factory=dict)  # what the method adds
     model_id: str = ""  # of this version
@@ -95,7 +95,7 @@ class Model(Summarised):
 
     def predict(self, record: Record) -> np.ndarray:
         """Free-run torque at the record's samples, N·m, shape (N,)."""
-        from stimrig.identify.simulation.predict import predict  # here: reading a model does not import numba
+        from stimrig.identify.problem.predict import predict  # here: reading a model does not import numba
 
         return predict(self, record)
 

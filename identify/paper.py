@@ -13,8 +13,8 @@ import numpy as np
 
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.fitting import fit
+from stimrig.identify.problem.predict import predict
 from stimrig.identify.records.record import HELD_OUT, Record
-from stimrig.identify.simulation.predict import predict
 
 A1_NM, A2_PER_US, A3 = 6.8994, 0.0410, 2389.7
 TIME_CONSTANT_S, DAMPING = 0.5284, 0.6369

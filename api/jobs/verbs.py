@@ -133,7 +133,7 @@ def forecast(
 
     `angle_rad`: of the joint in each pulse's period, where it moves.
     """
-    from stimrig.identify.simulation.pulses import Motion, above_rest
+    from stimrig.identify.problem.pulses import Motion, above_rest
 
     progress(0.1, "predicting")
     model = identify.Model.from_json(model_json)

@@ -21,9 +21,9 @@ from stimrig.identify.estimation.repetition import repetition
 from stimrig.identify.estimation.samples import block_means, inspect
 from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
 from stimrig.identify.model import Model
+from stimrig.identify.problem.predict import same_data
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Comparison
-from stimrig.identify.simulation.predict import same_data
 from stimrig.identify.yardstick import repetition_sentences
 
 POINTS = 2400

@@ -13,9 +13,9 @@ from stimrig.identify.effects import find_effect, registry
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import add_effect, detected_effects, effect_names, try_effect
 from stimrig.identify.estimation.finish import finish
-from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import fit_plain, renewed_curve
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Carried

@@ -32,9 +32,9 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, find_effect, registry
 from stimrig.identify.effects.base import replaced_by
 from stimrig.identify.estimation.candidates import trusted
-from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.left_out import Difference, LeftOut, difference, leave_out
 from stimrig.identify.estimation.samples import Raw, fitted_rows
+from stimrig.identify.estimation.solve import Fitted
 
 ZERO = {"free_zero": "baseline_drift"}
 """A free effect, and the one of the library that nothing foretells and that may look like it."""

@@ -10,8 +10,8 @@ from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.thresholds import FORM_ERROR, LEAST_HELD_OUT_ROWS, NEXT_MARGIN, QUIET
 from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.left_out import FLOOR_SHARE, difference, hold_out
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.noise import WHITE_AND_SLOW, band_part, profile
 
 LEAST_RESTING = 40

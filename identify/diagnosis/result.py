@@ -16,9 +16,9 @@ from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import Effect, find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters, finish
-from stimrig.identify.estimation.joint import predict_fitted
 from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.shapes import shape_of
+from stimrig.identify.estimation.solve import predict_fitted
 from stimrig.identify.estimation.still import moves
 from stimrig.identify.estimation.uncertainty import covariance_of
 from stimrig.identify.experiments import NOTHING, Experiment, plan, plan_further

@@ -31,13 +31,13 @@ from stimrig.identify.estimation.effect_fit import (
     try_effect,
 )
 from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.joint import Fitted, knows_joint, solve, start_from
 from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
 from stimrig.identify.estimation.plain import fit_plain, renewed_curve
 from stimrig.identify.estimation.samples import Raw
+from stimrig.identify.estimation.solve import Fitted, knows_joint, solve, start_from
 from stimrig.identify.noise import NoiseLevel
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.problem import Problem
 
 LEAST_S = 3.0
 """Fitted time, s, below which no effect is looked for: a train of a calibration, 2 s and its rests at most, is of one

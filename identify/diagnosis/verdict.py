@@ -13,7 +13,7 @@ from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work, 
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import likelihood_warnings
 from stimrig.identify.estimation.effect_fit import Candidate
-from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.solve import Fitted
 
 LONGEST_HELD_S = 0.05
 """A reading that is held for longer than two pulses hides how the torque rises and falls."""

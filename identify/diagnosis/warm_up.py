@@ -6,12 +6,12 @@ import numpy as np
 
 from stimrig.identify.effects import registry
 from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.joint import start_from
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import fitted_rows, prepare
+from stimrig.identify.estimation.solve import start_from
 from stimrig.identify.noise import find_band
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.problem import Problem
 
 
 def warm() -> None:

@@ -11,14 +11,14 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.earlier import Change, Earlier
-from stimrig.identify.estimation.joint import Fitted, gram
 from stimrig.identify.estimation.short_record import Short, fit_short
+from stimrig.identify.estimation.solve import Fitted, gram
 from stimrig.identify.estimation.still import joint_of
 from stimrig.identify.model import Model
 from stimrig.identify.noise import profile
+from stimrig.identify.problem.problem import Problem
+from stimrig.identify.problem.setup import Setup
 from stimrig.identify.recruitment.near_shape import DEVIATIONS
-from stimrig.identify.simulation.problem import Problem
-from stimrig.identify.simulation.setup import Setup
 
 LEAST_SD = 1e-5
 """Standard deviation, as a share of the plateau, that is added to the curve's coefficients: below its threshold a curve
@@ -42,7 +42,7 @@ class Averaged(Fitted):
 
 
 def averaged(short: Short, mean_of_draws: bool = True) -> Averaged:
-    """The solved problem of a fit by draws, in the parameters of `simulation.problem`.
+    """The solved problem of a fit by draws, in the parameters of `problem.problem`.
 
     These are the mean of the draws; without `mean_of_draws` the most probable ones.
     """

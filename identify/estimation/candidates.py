@@ -13,9 +13,9 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import any_free
-from stimrig.identify.estimation.joint import Fitted, knows_joint, solve
 from stimrig.identify.estimation.left_out import bouts, difference, leave_out, near_widths
 from stimrig.identify.estimation.rests import relaxed
+from stimrig.identify.estimation.solve import Fitted, knows_joint, solve
 from stimrig.identify.noise import WHITE, NoiseLevel
 from stimrig.identify.records.record import FORGOTTEN_S
 

@@ -13,11 +13,11 @@ import numpy as np
 
 from stimrig.identify.effects.base import Form, Parameter
 from stimrig.identify.estimation.averaged import averaged
-from stimrig.identify.estimation.joint import Fitted, gram
 from stimrig.identify.estimation.short_record import Short
+from stimrig.identify.estimation.solve import Fitted, gram
 from stimrig.identify.estimation.uncertainty import square_root
 from stimrig.identify.noise import NoiseLevel
-from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.problem.problem import Problem
 
 SLOW_HZ, QUICKEST_HZ, FALL = 0.25, 1.0, 3.0
 """A breath takes two and a half seconds and more: waves above `SLOW_HZ` are smaller by the power `FALL` of their

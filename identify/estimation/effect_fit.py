@@ -11,14 +11,14 @@ from stimrig.identify.effects import find_effect, registry
 from stimrig.identify.effects.base import STAGES, Effect, Form, Scene, replaced_by
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.candidates import trusted
-from stimrig.identify.estimation.joint import Fitted, solve, start_from
 from stimrig.identify.estimation.joint_sensor import with_angle_delay
 from stimrig.identify.estimation.left_out import Difference
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
+from stimrig.identify.estimation.solve import Fitted, solve, start_from
 from stimrig.identify.noise import find_band
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.problem import Problem
 
 PATIENCE = 2
 """A chain of forms (one bump, two bumps, …) ends after this many steps without a gain."""

@@ -13,17 +13,17 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
 from stimrig.identify.estimation.fit_statistics import evaluate, fit_statistics, white_sd
-from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.joint_sensor import sensor_of, words
 from stimrig.identify.estimation.quality import quality, valid_for
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.shapes import shape_of
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.estimation.uncertainty import bands, covariance_of, unexplained
 from stimrig.identify.model import Covariance, Model, Noise
 from stimrig.identify.noise import correlation
+from stimrig.identify.problem.joint_surface import Surfaces, joint_tables
+from stimrig.identify.problem.predict import fingerprint, predict_on
 from stimrig.identify.recruitment import Curve
-from stimrig.identify.simulation.joint_surface import Surfaces, joint_tables
-from stimrig.identify.simulation.predict import fingerprint, predict_on
 
 AT_WORK = 0.05
 

@@ -8,9 +8,9 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.joint import Fitted, predict_fitted
 from stimrig.identify.estimation.repetition import repetition
 from stimrig.identify.estimation.samples import block_means
+from stimrig.identify.estimation.solve import Fitted, predict_fitted
 from stimrig.identify.noise import whitened
 from stimrig.identify.records.readings import contrasts
 from stimrig.identify.records.record import HELD_OUT

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from stimrig.identify.estimation.joint import Fitted, gram, knows_joint, solve
-from stimrig.identify.simulation.predict import sensor_cost_nm
-from stimrig.identify.simulation.problem import Problem
+from stimrig.identify.estimation.solve import Fitted, gram, knows_joint, solve
+from stimrig.identify.problem.predict import sensor_cost_nm
+from stimrig.identify.problem.problem import Problem
 
 LARGEST_S = 0.1
 PRIOR_S = 0.02

@@ -15,10 +15,10 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.joint import Fitted, Point, log_posterior, newton_step, solve
 from stimrig.identify.estimation.rests import relaxed
+from stimrig.identify.estimation.solve import Fitted, Point, log_posterior, newton_step, solve
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import FORGOTTEN_S
-from stimrig.identify.simulation.problem import Problem
 
 APART_S = 1.0
 """A pause that separates two bouts of stimulation; the zeros of a PRBS are shorter."""

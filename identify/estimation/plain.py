@@ -14,11 +14,13 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.candidates import chosen
-from stimrig.identify.estimation.joint import Fitted, gram, knows_joint, solve, solve_scaled
 from stimrig.identify.estimation.rests import rest_levels
 from stimrig.identify.estimation.samples import white_noise
+from stimrig.identify.estimation.solve import Fitted, gram, knows_joint, solve, solve_scaled
 from stimrig.identify.estimation.still import joint_of, still_rows
 from stimrig.identify.noise import WHITE, WHITE_AND_SLOW, NoiseLevel
+from stimrig.identify.problem.problem import Problem
+from stimrig.identify.problem.setup import Setup
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Basis, Curve
 from stimrig.identify.recruitment.bases import SplineBasis
@@ -33,8 +35,6 @@ from stimrig.identify.recruitment.smoothing import (
     knots_for,
     spline_roughness,
 )
-from stimrig.identify.simulation.problem import Problem
-from stimrig.identify.simulation.setup import Setup
 
 STARTS_S = (0.12, 0.4)
 USUAL_NOISE = 0.02

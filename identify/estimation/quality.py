@@ -12,10 +12,10 @@ from stimrig.identify.dynamics.linear import Discrete
 from stimrig.identify.effects import depend_on_joint
 from stimrig.identify.errors import RunsAway
 from stimrig.identify.model import Model
+from stimrig.identify.problem.joint_surface import JointEffect, Surfaces
+from stimrig.identify.problem.predict import refuse_rate
+from stimrig.identify.problem.pulses import Motion, above_rest
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.joint_surface import JointEffect, Surfaces
-from stimrig.identify.simulation.predict import refuse_rate
-from stimrig.identify.simulation.pulses import Motion, above_rest
 from stimrig.identify.yardstick import held_out_pulses
 
 UNDER_CEILING_POINTS = 1.0

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.noise import MEAN_OF_SLOW, SHORTEST, NoiseLevel
 
 LAGS = 20

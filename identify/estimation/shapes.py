@@ -9,7 +9,7 @@ import numpy as np
 
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Form, Shape
-from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.estimation.uncertainty import square_root
 
 DRAWS = 200

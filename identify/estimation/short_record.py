@@ -15,12 +15,12 @@ from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S, SecondOrder
 from stimrig.identify.estimation.curve_posterior import CurvePosterior, Mode, Quadratic
 from stimrig.identify.estimation.earlier import Earlier
-from stimrig.identify.estimation.joint import gram
+from stimrig.identify.estimation.solve import gram
 from stimrig.identify.noise import NoiseLevel, profile, whitened
+from stimrig.identify.problem.problem import Problem
+from stimrig.identify.problem.setup import Setup
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.near_shape import FINE_KNOTS, KNOTS, LOGISTIC_RISE, NearShape, dense_knots, new_person
-from stimrig.identify.simulation.problem import Problem
-from stimrig.identify.simulation.setup import Setup
 
 
 @dataclass(frozen=True)

@@ -15,12 +15,12 @@ import numpy as np
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.fit_statistics import held_out_change
-from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.rests import RELAXED_S, scatter_at_rest, since_pulse
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.model import Covariance, Model
+from stimrig.identify.problem.joint_surface import POINTWISE
+from stimrig.identify.problem.predict import same_data, slopes, unpredictable_torque
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.joint_surface import POINTWISE
-from stimrig.identify.simulation.predict import same_data, slopes, unpredictable_torque
 
 BLOCK_S = 3.0
 """Longer than a contraction's rise: within a block, what is wrong stays wrong."""

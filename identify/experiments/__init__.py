@@ -11,12 +11,12 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import ends_of, make_grid
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.experiments.designs import Design, designs, held_levels
 from stimrig.identify.noise import whitened
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Result
-from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.summary import Sheet
 
 ENOUGH = 7.0

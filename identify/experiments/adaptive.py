@@ -24,10 +24,10 @@ from stimrig.identify.errors import IdentifyError
 from stimrig.identify.estimation.averaged import averaged
 from stimrig.identify.estimation.disturbance import disturbed, unsure
 from stimrig.identify.estimation.earlier import Earlier
-from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.residual_tests import residual_tests
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.estimation.short_record import Short, fit_short
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.experiments.designs import Segment, pieces, played_widths
 from stimrig.identify.experiments.knowledge import Knowledge, Target, foresee, knowledge, require_number
 from stimrig.identify.records.record import Record

@@ -14,10 +14,10 @@ from stimrig.identify.inversion.plant import NOTHING, Plant
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
+from stimrig.identify.problem.joint_surface import Surfaces
+from stimrig.identify.problem.pulses import above_rest
 from stimrig.identify.recruitment import THRESHOLD_SHARE
 from stimrig.identify.results import Result
-from stimrig.identify.simulation.joint_surface import Surfaces
-from stimrig.identify.simulation.pulses import above_rest
 from stimrig.identify.summary import Sheet, quantity
 
 __all__ = ["Inversion", "Reference", "invert"]

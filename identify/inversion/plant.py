@@ -12,8 +12,8 @@ from stimrig.identify.dynamics.second_order import recursion, transition
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.model import Model
-from stimrig.identify.simulation.joint_surface import Surfaces
-from stimrig.identify.simulation.pulses import SAMPLES_A_PULSE, Motion, above_rest
+from stimrig.identify.problem.joint_surface import Surfaces
+from stimrig.identify.problem.pulses import SAMPLES_A_PULSE, Motion, above_rest
 
 OWED = 0.05
 """Most that one pulse leaves to those after it, as a share of the largest torque."""

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.errors import BadRecord, BadRequest
+from stimrig.identify.problem.pulses import Motion
 from stimrig.identify.records.cells import is_number
 from stimrig.identify.records.csv import COMMENTS, encoding_of, text_lines
-from stimrig.identify.simulation.pulses import Motion
 
 LONGEST_S = 300.0
 MOST_SAMPLES = 60_000

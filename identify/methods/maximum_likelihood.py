@@ -16,9 +16,9 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.finish import finish
-from stimrig.identify.estimation.joint import Fitted, solve
 from stimrig.identify.estimation.plain import fit_plain, fit_spline, start_at
 from stimrig.identify.estimation.samples import fitted_rows
+from stimrig.identify.estimation.solve import Fitted, solve
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.two_stage import general

@@ -28,8 +28,8 @@ from stimrig.identify.dynamics.second_order import recursion
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.estimation.finish import finish, finish_discrete
-from stimrig.identify.estimation.joint import Fitted, solve
 from stimrig.identify.estimation.plain import curve_at, final_spline, fit_from, pilot, plain_setup, start_at
+from stimrig.identify.estimation.solve import Fitted, solve
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, near_rest, order_option, quiet_level, segment_rows, shifted, with_past
 from stimrig.identify.model import Model

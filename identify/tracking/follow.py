@@ -23,11 +23,11 @@ from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import Model
 from stimrig.identify.model_schema import parameter_value
+from stimrig.identify.problem.predict import refuse_rate
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.results import Result
-from stimrig.identify.simulation.predict import refuse_rate
 from stimrig.identify.summary import Sheet, quantity
 from stimrig.identify.tracking.state import CURVE, LEVELS, QUANTITIES, USUAL, Rates, State
 from stimrig.identify.tracking.trial import TrialFit, curve_covariance, fit_trial, placed
@@ -140,7 +140,7 @@ def follow(
     ------
     BadModel
         The model's dynamics are not of second order, the record's pulse rate is another one, or see
-        `stimrig.identify.simulation.predict.problem_of`.
+        `stimrig.identify.problem.predict.problem_of`.
     BadRecord
         The record is too short, or sampled more slowly than the pulses.
     """

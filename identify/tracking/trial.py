@@ -21,9 +21,9 @@ from stimrig.identify.effects import Parameter, Scene, form
 from stimrig.identify.errors import BadRecord
 from stimrig.identify.estimation.averaged import positive
 from stimrig.identify.model import Model
+from stimrig.identify.problem.predict import problem_of
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.predict import problem_of
-from stimrig.identify.simulation.problem import Problem
 from stimrig.identify.tracking.state import LEVELS, State
 
 SHORTEST_S = 1.0
@@ -93,7 +93,7 @@ def placed(model: Model, levels: np.ndarray, grid: Grid) -> tuple[Problem, np.nd
     The first form is the gain, the last two are the shift and the drift. `levels`: log gain, threshold shift (µs), log
     time scale, and what is added to the curve's coefficients (N·m), shape (3 + n,).
 
-    Raises BadModel: as `stimrig.identify.simulation.predict.problem_of`.
+    Raises BadModel: as `stimrig.identify.problem.predict.problem_of`.
     """
     log_gain, shift_us, log_time = levels[:LEVELS].tolist()
     forms = ((gain, (log_gain, 0.0)), (shift, (shift_us, 0.0)), (drift, (0.0,)))
@@ -143,7 +143,7 @@ def curve_covariance(model: Model) -> np.ndarray:
 def fit_trial(model: Model, expected: State, record: Record) -> TrialFit:
     """Fit a trial, from its rest before to its rest after, from what is expected of it on.
 
-    Raises BadModel, BadRecord: as `stimrig.identify.simulation.predict.predict`; and a trial shorter than a second.
+    Raises BadModel, BadRecord: as `stimrig.identify.problem.predict.predict`; and a trial shorter than a second.
     """
     grid = make_grid(record)
     if not np.sum(grid.fitted) * grid.step_s >= SHORTEST_S:

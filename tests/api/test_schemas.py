@@ -21,7 +21,7 @@ from stimrig.api.store import Store
 from stimrig.identify import paper
 from stimrig.identify.json_text import json_value
 from stimrig.identify.model import SCHEMA_VERSION
-from stimrig.identify.simulation.joint_surface import joint_tables
+from stimrig.identify.problem.joint_surface import joint_tables
 from tests.api.conftest import REAL, TOKEN, serving
 
 pytestmark = pytest.mark.slow

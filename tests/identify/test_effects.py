@@ -17,8 +17,8 @@ from stimrig.identify.errors import BadModel, BadRequest, NotIdentifiable
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.model import Model
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.problem import Problem
 from tests.identify import hidden_muscles
 
 CONTRACT = {

@@ -13,9 +13,9 @@ from stimrig.identify.criticism import compare
 from stimrig.identify.criticism.correlation import correlation_tests
 from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.methods import methods
+from stimrig.identify.problem.predict import predict
 from stimrig.identify.records import read
 from stimrig.identify.records.record import OPTIONAL, Record
-from stimrig.identify.simulation.predict import predict
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 from tests.harness.patients import make_record, protocol
 

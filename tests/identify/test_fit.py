@@ -9,11 +9,11 @@ from stimrig import identify
 from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.fit_statistics import BLOCK_S, FOLDS, best_fit_percent, held_out_change
-from stimrig.identify.estimation.joint import solve
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
+from stimrig.identify.estimation.solve import solve
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.problem import Problem
 from tests.harness.patients import Patient, make_record
 
 NOISY = 0.05

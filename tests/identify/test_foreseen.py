@@ -13,7 +13,7 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.uncertainty import prediction_band
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
-from stimrig.identify.simulation.predict import problem_of, unpredictable_torque
+from stimrig.identify.problem.predict import problem_of, unpredictable_torque
 from tests.identify import hidden_muscles
 
 EFFECTS = ("mains_hum", "baseline_drift", "voluntary_effort", "tremor")

@@ -26,9 +26,9 @@ from stimrig.identify.estimation.quality import _stable
 from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
+from stimrig.identify.problem.predict import problem_of
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Diagnosis, Improvement
-from stimrig.identify.simulation.predict import problem_of
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
 from tests.identify import hidden_muscles

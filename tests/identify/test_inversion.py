@@ -18,9 +18,9 @@ from stimrig.identify.inversion.demand import BEND, RIDGE, best_demand
 from stimrig.identify.inversion.plant import on_pulses
 from stimrig.identify.inversion.reference import read_reference
 from stimrig.identify.model import Model
+from stimrig.identify.problem.pulses import above_rest
 from stimrig.identify.recruitment import Curve
 from stimrig.identify.recruitment.bases import SigmoidBasis, SplineBasis
-from stimrig.identify.simulation.pulses import above_rest
 from tests.harness.muscle import FINE_HZ, Patient, second_order
 from tests.identify import hidden_muscles
 

@@ -15,14 +15,14 @@ from stimrig import identify
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.candidates import SLOW, trusted
 from stimrig.identify.estimation.effect_fit import fitted_with
-from stimrig.identify.estimation.joint import Fitted
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.model import Model
+from stimrig.identify.problem.predict import predict
+from stimrig.identify.problem.pulses import Motion
 from stimrig.identify.records.join import join
 from stimrig.identify.records.joint_motion import STEADY, JointMotion, smooth
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.predict import predict
-from stimrig.identify.simulation.pulses import Motion
 from tests.harness.carried_sessions import as_record
 
 ARM = 5

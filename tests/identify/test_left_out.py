@@ -23,8 +23,8 @@ from stimrig.identify.estimation.effect_fit import Candidate, fitted_with
 from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, hold_out, leave_out
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import fitted_rows, prepare
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.join import join
-from stimrig.identify.simulation.problem import Problem
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
 

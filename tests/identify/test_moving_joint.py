@@ -19,18 +19,18 @@ from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.effects.passive_torque import relaxed
 from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.estimation.effect_fit import add_effects, fitted_with
-from stimrig.identify.estimation.joint import Fitted
 from stimrig.identify.estimation.plain import renewed_curve
 from stimrig.identify.estimation.quality import quality, range_warnings
 from stimrig.identify.estimation.samples import fitted_rows, prepare
+from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.methods.maximum_likelihood import start
 from stimrig.identify.model import Model
+from stimrig.identify.problem.joint_surface import Surfaces
+from stimrig.identify.problem.pulses import Motion, above_rest
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.joint_surface import Surfaces
-from stimrig.identify.simulation.pulses import Motion, above_rest
 from tests.harness import few_effects
 from tests.harness.carried_sessions import as_record
 

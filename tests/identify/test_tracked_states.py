@@ -18,8 +18,8 @@ from stimrig.identify.effects import registry as effects
 from stimrig.identify.errors import BadModel
 from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
+from stimrig.identify.problem.predict import predict, problem_of
 from stimrig.identify.records.record import Part, Record
-from stimrig.identify.simulation.predict import predict, problem_of
 from stimrig.identify.tracking import State, follow, model_for_next
 from stimrig.identify.tracking.follow import begin, moved_model, passed, rested, set_states
 from tests.harness.muscle import Patient

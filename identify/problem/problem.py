@@ -18,8 +18,8 @@ from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUND
 from stimrig.identify.dynamics.second_order import Core, read_means
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw, run_core
 from stimrig.identify.effects.base import Form, Parameter, Values
+from stimrig.identify.problem.setup import Setup
 from stimrig.identify.recruitment import Basis
-from stimrig.identify.simulation.setup import Setup
 
 
 @dataclass(frozen=True)

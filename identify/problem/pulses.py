@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.errors import BadModel
+from stimrig.identify.problem.joint_surface import Surfaces
+from stimrig.identify.problem.predict import Muscle, predict
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
-from stimrig.identify.simulation.joint_surface import Surfaces
-from stimrig.identify.simulation.predict import Muscle, predict
 
 REST_S = 1.0
 SAMPLES_A_PULSE = 8

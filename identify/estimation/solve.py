@@ -13,8 +13,8 @@ from stimrig.identify.effects import depend_on_joint, find_effect, registry
 from stimrig.identify.effects.base import Form
 from stimrig.identify.estimation.descent import Damping, Search, Trial, descend
 from stimrig.identify.noise import NoiseLevel, band_part, profile
+from stimrig.identify.problem.problem import Problem
 from stimrig.identify.recruitment import Curve
-from stimrig.identify.simulation.problem import Problem
 
 
 @njit(cache=True, nogil=True, fastmath=True)
@@ -125,7 +125,7 @@ class Fitted:
 
     @cached_property
     def unpredictable_torque(self) -> dict[str, tuple[float, float]]:
-        """As `stimrig.identify.simulation.predict.unpredictable_torque`."""
+        """As `stimrig.identify.problem.predict.unpredictable_torque`."""
         problem, grid = self.problem, self.problem.setup.grid
         rows = self.problem.setup.fitted[grid.interval] & ~grid.record.held_out & grid.counted
         sizes = {}

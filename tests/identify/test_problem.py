@@ -8,13 +8,13 @@ import pytest
 from bench.muscles.hidden_records import generate
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import fitted_with, try_effect
-from stimrig.identify.estimation.joint import predict_fitted
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
+from stimrig.identify.estimation.solve import predict_fitted
 from stimrig.identify.noise import NoiseLevel, band_part, profile, whitened
+from stimrig.identify.problem.problem import Problem
+from stimrig.identify.problem.setup import Setup
 from stimrig.identify.records.join import join
-from stimrig.identify.simulation.problem import Problem
-from stimrig.identify.simulation.setup import Setup
 from tests.harness.carried_sessions import as_record
 from tests.identify import hidden_muscles
 from tests.identify.test_join import record

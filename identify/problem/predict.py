@@ -15,12 +15,12 @@ from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, run_
 from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.effects.base import Form, replaced_by
 from stimrig.identify.errors import BadModel, BadRequest, RunsAway
+from stimrig.identify.problem.joint_surface import JointEffect, angle_range
+from stimrig.identify.problem.problem import Problem
+from stimrig.identify.problem.setup import Setup
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment import Curve
-from stimrig.identify.simulation.joint_surface import JointEffect, angle_range
-from stimrig.identify.simulation.problem import Problem
-from stimrig.identify.simulation.setup import Setup
 
 LARGEST_RATE_CHANGE = 0.25
 GROWN, LEAST_USUAL_NM = 1e6, 1.0
