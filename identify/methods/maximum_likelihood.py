@@ -21,7 +21,7 @@ from stimrig.identify.estimation.samples import fitted_rows
 from stimrig.identify.estimation.solve import Fitted, solve
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import flag, order_option
-from stimrig.identify.methods.two_stage import general
+from stimrig.identify.methods.transfer_function import general
 from stimrig.identify.model import Model
 from stimrig.identify.noise import WHITE_AND_SLOW
 from stimrig.identify.recruitment import Basis, basis_at

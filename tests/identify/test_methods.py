@@ -11,7 +11,7 @@ from stimrig.identify import paper
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.methods import Method, method_of, methods
-from stimrig.identify.methods.two_stage import choose_order
+from stimrig.identify.methods.transfer_function import choose_order
 from tests.harness.patients import Patient, make_record, prbs
 
 ALL = ("maximum-likelihood", "narx", "ramp-deconvolution", "separable-least-squares", "two-stage")
