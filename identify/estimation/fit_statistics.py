@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -170,6 +171,7 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     return statistics | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
 
 
+@lru_cache(maxsize=2)  # the statistics of a model and its covariance both ask for it
 def held_out_change(fitted: Fitted) -> np.ndarray:
     """Change of the predicted torque in each fitted interval when its fold is left out of the fit, N·m, shape (K,).
 
