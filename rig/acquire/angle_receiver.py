@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from stimrig.rig.acquire.stream import Stream
+from stimrig.rig.align import RATE_TOLERANCE
 from stimrig.rig.align_angle import LiveSlope
 from stimrig.rig.devices import AngleSensor
 from stimrig.rig.errors import DeviceError
@@ -45,6 +46,11 @@ class AngleReceiver(Stream):
         """Columns: time of arrival (rig clock, s), angle (rad), velocity (rad/s)."""
         self.angle_rad: float | None = None
         self.velocity_rad_s: float | None = None
+        self._delay_s = 0.0
+        """Delay of the newest sample against the promptest one since the counter began, rig seconds."""
+        self._promptest: tuple[float, float] | None = None
+        """Time of the newest sample and the smallest delay until then. It grows by `RATE_TOLERANCE` with time, since a
+        sensor may be slower than its nominal rate."""
         self._behind = 0
         self._restarted = False
         """True where the next sample is the first one since it was opened."""
@@ -58,8 +64,12 @@ class AngleReceiver(Stream):
         self._recent = deque(self._scaled(samples) for samples in self._recent)
 
     def data_age_s(self, now_s: float) -> float:
-        """Return the age of the newest angle: the time since its arrival, and its delay."""
-        return self.age_s(now_s) + self.behind_s()
+        """Return the age of the newest angle: the time since its arrival, and its delay.
+
+        The delay is against all samples, not those of the last seconds as in `behind_s`: a sensor that falls behind and
+        stays there does not become current again.
+        """
+        return self.age_s(now_s) + self._delay_s
 
     def recent(self, duration_s: float) -> NDArray[Any]:
         """The samples of the last seconds, at most `RECENT_S`; dtype `ANGLE_SAMPLE`."""
@@ -96,6 +106,7 @@ class AngleReceiver(Stream):
         self._check(samples)
 
     def _remember(self, samples: NDArray[Any]) -> None:
+        self._measure_delay()
         numbers = samples["counter"]
         if self._unwrapper is None:
             numbers = self._total - np.arange(len(samples))[::-1]
@@ -105,6 +116,14 @@ class AngleReceiver(Stream):
         self._recent.append(samples)
         while self._recent[0]["host_time_s"][-1] < samples["host_time_s"][-1] - RECENT_S * self._clock.speed:
             self._recent.popleft()
+
+    def _measure_delay(self) -> None:
+        now_s, _, delay_s = self._rate[-1]
+        smallest_s = delay_s
+        if self._promptest is not None:
+            then_s, then_delay_s = self._promptest
+            smallest_s = min(delay_s, then_delay_s + RATE_TOLERANCE * (now_s - then_s))
+        self._promptest, self._delay_s = (now_s, smallest_s), delay_s - smallest_s
 
     def start(self) -> None:
         """Open it, read it until it is gone, and so on until closed."""
@@ -123,8 +142,7 @@ class AngleReceiver(Stream):
         await self._source.close()
 
     def _count_on(self, now_s: float) -> None:
-        self._behind = 0
-        self._rate.clear()
+        self._promptest, self._behind = None, 0
         if self._unwrapper is not None and self._previous is not None:
             passed_s = max(0.0, now_s - self._previous[1])
             self._unwrapper.resume(self._previous[0] + max(1, round(passed_s * self.nominal_rate_hz)))

@@ -152,6 +152,21 @@ def test_another_rate_than_the_rig_files_ends_the_test(tmp_path: Path, rate: flo
     assert not rig.stimulator.sent  # told during the rest
 
 
+def test_no_test_starts_long_after_the_sensor_has_fallen_behind(tmp_path: Path):
+    rig = held(tmp_path)
+    assert rig.angle is not None
+    rig.angle.start()
+    for _ in range(200):  # 2 s later in the end, by small steps: it is never silent
+        rig.machine.wait(0.02)
+        rig.sensor.late_s += 0.01
+    rig.machine.wait(10.0)
+    assert 1.5 < rig.angle.data_age_s(rig.clock.now_s()) < 2.1
+    rig.machine.run(rig.receiver.open())
+    result = rig.machine.run(rig.run.execute())
+    assert result.outcome == "fault" and "the angle is stale" in result.reason
+    assert not rig.stimulator.sent
+
+
 def test_no_pulse_comes_through_a_passive_test(tmp_path: Path):
     plan = AnglePlan(range_rad=RANGE)
     with pytest.raises(RefusedError, match="passive test"):
