@@ -17,6 +17,8 @@ from stimrig.rig.errors import BusyError, DeviceError, LatchedError, RigError, U
 from stimrig.rig.messages import RigState
 
 BUSY: tuple[RigState, ...] = ("arming", "running", "sealing", "stopping")
+NO_PREVIEW: tuple[RigState, ...] = ("calibrating", "arming", "running", "stopping")
+"""No plan is previewed in these: the next pulse would wait for it."""
 STOPPED: tuple[RigState, ...] = ("latched", "uncertain")
 BEFORE = "; before: "
 """Between the reasons of several stops, the newest first."""

@@ -36,7 +36,7 @@ from stimrig.rig.messages import (
     StopEvidence,
     TestPlan,
 )
-from stimrig.rig.phase import Phase
+from stimrig.rig.phase import NO_PREVIEW, Phase
 from stimrig.rig.requests import AnglePoseRequest, PreviewRequest, Request
 from stimrig.rig.tasks import Turn
 
@@ -218,15 +218,19 @@ class Rig:
     async def preview(self, request: PreviewRequest) -> Preview:
         """Build a plan that a person looks at: one at a time, and none beside a test, whose sender it would hold up.
 
-        Raises BusyError: a test is in progress, or too many wait. PlanError, RefusedError: as `start`.
+        None in a guided calibration either: its next train would wait for it.
+
+        Raises BusyError: a test or a calibration is in progress, or too many wait. PlanError, RefusedError: as `start`.
         """
         if self._previews >= MOST_PREVIEWS:
             raise BusyError(f"previews: {self._previews} requests are waiting; try again in a moment")
         self._previews += 1
         try:
             async with self._preview_turn, self.state.in_turn():  # a start waits for one of them, not for all
-                if self.state.phase.state in ("arming", "running", "stopping"):
-                    raise BusyError(f"test {self.state.phase.test_id} is in progress; look at the plan afterwards")
+                phase = self.state.phase
+                if phase.state in NO_PREVIEW:
+                    activity = "a calibration" if phase.calibrating else f"test {phase.test_id}"
+                    raise BusyError(f"{activity} is in progress; look at the plan afterwards")
                 check_range(request.plan, self.joint.set_at_utc)
                 return await self._tasks.work(self._previewed, request)
         finally:

@@ -84,6 +84,14 @@ def test_no_plan_is_previewed_beside_a_test_and_only_so_many_wait(make: Make):
     assert live.preview(live.plan("p")).duration_s == 3.0
 
 
+def test_no_plan_is_previewed_in_a_calibration(make: Make):
+    live = make()
+    live.ask(live.rig.calibrations.start(CalibrateStartRequest(calibration_id="c", participant="P", by="t")))
+    assert live.states[-1] == "calibrating"
+    with pytest.raises(BusyError, match=r"^a calibration is in progress; look at the plan afterwards$"):
+        live.preview(live.plan("p"))
+
+
 def test_a_calibration_does_not_shorten_the_rest_after_a_test(make: Make):
     live = make(limits=LimitSettings(rest_between_tests_s=60.0))
     live.play("one", hold_s=0.5)
