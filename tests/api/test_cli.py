@@ -133,6 +133,16 @@ def test_bad_arguments_are_one_line(
     assert (code, out) == (2, "") and len(err.splitlines()) - len(notes) == 1 and named in err, err
 
 
+def test_serve_starts_no_emulated_rig_where_a_rig_has_a_socket(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    start = Mock(side_effect=AssertionError("it starts a rig"))
+    monkeypatch.setattr("stimrig.api.cli.commands.serve.Services", start)
+    monkeypatch.setenv("STIMRIG_RIG_SOCKET", str(tmp_path / "rig.sock"))
+    assert "python -m stimrig.api.web" in refused(capsys, "serve", "--data", tmp_path)
+    assert not start.called
+
+
 def test_a_model_that_no_effect_stands_on_is_refused(
     capsys: pytest.CaptureFixture[str], record: Path, tmp_path: Path
 ) -> None:

@@ -10,6 +10,7 @@ from typing import Annotated
 
 import typer
 
+from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.options import DataDir, RigFile, set_options
 from stimrig.api.cli.stop_key import StopKey, at_rig
 from stimrig.api.cli.supervisor import Services
@@ -29,6 +30,11 @@ def serve(
 ) -> None:
     """The service and the page, until Ctrl-C or SIGTERM."""
     settings = Settings(**set_options(port=port, host=host, rig_file=rig, data_dir=data))
+    if settings.rig_socket is not None and settings.rig_file is None:  # an emulated rig would stand in for that one
+        raise InputError(
+            f"STIMRIG_RIG_SOCKET is set ({settings.rig_socket}), but this verb starts a rig. For the rig at that "
+            "socket start python -m stimrig.api.web; for the emulated rig unset STIMRIG_RIG_SOCKET."
+        )
     services = Services(settings, emulate.split())
     with contextlib.suppress(KeyboardInterrupt), services:
         print_lines(*welcome(services, rig_status(services.socket)))
