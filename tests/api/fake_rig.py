@@ -23,6 +23,7 @@ from stimrig.rig import messages as m
 from stimrig.rig import requests as rig_requests
 from stimrig.rig.align import Alignment
 from stimrig.rig.assembly import Recording
+from stimrig.rig.phase import NO_PREVIEW
 from tests.api.fake_arm import ZERO_S, FakeArm
 from tests.api.fake_score import PULSE_RATE_HZ, FakeScore
 from tests.harness.muscle import Patient
@@ -206,6 +207,8 @@ class FakeRig:
         return m.Reply(id=request.id, ok=True, body=(answer or self.status()).model_dump())
 
     async def _on_preview(self, request: Any) -> m.Preview:
+        if self.state in NO_PREVIEW:
+            raise Refusal("busy", "The rig is busy", "a test is in progress; look at the plan afterwards")
         widths, segments = widths_of(request.plan)
         charge = sum(widths) * request.plan.profile.current_ma / 1000
         return m.Preview(

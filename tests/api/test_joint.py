@@ -204,6 +204,22 @@ def test_a_stopped_held_test_leaves_its_angle_open(service: Service, client: htt
     assert not any(row["done"] for row in client.get(f"/v1/participants/{ready}/joint").json()["targets"])
 
 
+def test_what_is_open_is_told_while_a_test_plays_once_it_was_looked_at(
+    service: Service, client: httpx.Client, ready: str
+) -> None:
+    """The rig previews nothing then: the layout is that of the last look with the same limits."""
+    at = f"/v1/participants/{ready}/joint"
+    before = client.get(at).json()
+    service.rig_thread.become("running")
+    assert client.get(at).json()["doses"] == before["doses"]
+    client.put(f"/v1/participants/{ready}/profile", json={"max_pulse_width_us": 210.0})
+    unknown = client.get(at)
+    assert unknown.status_code == 409 and unknown.json()["type"] == "/problems/rig-busy"
+    page = client.get(f"/participants/{ready}/joint", headers={"Accept": "text/html"}).text
+    assert "a test is in progress; look at the plan afterwards" in page
+    service.rig_thread.become("ready")
+
+
 def test_a_moving_test_counts_under_stimulation_only(service: Service, client: httpx.Client, ready: str) -> None:
     service.rig.arm.way = back_and_forth(RANGE[0] + 0.01, RANGE[1] - 0.01, (0.6, 1.6))
     begun = begin(client, ready, "moving")
