@@ -40,7 +40,8 @@ ANSWER_S = 15.0
 """So long the rig may take to answer a start."""
 MOST_PREVIEWS = 4
 PREVIEW_S = 35.0
-"""More than the rig takes for one before it says that the computer is too busy."""
+"""Far longer than all previews that may wait in the rig take: each takes up to a third of a second. A start or a
+re-arming before them may wait for its devices."""
 MISSED_POLLS = 3
 """After so many states that don't name the test, its end was lost: it comes within milliseconds of the state."""
 

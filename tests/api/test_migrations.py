@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 import sqlite3
+import subprocess
+import sys
 from contextlib import closing
 from pathlib import Path
 
@@ -115,3 +118,13 @@ def test_what_does_not_fit_is_refused(database: Path, statement: str, words: str
     with pytest.raises(ApiError, match=words):
         Store(f"sqlite:///{database}")
     assert database.read_bytes() == before, "nothing was changed in it"
+
+
+@pytest.mark.slow
+def test_the_service_says_so_in_one_line_and_ends(database: Path) -> None:
+    execute(database, NEWER)
+    environment = {**os.environ, "STIMRIG_DATA_DIR": str(database.parent), "STIMRIG_PORT": "0"}
+    command = [sys.executable, "-m", "stimrig.api.web"]
+    done = subprocess.run(command, env=environment, cwd=ROOT, capture_output=True, text=True, timeout=60)
+    lines = [line for line in done.stderr.splitlines() if not line.startswith("{")]
+    assert done.returncode == 2 and len(lines) == 1 and "version 0900" in lines[0], done.stderr
