@@ -78,7 +78,8 @@ def try_effect(
         # The next form of a chain starts from this one, which must therefore be fitted to its end.
         whole = form.propose is not None or min_gain == -np.inf
         floor = max(base.log_evidence + min_gain - effect.prior, best.log_evidence if best else -np.inf)
-        fitted = fit_form(effect, form, base, residual, previous, -np.inf if whole else floor)
+        helps = bool(gains) and max(gains.values()) > 0.0
+        fitted = fit_form(effect, form, base, residual, previous, -np.inf if whole else floor, thorough=whole or helps)
         if fitted is None:
             idle = PATIENCE
             continue
@@ -105,12 +106,18 @@ def try_band(effect: Effect, base: Fitted) -> Candidate | None:
 
 
 def fit_form(
-    effect: Effect, form: Form, base: Fitted, residual: np.ndarray, previous: dict[str, float], floor: float = -np.inf
+    effect: Effect,
+    form: Form,
+    base: Fitted,
+    residual: np.ndarray,
+    previous: dict[str, float],
+    floor: float = -np.inf,
+    thorough: bool = True,
 ) -> Fitted | None:
-    """Add one form to a model and fit it from the most promising of its starting values.
+    """Add one form to a model, from each of its starting values, and return the best fit.
 
-    A fit that will not reach the log evidence `floor` is stopped early. Where the form does not accept the result, the
-    next start is tried.
+    A fit that will not reach the log evidence `floor` is stopped early. Without `thorough` only the most promising
+    start is followed, and that no further where its first step promises too little.
     """
     setup = base.problem.setup
     scene: Scene = setup.scene
@@ -126,11 +133,16 @@ def fit_form(
         thetas.append(start_from(problem, base, {len(base.effects): start}))
     if len(thetas) > 1:
         thetas.sort(key=lambda theta: -_promise(base, problem, theta))
+    best: Fitted | None = None
     for theta in thetas:
-        fitted = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor)
-        if form.accepts(fitted.parameters_of(effect.id), scene):
-            return fitted
-    return None
+        fitted = solve(problem, theta, base.noise, tolerance=TOLERANCE, floor=floor, patience=2 if thorough else 1)
+        if not form.accepts(fitted.parameters_of(effect.id), scene):
+            continue
+        if best is None or fitted.log_evidence > best.log_evidence:
+            best, floor = fitted, max(floor, fitted.log_evidence)
+        if not thorough:
+            break
+    return best
 
 
 def _promise(base: Fitted, problem: Problem, theta: np.ndarray) -> float:

@@ -45,6 +45,8 @@ REWEIGHTED, SETTLED = 3, 0.1
 """The smoothness is chosen anew at the solution, so many times at most, until its logarithm changes by less."""
 STIFFEST = 1e12
 """Largest precision of a curve's bending, for a curve of size 1: rounding leaves no prior of a stiffer one."""
+NO_NOISE = 1e-14
+"""Variance, as a share of the usual one, below which it is that of rounding."""
 CURVE_POINTS = 201
 QUIET = 0.0015
 """If the noise of a sample is below this share of the largest torque, the spline gets more knots: its error at a bend
@@ -234,9 +236,10 @@ def _smoothness(products: np.ndarray, precision: np.ndarray, roughness: np.ndarr
     projected = products[:inner, :inner] - products[:inner, inner:] @ np.linalg.solve(bound, products[inner:, :inner])
     design, moment = ((projected + projected.T) / 2)[1:, 1:].copy(), projected[1:, 0].copy()
     if np.any(roughness):
-        return choose_weight(design, moment, float(projected[0, 0]), rows, roughness, others)
+        choice = choose_weight(design, moment, float(projected[0, 0]), rows, roughness, others)
+        return Choice(choice.weight, max(choice.variance, NO_NOISE))
     explained = float(moment @ np.linalg.lstsq(design, moment, rcond=None)[0])
-    return Choice(0.0, max(float(projected[0, 0]) - explained, 1e-14) / max(rows - inner - others, 1))
+    return Choice(0.0, max((float(projected[0, 0]) - explained) / max(rows - inner - others, 1), NO_NOISE))
 
 
 def _on_rows(fitted: Fitted, rows: np.ndarray) -> Fitted:

@@ -161,12 +161,13 @@ def solve(
     max_steps: int = 20,
     tolerance: float = 0.02,
     floor: float | None = None,
+    patience: int = 1,
     profiled: bool = True,
 ) -> Fitted:
     """Find the most probable parameters, from a start `theta` on the scale on which parameters are varied.
 
     It stops after `max_steps` steps, when the log posterior rises by less than `tolerance`, or where the log evidence
-    `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on; else it
+    `floor` is out of reach from step `patience` on. `profiled`: the noise is estimated at each step, from `noise` on; else it
     stays as given.
     """
     start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
@@ -180,7 +181,8 @@ def solve(
         # The start of an effect may be a point where the gradient is zero at first.
         if (step > 1 or not problem.chosen) and promised < 0.5 * tolerance:
             return None
-        if floor is not None and at.log_evidence + OPTIMISM * (promised + 1.0) < floor:
+        # The first step predicts too little from a distant start: in a trial, a sixth of the final gain.
+        if floor is not None and step >= patience and at.log_evidence + OPTIMISM * (promised + 1.0) < floor:
             return None
 
         def trial(damping: float) -> Point:
