@@ -80,8 +80,10 @@ def fit(
             if wanted and against:
                 message = f"effects cannot be fitted with {' and '.join(against)}"
                 raise BadRequest(message, place="effects", fix="Use maximum-likelihood without this option.")
-            if len(record.parts) > 1 and chosen is not MAXIMUM_LIKELIHOOD:
-                message = f"{method} takes a single recording; this record has {len(record.parts)} parts"
+            of_order = options.get("order", "second-order") != "second-order"
+            if len(record.parts) > 1 and (chosen is not MAXIMUM_LIKELIHOOD or of_order):
+                taker = "another order" if of_order else method
+                message = f"{taker} takes a single recording; this record has {len(record.parts)} parts"
                 raise BadRequest(message, place="method", fix="Use maximum-likelihood, or give one of the parts.")
             grid, raw = prepare(record)
             if not wanted:

@@ -94,6 +94,6 @@ EFFECT = Effect(
     plain="A muscle that shortens quickly gives less torque; one that is stretched gives more. It does not matter "
     "while the limb is held still.",
     source="Hill 1938; Marion et al. 2010; De Groote et al. 2016",
-    needs=("velocity_rad_s",),
+    needs=("angle_rad", "velocity_rad_s"),
     main={"slope_s_per_rad": "slope", "gain_nm_s_per_rad2": "gain"},
 )

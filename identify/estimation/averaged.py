@@ -29,7 +29,7 @@ DRAWS = 1500
 NEAR_SIGMOID_OPTIONS = {"recruitment", "earlier", "order"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Averaged(Fitted):
     """A solved problem whose parameters are the mean of draws."""
 

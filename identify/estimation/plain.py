@@ -134,7 +134,8 @@ def start_at(setup: Setup, linear: SecondOrder, roughness: np.ndarray) -> tuple[
     values = np.zeros(problem.size)
     values[:3] = linear.time_constant_s, linear.damping, linear.delay_s
     theta = np.clip(problem.from_physical(values), problem.lower, problem.upper)
-    theta[3:] = 0.0
+    prior_mean, precision = problem.prior
+    theta[3:] = prior_mean[3:]
     mean, slopes = problem.run(theta, derivatives=True)
     assert slopes is not None
     noise = NoiseLevel(0.0, 0.0, USUAL_NOISE * setup.scale_nm)
@@ -142,12 +143,11 @@ def start_at(setup: Setup, linear: SecondOrder, roughness: np.ndarray) -> tuple[
     curve = np.arange(problem.coefficients.start, problem.coefficients.stop)
     free = np.r_[curve, others]
     products = gram(setup.whitened(np.vstack([setup.target_nm - mean, slopes[free]]), noise))
-    prior_mean, precision = problem.prior
     smoothness = _smoothness(products, precision[np.ix_(others, others)], roughness, int(setup.fitted.sum()))
     problem = _smoothed(problem, roughness, smoothness)
     part = problem.prior[1][np.ix_(free, free)]
     products = products / smoothness.variance
-    theta[free] = solve_scaled(products[1:, 1:] + part, products[0, 1:] + part @ prior_mean[free])
+    theta[free] += solve_scaled(products[1:, 1:] + part, products[0, 1:])
     return problem, theta, replace(WHITE, sd_nm=noise.sd_nm * float(np.sqrt(smoothness.variance)))
 
 

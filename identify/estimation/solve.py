@@ -166,9 +166,9 @@ def solve(
 ) -> Fitted:
     """Find the most probable parameters, from a start `theta` on the scale on which parameters are varied.
 
-    It stops after `max_steps` steps, when the log posterior rises by less than `tolerance`, or where the log evidence
-    `floor` is out of reach from step `patience` on. `profiled`: the noise is estimated at each step, from `noise` on; else it
-    stays as given.
+    It stops after `max_steps` steps, when the log posterior rises by less than `tolerance`, or from step `patience` on
+    where the log evidence `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on;
+    else it stays as given.
     """
     start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
     assert start is not None
@@ -387,7 +387,12 @@ def band_as_effect(fitted: Fitted) -> Fitted:
     mean, slopes = problem.run(theta, derivatives=True)
     assert slopes is not None
     residual = setup.target_nm - mean
-    quiet = replace(fitted.noise, band=0.0, share=fitted.noise.share, sd_nm=float(np.std(residual[setup.fitted])))
+    quiet = replace(
+        fitted.noise,
+        band=0.0,
+        share=min(fitted.noise.share / (1.0 - fitted.noise.band), 1.0),
+        sd_nm=float(np.std(residual[setup.fitted])),
+    )
     return replace(
         fitted, problem=problem, theta=theta, slopes=slopes, hessian=hessian, residual_nm=residual, noise=quiet
     )

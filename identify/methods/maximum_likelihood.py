@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.dynamics.grid import LONGEST_DELAY_S, Grid
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.finish import finish
@@ -29,6 +29,7 @@ from stimrig.identify.recruitment.bases import PowerBasis
 from stimrig.identify.recruitment.smoothing import KNOTS
 
 HIGHEST_POWER = 9
+LEAST_KNOTS, MAX_KNOTS = 4, 201
 
 
 def with_basis(first: Fitted, basis: Basis) -> Fitted:
@@ -110,7 +111,14 @@ def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fit
 
         return near_sigmoid(grid, rows, options)
     delay_s = float(options["delay_s"]) if "delay_s" in options else None
-    knots = int(options["knots"]) if "knots" in options else None
+    knots, power = (int(options[name]) if name in options else None for name in ("knots", "power"))
+    for name, value, lowest, highest in (
+        ("delay_s", delay_s, 0.0, LONGEST_DELAY_S),
+        ("knots", knots, LEAST_KNOTS, MAX_KNOTS),
+        ("power", power, 1, HIGHEST_POWER),
+    ):
+        if value is not None and not lowest <= value <= highest:
+            raise BadRequest(f"{value:g} is out of range", place=name, fix=f"Give {lowest:g} to {highest:g}.")
     kind = str(options.get("recruitment", "spline"))
     if kind not in {"spline", "power-series", "sigmoid"}:
         fix = "Give spline, power-series, sigmoid or near-sigmoid."
@@ -124,7 +132,7 @@ def start(grid: Grid, rows: np.ndarray, options: Mapping[str, Any]) -> tuple[Fit
     fitted = fit_spline(grid, rows, knots, delay_s)
     reason = _spline_words(fitted)
     if kind == "power-series":
-        fitted, reason = power_series(fitted, int(options["power"]) if "power" in options else None)
+        fitted, reason = power_series(fitted, power)
     elif kind == "sigmoid":
         fitted, reason = sigmoid(fitted), "sigmoid (30)"
     if rising:

@@ -66,7 +66,8 @@ class Problem:
             Parameter("delay_s", "s", *setup.delay_bounds_s),
         ]
         numbers = ["", *(f"_{part}" for part in range(2, parts + 1))]
-        table += [Parameter(f"baseline{number}_nm", "N·m", -span, span) for number in numbers]
+        rests = setup.rests_nm[0].tolist() if setup.rests_nm else [0.0] * parts
+        table += [Parameter(f"baseline{n}_nm", "N·m", r - span, r + span) for n, r in zip(numbers, rests, strict=True)]
         states = setup.grid.starts.size
         for number in ["", *(f"_{state}" for state in range(2, states + 1))]:
             table.append(Parameter(f"initial_torque{number}_nm", "N·m", -span, span))

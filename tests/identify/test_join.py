@@ -16,6 +16,7 @@ from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.records.join import PAUSE_S, join, write_joined
 from stimrig.identify.records.record import Part, Pulses, Source
+from tests.harness.patients import Patient, make_record
 
 
 def record(
@@ -329,3 +330,14 @@ def test_what_cannot_be_joined_is_refused():
         join([], [])
     with pytest.raises(identify.BadRecord, match="begins"):
         join([a], [])
+
+
+@pytest.mark.parametrize("apart_nm", [10.0, 1000.0])
+def test_the_zeros_of_parts_may_be_far_apart(apart_nm: float) -> None:
+    """A weak muscle beside the weight of an arm that was held otherwise in the second recording."""
+    records = [make_record(Patient(), np.random.default_rng(seed), rate_hz=40, noise_nm=0.02)[0] for seed in (1, 2)]
+    other = records[1].with_torque(records[1].torque_nm + apart_nm)
+    together, away = (join([records[0], second], begun_s=[0.0, 200.0]) for second in (records[1], other))
+    fits = [fit_plain(prepare(record)[0], prepare(record)[0].fitted) for record in (together, away)]
+    assert fits[1].log_evidence == pytest.approx(fits[0].log_evidence, abs=0.5)
+    assert fits[1].problem.setup.scale_nm == pytest.approx(fits[0].problem.setup.scale_nm, rel=1e-3)

@@ -164,3 +164,10 @@ def test_table1_rows_and_progress():
     assert row[0.0, "two-stage"]["ours"] >= 99.98
     assert row[0.1, "two-stage"]["ours"] >= row[0.1, "two-stage"]["ceiling"] - 0.1
     assert row[0.0, "ramp-deconvolution"]["unseen"] < row[0.0, "ramp-deconvolution"]["clean"] - 10
+
+
+@pytest.mark.parametrize(("name", "value"), [("delay_s", "nan"), ("delay_s", 10.0), ("knots", 0), ("power", 0)])
+def test_an_option_out_of_range_is_refused(name: str, value: object) -> None:
+    record, _ = make_record(Patient(), np.random.default_rng(1), rate_hz=40)
+    with pytest.raises(identify.BadRequest, match="out of range"):
+        identify.fit(record, recruitment="power-series", **{name: value})
