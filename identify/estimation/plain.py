@@ -16,7 +16,7 @@ from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.candidates import chosen
 from stimrig.identify.estimation.rests import rest_levels
 from stimrig.identify.estimation.samples import white_noise
-from stimrig.identify.estimation.solve import Fitted, gram, knows_joint, solve, solve_scaled
+from stimrig.identify.estimation.solve import Fitted, gram, knows_joint, linear_start, solve, solve_scaled
 from stimrig.identify.estimation.still import joint_of, still_rows
 from stimrig.identify.noise import WHITE, WHITE_AND_SLOW, NoiseLevel
 from stimrig.identify.problem.problem import Problem
@@ -378,4 +378,6 @@ def _renewed(base: Fitted) -> Fitted:
     rough = Problem(setup.with_(basis=basis, roughness=roughness), base.effects)
     theta = rough.from_physical(np.concatenate([values[: place.start], start_nm, values[place.stop :]]))
     start = solve(rough, theta, base.noise, max_steps=0, profiled=False)
-    return solve(with_smoothness(start, roughness), theta, base.noise)
+    smoothed = with_smoothness(start, roughness)
+    # The old curve on the new knots is not smooth: a stiff prior would be far away.
+    return solve(smoothed, linear_start(smoothed, theta, base.noise), base.noise)

@@ -133,6 +133,7 @@ def choose_weight(
     inverse = np.linalg.inv(root)
     half = inverse @ roughness @ inverse.T
     bent, turn = np.linalg.eigh((half + half.T) / 2)
+    bent = np.maximum(bent, 0.0)  # of knots a wide range apart rounding leaves negative ones
     bent[:straight] = 0.0  # else rounding would decide among the weights of a curve that is not bent at all
     part = (turn.T @ (inverse @ moment)) ** 2
     smallest = 1e-14 * energy
