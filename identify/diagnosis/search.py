@@ -35,7 +35,7 @@ from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
 from stimrig.identify.estimation.plain import fit_plain, renewed_curve
 from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.estimation.solve import Fitted, knows_joint, solve, start_from
-from stimrig.identify.noise import NoiseLevel
+from stimrig.identify.noise import WHITE_AND_SLOW, NoiseLevel
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
 
@@ -296,7 +296,7 @@ def released(fitted: Fitted) -> Fitted:
     """The model with its noise no longer held white, where its likelihood can then be trusted."""
     if not fitted.noise.white_only:
         return fitted
-    free = solve(fitted.problem, fitted.theta, NoiseLevel(0.5, 0.5, fitted.noise.sd_nm))
+    free = solve(fitted.problem, fitted.theta, WHITE_AND_SLOW)
     return fitted if free.distrusted else free
 
 

@@ -115,12 +115,13 @@ def pilot(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Fitted:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
     basis = SplineBasis(np.linspace(0.0, float(np.max(grid.pulse_width_us)), PILOT_KNOTS))
     roughness = spline_roughness(basis, order=bending_order(widths_us))
-    return fit_from(plain_setup(grid, rows, basis, delay_s=delay_s), STARTS_S, roughness)
+    bounds_s = None if delay_s is None else (delay_s, delay_s)
+    return fit_from(plain_setup(grid, rows, basis, bounds_s), STARTS_S, roughness)
 
 
-def fit_from(setup: Setup, starts_s: tuple[float, ...], roughness: np.ndarray, delay_s: float = 0.0) -> Fitted:
+def fit_from(setup: Setup, starts_s: tuple[float, ...], roughness: np.ndarray) -> Fitted:
     """The plain structure with white noise, from the best of several starting values of the time constant."""
-    starts = [start_at(setup, SecondOrder(t, 0.9, delay_s), roughness) for t in starts_s]
+    starts = [start_at(setup, SecondOrder(t, 0.9, 0.0), roughness) for t in starts_s]
     problem, theta, white = min(starts, key=lambda start: start[2].sd_nm)
     return solve(problem, theta, white, tolerance=PILOT_TOLERANCE)
 
@@ -151,50 +152,51 @@ def start_at(setup: Setup, linear: SecondOrder, roughness: np.ndarray) -> tuple[
     return problem, theta, replace(WHITE, sd_nm=noise.sd_nm * float(np.sqrt(smoothness.variance)))
 
 
-def plain_setup(
-    grid: Grid,
-    rows: np.ndarray,
-    basis: Basis,
-    zeros_nm: np.ndarray | None = None,
-    sign: float = 1.0,
-    delay_s: float | None = None,
-) -> Setup:
-    """The set-up of a record, without a penalty on its curve.
+def plain_setup(grid: Grid, rows: np.ndarray, basis: Basis, delay_bounds_s: tuple[float, float] | None = None) -> Setup:
+    """The set-up of a record whose rests show its zeros and whose torque rises by stimulation, without a penalty.
 
-    `zeros_nm`: zero of each part, N·m, shape (B,); by default as its rests show it. `sign`: 1 where stimulation raises
-    the torque, -1 where it lowers it. `delay_s`: a delay that is known.
+    `delay_bounds_s`: by default those of the grid.
     """
     level_nm, sd_nm = rest_levels(grid, rows)
-    zeros_nm = level_nm if zeros_nm is None else zeros_nm
-    zero = float(zeros_nm[0])
-    above_rest = np.convolve(np.where(rows, grid.torque_nm - zeros_nm[grid.part], 0.0), np.ones(3) / 3, "same")
-    return Setup(
+    setup = Setup(
         grid=grid,
-        target_nm=sign * (grid.torque_nm - zero),
+        target_nm=grid.torque_nm,
         fitted=rows,
         basis=basis,
         roughness=np.zeros((basis.size, basis.size)),
-        scale_nm=max(float(np.percentile(np.abs(above_rest[rows]), 99.5)), 1e-9),
+        scale_nm=1.0,
         noise_sd_nm=grid.noise_sd_nm,
-        delay_bounds_s=grid.delay_bounds_s if delay_s is None else (delay_s, delay_s),
-        zero_nm=zero,
-        sign=sign,
-        rests_nm=(sign * (level_nm - zero), sd_nm),
+        delay_bounds_s=grid.delay_bounds_s if delay_bounds_s is None else delay_bounds_s,
+        rests_nm=(level_nm, sd_nm),
         spread=_spread(grid),
         reference_s=_reference(grid, rows),
         **joint_of(grid, rows),
+    )
+    return _with_zeros(setup, level_nm, 1.0)
+
+
+def _with_zeros(setup: Setup, zeros_nm: np.ndarray, sign: float) -> Setup:
+    """The set-up with other zeros of its parts, N·m, shape (B,); `sign`: -1 where stimulation lowers the torque."""
+    grid, rows, zero = setup.grid, setup.fitted, float(zeros_nm[0])
+    assert setup.rests_nm is not None
+    level_nm, sd_nm = setup.to_record(setup.rests_nm[0]), setup.rests_nm[1]
+    above_rest = np.convolve(np.where(rows, grid.torque_nm - zeros_nm[grid.part], 0.0), np.ones(3) / 3, "same")
+    return setup.with_(
+        target_nm=sign * (grid.torque_nm - zero),
+        scale_nm=max(float(np.percentile(np.abs(above_rest[rows]), 99.5)), 1e-9),
+        zero_nm=zero,
+        sign=sign,
+        rests_nm=(sign * (level_nm - zero), sd_nm),
     )
 
 
 def _with_knots(first: Fitted, count: int, noise: NoiseLevel) -> Fitted:
     """The plain structure with its final spline, from a pilot."""
-    setup, linear, curve = first.problem.setup, first.linear, first.curve
-    torque_nm = _points(curve)[1]
+    linear, torque_nm = first.linear, _points(first.curve)[1]
     sign = 1.0 if torque_nm[np.argmax(np.abs(torque_nm))] >= 0 else -1.0
-    zeros_nm = setup.to_record(first.physical[list(first.problem.baselines)])
-    delay_s = setup.delay_bounds_s[0] if np.ptp(setup.delay_bounds_s) == 0.0 else None
-    setup = plain_setup(setup.grid, setup.fitted, setup.basis, zeros_nm, sign, delay_s)
-    basis, roughness = final_spline(setup, linear, curve, count)
+    zeros_nm = first.problem.setup.to_record(first.physical[list(first.problem.baselines)])
+    setup = _with_zeros(first.problem.setup, zeros_nm, sign)
+    basis, roughness = final_spline(setup, linear, first.curve, count)
     problem, theta, _ = start_at(setup.without_penalty(basis), linear, roughness)
     fitted = solve(problem, theta, noise)
     for _ in range(REWEIGHTED):
@@ -252,8 +254,8 @@ def _on_rows(fitted: Fitted, rows: np.ndarray) -> Fitted:
         if part_rows.any() and not np.any(old.fitted & part_rows):
             rest = part_rows & (grid.pulse_width_us == 0)
             zeros_nm[part] = np.median(grid.torque_nm[rest if rest.any() else part_rows])
-    setup = plain_setup(grid, rows, old.basis, zeros_nm, old.sign).with_(roughness=old.roughness)
-    setup = setup.with_(delay_bounds_s=old.delay_bounds_s)
+    setup = _with_zeros(plain_setup(grid, rows, old.basis, old.delay_bounds_s), zeros_nm, old.sign)
+    setup = setup.with_(roughness=old.roughness)
     values[baselines] = setup.to_muscle(zeros_nm)
     problem = Problem(setup, [])
     return solve(problem, problem.from_physical(values), fitted.noise)

@@ -251,14 +251,14 @@ def _at(
     problem: Problem, theta: np.ndarray, noise: NoiseLevel, wide: bool = False, profiled: bool = True
 ) -> Point | None:
     """The point with these parameters. Without effects the linear ones are solved for, given all others."""
-    for _ in range(2):
+    for attempt in (1, 2):
         mean, slopes = problem.run(theta, derivatives=True)
         if slopes is None or not np.all(np.isfinite(mean)):
             return None
         residual = problem.setup.target_nm - mean
         if problem.chosen:
             break
-        if wide and profiled:
+        if wide and profiled and attempt == 1:
             noise = profile(residual / problem.setup.spread, problem.setup.stretches, noise)[0]
         change, gained = _linear_step(problem, theta, residual, slopes, noise)
         theta = theta.copy()

@@ -14,6 +14,8 @@ from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.estimation.solve import solve
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment.bases import SplineBasis
+from stimrig.identify.recruitment.smoothing import choose_weight, spline_roughness
 from tests.harness.patients import Patient, make_record
 
 NOISY = 0.05
@@ -152,3 +154,16 @@ def test_an_effect_that_is_asked_for_is_fitted_to_its_end() -> None:
     plain = identify.fit(record)
     delayed = identify.fit(record, effects=["electromechanical_delay:delay"])
     assert delayed.fit["fit_percent"] > plain.fit["fit_percent"] - 0.1
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_rounding_of_the_penalty_does_not_choose_the_smoothness(seed: int) -> None:
+    """Of knots 0.015 to 15 µs apart rounding leaves the penalty a negative eigenvalue: the variance was 3e-11."""
+    rng = np.random.default_rng(seed)
+    basis = SplineBasis(np.unique(np.r_[np.linspace(0.0, 300.0, 20), 150.0 + np.linspace(0.0, 0.1, 8)[1:]]))
+    design = 100.0 * basis.design(rng.uniform(0.0, 300.0, 500))
+    straight = np.linspace(0.0, 1.0, 400)
+    line = np.linalg.lstsq(basis.design(300.0 * straight), straight, rcond=None)[0]
+    torque = design @ line + rng.standard_normal(500)
+    choice = choose_weight(design.T @ design, design.T @ torque, float(torque @ torque), 500, spline_roughness(basis))
+    assert choice.variance == pytest.approx(1.0, rel=0.2)
