@@ -2,7 +2,7 @@
 
     python -m bench.moving_joint --arms 1000:1050 [--json FILE]
 
-The arms come from `hardware_sim.arm_patient`, whose laws and distributions were written apart from the library. Arms
+The arms come from `bench.muscles.arm_patient`, whose laws and distributions were written apart from the library. Arms
 0 to 99 were developed on; report on arms from 1000. Of each arm: the paper's isometric test, and the three guided tests
 (passive; held at four angles; moving), with torque-times of each; then an unseen trial with another movement.
 """

@@ -145,6 +145,8 @@ def _list_bucket(url: str) -> Iterator[Entry]:
                 yield _object_entry(files, objects[name], url)
     except CohortError:
         raise
+    except ImportError as error:
+        raise CohortError(f"{url}: {_one_line(error)}. For buckets: pip install 'stimrig[s3]'.") from error
     except Exception as error:  # each protocol has errors of its own
         raise CohortError(f"{url}: {_one_line(error)}. Check the address, the network and the keys.") from error
 

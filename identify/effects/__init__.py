@@ -1,4 +1,6 @@
-"""The library of physical effects: one file each, found in this package, in entry points and in a user's folder.
+"""The library of physical effects, found in this package, in entry points and in a user's folder.
+
+Each has its own file; the free ones share `free_effects.py`, which lists them as `EFFECTS`.
 
 A user's own effect is a file with `EFFECT = Effect(...)`, found in the folder named by the environment variable
 STIMRIG_EFFECTS_DIR, or through an entry point of the group `stimrig.effects`. See `docs/add-an-effect.md`.

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from stimrig.identify.estimation.solve import Fitted, gram, knows_joint, solve
+from stimrig.identify.estimation.solve import Fitted, gram, knows_joint, solve, solve_scaled
 from stimrig.identify.problem.predict import sensor_cost_nm
 from stimrig.identify.problem.problem import Problem
 
@@ -50,8 +50,7 @@ def _step(fitted: Fitted) -> tuple[float, np.ndarray]:
     system[-1, -1] += PRIOR_S**-2
     gradient[:-1] -= precision @ (fitted.theta - mean)
     gradient[-1] -= late_s / PRIOR_S**2
-    scale = 1.0 / np.sqrt(np.diag(system))
-    step = scale * np.linalg.solve(system * scale[:, None] * scale[None, :], scale * gradient)
+    step = solve_scaled(system, gradient)
     problem = fitted.problem
     theta = np.clip(fitted.theta + step[:-1], problem.lower, problem.upper)
     return float(np.clip(late_s + step[-1], -LARGEST_S, LARGEST_S)), theta

@@ -55,10 +55,10 @@ class StrictFile:
         except Exception as error:
             raise self.bad("unreadable or half-written HDF5", path) from error
 
-    def text(self, name: str, default: str | None = None, longest: int = LONGEST_TEXT) -> str:
+    def text(self, name: str, default: str | None = None) -> str:
         """A text attribute of the root. Raises BadRecord: not there and no default, no text, or longer."""
         value = self._attribute(name, default)
-        if not isinstance(value, str | bytes) or len(value) > longest:
+        if not isinstance(value, str | bytes) or len(value) > LONGEST_TEXT:
             raise self.bad("no text, or one without an end", f"attribute {name}")
         return _sound(value)
 

@@ -16,7 +16,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.records.record import Record
 from stimrig.identify.tracking import Outcome, State, Step, follow, model_for_next
 from stimrig.identify.tracking.follow import moved_model
-from stimrig.identify.tracking.state import learn_rates, values_of
+from stimrig.identify.tracking.state import USUAL, learn_rates, values_of
 from tests.harness.changing import Changing, reach_widths
 from tests.harness.muscle import Patient
 from tests.harness.patients import make_record
@@ -120,8 +120,9 @@ def test_a_sudden_change_is_followed_when_the_next_trial_says_the_same(model: Mo
     assert gains[5] / gains[2] == pytest.approx(0.7, abs=0.03)
 
 
-def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model) -> None:
-    steps = followed(model, session(Changing(PATIENT, gain=lambda n: 0.2 if 3 <= n < 6 else 1.0), 8))
+@pytest.mark.parametrize("share", [0.0, 0.2])
+def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model, share: float) -> None:
+    steps = followed(model, session(Changing(PATIENT, gain=lambda n: share if 3 <= n < 6 else 1.0), 8))
     assert {step.outcome for step in steps[3:6]} == {Outcome.NO_TORQUE}
     assert {step.outcome for step in (*steps[:3], *steps[6:])} == {Outcome.FOLLOWED}
     for step in steps[3:6]:
@@ -131,16 +132,18 @@ def test_a_loose_electrode_is_told_at_once_and_moves_nothing(model: Model) -> No
 
 
 @pytest.mark.parametrize("seed", [7, 11])
-def test_a_sudden_loss_is_found_and_not_taken_for_a_threshold(model: Model, seed: int) -> None:
+@pytest.mark.parametrize("gain", [0.6, 0.3])
+def test_a_sudden_loss_is_found_and_not_taken_for_a_threshold(model: Model, gain: float, seed: int) -> None:
     """The fit of a trial has a second place to end, where the threshold rose."""
-    steps = followed(model, session(Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else 0.3), 6, seed))
+    steps = followed(model, session(Changing(PATIENT, gain=lambda n: 1.0 if n < 3 else gain), 6, seed))
     assert steps[3].outcome is Outcome.ODD
-    assert steps[-1].after.values["gain"] == pytest.approx(0.3, rel=0.06)
+    assert steps[-1].after.values["gain"] == pytest.approx(gain, rel=0.06)
     assert abs(steps[-1].after.values["threshold_shift_us"]) < 2.0
 
 
-def test_a_zero_that_drifts_within_trials_is_no_change_of_the_muscle(model: Model) -> None:
-    drifting = Changing(PATIENT, added=lambda _, time_s: -0.6 * time_s / time_s[-1])
+@pytest.mark.parametrize("drift_nm", [0.3, -0.6])
+def test_a_zero_that_drifts_within_trials_is_no_change_of_the_muscle(model: Model, drift_nm: float) -> None:
+    drifting = Changing(PATIENT, added=lambda _, time_s: drift_nm * time_s / time_s[-1])
     plain, found = (followed(model, session(muscle, 5))[-1] for muscle in (Changing(PATIENT), drifting))
     sd = np.sqrt(np.diag(plain.after.covariance)[:3])
     assert np.all(np.abs(found.after.mean - plain.after.mean)[:3] < 0.3 * sd)
@@ -221,6 +224,32 @@ def test_a_trial_without_a_second_to_use_is_refused(model: Model, held_out: bool
         follow(model, None, cut)
 
 
+def test_another_pulse_rate_is_refused(model: Model) -> None:
+    time_s = np.arange(2000) / 400.0
+    record = Record.from_arrays(time_s, np.full(2000, 100.0), np.zeros(2000), pulse_rate_hz=20.0)
+    with pytest.raises(BadModel, match="pulses a second"):
+        follow(model, None, record)
+
+
+def test_a_trial_that_begins_within_a_contraction(model: Model) -> None:
+    whole = Changing(PATIENT, gain=lambda _: 0.9).play(WIDTHS, 0, np.random.default_rng(2))
+    late = whole.time_s > 4.0
+    cut = Record.from_arrays(whole.time_s[late], whole.pulse_width_us[late], whole.torque_nm[late])
+    part, all_of_it = follow(model, None, cut).after, follow(model, None, whole).after
+    assert np.all(np.abs(part.mean - all_of_it.mean)[:3] < 1.96 * np.sqrt(np.diag(part.covariance)[:3]))
+
+
+def test_forty_trials_stay_well_behaved(model: Model) -> None:
+    rng, state = np.random.default_rng(9), None
+    muscle = Changing(PATIENT, gain=lambda n: 1.0 + 0.1 * np.sin(n / 9))
+    for trial in range(40):
+        step = follow(model, state, muscle.play(WIDTHS, trial, rng))
+        state = step.coming
+    assert np.linalg.eigvalsh(step.after.covariance).min() > -1e-12
+    assert step.after.values["gain"] == pytest.approx(1.0 + 0.1 * np.sin(39.5 / 9), abs=0.04)
+    assert moves([step]).max() < 1.0
+
+
 def test_a_person_who_always_tires_is_expected_to(model: Model) -> None:
     muscle = Changing(PATIENT, gain=lambda n: 0.95**n)
     told = [[step.after.bands() for step in followed(model, session(muscle, 6, seed))] for seed in (11, 12, 13)]
@@ -231,3 +260,12 @@ def test_a_person_who_always_tires_is_expected_to(model: Model) -> None:
     usual, learnt = follow(model, None, first), follow(model, None, first, rates)
     wanted = usual.after.values["gain"] * 0.95
     assert abs(learnt.coming.values["gain"] - wanted) < 0.75 * abs(usual.coming.values["gain"] - wanted)
+
+
+def test_a_person_who_jumps_about_gets_wider_bands(model: Model) -> None:
+    rng = np.random.default_rng(6)
+    levels = rng.normal(0.0, 0.06, 30)
+    jumping = Changing(PATIENT, gain=lambda n: float(np.exp(levels[int(n)])))
+    bands = [[step.after.bands() for step in followed(model, session(jumping, 10, seed))] for seed in (21, 22)]
+    rates = learn_rates(bands)
+    assert rates.step[0] > 3.0 * USUAL.step[0] and rates.step[2] < 1.5 * USUAL.step[2]

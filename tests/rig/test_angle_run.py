@@ -126,6 +126,7 @@ def test_a_joint_that_leaves_its_target_by_more_than_twice_its_tolerance_ends_th
 
 @pytest.mark.parametrize("noise_deg", [0.0, 0.02])
 def test_without_a_movement_a_moving_test_ends(tmp_path: Path, noise_deg: float):
+    """With more noise of the sensor a joint that stands still takes longer to be seen."""
     rig = moving(tmp_path)
     rig.sensor.noise_deg = noise_deg
     stands_s = rig.clock.now_s() + 0.165 + 1.3
