@@ -75,9 +75,6 @@ log = logging.getLogger("rig.run")
 
 LEAD_S = 0.1
 """Real seconds between arming and the first deadline."""
-POLL_S = 0.005
-LONGEST_LOOK_S = 0.05
-"""Real seconds that count at most between two looks: a computer that stood still has not waited for a device."""
 
 
 @dataclass(slots=True)
@@ -217,9 +214,7 @@ class TestRun:
                 self._fault(self._angle.fault() or "angle sensor: no angle arrived before the test; check its cable")
             if waited_s >= SETTLE_S:
                 self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
-            looked_s = self._clock.now_s()
-            await self._tasks.sleep(POLL_S, self.halt.signal)
-            waited_s += min((self._clock.now_s() - looked_s) / self._clock.speed, LONGEST_LOOK_S)
+            waited_s += await self._receiver.look_again(self.halt.signal)
         return False
 
     async def _open_gate(self) -> bool:

@@ -17,7 +17,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, Connections, StopServer
-from stimrig.rig.control.replies import head_of, id_of, invalid_request, refusal, to_line
+from stimrig.rig.control.replies import head_of, id_of, refusal, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
 from stimrig.rig.errors import BusyError, ConfigError, PlanError, RigError
 from stimrig.rig.messages import Event, StateEvent, Status, stop_socket
@@ -139,32 +139,23 @@ class Server:
 
     async def _answer(self, line: bytes, writer: asyncio.StreamWriter, crowded: bool) -> None:
         head = head_of(line)
-        kind = head[0] if head else ""
-        if kind == "stop" and self._stop_server is not None:
-            if head and len(line) > MAX_LINE_BYTES:  # it stops, but is not parsed: that would delay the sender
+        if head and head[0] == "stop" and self._stop_server is not None:
+            if len(line) > MAX_LINE_BYTES:  # it stops, but is not parsed: that would delay the sender
                 line = to_line(StopRequest(id=head[1], reason=UNREADABLE))
             _write(writer, to_line(await self._stop_server.answer(line)))
             return
         try:
             if crowded:
                 raise BusyError(f"{MAX_PENDING} requests of this connection are waiting; read their replies first")
-            self._refuse_long(line, kind)
+            if len(line) > LONG_LINE_BYTES and not head:
+                size_kb = LONG_LINE_BYTES // 1000
+                raise PlanError(f"request: if over {size_kb} kB, it must begin with its kind and its id")
+            if len(line) > LONG_LINE_BYTES and self.rig.state.phase.busy:
+                raise BusyError("a test is in progress; wait or stop it")
             request = read_request(line)
-        except RigError as error:
-            _write(writer, to_line(refusal(id_of(line[:200]), error)))
+        except (RigError, ValidationError) as error:
+            _write(writer, to_line(refusal(id_of(line[:LONG_LINE_BYTES]), error)))
             return
-        except ValidationError as error:
-            _write(writer, to_line(invalid_request(id_of(line), error)))
-            return
-        await self._obey(request, writer)
-
-    def _refuse_long(self, line: bytes, kind: str) -> None:
-        if len(line) > LONG_LINE_BYTES and kind == "":
-            raise PlanError(f"request: if over {LONG_LINE_BYTES // 1000} kB, it must begin with its kind and its id")
-        if len(line) > LONG_LINE_BYTES and self.rig.state.phase.busy:
-            raise BusyError("a test is in progress; wait or stop it")
-
-    async def _obey(self, request: Any, writer: asyncio.StreamWriter) -> None:
         if request.kind == "stop":  # it does not begin with its kind and id
             await self._answer(to_line(request), writer, crowded=False)
             return

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from pydantic import ValidationError
 
-from stimrig.rig.control.replies import id_of, internal_error, refusal, to_line
-from stimrig.rig.errors import ConfigError, RigError
+from stimrig.rig.control.replies import id_of, refusal, to_line
+from stimrig.rig.errors import RigError
 from stimrig.rig.messages import Reply, StopEvidence
 from stimrig.rig.requests import StopRequest
 
@@ -84,16 +84,11 @@ class StopServer:
         self._thread = threading.Thread(target=self._loop.run_forever, name="stop-door", daemon=True)
 
     def open(self, path: Path) -> None:
-        """Start listening. Raises ConfigError."""
+        """Start listening. Raises OSError."""
         self._thread.start()
-        try:
-            path.unlink(missing_ok=True)
-            asyncio.run_coroutine_threadsafe(self._listen(path), self._loop).result()
-            path.chmod(0o660)
-        except OSError as error:
-            raise ConfigError(
-                f"socket: {path}: {error.strerror or error}; use a short path in a writable folder"
-            ) from None
+        path.unlink(missing_ok=True)
+        asyncio.run_coroutine_threadsafe(self._listen(path), self._loop).result()
+        path.chmod(0o660)
 
     def close(self) -> None:
         if self._thread.is_alive():
@@ -111,11 +106,10 @@ class StopServer:
         try:
             evidence = await asyncio.wrap_future(self._stop(request.reason, request.by))
             return Reply(id=request.id, ok=True, body=evidence.model_dump(mode="json"))
-        except RigError as error:
-            return refusal(request.id, error)
         except Exception as error:
-            log.exception("a stop failed")
-            return internal_error(request.id, error)
+            if not isinstance(error, RigError):
+                log.exception("a stop failed")
+            return refusal(request.id, error)
 
     async def _listen(self, path: Path) -> None:
         self._server = await asyncio.start_unix_server(self._serve, path, limit=MAX_LINE_BYTES, backlog=512)

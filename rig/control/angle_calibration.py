@@ -43,8 +43,6 @@ SCALES = 0.7, 1.4
 """Bounds of the scale of two poses over the rig file's: beyond them a number was mistyped or the sensor slips."""
 SENSOR = "device", "bus", "dbc", "message", "signal", "of_the_cell"
 """Settings that tell one sensor from another."""
-ROUNDED = 1e-9
-"""Share by which what a file says may differ from what its two poses make."""
 
 
 class Joint:
@@ -172,23 +170,16 @@ class Joint:
                 f"angle_pose: it is {degrees(abs(apart_rad))} from the first pose, at {degrees(first.angle_rad)}; at "
                 f"least {degrees(APART_RAD)} are needed: move the joint farther"
             )
-        slope = _slope(first, second)
+        scale = _scale(first, second)
         turned_rad = abs(second.raw - first.raw) * rig_file.radians_per_unit
         lo, hi = (factor * rig_file.radians_per_unit for factor in SCALES)
-        if not (lo <= abs(slope) <= hi):
+        if not (lo <= scale["radians_per_unit"] <= hi):
             self._first = None
             raise RefusedError(
                 f"angle_pose: between the two poses the goniometer turned by {degrees(abs(apart_rad))}, the sensor by "
                 f"{degrees(turned_rad)}; check goniometer and mounting, then begin with the first pose"
             )
-        return AngleCalibration(
-            poses=[first, second],
-            offset=first.raw - first.angle_rad / slope,
-            direction=1 if slope > 0 else -1,
-            radians_per_unit=abs(slope),
-            by=by,
-            set_at_utc=utc_text(self._clock.unix_s()),
-        )
+        return AngleCalibration(poses=[first, second], **scale, by=by, set_at_utc=utc_text(self._clock.unix_s()))
 
     def _refuse_absent(self, place: str) -> None:
         if not self._present:
@@ -200,10 +191,15 @@ class Joint:
         return self._pair.angle
 
 
-def _slope(first: AnglePose, second: AnglePose) -> float:
-    """Rad of a unit, negative where the signal falls when the joint is flexed; infinite where it did not change."""
+def _scale(first: AnglePose, second: AnglePose) -> dict[str, Any]:
+    """Offset, direction and scale that two poses make; the scale is infinite where the signal did not change."""
     apart = second.raw - first.raw
-    return (second.angle_rad - first.angle_rad) / apart if apart else float("inf")
+    slope = (second.angle_rad - first.angle_rad) / apart if apart else float("inf")
+    return {
+        "offset": first.raw - first.angle_rad / slope,
+        "direction": 1 if slope > 0 else -1,
+        "radians_per_unit": abs(slope),
+    }
 
 
 def _check_poses(calibration: AngleCalibration) -> AngleCalibration:
@@ -211,18 +207,11 @@ def _check_poses(calibration: AngleCalibration) -> AngleCalibration:
 
     Raises ValueError: it is not.
     """
-    if len(calibration.poses) != 2:
-        raise ValueError(f"it has {len(calibration.poses)} poses")
     first, second = calibration.poses
-    slope = _slope(first, second)
-    apart_rad, scale_rad = abs(second.angle_rad - first.angle_rad), calibration.direction * calibration.radians_per_unit
-    off_rad = abs(slope * (first.raw - calibration.offset) - first.angle_rad)
-    if not (
-        apart_rad >= APART_RAD and calibration.radians_per_unit > 0 and abs(scale_rad - slope) <= ROUNDED * abs(slope)
-    ):
-        raise ValueError("direction and radians_per_unit are not those of its poses")
-    if not (off_rad <= ROUNDED * max(1.0, abs(slope * first.raw))):
-        raise ValueError("its offset is not that of its poses")
+    if not (abs(second.angle_rad - first.angle_rad) >= APART_RAD and second.raw != first.raw):
+        raise ValueError("its poses are too near")
+    if calibration.model_copy(update=_scale(first, second)) != calibration:
+        raise ValueError("it is not what its two poses make")
     return calibration
 
 

@@ -40,7 +40,7 @@ def live_event(
             "angle_rad": finite(angle.angle_rad), "velocity_rad_s": finite(angle.velocity_rad_s),
             "angle": _emptied(angle.live),
         }  # fmt: skip
-    return LiveEvent(**fields, **(IDLE if run is None else _of_run(run, zero_s)))
+    return LiveEvent(**fields, **(IDLE if run is None else _of_run(run, zero_s, now_s)))
 
 
 def _emptied(queue: deque[NDArray[Any]]) -> str:
@@ -50,15 +50,16 @@ def _emptied(queue: deque[NDArray[Any]]) -> str:
     return b64encode(b"".join(rows)).decode()
 
 
-def _of_run(run: TestRun, zero_s: float) -> dict[str, Any]:
+def _of_run(run: TestRun, zero_s: float, now_s: float) -> dict[str, Any]:
+    elapsed_s = max(0.0, now_s - zero_s)
     done = run.gate.done[run.told_pulses :]
     run.told_pulses += len(done)
     rate_hz = run.plan.pulse_rate_hz
     segments = run.score.queue.segments if run.score.adaptive else ()  # they hold every pulse before
     return {
         "test_id": run.plan.test_id,
-        "segment": run.segment(),
-        "elapsed_s": run.elapsed_s(),
+        "segment": run.score.segment_at(elapsed_s),
+        "elapsed_s": elapsed_s,
         "duration_s": run.score.longest_s,
         "dropped_pulses": run.gate.dropped,
         "sent_pulses": run.sent,

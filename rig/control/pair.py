@@ -127,11 +127,9 @@ class Pair:
         receiver = self.receiver
         if receiver is None:
             return False
-        asked_s = self._clock.now_s()
-        end_s = asked_s + FRESH_S * self._clock.speed
+        asked_s, waited_s = self._clock.now_s(), 0.0
         while receiver.age_s(asked_s) >= 0 or not receiver.settled():
-            has_torque = receiver.age_s(asked_s) < 0
-            if self._clock.now_s() > (end_s + SETTLE_S * self._clock.speed if has_torque else end_s):
+            if waited_s > (FRESH_S + SETTLE_S if receiver.age_s(asked_s) < 0 else FRESH_S):
                 return False
-            await self._tasks.sleep(0.005)
+            waited_s += await receiver.look_again()
         return True

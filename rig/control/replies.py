@@ -30,23 +30,17 @@ def id_of(line: bytes) -> int:
     return 0
 
 
-def refusal(number: int, error: RigError) -> Reply:
-    """Reply for an exception of the rig."""
-    return Reply(id=number, ok=False, problem=Problem(code=error.code, title=error.title, detail=str(error)))
-
-
-def internal_error(number: int, error: Exception) -> Reply:
-    """Reply for a bug in this program."""
-    detail = f"{type(error).__name__}: {error}"
-    return Reply(id=number, ok=False, problem=Problem(code=RigError.code, title=RigError.title, detail=detail))
-
-
-def invalid_request(number: int, error: ValidationError) -> Reply:
-    """Reply for an invalid request: names the first place that is wrong."""
-    first: Any = error.errors(include_input=False, include_url=False)[0]
-    place = ".".join(str(part) for part in first["loc"]) or "request"
-    detail = f"{place}: {first['msg']}"
-    return Reply(id=number, ok=False, problem=Problem(code="bad-plan", title="The request is wrong", detail=detail))
+def refusal(number: int, error: Exception) -> Reply:
+    """Reply for a refusal of the rig, an invalid request (names the first place that is wrong), or a bug."""
+    if isinstance(error, ValidationError):
+        first: Any = error.errors(include_input=False, include_url=False)[0]
+        place = ".".join(str(part) for part in first["loc"]) or "request"
+        problem = Problem(code="bad-plan", title="The request is wrong", detail=f"{place}: {first['msg']}")
+    elif isinstance(error, RigError):
+        problem = Problem(code=error.code, title=error.title, detail=str(error))
+    else:
+        problem = Problem(code=RigError.code, title=RigError.title, detail=f"{type(error).__name__}: {error}")
+    return Reply(id=number, ok=False, problem=problem)
 
 
 def to_line(message: BaseModel) -> bytes:

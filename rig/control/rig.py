@@ -18,7 +18,7 @@ from stimrig.rig.control.live import finite, live_event
 from stimrig.rig.control.memory import LatchFile, Rest, Result
 from stimrig.rig.control.pair import Pair
 from stimrig.rig.control.playing import LONGEST_WORDS, Player, check_names
-from stimrig.rig.control.replies import internal_error, refusal
+from stimrig.rig.control.replies import refusal
 from stimrig.rig.control.sealing import RecordingStore
 from stimrig.rig.control.state import State
 from stimrig.rig.errors import BusyError, ConfigError, DeviceError, LatchChangedError, PlanError, RigError
@@ -369,9 +369,8 @@ async def obey(rig: Rig, request: Any) -> Reply:
         do = _DO.get(request.kind)
         answer = None if do is None else await do(rig, request)
         body = (rig.status() if answer is None else answer).model_dump(mode="json")
-    except RigError as error:
-        return refusal(request.id, error)
     except Exception as error:
-        log.exception("request %s failed", request.kind)
-        return internal_error(request.id, error)
+        if not isinstance(error, RigError):
+            log.exception("request %s failed", request.kind)
+        return refusal(request.id, error)
     return Reply(id=request.id, ok=True, body=body)

@@ -16,9 +16,9 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[.
     """Open a rig; one after another they share folder and clock. What is still open at the end is closed."""
     made: list[LiveRig] = []
 
-    def of(**more: Any) -> LiveRig:
+    def of(kind: type[LiveRig] = LiveRig, **more: Any) -> LiveRig:
         clock = made[-1].clock if made else None
-        made.append(LiveRig(tmp_path, monkeypatch, **{"clock": clock, **more}))
+        made.append(kind(tmp_path, monkeypatch, **{"clock": clock, **more}))
         return made[-1]
 
     yield of

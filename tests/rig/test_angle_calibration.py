@@ -6,13 +6,11 @@ import json
 import math
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from stimrig.rig import journal
-from stimrig.rig.acquire.angle_receiver import AngleReceiver
 from stimrig.rig.control import angle_calibration
 from stimrig.rig.control.angle_calibration import Joint
 from stimrig.rig.control.calibration import check_range
@@ -21,42 +19,43 @@ from stimrig.rig.errors import BusyError, DeviceError, LatchChangedError, PlanEr
 from stimrig.rig.journal import Kind
 from stimrig.rig.limits import HARD_LIMITS
 from stimrig.rig.messages import AngleCalibration, AnglePlan, Profile, Status
-from stimrig.rig.phase import Phase
 from stimrig.rig.requests import AnglePoseRequest
 from tests.rig.fakes import FakeSensor, rest
 from tests.rig.live import SPEED, LiveRig
-from tests.simulator.virtual_time import VirtualMachine
 
 BOUND = HARD_LIMITS["angle_rad"]
 SETTINGS = can_angle_sensor.Settings(device="can_angle_sensor")
 
 
-class Posed:
-    def __init__(self, folder: Path, settings: can_angle_sensor.Settings | None = SETTINGS) -> None:
-        self.folder, self.machine, self.degrees = folder, VirtualMachine(), 20.0
-        self.moving_deg_s = 0.0
+class AngledRig(LiveRig):
+    """With an angle sensor that is held at `degrees`, or moves from there."""
+
+    degrees, moving_deg_s = 60.0, 0.0
+
+    def devices(self) -> dict[str, Any]:
         at = lambda t: math.radians(self.degrees + self.moving_deg_s * (t - 1000.0))  # noqa: E731
         self.sensor = FakeSensor(self.machine, at)
-        self.receiver = AngleReceiver(self.sensor, self.machine.tasks)
-        self.receiver.start()
-        config: Any = SimpleNamespace(data_dir=folder, angle_sensor=settings, require_calibration=False)
-        pair: Any = SimpleNamespace(angle=self.receiver, rescale=self.receiver.rescale)
-        self.joint = Joint(config, self.machine, pair, BOUND)
+        return {**super().devices(), "angle_sensor": self.sensor}
 
-    def hold(self, degrees: float, duration_s: float = 1.5) -> None:
+    @property
+    def joint(self) -> Joint:
+        return self.rig.joint
+
+    def hold(self, degrees: float) -> None:
+        """For as long as a pose asks for."""
         self.degrees = degrees
-        self.machine.wait(duration_s)
+        self.machine.wait(1.1 * angle_calibration.POSE_S * SPEED)
 
-    def pose(self, told_deg: float, first: bool = False) -> bool:
-        before = self.joint.calibration
+    def pose(self, told_deg: float, first: bool = False) -> Status:
         request = AnglePoseRequest(angle_rad=math.radians(told_deg), by="nurse", first=first)
-        self.machine.run(self.joint.pose(request, Phase("ready")))
-        return self.joint.calibration is not before
+        return self.ask(self.rig.angle_pose(request))
 
     def take(self, degrees: float, told_deg: float | None = None, first: bool = False) -> bool:
         """Hold, and pose; whether that was the second pose."""
         self.hold(degrees)
-        return self.pose(degrees if told_deg is None else told_deg, first)
+        before = self.joint.calibration
+        self.pose(degrees if told_deg is None else told_deg, first)
+        return self.joint.calibration is not before
 
     def calibrate(self) -> AngleCalibration:
         assert not self.take(20.0) and self.take(90.0)
@@ -65,21 +64,32 @@ class Posed:
 
     def shown_deg(self, raw: float) -> float:
         """The angle that a value of the sensor stands for now."""
-        return math.degrees(self.receiver.scale.angle_rad(raw))
+        assert self.rig.pair.angle is not None
+        return math.degrees(self.rig.pair.angle.scale.angle_rad(raw))
 
 
-def kept(folder: Path, settings: can_angle_sensor.Settings | None = SETTINGS) -> AngleCalibration | None:
-    again = Posed(folder, settings)
-    again.machine.run(again.joint.recall())
-    return again.joint.calibration
+Angled = Callable[..., AngledRig]
 
 
 @pytest.fixture
-def posed(tmp_path: Path) -> Posed:
-    return Posed(tmp_path)
+def angled(make: Callable[..., Any]) -> Angled:
+    return lambda **changes: make(AngledRig, **{"angle_sensor": SETTINGS, **changes})
 
 
-def test_two_poses_give_offset_direction_and_scale_kept_for_this_sensor_alone(posed: Posed):
+@pytest.fixture
+def posed(angled: Angled) -> AngledRig:
+    return angled()
+
+
+def kept(posed: AngledRig, angled: Angled, settings: can_angle_sensor.Settings | None = SETTINGS) -> Any:
+    """The calibration that the next process has."""
+    posed.close()
+    again = angled(angle_sensor=settings)
+    again.close()
+    return again.joint.calibration
+
+
+def test_two_poses_give_offset_direction_and_scale_kept_for_this_sensor_alone(posed: AngledRig, angled: Angled):
     assert posed.take(20.0) is False
     assert posed.joint.first is not None and posed.joint.calibration is None
     assert posed.take(90.0) is True
@@ -88,9 +98,9 @@ def test_two_poses_give_offset_direction_and_scale_kept_for_this_sensor_alone(po
     assert found.offset == pytest.approx(30.0, abs=0.05)
     assert found.radians_per_unit == pytest.approx(math.pi / 180, rel=1e-3)
     assert posed.joint.first is None and posed.shown_deg(30.0 - 57.0) == pytest.approx(57.0, abs=0.1)
-    assert kept(posed.folder) == found
-    assert kept(posed.folder, SETTINGS.model_copy(update={"signal": "Other_deg"})) is None
-    assert kept(posed.folder, None) is None
+    assert kept(posed, angled) == found
+    assert kept(posed, angled, SETTINGS.model_copy(update={"signal": "Other_deg"})) is None
+    assert kept(posed, angled, None) is None
 
 
 @pytest.mark.parametrize(
@@ -106,35 +116,39 @@ def test_two_poses_give_offset_direction_and_scale_kept_for_this_sensor_alone(po
         {"poses": [{"angle_rad": 0.4, "raw": math.nan}, {"angle_rad": 1.6, "raw": 80.0}]},
     ],
 )
-def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(posed: Posed, change: dict[str, Any]):
+def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(
+    posed: AngledRig, angled: Angled, tmp_path: Path, change: dict[str, Any]
+):
     found = posed.calibrate()
-    path = posed.folder / "angle-calibration.json"
+    assert kept(posed, angled) == found
+    path = tmp_path / "angle-calibration.json"
     content = json.loads(path.read_text())
-    path.write_text(json.dumps(content))
-    assert kept(posed.folder) == found
     content["calibration"] |= change
     path.write_text(json.dumps(content))
-    assert kept(posed.folder) is None
+    assert kept(posed, angled) is None
 
 
 @pytest.mark.parametrize(
     "content", ["[" * 100_000, '{"sensor": 1', "[]", "", "\udcff", '{"sensor":' + 5_000 * "9" + "}"]
 )
-def test_a_rig_comes_up_whatever_stands_in_the_file(tmp_path: Path, content: str):
+def test_a_rig_comes_up_whatever_stands_in_the_file(angled: Angled, tmp_path: Path, content: str):
     (tmp_path / "angle-calibration.json").write_bytes(content.encode("utf-8", "surrogateescape"))
-    assert kept(tmp_path) is None
+    assert angled().joint.calibration is None
 
 
-def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_second(posed: Posed):
+def test_a_new_first_pose_begins_again_and_the_old_calibration_holds_until_the_second(posed: AngledRig):
     old = posed.calibrate()
     assert posed.take(40.0, told_deg=45.0) is False and posed.joint.calibration is old
     assert posed.take(100.0, told_deg=105.0) is True and posed.joint.calibration is not old
     assert posed.shown_deg(30.0 - 40.0) == pytest.approx(45.0, abs=0.1)
 
 
-def test_a_first_pose_of_long_ago_is_none(posed: Posed):
+def test_a_first_pose_of_long_ago_is_none(posed: AngledRig, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(angle_calibration, "FIRST_LASTS_S", 3.0)
     posed.take(20.0)
-    posed.machine.wait(angle_calibration.FIRST_LASTS_S + 1.0)
+    posed.machine.wait(2.0 * SPEED)
+    assert posed.joint.first is not None
+    posed.machine.wait(1.1 * SPEED)
     assert posed.joint.first is None
     assert posed.take(75.0, told_deg=90.0) is False, "the sensor sits elsewhere meanwhile"
     assert posed.take(5.0, told_deg=20.0) is True
@@ -142,7 +156,7 @@ def test_a_first_pose_of_long_ago_is_none(posed: Posed):
     assert [pose.angle_rad for pose in posed.joint.calibration.poses] == [math.radians(90.0), math.radians(20.0)]
 
 
-def test_a_wrong_first_pose_is_taken_once_more(posed: Posed):
+def test_a_wrong_first_pose_is_taken_once_more(posed: AngledRig):
     posed.take(20.0, told_deg=25.0)
     assert posed.take(90.0, first=True) is False
     assert posed.joint.first is not None and posed.joint.first.angle_rad == pytest.approx(math.radians(90.0))
@@ -150,15 +164,15 @@ def test_a_wrong_first_pose_is_taken_once_more(posed: Posed):
     assert posed.joint.calibration is not None and posed.joint.calibration.offset == pytest.approx(30.0, abs=0.05)
 
 
-def test_a_pose_of_a_joint_that_moved_is_refused(posed: Posed):
-    posed.moving_deg_s = 3.0
+def test_a_pose_of_a_joint_that_moved_is_refused(posed: AngledRig):
+    posed.moving_deg_s = 0.75
     with pytest.raises(RefusedError, match=r"the joint moved by 1\.\d° during the last 0.5 s"):
         posed.take(20.0)
     posed.moving_deg_s = 0.0
     assert posed.take(20.0) is False
 
 
-def test_poses_that_are_too_near_are_refused_and_the_first_one_stays(posed: Posed):
+def test_poses_that_are_too_near_are_refused_and_the_first_one_stays(posed: AngledRig):
     posed.take(20.0)
     with pytest.raises(RefusedError, match=r"25.0° from the first pose, at 20.0°; at least 28.6°"):
         posed.take(45.0)
@@ -174,7 +188,7 @@ def test_poses_that_are_too_near_are_refused_and_the_first_one_stays(posed: Pose
     ],
     ids=["slipped", "misread", "would halve every angle"],
 )
-def test_poses_that_give_another_scale_begin_again(posed: Posed, second_deg: float, told_deg: float, words: str):
+def test_poses_that_give_another_scale_begin_again(posed: AngledRig, second_deg: float, told_deg: float, words: str):
     posed.take(20.0)
     with pytest.raises(RefusedError, match=words):
         posed.take(second_deg, told_deg)
@@ -182,13 +196,13 @@ def test_poses_that_give_another_scale_begin_again(posed: Posed, second_deg: flo
 
 
 @pytest.mark.parametrize("told_rad", [math.nan, math.inf, -1.0, 3.0])
-def test_no_angle_of_an_elbow_is_no_pose(posed: Posed, told_rad: float):
+def test_no_angle_of_an_elbow_is_no_pose(posed: AngledRig, told_rad: float):
     posed.hold(20.0)
     with pytest.raises(RefusedError, match="angle_pose: angle_rad"):
         posed.pose(math.degrees(told_rad))
 
 
-def test_without_good_angles_there_is_no_pose(posed: Posed):
+def test_without_good_angles_there_is_no_pose(posed: AngledRig):
     with pytest.raises(DeviceError, match="too few angles"):
         posed.pose(20.0)
     for word in (1, 2, 254):
@@ -202,39 +216,13 @@ def test_without_good_angles_there_is_no_pose(posed: Posed):
         posed.pose(20.0)
 
 
-def test_what_cannot_be_stored_does_not_hold(posed: Posed, monkeypatch: pytest.MonkeyPatch):
+def test_what_cannot_be_stored_does_not_hold(posed: AngledRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     posed.take(20.0)
-    (posed.folder / "file").write_text("")
-    monkeypatch.setattr(posed.joint._file, "path", posed.folder / "file" / "x.json")
+    (tmp_path / "file").write_text("")
+    monkeypatch.setattr(posed.joint._file, "path", tmp_path / "file" / "x.json")
     with pytest.raises(RigError):
         posed.take(90.0)
     assert posed.joint.calibration is None
-
-
-class AngledRig(LiveRig):
-    degrees = 60.0
-
-    def devices(self) -> dict[str, Any]:
-        self.sensor = FakeSensor(self.machine, lambda _: math.radians(self.degrees))
-        return {**super().devices(), "angle_sensor": self.sensor}
-
-    def hold(self, degrees: float) -> None:
-        """For as long as a pose asks for."""
-        self.degrees = degrees
-        self.machine.wait(1.1 * angle_calibration.POSE_S * SPEED)
-
-    def pose(self, degrees: float, told_deg: float | None = None) -> Status:
-        self.hold(degrees)
-        told_rad = math.radians(degrees if told_deg is None else told_deg)
-        return self.ask(self.rig.angle_pose(AnglePoseRequest(angle_rad=told_rad, by="nurse")))
-
-
-Angled = Callable[..., AngledRig]
-
-
-@pytest.fixture
-def angled(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Angled:
-    return lambda **changes: AngledRig(tmp_path, monkeypatch, angle_sensor=SETTINGS, **changes)
 
 
 HELD = {"kind": "held", "angle": AnglePlan(range_rad=(0.2, 2.0), target_rad=math.radians(60))}
@@ -246,16 +234,18 @@ def test_poses_are_told_kept_and_stand_in_the_journal(angled: Angled, tmp_path: 
     told = live.rig.status().angle
     assert told.present and not told.calibrated and told.range_rad == (BOUND.lo, BOUND.hi)
     assert told.angle_rad == pytest.approx(math.radians(60), abs=0.01) and abs(told.velocity_rad_s or 9) < 0.05
-    status = live.pose(20.0, told_deg=25.0)
+    live.hold(20.0)
+    status = live.pose(25.0)
     assert status.angle.pose is not None and not status.angle.calibrated
-    status = live.pose(90.0, told_deg=95.0)
+    live.hold(90.0)
+    status = live.pose(95.0)
     assert status.angle.calibrated and status.angle.pose is None and status.angle.calibration is not None
     live.machine.wait(0.1)
     assert live.rig.status().angle.angle_rad == pytest.approx(math.radians(95), abs=0.01)
     live.hold(55.0)
     live.start(live.plan("t", **HELD))
     with pytest.raises(BusyError, match="test t is"):
-        live.ask(live.rig.angle_pose(AnglePoseRequest(angle_rad=1.0, by="nurse")))
+        live.pose(60.0)
     header = journal.read(tmp_path / "journals" / "t.journal").first_json(Kind.HEADER)
     assert header is not None and header["angle"]["calibration"]["by"] == "nurse" and header["angle"]["one_bus"] is True
     live.wait("ready")
@@ -319,8 +309,7 @@ def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Angled):
     plan = live.plan("p", kind="passive", angle=AnglePlan(range_rad=(0.2, 2.0)), segments=[rest(0.5)])
     with pytest.raises(RefusedError, match=r"the angle sensor is not calibrated; take two poses .* 28\.6°"):
         live.start(plan)
-    live.pose(20.0)
-    live.pose(90.0)
+    live.calibrate()
     live.hold(60.0)
     live.start(plan)  # without a pulse it needs no widths that were found today
     live.wait("ready")
@@ -345,9 +334,7 @@ def test_a_range_that_was_said_under_another_calibration_is_refused(angled: Angl
     live.machine.wait(0.2)
     live.start(live.plan("before", profile=said, **HELD))  # no calibration then, and none now
     live.wait("ready")
-    live.pose(20.0)
-    first = live.pose(90.0).angle.calibration
-    assert first is not None
+    first = live.calibrate()
     live.hold(60.0)
     for wrong in (said, said.model_copy(update={"angle_set_at_utc": "2026-01-01T00:00:00Z"})):
         with pytest.raises(RefusedError, match=f"calibrated anew at {first.set_at_utc}; say the range again"):

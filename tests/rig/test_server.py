@@ -15,7 +15,7 @@ import pytest
 from stimrig.rig import __main__ as program
 from stimrig.rig.adapters.server import LONG_LINE_BYTES, Server
 from stimrig.rig.adapters.stop_server import MAX_LINE_BYTES, UNREADABLE, StopServer
-from stimrig.rig.control.replies import internal_error, to_line
+from stimrig.rig.control.replies import refusal, to_line
 from stimrig.rig.messages import Reply, StateEvent, Status, StopEvidence
 from stimrig.rig.phase import Phase
 from stimrig.rig.requests import LONGEST_LINE
@@ -96,7 +96,7 @@ def test_a_long_plan_is_parsed_beside_no_test_only(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: Phase, answer: str
 ) -> None:
     """Who asks is answered in any case; `internal` says here that the rig was asked."""
-    monkeypatch.setattr("stimrig.rig.adapters.server.obey", lambda _, asked: internal_error(asked.id, ValueError()))
+    monkeypatch.setattr("stimrig.rig.adapters.server.obey", lambda _, asked: refusal(asked.id, ValueError()))
     rig = LiveRig(tmp_path, monkeypatch).rig
     rig.state.phase = phase
     widths = {"name": "s", "sequence": "widths", "settings": {"pulse_width_us": [100.25] * 10_000}}

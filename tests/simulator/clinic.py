@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from pydantic import ValidationError
 
-from stimrig.rig.control.replies import id_of, invalid_request, to_line
+from stimrig.rig.control.replies import id_of, refusal, to_line
 from stimrig.rig.control.rig import Rig, obey, read_request
 from stimrig.rig.messages import Event, FinishedEvent, Reply, StateEvent
 from stimrig.rig.requests import RearmRequest, StopRequest
@@ -149,5 +149,5 @@ async def answer(rig: Rig, line: bytes) -> Reply:
     try:
         request = read_request(line)
     except ValidationError as error:
-        return invalid_request(id_of(line), error)
+        return refusal(id_of(line), error)
     return await obey(rig, request)

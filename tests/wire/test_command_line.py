@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -29,14 +29,6 @@ bus = {{ interface = "socketcand", host = "127.0.0.1", port = 9, channel = "can0
 """
 ANSWERS = "no\nyes\n"
 """Nobody pulls at the emulator's lever; the dummy load is there."""
-
-
-@pytest.fixture(scope="module")
-def fast(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench]:
-    """An emulator four times as fast as the world: what a check listens to is judged by the devices' clocks."""
-    bench = Bench(tmp_path_factory.mktemp("fast"), "--noise-seed", "7", speed=4.0)
-    yield bench
-    bench.close()
 
 
 @pytest.fixture
@@ -96,13 +88,13 @@ def check(bench: Bench, folder: Path, *module: str) -> subprocess.Popen[str]:
     )  # fmt: skip
 
 
-def test_one_small_pulse_where_a_person_says_yes(fast: Bench, tmp_path: Path) -> None:
-    before = len(fast.felt())
-    out, err = check(fast, tmp_path, "stimrig.rig.check").communicate(ANSWERS, timeout=120)
+def test_one_small_pulse_where_a_person_says_yes(emulator: Bench, tmp_path: Path) -> None:
+    before = len(emulator.felt())
+    out, err = check(emulator, tmp_path, "stimrig.rig.check").communicate(ANSWERS, timeout=120)
     report = json.loads(out)
     outcomes = {step["name"]: step["outcome"] for step in report["steps"]}
     assert outcomes.pop("sign of the torque") == "not done", err
-    pulses = fast.felt()[before:]
+    pulses = emulator.felt()[before:]
     pulse = next(step for step in report["steps"] if step["name"] == "test pulse")
     if "DROPPED" in pulse["figure"]:  # the machine stood still while it was due
         assert pulses == []
@@ -114,21 +106,21 @@ def test_one_small_pulse_where_a_person_says_yes(fast: Bench, tmp_path: Path) ->
 @pytest.mark.parametrize(
     ("module", "end"), [(["stimrig.rig.check"], signal.SIGINT), (["stimrig", "rig", "check"], signal.SIGKILL)]
 )
-def test_ctrl_c_stops_the_stimulator(fast: Bench, tmp_path: Path, module: list[str], end: int) -> None:
+def test_ctrl_c_stops_the_stimulator(emulator: Bench, tmp_path: Path, module: list[str], end: int) -> None:
     """And so does the end of the command that started the check."""
-    before = fast.state()["pulses_received"]
-    process = check(fast, tmp_path, *module)
+    before = emulator.state()["pulses_received"]
+    process = check(emulator, tmp_path, *module)
     assert process.stdin is not None
     process.stdin.write(ANSWERS)
     process.stdin.flush()
     end_s = time.monotonic() + 60
-    while fast.state()["mode"] == "none":  # until the stimulator is made ready for the pulse
+    while emulator.state()["mode"] == "none":  # until the stimulator is made ready for the pulse
         assert process.poll() is None and time.monotonic() < end_s, process.communicate()
         time.sleep(0.02)
     process.send_signal(end)
     out, err = process.communicate(timeout=60)  # until the check itself has ended, too
     assert (process.returncode, out) == (130 if end == signal.SIGINT else -end, ""), err
     assert err.strip().splitlines()[-1] == "check: interrupted; the stimulator was stopped"
-    state = fast.state()
+    state = emulator.state()
     assert state["mode"] == "none", "it was told to stop, not only left alone"
-    assert later(fast)["pulses_received"] == state["pulses_received"] <= before + 1
+    assert later(emulator)["pulses_received"] == state["pulses_received"] <= before + 1

