@@ -101,13 +101,8 @@ class Calibrations:
         profile = None if discard else calibration.profile(self._tasks.clock.unix_s())
         result = CalibrationResult(profile=profile, recordings=calibration.recordings)
         if not discard:
-            calibrated = {
-                "calibration_id": of.calibration_id,
-                "participant": of.participant,
-                "by": of.by,
-                "result": result,
-            }
-            await self._result.store(Calibrated.model_validate(calibrated))
+            kept = Calibrated(calibration_id=of.calibration_id, participant=of.participant, by=of.by, result=result)
+            await self._result.store(kept)
         if self._state.phase.state == "calibrating":  # a stop may have come meanwhile: it takes no result back
             self._state.change(self._state.phase.calibrated())
         return result

@@ -6,6 +6,13 @@ The result is valid for the day on which the calibration began. After midnight a
 no mark, gives no profile, and says so: yesterday's thresholds must not become today's profile. A test that would end
 after its profile expires is refused at its start, not cut short: the person learns the reason before anything is felt,
 and the calendar never ends a train in its middle. Nothing that has begun uses the wall clock.
+
+The rule of the steps: a step up is large until the place where the next answer is expected, and fine from there on.
+Where nobody knows the participant, a large step is the widest `calibration_step_us`. Where an earlier calibration is
+known, it is the wider `calibration_known_step_us`, but it never ends above what that calibration marked. A step down
+goes half the way back to the next narrower train, and a step up after it goes half the way up again. No step of any
+kind adds more charge to a pulse than `calibration_rise_uc`; the first train rises from nothing, and only where an
+earlier calibration is known may it be more (`calibration_first_uc`).
 """
 
 from __future__ import annotations
@@ -15,7 +22,6 @@ from datetime import UTC, datetime, timedelta
 
 from stimrig.rig import limits
 from stimrig.rig.clock import utc_text
-from stimrig.rig.control.calibration_steps import rule_of
 from stimrig.rig.errors import PlanError, RefusedError
 from stimrig.rig.limits import FINEST, Limit, Steps
 from stimrig.rig.messages import (
@@ -40,6 +46,8 @@ MAX_VALID_S = 25 * 3600.0
 """A day, and the hour that is added when summer time ends."""
 OWNER = "calibration request"
 
+FIRST_SHARE = 0.6
+"""The first train's width, as a share of the last sensory threshold: too narrow to be felt, unless much has changed."""
 MOST_MISSED = 0.1
 """Share of a train's pulses that may be missing: one with more feels weaker than its width."""
 
@@ -79,7 +87,7 @@ class Calibration:
         most_us = table["pulse_width_us"].hi if request.max_pulse_width_us is None else request.max_pulse_width_us
         wanted = Profile(current_ma=request.current_ma, max_pulse_width_us=most_us, max_torque_nm=request.max_torque_nm)
         self.table = limits.for_profile(table, wanted, OWNER)
-        self._rule = rule_of(request, self.table)
+        self._set_steps()
         self._check_shortest()
         self._width_us = 0.0
         self._left_us: set[float] = set()
@@ -90,11 +98,32 @@ class Calibration:
         self._charge_uc = 0.0
         self.recordings: list[str] = []
 
+    def _set_steps(self) -> None:
+        """Widths of the steps, and of the first train; the current must have been checked.
+
+        Raises RefusedError: the earlier calibration makes no sense.
+        """
+        request, amperes = self.request, self.request.current_ma * 1e-3
+        rise_us = self.table["calibration_rise_uc"].hi / amperes
+        self._fine_us = self._large_us = self._known_us = self._first_us = min(request.step_us, rise_us)
+        self._last_us: dict[Threshold, float] = {}
+        if not request.large_steps:
+            return
+        self._last_us = marks_of(request.last, request.current_ma)
+        self._large_us, self._known_us = (
+            max(self._fine_us, min(self.table[name].hi, rise_us))
+            for name in ("calibration_step_us", "calibration_known_step_us")
+        )
+        self._first_us = self._large_us
+        if self._last_us:
+            most_us = self.table["calibration_first_uc"].hi / amperes
+            self._first_us = max(self._fine_us, min(FIRST_SHARE * self._last_us["sensory"], most_us))
+
     def _check_shortest(self) -> None:
         """Raise RefusedError where already the stimulator's shortest pulse is more than the first train may be."""
         shortest_us, rise_uc = self._steps.shortest_us, self.table["calibration_rise_uc"].hi
         charge_uc = shortest_us * self._steps.current(self.request.current_ma) * 1e-3
-        if charge_uc <= rise_uc or shortest_us <= self._rule.first_us:
+        if charge_uc <= rise_uc or shortest_us <= self._first_us:
             return
         most_ma = self._steps.current(rise_uc / shortest_us * 1e3)
         raise RefusedError(
@@ -127,17 +156,37 @@ class Calibration:
             )
 
     def _asked_us(self, direction: str) -> float:
-        """Where a step leads by the rule of the steps, before the limits."""
-        width_us = self._width_us
+        """Width of the next train by the rule of the steps, before the limits."""
+        width_us, fine_us, halves = self._width_us, self._fine_us, self.request.large_steps
         if direction == "up":
-            waiting = next(iter(self._missing()), None)
-            return self._rule.up(width_us, waiting, min((w for w in self._left_us if w > width_us), default=None))
+            if width_us == 0:
+                return self._first_us
+            step_us = self._step_us()
+            above_us = min((w for w in self._left_us if w > width_us), default=None)
+            if halves and above_us is not None:
+                step_us = min(step_us, above_us - width_us, max(fine_us, (above_us - width_us) / 2))
+            return width_us + step_us
         if direction == "fine":
-            return self._rule.fine(width_us)
+            return width_us + fine_us if width_us else min(fine_us, self._first_us)
         if direction == "down":
             played = (train.pulse_width_us for train in self._trains if train.pulses)
-            return self._rule.down(width_us, max((w for w in played if w < width_us), default=None))
+            below_us = max((w for w in played if w < width_us), default=None)
+            if not halves or below_us is None:
+                return width_us - fine_us
+            return width_us - max(fine_us, (width_us - below_us) / 2)
         return width_us
+
+    def _step_us(self) -> float:
+        """Size of a step up: large until where the next answer is expected."""
+        waiting = next(iter(self._missing()), None)
+        mark_us = self._last_us.get(waiting) if waiting else None
+        if mark_us is None:
+            return self._large_us
+        goal_us = mark_us - self._fine_us if waiting == "comfort" else mark_us
+        if self._width_us < goal_us:
+            return min(self._known_us, max(self._fine_us, goal_us - self._width_us))
+        is_near = waiting == "comfort" or self._width_us < mark_us + self._large_us
+        return self._fine_us if is_near else self._large_us
 
     def _up_to(self, width_us: float, most_us: float) -> float:
         """A step up that ends at the highest allowed width instead of above it, and is no train of no pulses."""
@@ -245,11 +294,11 @@ class Calibration:
             participant=request.participant,
             by=request.by,
             current_ma=request.current_ma,
-            step_us=self._rule.fine_us,
+            step_us=self._fine_us,
             train_s=request.train_s,
             max_torque_nm=request.max_torque_nm,
             large_steps=request.large_steps,
-            last_us=dict(self._rule.last_us),
+            last_us=dict(self._last_us),
             pulse_width_us=self._width_us,
             ceiling_us=ceiling.hi,
             ceiling_owner=ceiling.owner,
@@ -281,6 +330,29 @@ class Calibration:
             bounds.append((self._marks_us["comfort"], "marked comfort maximum"))
         most_us, owner = min(bounds)
         return Limit(width.name, 0.0, most_us, width.unit, width.reason, width.source, owner)
+
+
+def marks_of(last: Profile | None, current_ma: float) -> dict[Threshold, float]:
+    """The marks of an earlier calibration, as far as they say something about this current.
+
+    With a higher current every pulse is stronger than it was, so the old marks would be too high: none is used.
+
+    Raises RefusedError: the marks are not above 0 and in their order, or the current is no number.
+    """
+    if last is None or last.sensory_pulse_width_us is None or last.motor_pulse_width_us is None:
+        return {}
+    marks: dict[Threshold, float] = {
+        "sensory": last.sensory_pulse_width_us,
+        "motor": last.motor_pulse_width_us,
+        "comfort": last.max_pulse_width_us,
+    }
+    in_order = all(low <= high for low, high in itertools.pairwise((*marks.values(), float("1e4"))))
+    if not (in_order and marks["sensory"] > 0 and last.current_ma > 0):
+        raise RefusedError(
+            "calibration: the marks of the earlier calibration are not above 0 and in the order sensory, motor, "
+            "comfort; calibrate without them"
+        )
+    return marks if current_ma <= last.current_ma else {}
 
 
 def end_of_day_s(unix_s: float) -> float:

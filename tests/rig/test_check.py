@@ -240,19 +240,20 @@ def test_a_missing_port_is_told_with_its_remedy(tmp_path: Path, capfd: pytest.Ca
     assert stimrig.run(asked) == 1
     out, err = capfd.readouterr()
     assert out.startswith("faults\n") and FAULTS["port_missing"][1] in out and "failed" in err
-    assert stimrig.run([*asked, "--json"]) == 1
+    assert verb.main(["--config", asked[3], "--no-questions"]) == 1
     report = json.loads(capfd.readouterr().out)
     assert unmet("rig", report) == [] and report["verdict"] == "faults"
 
 
 def test_bad_input_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
-    for asked in (
-        [],
-        ["--rig", "a", "--emulator-json", "b"],
-        ["--rig", str(tmp_path / "no.toml")],
-        ["--emulator-json", "{}"],
+    no_file = str(tmp_path / "no.toml")
+    for run, asked in (
+        (stimrig.run, ["rig", "check"]),
+        (stimrig.run, ["rig", "check", "--rig", "a", "--emulator-json", "b"]),
+        (stimrig.run, ["rig", "check", "--rig", no_file]),
+        (verb.main, ["--emulator-json", "{}"]),
     ):
-        assert stimrig.run(["rig", "check", *asked]) == 2
+        assert run(asked) == 2
         out, err = capfd.readouterr()
         assert out == "" and len(err.strip().splitlines()) == 1
 

@@ -167,8 +167,8 @@ def test_recover_seals_says_what_is_missing_and_leaves_the_journal(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ):
-    def recovered(*words: str) -> tuple[int, str, str]:
-        code = main.run(["recover", *words])
+    def recovered(*words: str, run: Callable[[list[str]], int] = recover.main) -> tuple[int, str, str]:
+        code = run([*words])
         return code, *capsys.readouterr()
 
     monkeypatch.chdir(ROOT)
@@ -180,7 +180,7 @@ def test_recover_seals_says_what_is_missing_and_leaves_the_journal(
         (tmp_path / name).mkdir()
     path = tmp_path / "journals" / "t.unsealed"
     path.write_bytes(spoiled)
-    code, out, _ = recovered(str(path), "--json")
+    code, out, _ = recovered("recover", str(path), "--json", run=main.run)
     found = json.loads(out)
     assert (code, found["pulses"], found["test_id"], found["participant"]) == (0, pulses, "t", "unknown")
     assert "both copies of the header are lost" in found["note"]
@@ -197,10 +197,10 @@ def test_recover_seals_says_what_is_missing_and_leaves_the_journal(
     code, _, err = recovered(str(path))
     assert code == 2 and "another recording of this test exists" in err
     (tmp_path / "noise").write_bytes(b"no journal")
-    for wrong in ("noise", "nowhere"):
-        code, out, err = recovered("--", str(tmp_path / wrong))
+    for wrong, run, words in (("noise", recover.main, []), ("nowhere", main.run, ["recover", "--"])):
+        code, out, err = recovered(*words, str(tmp_path / wrong), run=run)
         assert (code, out, len(err.splitlines())) == (2, "", 1)
-        assert err.startswith("stimrig recover: journal ")
+        assert err.removeprefix("stimrig ").startswith("recover: journal ")
 
 
 def test_recover_refuses_what_a_living_rig_has(tmp_path: Path, capsys: pytest.CaptureFixture[str]):

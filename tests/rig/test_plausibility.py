@@ -180,14 +180,6 @@ def test_a_rate_is_told_however_the_samples_come_and_no_other_is_taken_for_one(n
         assert float(words.split()[2]) == pytest.approx(1600 * rate, rel=0.01), words
 
 
-@pytest.mark.parametrize("size", [64, 160])
-@pytest.mark.parametrize("rate", [0.5, 0.9, 1.0, 1.1])
-def test_a_line_that_gathers_samples_hides_no_rate(rate: float, size: int):
-    apart_s = size / 1600 / rate
-    told = [words for words in heard([i * apart_s for i in range(int(8 / apart_s))], size) if words]
-    assert bool(told) == (rate != 1.0)
-
-
 @pytest.mark.parametrize(("rate", "size"), [(0.05, 4), (0.24, 4), (0.3, 4), (4.5, 4), (0.9, 16)])
 def test_a_rate_that_is_another_is_told_at_the_end_of_a_short_test(rate: float, size: int):
     *_, told = heard([i * size / 1600 / rate for i in range(int(2.8 * 1600 / size * rate))], size)

@@ -435,16 +435,3 @@ def test_a_stop_outranks_it(make: Make):
     assert live.stop("it hurts").confirmed
     assert live.wait("latched") == "it hurts (by nurse)"
     assert remembered(live)["state"] == "latched"
-
-
-def test_an_end_that_the_stimulator_does_not_confirm_is_a_fault(make: Make, monkeypatch: Any):
-    live = make()
-    live.start(live.plan("one", hold_s=5.0))
-    live.wait_pulses(5)
-
-    async def state() -> tuple[bool, str]:
-        return False, "stimulating"
-
-    monkeypatch.setattr(live.stimulator, "state", state)
-    assert withdraw(live, begun=True)
-    assert "the end of stimulation is not confirmed" in live.wait("latched")

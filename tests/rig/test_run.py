@@ -68,8 +68,11 @@ def test_the_sealed_file_holds_what_was_played(tmp_path: Path):
         assert file["alignment"].attrs["method"] == "sync"
 
 
-def test_an_end_that_the_device_does_not_confirm_is_a_fault(tmp_path: Path):
+@pytest.mark.parametrize("withdrawn", [False, True])
+def test_an_end_that_the_device_does_not_confirm_is_a_fault(tmp_path: Path, withdrawn: bool):
     rig = VirtualRig(tmp_path)
+    if withdrawn:
+        rig.at(1.0, lambda: rig.halt.set("withdrawn", "signed out"))
 
     async def says_nothing_of_it() -> None: ...
 
