@@ -268,12 +268,13 @@ class RigCheck:
         gate, playing = rig.pair.gate, rig.player.playing
         if playing is not None:
             await self.tasks.wait(math.inf, playing.done)
-        assert gate is not None and rig.finished is not None
+        finished = rig.player.finished
+        assert gate is not None and finished is not None
         pulses = [pulse for pulse in gate.done if pulse.status != PulseStatus.REST]
         sync = np.concatenate([np.empty(0, "u1"), *(block["sync"] for block in receiver.live)])
-        edges, reason = int(np.sum((sync[1:] == 1) & (sync[:-1] != 1))), rig.finished.reason
+        edges, reason = int(np.sum((sync[1:] == 1) & (sync[:-1] != 1))), finished.reason
         self.figure = f"one pulse: {reason or f'{edges} edges of the sync line'}"
-        if rig.finished.outcome != "completed":
+        if finished.outcome != "completed":
             raise Fault(next((fault for words, fault in ENDINGS.items() if words in reason), "refused"))
         if [pulse.status for pulse in pulses] != [PulseStatus.ACKNOWLEDGED]:
             self.figure += f"; {', '.join(pulse.status.name for pulse in pulses)}"

@@ -99,7 +99,7 @@ class Health:
         self._angle = angle
 
     def suspicion(self) -> tuple[str, float] | None:
-        """Why the first pulse may not come yet, and for how long it may be waited for; see `Receiver.doubt`."""
+        """Why the first pulse may not come yet, and for how long it may be waited for; see `Receiver.suspicion`."""
         return self._receiver.suspicion(self._watch.stuck_torque_s, self._watch.unmoved_torque_s)
 
     def fault(self, stood_s: float = 0.0) -> str | None:

@@ -14,7 +14,6 @@ import time
 import uuid
 from collections.abc import Callable, Coroutine, Iterator
 from concurrent.futures import Future
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -100,24 +99,6 @@ class Driver:
                 return
 
 
-@contextlib.contextmanager
-def undisturbed() -> Iterator[None]:
-    """No garbage collection, and real-time priority for this thread if the system allows it."""
-    gc.collect()
-    gc.freeze()
-    gc.disable()
-    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
-    with contextlib.suppress(OSError):
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-    try:
-        yield
-    finally:
-        with contextlib.suppress(OSError):
-            os.sched_setscheduler(0, policy, parameters)
-        gc.enable()
-        gc.unfreeze()
-
-
 HOLD_S = 0.00025
 """Real seconds: the last part of a wait for a deadline, in which nothing else runs; a sleep ends later than asked."""
 MOST_OF_IT = 0.5
@@ -162,7 +143,9 @@ class LocalMachine:
 
     def __init__(self, clock: Clock) -> None:
         self.driver = Driver(clock)
-        self.tasks, self.boot_id = self.driver.tasks, boot_id()
+        self.tasks, self.boot_id = self.driver.tasks, ""
+        with contextlib.suppress(OSError, ValueError):
+            self.boot_id = BOOT_ID.read_text("ascii").strip()
         self.disk: Disk = Files()
         self.head_start_s = 0.0015
         self._strain = Strain()
@@ -187,18 +170,25 @@ class LocalMachine:
     def blocked_by(self, stood_s: float) -> str:
         return self._strain.cause(stood_s)
 
-    def undisturbed(self) -> AbstractContextManager[None]:
-        return undisturbed()
+    @contextlib.contextmanager
+    def undisturbed(self) -> Iterator[None]:
+        """No garbage collection, and real-time priority for this thread if the system allows it."""
+        gc.collect()
+        gc.freeze()
+        gc.disable()
+        policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+        with contextlib.suppress(OSError):
+            os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
+        try:
+            yield
+        finally:
+            with contextlib.suppress(OSError):
+                os.sched_setscheduler(0, policy, parameters)
+            gc.enable()
+            gc.unfreeze()
 
     def new_id(self) -> str:
         return uuid.uuid4().hex
 
     def cpu_s(self) -> float:
         return time.process_time()
-
-
-def boot_id() -> str:
-    try:
-        return BOOT_ID.read_text("ascii").strip()
-    except (OSError, ValueError):
-        return ""

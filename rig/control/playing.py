@@ -49,6 +49,7 @@ class Player:
         self.run: TestRun | None = None
         self.playing: Task[None] | None = None
         self.finished: FinishedEvent | None = None
+        """The newest test that has finished, recovered ones included."""
         self.withdrawals: dict[str, str] = {}
         """Tests that must not begin any more, and why: the newest ones."""
         self._halt: Halt | None = None

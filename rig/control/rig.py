@@ -26,7 +26,6 @@ from stimrig.rig.machine import Machine
 from stimrig.rig.messages import (
     PASSIVE,
     Event,
-    FinishedEvent,
     LiveEvent,
     Preview,
     Reply,
@@ -77,15 +76,6 @@ class Rig:
         self.player = Player(self.state, self.pair, self.joint, self.rest, self.store, machine, config.watch, publish)
         self.calibrations = Calibrations(self.player, self._result, self.table, self._publish_status)
 
-    @property
-    def latch(self) -> str:
-        return self.state.latch
-
-    @property
-    def finished(self) -> FinishedEvent | None:
-        """The newest test that has finished, recovered ones included."""
-        return self.player.finished
-
     def status(self) -> Status:
         phase, run, receiver = self.state.phase, self.player.run, self.pair.receiver
         calibration = self.state.calibration
@@ -112,7 +102,7 @@ class Rig:
             calibrated=self._result.waiting,
             limits=limits.bounds(self.table),
             require_calibration=self._require_calibration,
-            finished=self.finished,
+            finished=self.player.finished,
         )
 
     def trouble(self) -> str | None:

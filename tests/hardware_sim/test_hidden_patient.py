@@ -24,7 +24,7 @@ from tests.hardware_sim.emulated import emulated, wait_for
 pytestmark = pytest.mark.slow
 
 RATE_HZ = 1600
-SECONDS = 8.0
+SECONDS = 12.0
 
 
 def off_line(scenario: Scenario) -> np.ndarray:

@@ -121,8 +121,8 @@ class LiveRig:
 
     @property
     def finished(self) -> FinishedEvent:
-        assert self.rig.finished is not None
-        return self.rig.finished
+        assert self.rig.player.finished is not None
+        return self.rig.player.finished
 
     def preview(self, plan: TestPlan) -> Preview:
         return self.ask(self.rig.preview(PreviewRequest(plan=plan)))
@@ -131,7 +131,7 @@ class LiveRig:
         return self.ask(self.rig.stop(reason, by))
 
     def rearm(self, by: str = "nurse") -> Status:
-        return self.ask(self.rig.rearm(by, self.rig.latch))
+        return self.ask(self.rig.rearm(by, self.rig.state.latch))
 
     def step(self, direction: Direction = "up") -> None:
         self.ask(self.rig.calibrations.step(CalibrateStepRequest(direction=direction)))

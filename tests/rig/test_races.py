@@ -96,7 +96,7 @@ async def begin_train(live: LiveRig) -> None:
 
 def rearm_and_start(live: LiveRig) -> Coroutine[Any, Any, Any]:
     """Of a ready rig, while a start waits behind it."""
-    rearming, starting = live.begin(live.rig.rearm("nurse", live.rig.latch)), live.begin(begin_test(live))
+    rearming, starting = live.begin(live.rig.rearm("nurse", live.rig.state.latch)), live.begin(begin_test(live))
 
     async def both() -> None:
         with contextlib.suppress(LatchChangedError):
@@ -107,7 +107,7 @@ def rearm_and_start(live: LiveRig) -> Coroutine[Any, Any, Any]:
 
 
 def rearm(live: LiveRig) -> Coroutine[Any, Any, Any]:
-    return live.rig.rearm("nurse", live.rig.latch)
+    return live.rig.rearm("nurse", live.rig.state.latch)
 
 
 def stop_first(live: LiveRig) -> object:
@@ -224,7 +224,7 @@ def test_a_rearm_that_waits_its_turn_releases_no_stop_that_came_meanwhile(make: 
     """Two people re-arm at once, and somebody presses stop before the second one's turn."""
     live = make(disk=SimulatedDisk(World(0)), clock=None)
     live.stop("first")
-    one, two = (live.begin(live.rig.rearm(name, live.rig.latch)) for name in ("nurse", "doctor"))
+    one, two = (live.begin(live.rig.rearm(name, live.rig.state.latch)) for name in ("nurse", "doctor"))
     live.machine.wait(0.001)
     assert live.stop("second").confirmed
     live.until(two.done.is_set)
@@ -281,7 +281,7 @@ def test_a_later_reason_is_told_and_outlives_the_process(make: Make, state: str)
     again = make(disk=live.machine.disk, clock=live.clock)
     assert again.rig.status().reason == both
     with pytest.raises(LatchChangedError):
-        again.ask(again.rig.rearm("nurse", live.rig.latch))  # of the process before
+        again.ask(again.rig.rearm("nurse", live.rig.state.latch))  # of the process before
 
 
 def test_a_stop_while_uncertain_is_told_after_the_next_restart_too(make: Make):
@@ -290,7 +290,7 @@ def test_a_stop_while_uncertain_is_told_after_the_next_restart_too(make: Make):
     live.machine.disk.process_ended()
     live.machine.disk.replace(live.config.data_dir / "latch.json", b"damaged")
     live = make(disk=live.machine.disk, clock=live.clock)
-    seen = live.rig.latch
+    seen = live.rig.state.latch
     live.stop("it hurts")
     with pytest.raises(LatchChangedError):
         live.ask(live.rig.rearm("nurse", seen))
@@ -310,7 +310,7 @@ def test_a_stop_is_remembered_by_the_next_process_once_it_is_answered(make: Make
             live.wait("sealing")
 
     def go_on(live: LiveRig) -> Coroutine[Any, Any, Any]:
-        return live.rig.rearm("nurse", live.rig.latch) if begin == "re-arming" else live.machine.tasks.sleep(2.0)
+        return live.rig.rearm("nurse", live.rig.state.latch) if begin == "re-arming" else live.machine.tasks.sleep(2.0)
 
     for live, _ in moments(make, go_on, ready, before):
         live.stop("now")

@@ -123,7 +123,7 @@ def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
             late()
     discarded = live.ask(live.rig.calibrations.finish(CalibrateFinishRequest(by="t", discard=True)))
     assert discarded.profile is None
-    assert live.rig.finished is None, "a train is no test"
+    assert live.rig.player.finished is None, "a train is no test"
     assert live.rig.status().state == "ready"
 
 
