@@ -26,6 +26,10 @@ from stimrig.rig.tasks import Outcome
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
 RATE_HZ = 1600.0
+PER_BLOCK = 16
+"""Samples that the cell gives at once."""
+BEGINS_S = 0.175
+"""A test's clock begins so long after it was asked for: torque has settled by then, and its first pulse has a lead."""
 OF_ANGLE = {"angle": {"sample_rate_hz": 200.0, "of_the_cell": False, "one_bus": True, "calibration": {"by": "nurse"}}}
 
 
@@ -136,7 +140,7 @@ class FakeCell:
         self.clock = clock
         self.stimulator = stimulator
         self.silent = self.nan = self.gone = self.broken = self.is_open = False
-        self.per_block = 10
+        self.per_block = PER_BLOCK
         self.add_nm = 0.0
         self.skip = 0
         self.rate = 1.0
@@ -197,7 +201,8 @@ class FakeCell:
         block["host_time_s"] = now_s
         block["stamp_s"] = np.nan
         block["torque_nm"] = np.nan if self.nan else self.torque_nm + self.add_nm
-        block["torque_nm"] += self.noise_nm * self._rng.standard_normal(n)
+        if self.noise_nm:
+            block["torque_nm"] += self.noise_nm * self._rng.standard_normal(n)
         clipped_nm = self.sign * np.minimum(block["torque_nm"], self.ceiling_nm)
         if self.step_nm:
             clipped_nm = self.step_nm * np.round(clipped_nm / self.step_nm)
@@ -269,7 +274,7 @@ class VirtualRig:
 
     def at(self, time_s: float, action: Callable[[], object]) -> None:
         """Do something at a time on the test's clock (its start: torque settled, then the lead)."""
-        self.clock.call_at(self.clock.now_s() + 0.165 + time_s, lambda: void(action()))
+        self.clock.call_at(self.clock.now_s() + BEGINS_S + time_s, lambda: void(action()))
 
     def execute(self) -> RunResult:
         if self.angle is not None:

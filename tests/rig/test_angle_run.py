@@ -17,7 +17,7 @@ from stimrig.rig.control.sealing import warnings
 from stimrig.rig.errors import DeviceError, PlanError, RefusedError
 from stimrig.rig.messages import AdaptivePlan, AnglePlan
 from stimrig.rig.signals import Pulse, PulseStatus
-from tests.rig.fakes import VirtualRig, extend, hold, refusals, rest
+from tests.rig.fakes import BEGINS_S, VirtualRig, extend, hold, refusals, rest
 
 pytestmark = pytest.mark.slow
 
@@ -129,7 +129,7 @@ def test_without_a_movement_a_moving_test_ends(tmp_path: Path, noise_deg: float)
     """With more noise of the sensor a joint that stands still takes longer to be seen."""
     rig = moving(tmp_path)
     rig.sensor.noise_deg = noise_deg
-    stands_s = rig.clock.now_s() + 0.165 + 1.3
+    stands_s = rig.clock.now_s() + BEGINS_S + 1.3
     rig.sensor.angle_rad = lambda t: swinging(min(t, stands_s))
     result = rig.execute()
     assert result.outcome == "fault"

@@ -36,7 +36,7 @@ def repeat_frames(rig: VirtualRig) -> None:
 
 
 def again(rig: VirtualRig, counter: int) -> None:
-    rig.cell.counter = counter - 10
+    rig.cell.counter = counter - rig.cell.per_block
     rig.clock.call_at(rig.clock.now_s() + 0.001, lambda: again(rig, counter))
 
 

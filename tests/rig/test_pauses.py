@@ -12,7 +12,7 @@ from stimrig.rig.acquire.health import DEFAULT_WATCH
 from stimrig.rig.acquire.pauses import LONGEST_S, RECOVERY_S
 from stimrig.rig.messages import SegmentPlan
 from stimrig.rig.signals import PulseStatus
-from tests.rig.fakes import PULSES_HZ, VirtualRig, hold
+from tests.rig.fakes import BEGINS_S, PULSES_HZ, VirtualRig, hold
 
 JUMPING = {"name": "prbs", "sequence": "prbs", "settings": {}}
 BEGAN_S = 1.2
@@ -72,11 +72,11 @@ DOUBTS: dict[str, tuple[Fault, str]] = {
     "a cell that stays silent": (
         lambda r: (setattr(r.cell, "silent", True), r.clock.advance(0.4)), "silent for 1 s"),
     "a cell that was silent before": (
-        lambda r: (setattr(r.cell, "silent", True), r.at(-0.165 + 0.15, lambda: r.clock.advance(0.4))), "stale"),
+        lambda r: (setattr(r.cell, "silent", True), r.at(-BEGINS_S + 0.15, lambda: r.clock.advance(0.4))), "stale"),
     "a cell that counts on another clock": (
         lambda r: (setattr(r.cell, "skip", -1200), r.clock.advance(0.4)), "in order again"),
     "no acknowledgement of the last pulse": (
-        lambda r: (setattr(r.stimulator, "ack_delay_s", None), r.at(-0.165 + 0.03, lambda: r.clock.advance(0.4))),
+        lambda r: (setattr(r.stimulator, "ack_delay_s", None), r.at(-BEGINS_S + 0.03, lambda: r.clock.advance(0.4))),
         "not acknowledged"),
     "a stimulator that started anew": (
         lambda r: (setattr(r.stimulator, "armed", False), r.clock.advance(0.4)), "not initialised after a pause"),
@@ -91,7 +91,7 @@ DOUBTS: dict[str, tuple[Fault, str]] = {
 def test_what_is_not_whole_after_it_ends_the_test_and_nothing_is_sent(rig: VirtualRig, name: str):
     inject, words = DOUBTS[name]
     rig.at(BEGAN_S, lambda: inject(rig))
-    began_s = rig.clock.now_s() + 0.165 + BEGAN_S
+    began_s = rig.clock.now_s() + BEGINS_S + BEGAN_S
     result = rig.execute()
     assert result.outcome == "fault"
     assert words in result.reason, result.reason
@@ -123,7 +123,7 @@ def test_no_current_comes_back_after_a_series_of_them_without_end(rig: VirtualRi
     paused(rig, *((BEGAN_S + 0.33 * number, 0.3) for number in range(12)))
     result = rig.execute()
     assert result.outcome == "fault" and result.summary["pauses"] == []
-    assert rig.stimulator.sent[-1][0] < 1000.0 + 0.17 + BEGAN_S
+    assert rig.stimulator.sent[-1][0] < 1000.0 + BEGINS_S + 0.005 + BEGAN_S
 
 
 @pytest.mark.parametrize("for_s", [0.07, 0.095])
@@ -142,12 +142,12 @@ def test_many_that_are_too_short_for_a_pause_make_no_strong_pulse_on_a_rested_mu
 @pytest.mark.parametrize("answers_s", [0.45, 5.0])
 def test_who_stops_waits_for_no_answer_of_the_stimulator(rig: VirtualRig, answers_s: float):
     slow_to_tell(rig, answers_s)
-    stop_s = 0.165 + BEGAN_S + 0.4 + 0.25
-    rig.at(stop_s - 0.165, lambda: rig.halt.set("stopped", "enough"))
+    stop_s = BEGINS_S + BEGAN_S + 0.4 + 0.25
+    rig.at(stop_s - BEGINS_S, lambda: rig.halt.set("stopped", "enough"))
     paused(rig, (BEGAN_S, 0.4))
     assert rig.execute().outcome == "stopped"
     assert rig.stimulator.stopped_s[0] - (1000.0 + stop_s) < 0.02
-    assert rig.stimulator.sent[-1][0] < 1000.0 + 0.165 + BEGAN_S + 0.01
+    assert rig.stimulator.sent[-1][0] < 1000.0 + BEGINS_S + BEGAN_S + 0.01
 
 
 def test_a_cell_that_dies_while_the_stimulator_is_asked_ends_the_test_without_a_pulse(rig: VirtualRig):
@@ -156,7 +156,7 @@ def test_a_cell_that_dies_while_the_stimulator_is_asked_ends_the_test_without_a_
     paused(rig, (BEGAN_S, 0.4))
     result = rig.execute()
     assert result.outcome == "fault" and "torque is stale" in result.reason
-    assert rig.stimulator.sent[-1][0] < 1000.0 + 0.165 + BEGAN_S + 0.01
+    assert rig.stimulator.sent[-1][0] < 1000.0 + BEGINS_S + BEGAN_S + 0.01
 
 
 def slow_to_tell(rig: VirtualRig, answers_s: float) -> None:
@@ -176,17 +176,17 @@ def test_who_stops_during_it_is_heard_before_the_next_pulse(rig: VirtualRig, cau
     for after_s in (0.0, 0.05):
         rig.at(BEGAN_S + 0.4 + after_s, lambda: rig.halt.set(cause, "enough"))
     paused(rig, (BEGAN_S, 0.4))
-    began_s = rig.clock.now_s() + 0.165 + BEGAN_S
+    began_s = rig.clock.now_s() + BEGINS_S + BEGAN_S
     assert rig.execute().outcome == "stopped"
     assert rig.stimulator.sent[-1][0] <= began_s
 
 
 def test_nothing_is_sent_nor_fed_before_all_is_whole(rig: VirtualRig):
     """A backlog is read first: torque from before the pause is not torque of now."""
-    rig.cell.held = lambda now_s: BEGAN_S + 0.165 < now_s - 1000.0 < BEGAN_S + 0.165 + 0.55
+    rig.cell.held = lambda now_s: BEGAN_S + BEGINS_S < now_s - 1000.0 < BEGAN_S + BEGINS_S + 0.55
     paused(rig, (BEGAN_S, 0.3))
     result = rig.execute()
     assert result.outcome == "completed", result.reason
-    whole_s = 1000.0 + 0.165 + BEGAN_S + 0.55
+    whole_s = 1000.0 + BEGINS_S + BEGAN_S + 0.55
     assert not [time_s for time_s, _ in rig.stimulator.sent if whole_s - 0.5 < time_s < whole_s]
     assert not [time_s for time_s in rig.stimulator.fed_s if whole_s - 0.5 < time_s < whole_s]
