@@ -29,7 +29,7 @@ def emulated(*arguments: str) -> Iterator[Emulated]:
             running.stop()
 
 
-def wait_for(condition: Callable[[], bool], seconds: float = 20.0) -> None:
+def wait_for(condition: Callable[[], bool], seconds: float = 60.0) -> None:
     end_s = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end_s, "waited in vain"

@@ -19,7 +19,9 @@ from typing import Any
 import psutil
 
 ROOT = Path(__file__).resolve().parents[2]
-READY_TIMEOUT_S = 30.0
+READY_TIMEOUT_S = 120.0
+ANSWER_TIMEOUT_S = 60.0
+"""Both are reached only where something hangs: a busy machine may take long to start a process."""
 CLINIC_WATCH: dict[str, float] = {}
 """The watch of a rig file that says nothing of it: for benches that measure how soon silence stops a test."""
 
@@ -54,7 +56,7 @@ class Process:
             raise RuntimeError(f"{' '.join(arguments)} was not ready; its log: {self.log.read_text()[-3000:]}")
         return json.loads(line)
 
-    def stop(self, number: int = signal.SIGTERM, timeout_s: float = 20.0) -> int:
+    def stop(self, number: int = signal.SIGTERM, timeout_s: float = ANSWER_TIMEOUT_S) -> int:
         """End it and return its exit code."""
         if self.popen.poll() is None:
             self.popen.send_signal(number)
@@ -92,14 +94,14 @@ class RigClient:
                     self._replies[message["id"]].put(message)
         self.closed.set()
 
-    def ask(self, kind: str, timeout_s: float = 15.0, **fields: Any) -> dict[str, Any]:
+    def ask(self, kind: str, timeout_s: float = ANSWER_TIMEOUT_S, **fields: Any) -> dict[str, Any]:
         """Send a request and return the whole reply."""
         self._id += 1
         self._replies[self._id] = queue.Queue()
         self.send_raw(json.dumps({"kind": kind, "id": self._id, **fields}))
         return self._replies[self._id].get(timeout=timeout_s)
 
-    def start(self, plan: dict[str, Any], timeout_s: float = 15.0) -> dict[str, Any]:
+    def start(self, plan: dict[str, Any], timeout_s: float = ANSWER_TIMEOUT_S) -> dict[str, Any]:
         """Ask for a test, once the rest between two tests is over; the whole reply."""
         end = time.monotonic() + 30
         while True:
@@ -124,7 +126,7 @@ class RigClient:
         """The rig's status."""
         return self.ask("status")["body"]
 
-    def wait_state(self, *states: str, timeout_s: float = 20.0) -> dict[str, Any]:
+    def wait_state(self, *states: str, timeout_s: float = ANSWER_TIMEOUT_S) -> dict[str, Any]:
         """Poll until the rig is in one of the states."""
         end = time.monotonic() + timeout_s
         while (status := self.status())["state"] not in states:
@@ -216,7 +218,7 @@ def control(address: Any, command: dict[str, Any]) -> dict[str, Any]:
     else:
         connection = socket.create_connection((address["host"], address["port"]))
     with connection, connection.makefile("rwb") as file:
-        connection.settimeout(10)
+        connection.settimeout(ANSWER_TIMEOUT_S)
         file.write(json.dumps(command).encode() + b"\n")
         file.flush()
         return json.loads(file.readline())

@@ -309,6 +309,7 @@ def test_a_fixed_plan_that_does_not_fit_its_own_bound_is_refused_before_the_firs
 def test_the_measured_torque_time_ends_it_within_a_pulse(tmp_path: Path, pending: str):
     """Neither what is laid far ahead nor an end that waits for its boundary plays on over the bound."""
     rig = adaptive(tmp_path, max_nms=5.0, fixed=[rest(0.5), hold("long", on_s=3.0), hold("more", on_s=3.0)])
+    rig.cell.per_block = 10  # the torque of a block counts once it has come
     if pending == "enough":
         rig.at(0.6, lambda: rig.run.score.enough("me", at_once=False))
     if pending == "laid":

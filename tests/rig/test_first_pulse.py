@@ -16,7 +16,7 @@ from stimrig.rig.acquire.run import RunResult
 from stimrig.rig.acquire.stream import LOOK_AT
 from stimrig.rig.config import EMULATOR_WATCH
 from stimrig.rig.signals import SAMPLE, Block
-from tests.rig.fakes import VirtualRig, hold, rest
+from tests.rig.fakes import VirtualRig, hold, rest, void
 
 EMULATOR = Watch.model_validate(EMULATOR_WATCH)
 SILENT, STANDS, ERRORS = "load cell", "has given exactly ", "reports errors of the bus"
@@ -62,9 +62,6 @@ def play(rig: VirtualRig, idle_s: float, *events: tuple[float, Callable[[], obje
         rig.clock.call_at(rig.clock.now_s() + idle_s - before_s, lambda action=action: void(action()))
     rig.clock.wait(rig.machine.tasks, idle_s)
     return rig.machine.run(rig.run.execute())
-
-
-def void(_: object) -> None: ...
 
 
 MOMENTS = [

@@ -80,7 +80,7 @@ def restless(rig: VirtualRig) -> None:
 @pytest.mark.parametrize("rate", [0.5, 0.94, 1.06, 2.0])
 def test_a_short_test_of_a_cell_with_another_rate_is_a_fault(tmp_path: Path, rate: float):
     rig = VirtualRig(tmp_path, [hold(on_s=2.8)])  # shorter than the window in which it would be told at once
-    rig.cell.rate = rate
+    rig.cell.rate, rig.cell.per_block = rate, 10
     result = rig.execute()
     assert result.outcome == "fault"
     told_hz = float(result.reason.removeprefix("load cell: ").split()[0])

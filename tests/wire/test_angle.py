@@ -49,7 +49,7 @@ def ready(angled: tuple[Bench, RigClient]) -> tuple[Bench, RigClient]:
 def at(bench: Bench, client: RigClient, degrees: float) -> None:
     """Hold the arm there until the rig sees it."""
     assert bench.fault(cmd="arm", mode="held", angle_deg=degrees)["ok"]
-    end = time.monotonic() + 15
+    end = time.monotonic() + 60
     while True:
         raw = client.status()["angle"]
         still = raw["velocity_rad_s"] is not None and abs(raw["velocity_rad_s"]) < 0.1
@@ -63,7 +63,7 @@ def played(client: RigClient, test_id: str, **fields: Any) -> dict[str, Any]:
     client.ask("subscribe")
     reply = client.start(default_plan(test_id, **{"segments": STEPS, **fields}))
     assert reply["ok"], reply
-    event = client.wait_finished(test_id, timeout_s=40)
+    event = client.wait_finished(test_id)
     assert event["outcome"] == "completed", event
     return event
 
@@ -102,7 +102,7 @@ def test_no_pulse_is_felt_in_a_passive_test(ready: tuple[Bench, RigClient]):
 def test_a_sensor_that_is_plugged_in_again_is_found_by_itself(ready: tuple[Bench, RigClient]):
     bench, client = ready
     assert bench.fault(cmd="fault", name="angle_unplugged", on=True)["ok"]
-    end = time.monotonic() + 15
+    end = time.monotonic() + 60
     while not client.status()["angle"]["problem"]:
         assert time.monotonic() < end
         time.sleep(0.05)

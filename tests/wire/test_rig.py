@@ -66,7 +66,7 @@ def test_a_fault_stops_is_told_and_latches(shared: tuple[Bench, RigClient], faul
     injected = bench.fault(cmd="fault", name=fault, on=True)
     assert injected["ok"], injected
     counted = bench.state()["pulses_received"]
-    event = client.wait_finished(fault, timeout_s=60)
+    event = client.wait_finished(fault)
     check_kept(event, "fault")
     assert FAULTS[fault] in event["reason"]
     # pulses are counted, not seconds: a computer that stands still sends none
@@ -94,7 +94,7 @@ def test_a_load_cell_that_fails_before_the_start_is_told_before_the_first_pulse(
     test_id = f"{fault}-before"
     reply = client.start(default_plan(test_id, segments=STEPS))
     if reply["ok"]:
-        assert client.wait_finished(test_id, timeout_s=60)["outcome"] == "fault"
+        assert client.wait_finished(test_id)["outcome"] == "fault"
     # also where the rest between two tests left the rig the time to find it silent
     reason = client.status()["reason"] if reply["ok"] else reply["problem"]["detail"]
     assert "load cell" in reason and "look at its plug and supply, and at the CAN adapter" in reason, reply
@@ -269,9 +269,9 @@ def test_what_is_shown_and_sealed_is_what_was_felt(shared: tuple[Bench, RigClien
     bench, client = shared
     before = len(bench.felt())
     client.ask("subscribe")
-    while client.events.get(timeout=5)["event"] != "state":
+    while client.events.get(timeout=60)["event"] != "state":
         pass
-    live = client.events.get(timeout=5)
+    live = client.events.get(timeout=60)
     assert live["event"] == "live"
     assert live["test_id"] is None
     assert len(list(LiveEvent.model_validate(live).torque_rows())) > 0
