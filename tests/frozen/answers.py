@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import html
 import json
 import os
 import re
@@ -12,7 +13,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
@@ -194,40 +194,11 @@ def _hdf5(path: Path, folder: Path) -> dict[str, Any]:
     return found
 
 
-class _Words(HTMLParser):
-    """What is seen or chosen on a page: texts, links, and the fields and buttons of forms."""
-
-    CHOSEN = "href", "action", "method", "name", "value", "type"
-    SAID = "title", "aria-label", "placeholder", "alt", "lang"
-    SHOWN = "a", "form", "input", "button", "select", "option", "textarea", "html", "img"
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[str] = []
-        self.silent = ""
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        given = dict(attrs)
-        names = (*self.CHOSEN, *self.SAID) if tag in self.SHOWN else self.SAID
-        words = " ".join(f"{name}={given[name]}" for name in names if given.get(name))
-        if words and not self.silent:
-            self.found.append(f"<{tag} {words}>")
-        if tag in ("script", "style", "svg"):
-            self.silent = self.silent or tag
-
-    def handle_endtag(self, tag: str) -> None:
-        self.silent = "" if tag == self.silent else self.silent
-
-    def handle_data(self, data: str) -> None:
-        if not self.silent and data.strip():
-            self.found.append(" ".join(data.split()))
-
-
-def words_of(html: str, folder: Path) -> list[str]:
-    """The words, links and fields of a page or a text, one each."""
-    reader = _Words()
-    reader.feed(html)
-    return [_plain(line, folder) for line in reader.found]
+def words_of(page: str, folder: Path) -> list[str]:
+    """The texts of a page, one each."""
+    shown = re.sub(r"(?s)<(script|style|svg)\b.*?</\1>", "<>", page)
+    texts = (html.unescape(text) for text in re.split(r"<[^>]*>", shown))
+    return [_plain(" ".join(text.split()), folder) for text in texts if text.strip()]
 
 
 def _table(path: Path, folder: Path) -> Any:

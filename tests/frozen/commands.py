@@ -9,12 +9,11 @@ from typing import Any
 from stimrig.api.settings import Settings
 from stimrig.api.web.app import create_app
 from tests.frozen.answers import call, condensed, condensed_file, run, working_in
-from tests.frozen.records import MORE_WORDS, RECORDS
+from tests.frozen.records import IN_FULL, MORE_WORDS, RECORDS
 from tests.frozen.rig_records import of_kind
 from tests.harness import cohort_records
 
 METHODS = ("two-stage", "ramp-deconvolution", "separable-least-squares", "narx")
-IN_FULL = ("fatigue", "plain", "electromechanical_delay", "sealed", "rig_plain")
 VERBS = (
     "", "fit", "predict", "compare", "diagnose", "improve", "invert", "export", "recover", "audit", "audit verify",
     "audit export", "effects", "schema", "table1", "test", "doctor", "demo", "serve", "emulate",

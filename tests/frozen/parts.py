@@ -13,15 +13,15 @@ from pathlib import Path
 from typing import Any
 
 from tests.frozen import commands
-from tests.frozen.answers import WEAK, differences
-from tests.frozen.records import RECORDS
+from tests.frozen.answers import differences
+from tests.frozen.records import DIAGNOSED, FITTED
 
 HERE = Path(__file__).parent
 PARTS: dict[str, Callable[[Path], Any]] = {
-    **{f"fitted/{name}": partial(commands.of_record, name) for name in RECORDS},
+    **{f"fitted/{name}": partial(commands.of_record, name) for name in FITTED},
     "without_record": commands.without_record,
     "rest": commands.rest,
-    **{f"diagnosed/{name}": partial(commands.diagnosed, name) for name in RECORDS if name not in WEAK.split("|")},
+    **{f"diagnosed/{name}": partial(commands.diagnosed, name) for name in DIAGNOSED},
 }
 
 

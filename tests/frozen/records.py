@@ -1,4 +1,4 @@
-"""The fifty recordings, each from a seed: CSV in several forms, sealed recordings, MAT files."""
+"""The recordings, each from a seed: CSV in several forms, sealed recordings, MAT files."""
 
 from __future__ import annotations
 
@@ -94,5 +94,10 @@ RECORDS: dict[str, Make] = {
     "other_words": _in_other_words,
     "mat": _mat,
 }
+IN_FULL = ("fatigue", "plain", "electromechanical_delay", "sealed", "rig_plain")
+"""On these each verb and option is called, and both a fit and a diagnosis are kept."""
+DIAGNOSED = (*EFFECTS, *OUTSIDE, "pair", "plain", "plain_slow", "sealed", "rig_plain")
+"""A diagnosis begins with the plain fit, and depends on the record alone, whatever file it came from."""
+FITTED = tuple(name for name in RECORDS if name in IN_FULL or name not in DIAGNOSED)
 MORE_WORDS = {"other_words": "--map time_s=t:ms --map pulse_width_us=pw:ms --map torque_nm=Drehmoment:mNm"}
 """What every call on a recording says more."""

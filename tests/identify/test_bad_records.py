@@ -23,14 +23,7 @@ def base() -> Record:
 
 
 def cut(record: Record, *names: str) -> Record:
-    segment = np.array(record.segment_names)[record.segment]
-    keep = np.isin(segment, names)
-    return Record.from_arrays(
-        np.arange(keep.sum()) / record.sample_rate_hz,
-        record.pulse_width_us[keep],
-        record.torque_nm[keep],
-        segment[keep],
-    )
+    return record.take(np.isin(np.array(record.segment_names)[record.segment], names))
 
 
 def answer(record: Record, method: str) -> identify.Model | identify.IdentifyError:
@@ -135,16 +128,7 @@ def test_numbers_that_are_none():
     names=st.lists(st.sampled_from(["rest", "prbs", "ramp", "validate", "my own"]), min_size=1, max_size=5),
     method=st.sampled_from(METHODS),
 )
-@example(
-    size=400,
-    rate=100.0,
-    pulse_rate=20.0,
-    seed=4,
-    widths="many",
-    torque="huge",
-    names=["prbs", "validate"],
-    method="maximum-likelihood",
-)
+@example(400, 100.0, 20.0, 4, "many", "huge", ["prbs", "validate"], "maximum-likelihood")
 def test_any_record_gets_an_answer(size, rate, pulse_rate, seed, widths, torque, names, method):
     rng = np.random.default_rng(seed)
     each = max(int(rate / pulse_rate), 1)

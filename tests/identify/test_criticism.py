@@ -155,9 +155,3 @@ def test_a_residual_that_is_not_noise_asks_for_care_alone(record: identify.Recor
     assert (
         found["words"] == "Check this before use: the residual is not pure noise (whiteness test): see the diagnosis."
     )
-
-
-def test_torque_well_below_the_noise_has_no_best_fit() -> None:
-    measured = 0.04 * np.sin(np.arange(100.0))
-    assert best_fit_percent(measured, measured, 0.05) == 100.0
-    assert np.isnan(best_fit_percent(measured, measured, 0.1))

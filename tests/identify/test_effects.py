@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -34,14 +35,7 @@ FORMS = [(effect.id, form.name) for effect in registry().values() for form in ef
 def moving() -> Record:
     base = hidden_muscles.record(seed=3, rate_hz=100)
     angle = 1.4 + 0.2 * np.sin(0.7 * base.time_s)
-    return Record.from_arrays(
-        base.time_s,
-        base.pulse_width_us,
-        base.torque_nm,
-        np.array(base.segment_names)[base.segment],
-        angle_rad=angle,
-        velocity_rad_s=np.gradient(angle, base.time_s),
-    )
+    return replace(base, angle_rad=angle, velocity_rad_s=np.gradient(angle, base.time_s))
 
 
 @pytest.fixture(scope="module")
@@ -148,9 +142,7 @@ def plain(moving: Record) -> dict[str, Any]:
 @pytest.fixture(scope="module")
 def brief(moving: Record) -> Record:
     """Three seconds with a pause, so that every spoiled form is predicted soon."""
-    rows = slice(150, 450)
-    columns = moving.time_s[rows], moving.pulse_width_us[rows], moving.torque_nm[rows]
-    return Record.from_arrays(*columns, angle_rad=moving.angle_rad[rows], velocity_rad_s=moving.velocity_rad_s[rows])
+    return moving.take(np.arange(150, 450))
 
 
 def with_effect(plain: dict[str, Any], effect: str, form: str, parameters: dict[str, float], **settings: float):

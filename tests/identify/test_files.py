@@ -16,10 +16,17 @@ HEADER = "time_s,pulse_width_us,torque_nm,segment"
 ROWS = [f"{i / 40:.4f},{100 * (i % 3)},{0.1 * i:.3f},prbs" for i in range(20)]
 
 
+LATE_HEADER = HEADER + ",late_s,doubted"
+
+
 def write(folder: Path, *lines: str, header: str = HEADER) -> Path:
     path = folder / "data.csv"
     path.write_text("\n".join([header, *lines]) + "\n")
     return path
+
+
+def late(late_s: object, doubted: object) -> list[str]:
+    return [f"{row},{late_s},{doubted}" for row in ROWS]
 
 
 def changed(line: int, column: int, value: str) -> list[str]:
@@ -51,6 +58,10 @@ def test_rounded_times_become_even(tmp_path):
         (changed(4, 3, " "), HEADER, r"line 4, column segment: empty"),
         (changed(5, 2, "1,5"), HEADER, r"line 5: 5 cells under a header of 4.*decimal commas"),
         ([*ROWS[:10], "0.25,1,2"], HEADER, r"line 12, column segment: only 3 cells"),
+        (late("soon", 0), LATE_HEADER, r"line 2, column late_s: 'soon' is no number\. Write"),
+        (late(12, 0), LATE_HEADER, r"line 2, column late_s: 12 is no measurement"),
+        (late("nan", 0), LATE_HEADER, r"line 2, column late_s: no number"),
+        (late(0, 0.5), LATE_HEADER, r"line 2, column doubted: 0\.5 is no measurement\. 1 is"),
         ([], HEADER, "no row under the header"),
         (ROWS[:3], HEADER, "only 3 samples"),
         ([f"{i},0,0,rest" for i in range(20)], HEADER, "sampled at 1 Hz"),

@@ -97,17 +97,6 @@ def test_cross_validation_agrees_with_refits_of_the_same_design(ar1: float):
         assert np.linalg.norm(change[out] - honest) < 0.15 * np.linalg.norm(honest)
 
 
-def test_a_record_that_starts_in_mid_contraction():
-    record, clean = make_record(Patient(), np.random.default_rng(12), rate_hz=400, noise_nm=0.0)
-    cut = int(np.argmax(clean[: 400 * 14] * (np.arange(400 * 14) > 2000)))
-    names = np.array(record.segment_names)[record.segment]
-    late = Record.from_arrays(record.time_s[cut:], record.pulse_width_us[cut:], record.torque_nm[cut:], names[cut:])
-    model, predicted = fitted(late)
-    assert any(model.initial)
-    assert model.linear.time_constant_s == pytest.approx(0.5284, rel=2e-3)
-    assert best_fit_percent(clean[cut:], predicted) > 99.8
-
-
 @pytest.mark.parametrize("noise_nm", [0.02, 0.1])
 @pytest.mark.parametrize("rate_hz", [40, 1600])
 def test_fit_reaches_its_ceiling_and_the_noise_is_estimated(noise_nm, rate_hz):

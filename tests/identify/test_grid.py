@@ -11,12 +11,10 @@ from stimrig.identify.dynamics import grid as pulse_grid
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.dynamics.second_order import boundary_states
-from stimrig.identify.noise import NoiseLevel, whitened
 from stimrig.identify.records.record import Record
-from tests.harness.patients import Patient
+from tests.harness.patients import Patient, as_record
 
 PULSE_RATE_HZ = 40.0
-FINE = 200  # steps of the reference integration in each pulse interval
 
 
 def schedule(seed: int = 0) -> np.ndarray:
@@ -24,33 +22,13 @@ def schedule(seed: int = 0) -> np.ndarray:
     return np.r_[np.zeros(20), rng.integers(0, 2, 200) * 300.0, np.linspace(0, 300, 200)]
 
 
-def fine_torque(widths_us: np.ndarray, time_constant_s: float, damping: float) -> np.ndarray:
-    """Torque at 8 kHz by a method that shares nothing with the grid: a plain recursion at a two-hundredth of a step."""
-    step_s = 1.0 / PULSE_RATE_HZ / FINE
-    y, v, out = 0.0, 0.0, []
-    for w in np.repeat(widths_us / 40.0, FINE):
-        out.append(y)
-        # midpoint rule: second order, at 0.125 ms
-        a = (w - y - 2 * damping * time_constant_s * v) / time_constant_s**2
-        ym, vm = y + step_s / 2 * v, v + step_s / 2 * a
-        y += step_s * vm
-        v += step_s * (w - ym - 2 * damping * time_constant_s * vm) / time_constant_s**2
-    return np.array(out)
-
-
 @pytest.mark.parametrize(("rate_hz", "delay_s"), [(40, 0.0), (50, 0.031), (250, 0.0), (400, 0.031), (2000, 0.031)])
 def test_block_means_match_fine_integration(rate_hz: int, delay_s: float) -> None:
-    widths_us = schedule()
-    time_constant_s, damping = 0.15, 0.64
-    size = int(len(widths_us) / PULSE_RATE_HZ * rate_hz)
-    time_s = np.arange(size) / rate_hz
-    slot = np.minimum((time_s * PULSE_RATE_HZ + 1e-9).astype(int), len(widths_us) - 1)
-    reference = fine_torque(widths_us, time_constant_s, damping)
-    torque = np.interp(time_s - delay_s, np.arange(reference.size) / (PULSE_RATE_HZ * FINE), reference)
-    grid = make_grid(Record.from_arrays(time_s, widths_us[slot], torque))
+    patient, widths_us = Patient(time_constant_s=0.15, damping=0.64, delay_s=delay_s), schedule()
+    grid = make_grid(as_record(patient.torque(widths_us, rate_hz), widths_us, rate_hz))
+    drive = patient.recruitment(widths_us[: grid.size])
     assert np.array_equal(grid.pulse_width_us, widths_us[: grid.size])
-    found = SecondOrder(time_constant_s, damping, delay_s).on_grid(grid, widths_us[: grid.size] / 40.0)
-    assert np.abs(found - grid.torque_nm).max() < 2e-5
+    assert np.abs(SecondOrder(0.15, 0.64, delay_s).on_grid(grid, drive) - grid.torque_nm).max() < 2e-5
 
 
 def test_a_clock_that_wanders_is_followed_at_a_bounded_price(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,9 +57,7 @@ def test_the_curve_is_exact_however_short_a_lag_is(time_constant_s: float, dampi
     patient = Patient(time_constant_s=time_constant_s, damping=damping)
     widths_us = schedule()
     torque = patient.torque(widths_us, 400.0)
-    time_s = np.arange(torque.size) / 400.0
-    slot = np.floor(time_s * PULSE_RATE_HZ + 1e-9).astype(int)
-    grid = make_grid(Record.from_arrays(time_s[skipped:], widths_us[slot][skipped:], torque[skipped:]))
+    grid = make_grid(as_record(torque, widths_us, 400.0).take(np.arange(torque.size) >= skipped))
     linear = SecondOrder(time_constant_s, damping)
     drive = patient.recruitment(grid.pulse_width_us)
     assert np.abs(linear.on_grid(grid, drive) - grid.torque_nm).max() < 1e-6
@@ -102,17 +78,3 @@ def test_the_pulses_are_found_wherever_the_record_starts(phase: float, rate_hz: 
     first = np.flatnonzero(grid.pulse_width_us)[0] - np.flatnonzero(widths_us)[0]
     expected = widths_us[np.arange(grid.size) - first]
     assert np.array_equal(grid.pulse_width_us[inside], expected[inside])
-
-
-@pytest.mark.parametrize("share", [0.0, 0.6, 1.0])
-def test_whitening_is_exact(share: float) -> None:
-    """Against the dense covariance of the stationary process, white and slow."""
-    rows, noise, parts = np.random.default_rng(3).normal(size=(2, 12)), NoiseLevel(0.7, share, 1.3), [(0, 7), (8, 12)]
-    expected = np.zeros((2, 2))
-    for start, stop in parts:
-        lag = np.abs(np.subtract.outer(np.arange(stop - start), np.arange(stop - start)))
-        covariance = 1.3**2 * (share * 0.7**lag + (1.0 - share) * np.eye(stop - start))
-        expected += rows[:, start:stop] @ np.linalg.solve(covariance, rows[:, start:stop].T)
-    starts, stops = np.array(parts).T
-    white = whitened(rows, (starts, stops), noise)
-    assert white @ white.T == pytest.approx(expected, rel=1e-9)

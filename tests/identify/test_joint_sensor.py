@@ -184,7 +184,7 @@ def test_a_noisy_angle_costs_little_and_the_model_says_how_much():
 
 
 def test_slow_noise_that_holds_what_the_structure_leaves_is_left_for_the_likelier_optimum():
-    fitted = fitted_with(recorded_by(ENCODER), MOVING_JOINT)
+    fitted = fitted_with(as_record(record(arm_patient(ARM), "isometric", 1)), ["passive_torque:linear"])
     assert trusted(fitted) is fitted
     wrong = replace(fitted, noise=replace(fitted.noise, ar1=0.99, share=0.9), log_evidence=fitted.log_evidence - 50.0)
     again = trusted(wrong)

@@ -31,7 +31,7 @@ from tests.harness.carried_sessions import as_record
 
 @pytest.fixture(scope="module")
 def plain_record() -> identify.Record:
-    return as_record(generate(None, "middle", 3))
+    return as_record(generate(None, "middle", 3, rate_hz=200))
 
 
 def arm(seed: int) -> identify.Record:
@@ -110,7 +110,7 @@ def test_a_zero_that_wanders_is_no_fault_of_a_model():
 
 def test_each_part_of_a_record_has_its_own_zero(plain_record):
     def scatter_nm(*zeros_nm: float) -> float:
-        records = (plain_record, as_record(generate(None, "middle", 4)))
+        records = (plain_record, as_record(generate(None, "middle", 4, rate_hz=200)))
         parts = [one.with_torque(one.torque_nm + zero_nm) for one, zero_nm in zip(records, zeros_nm, strict=True)]
         return leave_out(fitted_with(join(parts, [0.0, 500.0]), [])).wander_nm
 

@@ -45,7 +45,7 @@ def record() -> identify.Record:
 def results(record: identify.Record) -> dict[str, Any]:
     """Its fatigue is found; improving is asked for a delay, too, that it has not."""
     model = identify.fit(record)
-    with few_effects.only("electromechanical_delay", "fatigue", "potentiation", "recruitment_hysteresis"):
+    with few_effects.only("electromechanical_delay", "fatigue", "potentiation"):
         diagnosis = identify.diagnose(record)
         improvement = identify.improve(record, force=["electromechanical_delay"])
     comparison = identify.compare(model, record)
@@ -91,6 +91,7 @@ def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
     with few_effects.only("fatigue", "output_saturation"):
         found = identify.diagnose(bare)
     assert found.verdict == "nothing_missing" and errors("diagnosis", found.to_dict()) == []
+    assert found.deciding_experiment is None and identify.next_experiment(found) is None
 
 
 def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch):
@@ -204,9 +205,8 @@ def test_a_model_with_effects_carries_bands_and_a_verdict():
     widths, clean = [], hidden_muscles.record("fatigue", seed=5, noise_nm=0.0)
     for noise_nm in (0.03, 0.06):
         record = hidden_muscles.record("fatigue", seed=5, noise_nm=noise_nm)
-        with few_effects.only("fatigue", "output_saturation"):
-            base, model = (identify.Model.from_json(each.to_json()) for each in identify.improve(record).models)
-        assert [effect["id"] for effect in model.effects] == ["fatigue"]
+        fits = identify.fit(record), identify.fit(record, effects=["fatigue"])
+        base, model = (identify.Model.from_json(each.to_json()) for each in fits)
         assert model.quality["verdict"] in ("usable", "usable with care")
         assert model.valid_for["pulse_rate_hz"] == [38.0, 42.0]
         lower, upper = prediction_band(model, record)

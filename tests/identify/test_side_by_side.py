@@ -97,7 +97,7 @@ def test_who_stops_half_way_leaves_no_copy_behind():
 @pytest.mark.slow
 def test_a_diagnosis_does_not_depend_on_who_did_what(monkeypatch):
     record = hidden_muscles.record("fatigue", seed=11, rate_hz=100)
-    with few_effects.only("fatigue", "output_saturation", "threshold_drift"):
+    with few_effects.only("fatigue", "output_saturation"):
         by_copies = diagnose(record).to_dict()
         monkeypatch.setattr(module, "WORKERS", 1)
         assert diagnose(record).to_dict() == by_copies

@@ -185,7 +185,7 @@ def test_what_changes_nothing_about_the_muscle_changes_no_answer(model: Model, n
     turned = model
     if how.get("sign") == -1.0:
         record, _ = make_record(PATIENT, np.random.default_rng(1))
-        turned = fit(Record.from_arrays(record.time_s, record.pulse_width_us, -record.torque_nm))
+        turned = fit(record.with_torque(-record.torque_nm))
     other = followed(turned, session(muscle, 5, **how))[-1]
     sd = np.sqrt(np.diag(usual.after.covariance)[:3] + np.diag(other.after.covariance)[:3])
     assert np.all(np.abs(usual.after.mean[:3] - other.after.mean[:3]) < 3.0 * sd + [0.004, 0.1, 0.01])
@@ -233,8 +233,7 @@ def test_another_pulse_rate_is_refused(model: Model) -> None:
 
 def test_a_trial_that_begins_within_a_contraction(model: Model) -> None:
     whole = Changing(PATIENT, gain=lambda _: 0.9).play(WIDTHS, 0, np.random.default_rng(2))
-    late = whole.time_s > 4.0
-    cut = Record.from_arrays(whole.time_s[late], whole.pulse_width_us[late], whole.torque_nm[late])
+    cut = whole.take(whole.time_s > 4.0)
     part, all_of_it = follow(model, None, cut).after, follow(model, None, whole).after
     assert np.all(np.abs(part.mean - all_of_it.mean)[:3] < 1.96 * np.sqrt(np.diag(part.covariance)[:3]))
 

@@ -13,7 +13,6 @@ from bench.muscles.arm_patient import arm_patient
 from bench.muscles.bout_records import RAMPS, record_of_bouts
 from bench.muscles.hidden_records import generate, main
 from bench.muscles.other_physics import SETS, draw_muscle
-from bench.muscles.physics_records import record_of_physics
 from bench.muscles.recorders import COUNT_NM, SHIFT_S, recorded
 from stimrig.hardware_sim.hidden.chain import Chain
 
@@ -28,17 +27,6 @@ DRAWN = [
     for place, name in enumerate(SETS[kinds])
 ]
 """One of each set; to compile all takes a minute."""
-
-
-def test_the_seed_settles_everything() -> None:
-    for make in (
-        lambda seed: generate("fatigue", "middle", seed, rate_hz=100),
-        lambda seed: arm_records.record(arm_patient(4), "held", seed),
-        record_of_bouts,
-        lambda seed: record_of_physics("physics", seed),
-    ):
-        one, again, other = (make(seed)["torque_nm"] for seed in (3, 3, 4))
-        assert np.array_equal(one, again) and not np.array_equal(one[:4000], other[:4000])
 
 
 # ---- hidden effects ----------------------------------------------------------------------------------------------
