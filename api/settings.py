@@ -30,8 +30,8 @@ class Settings(BaseSettings):
     host: str = Field(default="127.0.0.1", description="address to listen on")
     admin_token: SecretStr | None = Field(default=None, description="first administrator's token; default: drawn")
     session_hours: Annotated[float, Field(gt=0, le=24)] = 12.0
-    idle_lock_min: Annotated[float, Field(ge=0, le=720)] = Field(
-        default=10.0, description="a session locks after so many minutes without a person's action; 0: never"
+    idle_min: Annotated[float, Field(ge=0, le=720)] = Field(
+        default=10.0, description="a session ends after so many minutes without a person's action; 0: never by that"
     )
     time_zone: str | None = Field(default=None, description="as Europe/Berlin; default: the machine's")
     secure_cookies: bool = Field(default=False, description="True behind a TLS proxy: cookies over HTTPS only")

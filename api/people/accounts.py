@@ -5,7 +5,6 @@ What checks a password takes 0.1 s and is called in a thread.
 
 from __future__ import annotations
 
-import hmac
 import re
 import secrets
 import threading
@@ -24,7 +23,6 @@ from stimrig.api.errors import ApiError, require_found
 from stimrig.api.people.auth import Auth, Principal, Scope, unauthorized
 from stimrig.api.people.pace import Guesses, password_keys, place_of, refuse
 from stimrig.api.store import Store, locking
-from stimrig.api.store.audit import digest
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import PageSession, Token, User
 
@@ -104,37 +102,19 @@ class People:
         """
         if not principal.has_password or principal.page_session is None:
             raise ApiError(409, "no-password", "There is no password to confirm", "Signed in with a token.")
-        self._require_secret(principal, principal.page_session, password, "confirmation refused", CONFIRM_AGAIN)
+        key = ("session", principal.page_session.hash)
+        with self.passwords.room(known=True):
+            self.guesses.admit(key)
+            user: User | None = self.store.get(User, principal.name)
+            right = self.passwords.verify(user.password_hash if user else None, password, known=True)
+        if not right:
+            self.store.note(self.clock, principal.name, "confirmation refused", "page")
+            detail = "Nothing was decided. Enter it again."
+            raise unauthorized(detail, "wrong-password", "The password does not match")
+        self.guesses.was_right(key)
         with self.store.write() as session:
             if (row := session.get(PageSession, principal.page_session.hash)) is not None:
                 row.confirmed_unix_s = self.clock.unix_s()
-
-    def unlock(self, principal: Principal, secret: str) -> None:
-        """Unlock a session by its user's password, or by the token that opened it.
-
-        Raises ApiError: 401 it is not the right one; 429 too many tries.
-        """
-        if principal.page_session is not None and principal.locked:
-            self._require_secret(principal, principal.page_session, secret, "unlock refused", UNLOCK_AGAIN)
-            self.auth.idle.change(principal.page_session.hash, False, principal.name)
-
-    def _require_secret(
-        self, principal: Principal, page_session: PageSession, secret: str, refused: str, detail: str
-    ) -> None:
-        """Check the password, or the token of a session without one, given again. Raises ApiError: 401, 429."""
-        key = ("session", page_session.hash)
-        with self.passwords.room(known=True):
-            self.guesses.admit(key)
-            if principal.has_password:
-                row: User | None = self.store.get(User, principal.name)
-                right = self.passwords.verify(row.password_hash if row else None, secret, known=True)
-            else:
-                right = hmac.compare_digest(digest(secret), page_session.token_hash)
-        if not right:
-            self.store.note(self.clock, principal.name, refused, "page")
-            what = "password" if principal.has_password else "token"
-            raise unauthorized(detail, "wrong-password", f"The {what} does not match")
-        self.guesses.was_right(key)
 
     def is_confirmed(self, principal: Principal) -> bool:
         """Return whether an approval needs no password: a token has none, or it was given and not used yet."""
@@ -186,10 +166,6 @@ class People:
             self.auth.end_sessions(session, row.token_hash)
             self.auth.revoke_within(session, row.token_hash[:16], by)
             locking.write(session, row, self.clock.utc(), by, "remove user", row.name)
-
-
-CONFIRM_AGAIN = "Nothing was decided. Enter it again."
-UNLOCK_AGAIN = "The page stays locked. Enter it again."
 
 
 def user_named(session: Session, name: str) -> User | None:

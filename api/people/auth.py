@@ -27,8 +27,8 @@ from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import PageSession, Token
 
 log = logging.getLogger("stimrig.api")
-LOCKED = ("locked", "This page is locked")
-"""Code and title of the problem that a locked session meets."""
+RECORD_S = 15.0
+"""An action is not written down where the last one was so short a time ago: few pages wait for the disk."""
 MOST_REMEMBERED = 1000
 """Credentials remembered for a stop while the database is unreachable."""
 ROLES = {
@@ -51,7 +51,7 @@ class Principal:
     plan: dict[str, Any] | None = None  # what trials that key may play
     page_session: PageSession | None = None  # the browser's session, however it was opened; None for a bearer token
     has_password: bool = False  # whether the session is of a person with a password, who can be asked for it again
-    locked: bool = False  # whether that session waits to be unlocked: then it may press stop, and nothing else
+    ended: bool = False  # whether that session has run out or was idle for too long: then it may press stop alone
 
     @property
     def csrf(self) -> str | None:
@@ -72,13 +72,17 @@ class Principal:
 
 
 class Auth:
-    """Issues and checks tokens and sessions; keeps only hashes: of 256 random bits, so no slow hash is needed."""
+    """Issues and checks tokens and sessions; keeps only hashes: of 256 random bits, so no slow hash is needed.
+
+    `idle_min`: a session ends after so many minutes without a person's action; 0: never by that. Actions are what
+    `stimrig.api.web.guards` tells from what scripts ask for by themselves, and a live view of a running test.
+    """
 
     def __init__(
-        self, store: Store, clock: Clock, guesses: Guesses, idle: IdleLock, session_hours: float = 12.0
+        self, store: Store, clock: Clock, guesses: Guesses, idle_min: float = 0.0, session_hours: float = 12.0
     ) -> None:
         self.store, self.clock, self.guesses, self.session_s = store, clock, guesses, session_hours * 3600
-        self.idle = idle
+        self.idle_s, self._retry_s = idle_min * 60, -math.inf
         self.cookie_name = f"stimrig_session_{store.secret('session-cookie').hex()[:8]}"
         """Browsers tell hosts apart, not ports: another service on this host has another name."""
         self._last_names: OrderedDict[str, str] = OrderedDict()
@@ -221,25 +225,38 @@ class Auth:
             if (row := session.get(PageSession, session_hash)) is not None:
                 session.delete(row)
 
-    def cookie(self, cookie: str, *, forgive_age: bool = False, forgive_lock: bool = False) -> Principal:
-        """The holder of a page session.
-
-        `cookie`: its text; `forgive_age`: a session that ran out, or that is locked, still presses stop;
-        `forgive_lock`: one that is locked may be unlocked, or ended.
-        """
-        row = self.store.get(PageSession, digest(cookie))
-        if row is None or (row.expires_unix_s <= self.clock.unix_s() and not forgive_age):
-            raise unauthorized("The session has ended. Sign in again.")
-        locked = self.idle.locked(row)
-        if locked and not (forgive_age or forgive_lock):
-            fix = "Enter the password on the page /locked, or send it to POST /v1/sessions/unlock."
-            raise unauthorized(fix, *LOCKED)
+    def cookie(self, cookie: str, *, forgive_age: bool = False) -> Principal:
+        """The holder of a page session. `cookie`: its text; `forgive_age`: one that has ended still presses stop."""
+        row: PageSession | None = self.store.get(PageSession, digest(cookie))
+        ended = row is not None and self.has_ended(row)
+        if row is None or (ended and not forgive_age):
+            problem = unauthorized("The session has ended. Sign in again.")
+            problem.extra["ended"] = ended  # False: it was signed out, or there never was one
+            raise problem
         token: Token | None = self.store.get(Token, row.token_hash)
-        principal = replace(self._principal(token, forgive_age), page_session=row, locked=locked)
+        principal = replace(self._principal(token, forgive_age), page_session=row, ended=ended)
         if token is None or token.origin != "user":
             return principal
         more = {Scope.REARM} if principal.may(Scope.RUN_TEST) else set()
         return replace(principal, has_password=True, scopes=principal.scopes | more)
+
+    def has_ended(self, row: PageSession) -> bool:
+        """Return whether a session has run out, or was idle for too long."""
+        return row.expires_unix_s <= self.clock.unix_s() or 0 < self.idle_s < self._idle_for_s(row)
+
+    def _idle_for_s(self, row: PageSession) -> float:
+        return self.clock.unix_s() - (row.acted_unix_s or row.created_unix_s)
+
+    def record_action(self, row: PageSession) -> None:
+        """Record a person's action in a session that goes on. A database that takes none refuses nothing."""
+        if self._idle_for_s(row) > RECORD_S and self.clock.monotonic_s() >= self._retry_s:
+            try:
+                with self.store.write() as session:
+                    if (now := session.get(PageSession, row.hash)) is not None:
+                        now.acted_unix_s = self.clock.unix_s()
+            except SQLAlchemyError:
+                self._retry_s = self.clock.monotonic_s() + RECORD_S
+                log.exception("a person's action could not be recorded")
 
     # ---- requests
 
@@ -256,9 +273,7 @@ class Auth:
         async with asyncio.timeout(patience_s):
             return await asyncio.shield(task)
 
-    def identify(
-        self, connection: HTTPConnection, *, forgive_age: bool = False, forgive_lock: bool = False, bound: bool = False
-    ) -> Principal:
+    def identify(self, connection: HTTPConnection, *, forgive_age: bool = False, bound: bool = False) -> Principal:
         """Return the principal of a request or a WebSocket.
 
         A controller's key, which is bound to a participant, is refused (403) unless the caller checks the participant
@@ -274,7 +289,7 @@ class Auth:
                 address = connection.client.host if connection.client else ""
                 principal = self.bearer(token.strip(), address, forgive_age=forgive_age)
             elif text:
-                principal = self.cookie(text, forgive_age=forgive_age, forgive_lock=forgive_lock)
+                principal = self.cookie(text, forgive_age=forgive_age)
             else:
                 raise unauthorized("Send `Authorization: Bearer <token>`, or sign in on the page.")
         except ApiError as error:
@@ -317,45 +332,3 @@ def outside(participant: str | None) -> ApiError:
         "live signals and recordings of tests, and trials within the plan. This is not among them."
     )
     return ApiError(403, "outside-key", "This key does not open it", detail)
-
-
-RECORD_S = 15.0
-"""An action is not written down where the last one was so short a time ago: few pages wait for the disk."""
-
-
-class IdleLock:
-    """Locks idle sessions, which then need the password again.
-
-    Only a person's actions count, as `stimrig.api.web.guards` tells them from what scripts ask for by themselves, and a
-    live view of a running test. `after_min`: a session locks after so many minutes without one; 0: never by itself.
-    """
-
-    def __init__(self, store: Store, clock: Clock, after_min: float) -> None:
-        self.store, self.clock, self.after_s = store, clock, after_min * 60
-        self._retry_s = -math.inf
-
-    def locked(self, row: PageSession) -> bool:
-        """Return whether this session is locked."""
-        return row.locked_unix_s is not None or 0 < self.after_s < self._idle_s(row)
-
-    def _idle_s(self, row: PageSession) -> float:
-        return self.clock.unix_s() - (row.acted_unix_s or row.created_unix_s)
-
-    def acted(self, row: PageSession) -> None:
-        """Record a person's action in a session that is not locked. A database that takes none refuses nothing."""
-        if self._idle_s(row) > RECORD_S and self.clock.monotonic_s() >= self._retry_s:
-            try:
-                with self.store.write() as session:
-                    if (now := session.get(PageSession, row.hash)) is not None:
-                        now.acted_unix_s = self.clock.unix_s()
-            except SQLAlchemyError:
-                self._retry_s = self.clock.monotonic_s() + RECORD_S
-                log.exception("a person's action could not be recorded")
-
-    def change(self, session_hash: str, lock: bool, by: str) -> None:
-        """Lock a session now, or unlock it, as the person is back."""
-        with self.store.write() as session:
-            row, now_s = session.get(PageSession, session_hash), self.clock.unix_s()
-            if row is not None:
-                row.locked_unix_s, row.acted_unix_s = now_s if lock else None, now_s
-                audit.write(session, self.clock.utc(), by, "lock" if lock else "unlock", "page")

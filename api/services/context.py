@@ -18,7 +18,7 @@ from stimrig.api.models.analyses import Analyses
 from stimrig.api.models.registry import Versions
 from stimrig.api.models.tracked import TrackedVersions
 from stimrig.api.people.accounts import People
-from stimrig.api.people.auth import Auth, IdleLock
+from stimrig.api.people.auth import Auth
 from stimrig.api.people.pace import Guesses
 from stimrig.api.sessions.rig_client import RigClient
 from stimrig.api.sessions.runner import Runner
@@ -45,7 +45,7 @@ class Context:
         self.settings, self.clock, self.lock, self.started_s = settings, clock, lock, time.monotonic()
         store = self.store = Store(settings.database)
         guesses = self.guesses = Guesses(clock)
-        self.auth = Auth(store, clock, guesses, IdleLock(store, clock, settings.idle_lock_min), settings.session_hours)
+        self.auth = Auth(store, clock, guesses, settings.idle_min, settings.session_hours)
         admin_token = settings.admin_token.get_secret_value() if settings.admin_token else None
         self.drawn_token = self.auth.first_administrator(admin_token)
         self.people = People(store, clock, self.auth, guesses)

@@ -208,7 +208,6 @@ class PageSession(Table):
     expires_unix_s: Mapped[float]
     acted_unix_s: Mapped[float | None]
     """When a person last did something in it; None: not since it was opened."""
-    locked_unix_s: Mapped[float | None]
     confirmed_unix_s: Mapped[float | None]
     """When its person gave the password once more; good for one decision on a model."""
 

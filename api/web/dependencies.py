@@ -25,7 +25,6 @@ async def context_of(connection: HTTPConnection) -> Context:
 Confirm = Annotated[str, Query(max_length=64, description="`confirm.token` of the 409 that asked for it")]
 Ctx = Annotated[Context, Depends(context_of)]
 Anyone = Annotated[Principal, Depends(require())]
-EvenLocked = Annotated[Principal, Depends(require(even_locked=True))]
 MayStop = Annotated[Press, Depends(anyone_who_may_stop)]
 LiveReader = Annotated[Principal, Security(require(Scope.READ_LIVE), scopes=[Scope.READ_LIVE])]
 Tester = Annotated[Principal, Security(require(Scope.RUN_TEST), scopes=[Scope.RUN_TEST])]

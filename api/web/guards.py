@@ -46,18 +46,12 @@ Session = Annotated[object, Security(SESSION)]
 """For the OpenAPI document, which is given the name of its service's cookie; `Auth.identify` reads both."""
 
 
-def require(scope: Scope | None = None, *, even_locked: bool = False) -> Callable[..., Awaitable[Principal]]:
-    """A dependency: who holds the scope, or anyone with a valid token or session; a session's form has its CSRF token.
-
-    `even_locked`: the session may be locked: to unlock it, or to sign out.
-    """
+def require(scope: Scope | None = None) -> Callable[..., Awaitable[Principal]]:
+    """A dependency: who holds the scope, or anyone with a valid token or session; a session sends its CSRF token."""
 
     async def check(request: Request, _token: Token, _session: Session) -> Principal:
         context = request.app.state.context
-        if even_locked:
-            principal = request.state.principal = await context.auth.authenticate(request, forgive_lock=True)
-        else:
-            principal = await identified(request)
+        principal = await identified(request)
         if scope is not None and not principal.may(scope):
             scopes = ", ".join(sorted(principal.scopes))
             raise forbidden(f"This needs the scope {scope}; {principal.name} holds {scopes}.")
@@ -81,7 +75,7 @@ async def identified(request: Request) -> Principal:
         await asyncio.to_thread(refuse_outside, context.versions, principal, request.method, request.url.path)
     request.state.principal = principal
     if principal.page_session is not None and is_action(request):
-        await asyncio.to_thread(context.auth.idle.acted, principal.page_session)
+        await asyncio.to_thread(context.auth.record_action, principal.page_session)
     if wants_html(request) or not request.url.path.startswith("/v1/"):
         # before anything of the page is read: what it shows is not older
         request.state.version = await asyncio.to_thread(_page_version, context.store, request)

@@ -25,7 +25,7 @@ from schemathesis.checks import CHECKS
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError
-from stimrig.api.people.auth import Auth, IdleLock, Scope
+from stimrig.api.people.auth import Auth, Scope
 from stimrig.api.people.pace import Guesses
 from stimrig.api.sessions import runner
 from stimrig.api.sessions.rig_client import line_of
@@ -252,7 +252,7 @@ def test_a_token_that_is_read_while_it_is_revoked_is_not_valid_afterwards(
 ) -> None:
     """Every live channel looks once a second: one of the looks may be under way."""
     store, clock = Store(f"sqlite:///{tmp_path}/a.db"), Clock()
-    auth = Auth(store, clock, Guesses(clock), IdleLock(store, clock, 0))
+    auth = Auth(store, clock, Guesses(clock))
     text = auth.issue("bench", [Scope.READ_LIVE], "settings")
     get, was_read, is_revoked = store.get, threading.Event(), threading.Event()
 

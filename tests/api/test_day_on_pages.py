@@ -1,4 +1,4 @@
-"""A day with people on the pages: notes are written, the page locks and comes back as it was."""
+"""A day with people on the pages: notes are written, an idle session ends."""
 
 from __future__ import annotations
 
@@ -13,16 +13,6 @@ from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
 service = shared_service()
-
-
-def lock(page: Any) -> None:
-    page.get_by_role("button", name="Lock", exact=True).click()
-    page.get_by_role("heading", name="Locked").wait_for()
-
-
-def unlock(page: Any, password: str = PASSWORD) -> None:
-    page.get_by_label("Password").fill(password)
-    page.get_by_role("button", name="Unlock").click()
 
 
 def test_a_note_while_the_test_runs_does_not_leave_its_page(tab: Any, service: Service) -> None:
@@ -50,19 +40,22 @@ def test_a_note_while_the_test_runs_does_not_leave_its_page(tab: Any, service: S
     service.rig.speed = 30.0
 
 
-def test_a_locked_page_comes_back_and_every_tab_is_locked(tab: Any, service: Service, client: httpx.Client) -> None:
+def test_an_idle_session_ends_on_every_tab_and_its_page_comes_back(
+    tab: Any, service: Service, client: httpx.Client
+) -> None:
     client.post("/v1/participants", json={"code": "V1"})
     tab.goto(service.url + "/participants/V1?x=1")
     other = tab.context.new_page()
     other.goto(service.url + "/")
-    lock(other)
-    tab.get_by_role("heading", name="Locked").wait_for()  # both tabs
-    assert "V1" not in tab.locator("body").inner_text()
-    unlock(tab, "not the password")
-    tab.get_by_text("does not match").wait_for()
-    unlock(tab)
+    service.sql("UPDATE page_sessions SET created_unix_s = 1, acted_unix_s = 1")
+    for page in (tab, other):
+        page.get_by_role("heading", name="Sign in", exact=True).wait_for()
+        assert "V1" not in page.locator("body").inner_text()
+        expected(page.get_by_role("button", name="Stop stimulation")).to_be_visible()
+    tab.get_by_label("Name").fill("Ada")
+    tab.get_by_label("Password").fill(PASSWORD)
+    tab.get_by_role("button", name="Sign in", exact=True).click()
     tab.wait_for_url("**/participants/V1?x=1")
-    other.get_by_role("heading", name="Participants", exact=True).wait_for()
     other.close()
 
 

@@ -22,7 +22,7 @@ from tests.api.conftest import PASSWORD, STUB, TOKEN, Service, person, run_servi
 
 @pytest.fixture(scope="module")
 def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    for service in run_service(tmp_path_factory.mktemp("watch"), short_dir, STUB, speed=0.02, idle_lock_min=10):
+    for service in run_service(tmp_path_factory.mktemp("watch"), short_dir, STUB, speed=0.02, idle_min=10):
         with service.client() as admin:
             admin.post("/v1/participants", json={"code": "P017"})
         yield service
@@ -92,10 +92,6 @@ def sign_out(http: httpx.Client, _service: Service) -> None:
     assert http.delete("/v1/sessions/current").status_code == 204
 
 
-def lock(http: httpx.Client, _service: Service) -> None:
-    assert http.post("/v1/sessions/lock").status_code == 204
-
-
 def new_password(_http: httpx.Client, service: Service) -> None:
     with service.client() as admin:
         assert admin.put("/v1/users/Grace/password", json={"password": PASSWORD}).status_code == 204
@@ -110,7 +106,7 @@ def run_out(http: httpx.Client, service: Service) -> None:
     service.change(PageSession, digest(next(iter(http.cookies.values()))), expires_unix_s=1.0)
 
 
-@pytest.mark.parametrize("how", [sign_out, lock, run_out, new_password, removed])
+@pytest.mark.parametrize("how", [sign_out, run_out, new_password, removed])
 def test_it_closes_with_its_session_and_with_no_other(
     service: Service, test_id: str, how: Callable[[httpx.Client, Service], None]
 ) -> None:
@@ -122,8 +118,7 @@ def test_it_closes_with_its_session_and_with_no_other(
     ):
         how(hers, service)
         said = last(socket)
-        problem = "locked" if how is lock else "unauthorized"
-        assert said["type"] == "problem" and said["problem"]["type"] == f"/problems/{problem}"
+        assert said["type"] == "problem" and said["problem"]["type"] == "/problems/unauthorized"
         goes_on(others)
 
 

@@ -16,7 +16,7 @@ from stimrig.api.cli import main
 from stimrig.api.clock import Clock, utc_label
 from stimrig.api.errors import ApiError
 from stimrig.api.people import accounts
-from stimrig.api.people.auth import Auth, IdleLock, Scope
+from stimrig.api.people.auth import Auth, Scope
 from stimrig.api.people.pace import Guesses
 from stimrig.api.services.context import build
 from stimrig.api.settings import Settings
@@ -255,7 +255,7 @@ def test_services_of_one_host_leave_one_anothers_cookies_alone(tmp_path: Path) -
     """Browsers tell hosts apart, not ports."""
     stores = [Store(f"sqlite:///{tmp_path}/{name}.db") for name in "ab"]
     clock = Clock()
-    names = [Auth(store, clock, Guesses(clock), IdleLock(store, clock, 0)).cookie_name for store in stores * 2]
+    names = [Auth(store, clock, Guesses(clock)).cookie_name for store in stores * 2]
     assert len(set(names)) == 2 and names[:2] == names[2:], "one for each, over a restart, too"
     for store in stores:
         store.close()

@@ -22,7 +22,6 @@ from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.service_lock import HeldError, ServiceLock
 from tests.api.conftest import STUB, serving, soon, wait_done
-from tests.api.test_idle_lock import test_a_lock_holds_over_a_restart as test_a_lock_holds_over_a_restart
 from tests.api.test_locking import (
     test_who_decides_again_sends_the_version_of_the_answer as test_who_decides_again_sends_the_version_of_the_answer,
 )

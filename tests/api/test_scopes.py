@@ -29,10 +29,7 @@ POST   /v1/sessions                                        anybody        401
 POST   /v1/stop                                            anyone         200
 POST   /v1/sessions/confirm                                anyone         422
 DELETE /v1/sessions/current                                anyone         404
-GET    /locked                                             anyone         303
 POST   /v1/sessions/acted                                  anyone         204
-POST   /v1/sessions/lock                                   anyone         409
-POST   /v1/sessions/unlock                                 anyone         422
 GET    /v1/sequences                                       anyone         200
 GET    /v1/rig                                             read-live      200
 GET    /v1/rig/angle                                       read-live      200

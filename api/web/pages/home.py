@@ -1,4 +1,4 @@
-"""The first page, with the participants; signing in, and a session that is locked."""
+"""The first page, with the participants; signing in."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ import asyncio
 from typing import Any
 
 from fastapi import APIRouter, Request
-from fastapi.responses import RedirectResponse, Response
+from fastapi.responses import Response
 
 from stimrig.api.errors import ApiError
-from stimrig.api.people.auth import LOCKED, Scope
+from stimrig.api.people.auth import Scope
 from stimrig.api.services import participants
-from stimrig.api.web.dependencies import Context, Ctx, EvenLocked
+from stimrig.api.web.dependencies import Context, Ctx
 from stimrig.api.web.guards import identified, local
-from stimrig.api.web.pages.render import identify_viewer, page, problem_page
+from stimrig.api.web.pages.render import identify_viewer, page
 
 router = APIRouter(include_in_schema=False)
 FIRST_ROWS = 50
@@ -25,8 +25,8 @@ async def home(request: Request, context: Ctx, q: str = "", archived: str = "", 
     """Show participants and the rig; the sign-in form to who is not signed in."""
     try:
         principal = await identified(request)
-    except ApiError as error:
-        return await sign_in(request, context) if error.code != LOCKED[0] else problem_page(request, error)
+    except ApiError:
+        return await sign_in(request, context)
     search: dict[str, Any] = {"q": q[:80].strip(), "archived": archived == "1"}
     listed = None
     if principal.may(Scope.RUN_TEST):
@@ -51,11 +51,3 @@ async def sign_in(request: Request, context: Ctx, next: str = "/") -> Response:
     people = await asyncio.to_thread(context.people.any)
     await identify_viewer(request)
     return page(request, "sign_in.html", next=local(next), people=people)
-
-
-@router.get("/locked")
-async def locked(request: Request, principal: EvenLocked, next: str = "/") -> Response:
-    """Ask for the password of a locked session; straight on where nothing is locked."""
-    if not principal.locked:
-        return RedirectResponse(local(next), 303)
-    return page(request, "locked.html", waiting=principal, next=local(next))

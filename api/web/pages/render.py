@@ -14,7 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from stimrig.api import local_time
 from stimrig.api.clock import zone_name
 from stimrig.api.errors import ApiError
-from stimrig.api.people.auth import LOCKED, Principal, Scope
+from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.sessions.joint_plan import PASSIVE
 from stimrig.api.web.dependencies import Context
 from stimrig.api.web.pages.environment import environment
@@ -56,7 +56,7 @@ def rows_shown(request: Request) -> int | None:
 def page(request: Request, template: str, status: int = 200, **values: Any) -> HTMLResponse:
     """Render a page, with the bar that every page has."""
     viewer: Principal | None = getattr(request.state, "principal", None)
-    principal = None if viewer is None or viewer.locked else viewer
+    principal = None if viewer is None or viewer.ended else viewer
     context: Context = request.app.state.context
     right = getattr(request.state, "stop_right", None) if viewer is None else stop_right(context, viewer.name)
     bar = {
@@ -114,10 +114,8 @@ async def identify_viewer(request: Request) -> None:
 
 def problem_page(request: Request, problem: ApiError) -> Response:
     """Show a problem and what to do; lead to the door where nobody is signed in."""
-    if problem.code == LOCKED[0]:
-        return RedirectResponse(f"/locked?next={quote(here(request), safe='')}", 303)
     if problem.status == 401 and request.method == "GET":
-        return RedirectResponse(f"/sign-in?next={quote(request.url.path)}", 303)
+        return RedirectResponse(f"/sign-in?next={quote(here(request))}", 303)
     kind, *rest = request.url.path.strip("/").split("/")
     back = (f"/{kind}/{quote(rest[0])}", BACK[kind]) if len(rest) > 1 and kind in BACK else None
     response = page(request, "problem.html", problem.status, problem=problem, back=back)

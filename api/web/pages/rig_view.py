@@ -7,7 +7,6 @@ from fastapi.responses import JSONResponse, Response
 from sqlalchemy.exc import SQLAlchemyError
 
 from stimrig.api.errors import ApiError
-from stimrig.api.people.auth import LOCKED
 from stimrig.api.web.dependencies import Ctx
 from stimrig.api.web.pages import render
 from stimrig.api.web.pages.render import identify_viewer, page
@@ -18,15 +17,15 @@ router = APIRouter(include_in_schema=False)
 @router.get("/rig/now")
 async def rig_now(request: Request, context: Ctx) -> Response:
     """Return the state for the bar of every page, also of one whose session has ended."""
-    principal, locked, signed_in = None, False, False
+    principal, ended, signed_in = None, False, False
     try:
         principal = await context.auth.authenticate(request)
         signed_in = True
     except ApiError as error:  # the state is told all the same
-        locked = error.code == LOCKED[0]
+        ended = error.extra.get("ended", False)
     except SQLAlchemyError:
         signed_in = None
-    return JSONResponse({**render.rig_now(context, principal), "signed_in": signed_in, "locked": locked})
+    return JSONResponse({**render.rig_now(context, principal), "signed_in": signed_in, "ended": ended})
 
 
 @router.get("/stopped/{key}")

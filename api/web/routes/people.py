@@ -9,7 +9,7 @@ from fastapi.concurrency import run_in_threadpool
 from fastapi.responses import JSONResponse, RedirectResponse, Response
 from pydantic import Field, StringConstraints, ValidationError
 
-from stimrig.api.errors import ApiError, NotFoundError
+from stimrig.api.errors import NotFoundError
 from stimrig.api.people.auth import ROLES, Scope, unauthorized
 from stimrig.api.services import keys
 from stimrig.api.sessions import controllers
@@ -23,7 +23,6 @@ from stimrig.api.web.dependencies import (
     Anyone,
     Approver,
     Ctx,
-    EvenLocked,
     ParticipantVersion,
     Tester,
     UserVersion,
@@ -136,27 +135,13 @@ def confirm(context: Ctx, principal: Anyone, body: ConfirmIn) -> None:
     context.people.confirm(principal, body.password)
 
 
-@router.post("/sessions/lock", status_code=204)
-def lock(context: Ctx, principal: Anyone) -> None:
-    """Lock this session: until it is unlocked every request with it is refused, but for stop."""
-    if principal.page_session is None:
-        raise ApiError(409, "no-session", "There is nothing to lock", "A token has no session.")
-    context.auth.idle.change(principal.page_session.hash, True, principal.name)
-
-
 @router.post("/sessions/acted", status_code=204)
 async def acted(_principal: Anyone) -> None:
     """Note that a person has typed or moved the pointer on a page: its session is not idle."""
 
 
-@router.post("/sessions/unlock", status_code=204)
-def unlock(context: Ctx, principal: EvenLocked, body: ConfirmIn) -> None:
-    """Unlock this session by its person's password, or by the token that it was opened with."""
-    context.people.unlock(principal, body.password)
-
-
 @router.delete("/sessions/current", status_code=204)
-def sign_out(context: Ctx, principal: EvenLocked) -> None:
+def sign_out(context: Ctx, principal: Anyone) -> None:
     """Sign out."""
     if principal.page_session is None:
         raise NotFoundError("session", "current", "A token has none; DELETE /v1/tokens/{id} revokes it.")

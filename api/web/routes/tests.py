@@ -112,9 +112,9 @@ async def live(socket: WebSocket, context: Ctx, test_id: str) -> None:
 
 
 def _admit(socket: WebSocket, context: Context) -> Principal:
-    """Return who watches; a live view of a running test keeps the session from being locked as idle.
+    """Return who watches; a live view of a running test keeps the session from ending as idle.
 
-    Raises ApiError: 401 no valid token or session, or it is locked; 403 without the scope, or from another site's page.
+    Raises ApiError: 401 no valid token or session; 403 without the scope, or from another site's page.
     """
     principal = context.auth.identify(socket, bound=True)
     refuse_outside(context.versions, principal, "WS", socket.url.path)
@@ -123,7 +123,7 @@ def _admit(socket: WebSocket, context: Context) -> Principal:
     if principal.csrf is not None:
         same_origin(socket)
     if principal.page_session is not None:
-        context.auth.idle.acted(principal.page_session)
+        context.auth.record_action(principal.page_session)
     return principal
 
 

@@ -141,8 +141,8 @@ const act = (() => {
 
   function refused(form, given, answer, again) {
     const problem = answer.body || { title: `The service answered with ${answer.status}.` }, kind = (problem.type || "").split("/").pop();
-    if (kind === "locked" || (kind === "unauthorized" && given.call !== "POST /v1/sessions")) {
-      location.assign(`${kind === "locked" ? "/locked" : "/sign-in"}?next=${encodeURIComponent(here())}`);
+    if (kind === "unauthorized" && given.call !== "POST /v1/sessions") {
+      location.assign("/sign-in?next=" + encodeURIComponent(here()));
     } else if (answer.status === 412 && given.again !== "none") {
       ask(changed(problem, given.again), () => (given.again === "reload" ? location.reload() : again({ version: answer.etag })), true);
     } else if (problem.confirm) {

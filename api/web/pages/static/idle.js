@@ -1,7 +1,7 @@
-// A session that nobody touches locks. A person's actions are told to the service, which decides; scripts' are not.
+// A session that nobody touches ends. A person's actions are told to the service, which decides; scripts' are not.
 "use strict";
-{
-  const EVERY_MS = 20000, locked = document.getElementById("locked");
+if (document.getElementById("sign-out")) {
+  const EVERY_MS = 20000;
   let told = performance.now(), waiting = false; // loading the page was an action
 
   function acted(event) {
@@ -13,9 +13,7 @@
     }, Math.max(0, EVERY_MS - (performance.now() - told)));
   }
 
-  if (document.getElementById("lock")) {
-    for (const kind of ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"]) addEventListener(kind, acted, { passive: true, capture: true });
-    addEventListener("rig-now", ({ detail }) => { if (detail.locked) location.replace("/locked?next=" + encodeURIComponent(act.here())); });
-  }
-  if (locked) addEventListener("rig-now", ({ detail }) => { if (detail.signed_in) location.replace(locked.dataset.back); }); // unlocked in another tab
+  for (const kind of ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"]) addEventListener(kind, acted, { passive: true, capture: true });
+  // Nothing of a participant stays on the screen.
+  addEventListener("rig-now", ({ detail }) => { if (detail.ended) location.replace("/sign-in?next=" + encodeURIComponent(act.here())); });
 }

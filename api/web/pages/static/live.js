@@ -118,7 +118,7 @@ function showTrack() {
 
 // ---- age, tone and connection --------------------------------------------------------------------------------------
 
-let open = false, refused = false; // the connection; refused: the session has ended, is locked or may no longer
+let open = false, refused = false; // the connection; refused: the session has ended or may no longer
 function showAge() {
   if (state.test.done) return;
   const age_s = state.heard ? (performance.now() - state.heard) / 1000 + state.torqueAge : null;
@@ -126,7 +126,7 @@ function showAge() {
   const stale = refused || (state.test.state === "running" && (!state.connected || !open || age_s === null || age_s > STALE_S));
   hide("stale", !stale);
   byId("live").classList.toggle("is-stale", stale);
-  if (stale) say("stale", refused ? "You are signed out, or this page is locked. Display out of date: do not rely on it. The stop button still works. Sign in again in another tab to see more."
+  if (stale) say("stale", refused ? "You are signed out. Display out of date: do not rely on it. The stop button still works. Sign in again in another tab to see more."
     : !open ? "No connection to the service. Display out of date: do not rely on it. If the stop button does not answer, use the emergency switch on the stimulator."
     : !state.connected ? "The rig cannot be reached. Display out of date: do not rely on it; use the emergency switch on the stimulator if unsure."
     : "Display out of date. Do not rely on it; press Stop if unsure.");

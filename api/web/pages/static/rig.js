@@ -35,7 +35,7 @@
   }
 
   function touch() { // what was not heard of for long stays in doubt until the page is read anew
-    if (person && known.signed_in === false && !known.locked) lost = "signed_out";
+    if (person && known.signed_in === false) lost = "signed_out";
     else if (since(answered || begun) > LONG_MS || lost === "signed_out") lost = "out_of_touch"; // signed in again, in another tab: perhaps somebody else
     if (!lost) heard = known.at;
   }
