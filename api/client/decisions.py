@@ -8,11 +8,10 @@ from typing import Any
 PERSON, MODEL, CALIBRATION = "/v1/participants/{code}", "/v1/models/{model_id}", "/v1/participants/{code}/calibration"
 DECISIONS = {
     **{f"POST {MODEL}/{word}": MODEL for word in ("approve", "reject")},
-    **{f"PUT {PERSON}/{word}": PERSON for word in ("profile", "muscle", "archived")},
+    **{f"PUT {PERSON}/{word}": PERSON for word in ("profile", "muscle")},
     **{f"POST {PERSON}/{word}": PERSON for word in ("recordings", "calibration", "keys")},
     **{f"POST {CALIBRATION}/{word}": CALIBRATION for word in ("step", "mark", "finish", "discard")},
     "POST /v1/tests": PERSON,
-    "PUT /v1/tests/{test_id}/ran-by": "/v1/tests/{test_id}",
     "POST /v1/rearm": "/v1/rig",
     "POST /v1/rig/angle/pose": "/v1/rig/angle",
     "PUT /v1/users/{name}/password": "/v1/users",

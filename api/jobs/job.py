@@ -22,13 +22,12 @@ LEAST_SHARE = 0.05
 class Job:
     """A verb that a worker process does, or work of several such jobs, one after the other.
 
-    `urgent`: it goes before all others. `background`: nobody waits for it. `on_progress`: called on each progress.
+    `urgent`: it goes before all others. `on_progress`: called on each progress.
     """
 
     kind: str
     arguments: dict[str, Any] = field(default_factory=dict)
     urgent: bool = False
-    background: bool = False
     on_progress: Callable[[Job], None] | None = None
     # of a job that a person asked for, and that REST lists
     id: str = ""

@@ -14,7 +14,6 @@ from stimrig.api.jobs.worker import Worker
 from stimrig.api.logs import current_test
 
 log = logging.getLogger("stimrig.jobs")
-BACKGROUND_NICE = 15
 MOST_QUEUED = 50
 """Jobs that wait; more are refused, but urgent ones."""
 
@@ -23,24 +22,20 @@ class Pool:
     """A few workers and a queue; the fit after a test goes before everything else.
 
     `workers`: processes. Of several the first is kept free for urgent jobs; a pool of one keeps what its process
-    remembers. `worker`: makes a `Worker`; tests put another in its place. `background`: whether one more process, of
-    low priority, does jobs that nobody waits for; a new test cancels them.
+    remembers. `worker`: makes a `Worker`; tests put another in its place.
     """
 
-    def __init__(self, workers: int, worker: Callable[..., Worker] = Worker, *, background: bool = False) -> None:
+    def __init__(self, workers: int, worker: Callable[..., Worker] = Worker) -> None:
         self.workers = [worker() for _ in range(workers)]
         self.reserved = self.workers[0] if workers > 1 else None
-        self.background = worker(nice=BACKGROUND_NICE) if background else None
-        self.all_workers = [*self.workers, *([self.background] if self.background else [])]
         self.queue: list[Job] = []
         self.done_count = self.failed_count = 0
         self.busy_s = 0.0
         self._tasks = Tasks(log)
 
     def submit(
-        self, kind: str, *, urgent: bool = False, background: bool = False,
-        on_progress: Callable[[Job], None] | None = None, **arguments: Any,
-    ) -> Job:  # fmt: skip
+        self, kind: str, *, urgent: bool = False, on_progress: Callable[[Job], None] | None = None, **arguments: Any
+    ) -> Job:
         """Queue a job of one verb; await its `result`. Who is cancelled as he awaits it cancels the job.
 
         Raises ApiError: 503 too many wait already.
@@ -51,7 +46,7 @@ class Pool:
             )
             problem.headers["Retry-After"] = "60"
             raise problem
-        job = Job(kind, arguments, urgent, background, on_progress)
+        job = Job(kind, arguments, urgent, on_progress)
         job.result.add_done_callback(lambda result: self.cancel(job) if result.cancelled() else None)
         self.queue.insert(0 if urgent else len(self.queue), job)
         self._dispatch()
@@ -62,37 +57,25 @@ class Pool:
         for _ in self.workers:
             self.submit("warm")
 
-    def cancel_background(self) -> int:
-        """Cancel the jobs that nobody waits for, so that a test has the machine to itself; return how many."""
-        jobs = [job for job in self.queue if job.background]
-        jobs += [self.background.job] if self.background and self.background.job else []
-        for job in jobs:
-            self.cancel(job)
-        return len(jobs)
-
     def cancel(self, job: Job) -> None:
         """Take a job off the queue, or end the process that does it."""
         job = job.part or job
         if job in self.queue:
             self.queue.remove(job)
             job.fail(cancelled())
-        for worker in self.all_workers:
+        for worker in self.workers:
             if worker.job is job:
                 job.state = "cancelled"
                 worker.end()
 
     def _dispatch(self) -> None:
-        for worker in self.all_workers:
-            job = next((job for job in self.queue if self._does(worker, job)), None) if worker.job is None else None
-            if job is not None:
+        for worker in self.workers:
+            may_do = (job for job in self.queue if worker is not self.reserved or job.urgent or job.kind == "warm")
+            if worker.job is None and (job := next(may_do, None)) is not None:
                 self.queue.remove(job)
                 worker.job = job
                 job.start()
                 self._tasks.begin(self._work(worker, job))
-
-    def _does(self, worker: Worker, job: Job) -> bool:
-        kept_free = worker is self.reserved and not job.urgent and job.kind != "warm"
-        return job.background == (worker is self.background) and not kept_free
 
     async def _work(self, worker: Worker, job: Job) -> None:
         current_test.set(job.test_id)  # a task of its own; whoever happened to dispatch it may have had another test
@@ -112,7 +95,7 @@ class Pool:
     async def close(self) -> None:
         """End all processes."""
         self.queue.clear()
-        for worker in self.all_workers:
+        for worker in self.workers:
             worker.end()
         await self._tasks.close()
-        await asyncio.gather(*(worker.close() for worker in self.all_workers))
+        await asyncio.gather(*(worker.close() for worker in self.workers))

@@ -27,8 +27,6 @@ DIAGNOSIS, OWN_DIAGNOSIS = "diagnosis", "diagnosis of its structure"
 """Names of the stored diagnosis: of the plain structure, and of a version's own structure."""
 IMPROVEMENT = "improvement"
 """By-product of a diagnosis, stored separately: the models with the effects that it names."""
-HALF_DONE = 0.5
-"""From this progress on, a low-priority diagnosis is not restarted when a request begins to wait for it."""
 
 
 def is_plain(model: Model) -> bool:
@@ -62,19 +60,15 @@ class Analyses:
         """Return measured, predicted and commanded curves, thinned to what a screen shows."""
         return await self._find(model, "curves", "curves", model_json=stored_model.text(model))
 
-    async def diagnosis(
-        self, model: Model, on_call: OnCall | None = None, *, background: bool = False
-    ) -> dict[str, Any]:
+    async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
         """Diagnose what the structure of a model lacks; versions with the plain structure share one diagnosis."""
-        diagnosis = await self._diagnose(model, on_call, background=background)
+        diagnosis = await self._diagnose(model, on_call)
         return explanation.remaining(diagnosis[2], model.effects, model.fit)
 
-    async def _diagnose(
-        self, model: Model, on_call: OnCall | None, *, background: bool = False
-    ) -> tuple[Model, str, dict[str, Any]]:
+    async def _diagnose(self, model: Model, on_call: OnCall | None) -> tuple[Model, str, dict[str, Any]]:
         place, kind = await asyncio.to_thread(self._criticised, model)
         structure = {"model_json": stored_model.text(place)} if kind == OWN_DIAGNOSIS else {}
-        diagnosis = await self._find(place, kind, "diagnosis", on_call=on_call, background=background, **structure)
+        diagnosis = await self._find(place, kind, "diagnosis", on_call=on_call, **structure)
         return place, kind, diagnosis
 
     def _criticised(self, model: Model) -> tuple[Model, str]:
@@ -103,22 +97,13 @@ class Analyses:
         diagnosis = self.known(place.id, kind)
         return diagnosis and explanation.remaining(diagnosis, model.effects, model.fit)
 
-    async def diagnose_ahead(self, model: Model) -> None:
-        """Diagnose in advance at low priority; a new test cancels it, which is only logged."""
-        try:
-            await self.diagnosis(model, background=True)
-        except ApiError as error:
-            log.info("diagnosis of %s in the background: %s", model.id, error.title)
-        except Exception:
-            log.exception("diagnosis of %s in the background", model.id)
-
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
         """Return a stored analysis, or None."""
         row = self.store.get(Analysis, (model_id, kind))
         return row.document if row else None
 
     async def _find(
-        self, model: Model, kind: str, verb: str, recording_id: str | None = None, *, background: bool = False,
+        self, model: Model, kind: str, verb: str, recording_id: str | None = None, *,
         on_call: OnCall | None = None, **arguments: Any,
     ) -> dict[str, Any]:  # fmt: skip
         """Return a stored analysis; else have a worker do the verb, and store it as `kind`."""
@@ -127,11 +112,10 @@ class Analyses:
         if key not in self.running and (known := await asyncio.to_thread(self.known, *key)) is not None:
             return known
         call = self.running.get(key)
-        if call is not None and call.background and not background and call.progress < HALF_DONE:
-            self.pool.cancel(call)  # a request waits now; at low priority a busy machine could take minutes
-            call = None
         if call is None:
-            call = self.running[key] = self.pool.submit(verb, background=background, data=path, **arguments)
+            # A page waits for its curves, which take a fraction of a second, and not for a diagnosis.
+            urgent = verb != "diagnosis"
+            call = self.running[key] = self.pool.submit(verb, urgent=urgent, data=path, **arguments)
         if on_call is not None:
             on_call(call)
         try:

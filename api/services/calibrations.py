@@ -21,7 +21,6 @@ from stimrig.api.services import participants
 from stimrig.api.services.context import Context
 from stimrig.api.services.decisions import Change, Decision
 from stimrig.api.sessions import profiles
-from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.requests import CalibrationIn, MarkIn, StepIn
 from stimrig.api.store import audit, locking
 from stimrig.api.store.locking import Tags
@@ -43,7 +42,6 @@ async def begin(context: Context, code: str, body: CalibrationIn, decision: Deci
                 if values[name] is None:
                     detail = f"Send {name}; {name} is not known yet."
                     raise ApiError(422, "no-limits", "The participant has no limits", detail)
-            refuse_archived(row)
             if decision.on_page:
                 confirm_current(row, values, decision)
             now = context.clock.utc()
@@ -145,7 +143,7 @@ async def standing(context: Context, code: str) -> dict[str, Any]:
 
 
 def _outdated(session: Session, row: Participant, calibration_id: str) -> str:
-    """Say why a calibration cannot go on: limits, site or archive changed since it began; else empty.
+    """Say why a calibration cannot go on: limits or site changed since it began; else empty.
 
     One that began on other data than this service has cannot go on either.
     """

@@ -51,7 +51,7 @@ class Context:
         self.people = People(store, clock, self.auth, guesses)
         self.versions = Versions(store, clock)
         self.rig = RigClient(settings.rig_socket, clock)
-        self.pool = Pool(settings.workers, worker, background=True)
+        self.pool = Pool(settings.workers, worker)
         self.analyses = Analyses(store, clock, self.pool, self.versions, settings)
         self.tracked = TrackedVersions(store, clock, self.versions)
         self.limits_lock = asyncio.Lock()

@@ -1,7 +1,6 @@
-"""Participants: codes and a profile of limits, no names; their site and the archive; the list of all.
+"""Participants: codes and a profile of limits, no names; their site; the list of all.
 
-Models, approvals and keys belong to one site. In the archive participants who do not come any more are out of the way,
-and nothing of theirs is deleted.
+Models, approvals and keys belong to one site.
 """
 
 from __future__ import annotations
@@ -187,19 +186,6 @@ def refuse_busy(context: Context, code: str) -> None:
         raise ApiError(409, "participant-busy", "A calibration of this participant is open", detail)
 
 
-@under_limits_lock
-def put_archived(context: Context, code: str, archived: bool, decision: Decision) -> Participant:
-    """Put a participant into the archive, or take it out; doing it again changes nothing. Raises as `change_site`."""
-    if archived:
-        refuse_busy(context, code)
-    with deciding(context, code, decision) as (session, row):
-        if archived != (row.archived_utc is not None):
-            now = context.clock.utc()
-            row.archived_utc = now if archived else None
-            locking.write(session, row, now, decision.by, "archive" if archived else "unarchive", code)
-    return row
-
-
 @dataclass(frozen=True)
 class Listed:
     """A participant in the list: its last test, its newest model, and what the controller gets."""
@@ -210,28 +196,15 @@ class Listed:
     approved: Approval | None
 
 
-def matching(store: Store, q: str = "", archived: bool | None = None) -> list[Participant]:
-    """Participants whose code holds `q`, in any case; who was last tested, or made, comes first.
-
-    `archived`: only those that are archived, or that are not.
-    """
+def matching(store: Store, q: str = "") -> list[Participant]:
+    """Participants whose code holds `q`, in any case; who was last tested, or made, comes first."""
     last = select(Test.participant, func.max(Test.requested_utc).label("utc")).group_by(Test.participant).subquery()
     query = select(Participant).outerjoin(last, last.c.participant == Participant.code)
     if q.strip():
         query = query.where(Participant.code.icontains(q.strip(), autoescape=True))
-    if archived is not None:
-        query = query.where(Participant.archived_utc.is_not(None) if archived else Participant.archived_utc.is_(None))
     newest_first = func.coalesce(last.c.utc, Participant.created_utc).desc()
     with store.read() as session:
         return list(session.scalars(query.order_by(newest_first, Participant.code)))
-
-
-def participant_counts(store: Store) -> dict[str, int]:
-    """Count all participants and the archived ones."""
-    query = select(func.count(), func.count(Participant.archived_utc)).select_from(Participant)
-    with store.read() as session:
-        total, archived = session.execute(query).one()
-    return {"all": total, "archived": archived}
 
 
 def list_rows(store: Store, versions: Versions, participants: list[Participant]) -> list[Listed]:

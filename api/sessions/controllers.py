@@ -12,7 +12,7 @@ from pydantic import Field, FiniteFloat, StringConstraints
 from stimrig.api.errors import ApiError, forbidden, require_found
 from stimrig.api.models.places import site_of
 from stimrig.api.people.auth import Auth, Principal, Scope, outside
-from stimrig.api.sessions.playing import Requester, refuse_archived
+from stimrig.api.sessions.playing import Requester
 from stimrig.api.sessions.profiles import LIMITS, above
 from stimrig.api.sessions.requests import Body, CurrentMa, ProfileIn, TestIn, WidthUs
 from stimrig.api.sessions.runner import Runner
@@ -160,7 +160,7 @@ def make_key(auth: Auth, maker: Principal, participant: str, body: KeyFor, tags:
 
     Once the token of who makes it is revoked or has expired, the key opens nothing.
 
-    Raises ApiError: 403 who makes it lacks a scope of the key; 404 no such participant; 409 archived; 412 changed since
+    Raises ApiError: 403 who makes it lacks a scope of the key; 404 no such participant; 412 changed since
     it was seen; 422 the plan is wider than the participant's limits.
     """
     if lacking := [str(scope) for scope in KEY_SCOPES if not maker.may(scope)]:
@@ -170,7 +170,6 @@ def make_key(auth: Auth, maker: Principal, participant: str, body: KeyFor, tags:
     text, now = f"stimrig_{secrets.token_urlsafe(32)}", auth.clock.utc()
     with auth.store.write() as session:
         person: Participant = require_found(session.get(Participant, participant), "participant", participant)
-        refuse_archived(person)
         locking.check(session, person, tags)
         plan = body.model_dump(exclude={"name"})
         wider = above({name: plan[name] for name in LIMITED}, person.profile, "the limit of today,")

@@ -21,7 +21,7 @@ from stimrig.api.store.tables import OPEN_STATES, Model, Recording, Test
 from stimrig.rig.messages import LABEL_TITLES, FinishedEvent
 
 log = logging.getLogger("stimrig.outcomes")
-HIDDEN = ("plan", "summary", "version")
+HIDDEN = ("plan", "summary")
 """Columns of a test that clients do not see as they are."""
 
 
@@ -184,7 +184,6 @@ class Lifecycle:
         late_s = None if last_sample_unix_s is None else round(self.clock.unix_s() - last_sample_unix_s, 3)
         summary = {} if late_s is None else {"last_sample_to_model_s": late_s}
         await asyncio.to_thread(self.update, test_id, state="completed", model_id=model.id, summary=summary)
-        self._tasks.begin(self.analyses.diagnose_ahead(model))
 
     async def _recording_of(self, row: Test) -> tuple[Recording, str | None]:
         """Return the recording to identify, the test's or a joined one, and the model that it is joined to."""

@@ -22,7 +22,7 @@ from stimrig.rig.requests import StopRequest, WithdrawRequest
 log = logging.getLogger("stimrig.trials")
 ENDING_S = 2.0
 """So long a start waits for a test whose end has been heard."""
-RIGHTS = (*locking.MODELS, "set muscle", "archive")
+RIGHTS = (*locking.MODELS, "set muscle")
 """Changes with which a right ends that a controller plays by."""
 LOOK_AGAIN_S = 0.25
 """Interval at which it is checked whether a test may still be played: a right may end by time."""
@@ -180,14 +180,6 @@ def may_play(token: Token | None) -> bool:
 def other_than(asker: str, ran_by: str | None) -> str | None:
     """Return who ran a test, where that is not the requester."""
     return ran_by if ran_by and accounts.folded_name(ran_by) != accounts.folded_name(asker) else None
-
-
-def refuse_archived(participant: Participant) -> None:
-    """409: nothing is begun with a participant in the archive."""
-    if participant.archived_utc is not None:
-        way_out = f"on its page, or by PUT /v1/participants/{participant.code}/archived"
-        detail = f"{participant.code} is in the archive. Take it out first: {way_out}. Nothing was started."
-        raise ApiError(409, "archived", "This participant is archived", detail)
 
 
 def right_ended() -> ApiError:

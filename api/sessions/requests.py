@@ -304,12 +304,6 @@ class ParticipantIn(MuscleIn):
     profile: ProfileIn = FIRST_PROFILE
 
 
-class RanByIn(Body):
-    """Person who ran a test at the rig."""
-
-    ran_by: PersonName | None = Field(None, description="null: who asked for it")
-
-
 class DecisionIn(Body):
     """Why a model is approved or rejected."""
 

@@ -21,13 +21,13 @@ from stimrig.api.sessions.joint import JointTests
 from stimrig.api.sessions.kinds import Kind, Kinds, Planned
 from stimrig.api.sessions.lifecycle import Lifecycle
 from stimrig.api.sessions.live import Hub
-from stimrig.api.sessions.playing import Current, Playing, Requester, may_play, other_than, refuse_archived, right_ended
+from stimrig.api.sessions.playing import Current, Playing, Requester, may_play, other_than, right_ended
 from stimrig.api.sessions.previews import Preview, Previews, refuse_changed
 from stimrig.api.sessions.requests import TestIn, limits_of
 from stimrig.api.sessions.rig_client import News, RigClient
 from stimrig.api.sessions.stops import Stops
 from stimrig.api.sessions.trials import Trials
-from stimrig.api.store import locking
+from stimrig.api.store import audit, locking
 from stimrig.api.store.locking import Tags
 from stimrig.api.store.tables import OPEN_STATES, Participant, Test, Token
 from stimrig.rig import messages, requests
@@ -97,7 +97,6 @@ class Runner(Playing):
             participant = session.get(Participant, code)
             if participant is None:
                 raise NotFoundError("participant", code, "POST /v1/participants makes one.")
-            refuse_archived(participant)
             locking.check(session, participant, tags)
         return participant
 
@@ -180,7 +179,6 @@ class Runner(Playing):
             plan.test_id, plan.participant, requester.name, plan.kind, tokens=tokens, until_utc=until_utc
         )
         current_test.set(plan.test_id)
-        self.pool.cancel_background()
         try:
             answer = await self._previewed(plan)
             torque_time = {"torque_time_nms": answer["torque_time_nms"]}  # an estimate, by the model approved now
@@ -231,7 +229,7 @@ class Runner(Playing):
             dose = {name: preview.get(name) for name in ("duration_s", "charge_uc", "torque_time_nms")}
             entry = {"participant": plan.participant, "kind": plan.kind, "shown": dose, "version": version}
             entry |= {"model": requester.model} if requester.model else {}
-            locking.write(session, row, now, by, "start test", plan.test_id, **entry)
+            audit.write(session, now, by, "start test", plan.test_id, **entry)
             session.add(row)
             current.version = version
         log.info("test requested, kind %s", plan.kind, extra={"test_id": plan.test_id})

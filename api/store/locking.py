@@ -15,18 +15,17 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError
 from stimrig.api.store import audit
-from stimrig.api.store.tables import AuditEntry, Participant, Test, User
+from stimrig.api.store.tables import AuditEntry, Participant, User
 
 Tags = tuple[str, ...]
 """Entity tags of a request's `If-Match`, without their quotes."""
-Versioned = Participant | User | Test
+Versioned = Participant | User
 HASH_DIGITS = 6
 LIMITS, SITE = ("create participant", "set profile", "finish calibration"), ("create participant", "set muscle")
-ARCHIVE, MODELS = ("create participant", "archive", "unarchive"), ("approve", "reject")
-SETTINGS = (*LIMITS, "set muscle", "archive", "unarchive")
+MODELS = ("approve", "reject")
+SETTINGS = (*LIMITS, "set muscle")
 POSES = ("pose of the angle sensor", "calibrate the angle sensor")
 OF_POSES = and_(AuditEntry.subject == "rig", AuditEntry.action.in_(POSES))
-RAN_BY = "set who ran it"
 UNITS = {"_ma": "mA", "_us": "µs", "_nm": "N·m", "_rad": "rad"}
 MOST_CHANGES = 20  # that a refusal lists, the newest
 
@@ -82,7 +81,7 @@ def is_known(session: Session, version: int) -> bool:
 
 
 def settings_of(code: str) -> ColumnElement[bool]:
-    """Return the condition for entries about a participant's limits, site and archive."""
+    """Return the condition for entries about a participant's limits and site."""
     return and_(AuditEntry.subject == code, AuditEntry.action.in_(SETTINGS))
 
 
@@ -90,15 +89,13 @@ def about(row: Versioned) -> ColumnElement[bool]:
     """Return the condition for entries of decisions about a row."""
     if isinstance(row, User):
         return and_(AuditEntry.subject == row.name, AuditEntry.action.in_(audit.ACCOUNTS))
-    if isinstance(row, Test):
-        return and_(AuditEntry.subject == row.id, AuditEntry.action == RAN_BY)
     of_participant = AuditEntry.detail["participant"].as_string() == row.code
     decided = and_(of_participant, AuditEntry.action.in_((*MODELS, "issue token")))
     return or_(settings_of(row.code), decided, OF_POSES)
 
 
 def _change(session: Session, place: int, entry: AuditEntry) -> dict[str, Any]:
-    actions = next((group for group in (LIMITS, SITE, ARCHIVE, MODELS) if entry.action in group), (entry.action,))
+    actions = next((group for group in (LIMITS, SITE, MODELS) if entry.action in group), (entry.action,))
     same = AuditEntry.subject == entry.subject, AuditEntry.action.in_(actions), AuditEntry.seq <= place
     before = session.scalars(select(AuditEntry).where(*same).order_by(AuditEntry.seq.desc()).limit(1)).first()
     old, new = _values(before, actions), _values(entry, actions)
@@ -113,9 +110,7 @@ def _values(entry: AuditEntry | None, actions: tuple[str, ...]) -> dict[str, Any
         return entry.detail.get("profile") or {}
     if actions is SITE:
         return {name: entry.detail.get(name) for name in ("side", "muscle", "placement")}
-    if actions is ARCHIVE:
-        return {"": "in the archive" if entry.action == "archive" else "not in the archive"}
-    return {"": entry.detail.get("ran_by") or entry.action}
+    return {"": entry.action}
 
 
 def _words(values: dict[str, Any], other: dict[str, Any]) -> str:

@@ -37,7 +37,6 @@ class Participant(Table):
     muscle: Mapped[str | None]
     placement: Mapped[str | None]
     """Where the electrodes are: with side and muscle the site, to which models and keys belong."""
-    archived_utc: Mapped[str | None]
     version: Mapped[int] = mapped_column(BigInteger, default=0)
     __mapper_args__ = {"version_id_col": version, "version_id_generator": False}  # noqa: RUF012
 
@@ -61,8 +60,6 @@ class Test(Table):
     finished_utc: Mapped[str | None]
     ran_by: Mapped[str | None]
     """The person who ran it at the rig, if not `requested_by`."""
-    version: Mapped[int] = mapped_column(BigInteger, default=0)
-    __mapper_args__ = {"version_id_col": version, "version_id_generator": False}  # noqa: RUF012
 
 
 class Note(Table):

@@ -88,11 +88,8 @@ def _page_version(store: Store, request: Request) -> int:
     with store.read() as session:
         if request.url.path == "/rig/angle":
             return locking.pose_version(session)
-        if "test_id" in names:
-            row = session.get(Test, names["test_id"])
-        else:
-            model = session.get(Model, names.get("model_id", ""), options=[defer(Model.document)])
-            row = session.get(Participant, model.participant if model else names.get("code", ""))
+        model = session.get(Model, names.get("model_id", ""), options=[defer(Model.document)])
+        row = session.get(Participant, model.participant if model else names.get("code", ""))
         return row.version if row else 0
 
 

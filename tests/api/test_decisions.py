@@ -103,10 +103,6 @@ def user(world: World) -> None:
     assert world.me.post("/v1/users", json=added).is_success
 
 
-def played(world: World) -> None:
-    world.names["test_id"] = run_test(world.me, world.code)["id"]
-
-
 def stopped(world: World) -> Any:
     return world.colleague.post("/v1/stop", json={"reason": "pain"})
 
@@ -141,7 +137,6 @@ CASES = {
     "reject": Case(two_approved, MODEL.json, World.model),
     "profile": Case(World.lower, LIMITS),
     "muscle": Case(World.lower, {"side": "left"}),
-    "archived": Case(World.lower, {"archived": False}),
     "recordings": Case(World.lower, "recording"),
     "tests": Case(World.lower, "participant"),
     "calibration": Case(World.lower, {}),
@@ -150,9 +145,6 @@ CASES = {
     "finish": Case(another_train, None, World.marked, "Another train"),
     "discard": Case(another_calibration, None, World.calibration, "colleague has begun another calibration"),
     "keys": Case(World.lower, KEY),
-    "ran-by": Case(
-        lambda world: world.colleague.put(f"/v1/tests/{world.names['test_id']}/ran-by", json={"ran_by": "Bea"}),
-        {"ran_by": "Cem"}, played),
     "pose": Case(
         lambda world: world.colleague.post("/v1/rig/angle/pose", json={"angle_rad": 0.2}), {"angle_rad": 1.5}, sensor),
     "password": Case(
@@ -215,8 +207,8 @@ def test_what_was_changed_since_is_decided_anew(world: World, door: str) -> None
     assert world.entries()[-1]["seq"] > before[-1]["seq"] or door in UNWRITTEN
 
 
-UNWRITTEN = {"PUT /v1/participants/{code}/archived", "POST /v1/participants/{code}/calibration/step"}
-"""Nothing was archived; a train is in the calibration's own recording."""
+UNWRITTEN = {"POST /v1/participants/{code}/calibration/step"}
+"""A train is in the calibration's own recording."""
 TWICE = {"POST /v1/rearm", "POST /v1/models/{model_id}/reject", "POST /v1/participants/{code}/recordings",
          *UNWRITTEN}  # fmt: skip
 """A rig that is armed stays armed, what was rejected stays rejected; a recording is added."""

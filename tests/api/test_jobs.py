@@ -127,14 +127,6 @@ async def test_too_many_jobs_are_refused_but_urgent_ones(pool: Pool) -> None:
     assert pool.submit("fit", urgent=True, data="x").state == "queued"
 
 
-@pooled(background=True)
-async def test_a_new_test_cancels_what_nobody_waits_for(pool: Pool) -> None:
-    jobs = [pool.submit("fit", background=True, data="x", effects=["slow"]) for _ in range(2)]
-    assert pool.cancel_background() == 2
-    for job in jobs:
-        await refused(job, "cancelled")
-
-
 @pooled()
 async def test_an_expected_error_names_its_place(pool: Pool) -> None:
     error = await refused(pool.submit("fit", data="x", effects=["bad"]), "no effect bad")

@@ -69,7 +69,6 @@ def test_who_decides_again_sends_the_version_of_the_answer(client: httpx.Client,
     for method, path, body in (
         ("PUT", f"{HOME}/profile", {"current_ma": 9}), ("POST", f"/v1/models/{model}/approve", {}),
         ("PUT", f"{HOME}/muscle", {"side": "left"}), ("POST", f"{HOME}/keys", KEY),
-        ("PUT", f"{HOME}/archived", {"archived": True}), ("PUT", f"{HOME}/archived", {"archived": False}),
         ("POST", f"/v1/models/{model}/reject", {"reason": "wrong arm"}),
     ):  # fmt: skip
         old, answer = tag, client.request(method, path, json=body, headers={"If-Match": tag})
@@ -263,7 +262,7 @@ def test_a_token_that_came_back_starts_tests(service: Service, participant: str,
 
 
 @pytest.mark.parametrize("how", [
-    "its day", "its right, while the store cannot be read", "set muscle", "archive", "revoked elsewhere",
+    "its day", "its right, while the store cannot be read", "set muscle", "revoked elsewhere",
     "its maker revoked", *RIGHTS,
 ])  # fmt: skip
 def test_a_trial_that_plays_ends_with(

@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from tests.api.browser import chart
-from tests.api.conftest import Service, shared_service, signed_in, soon
+from tests.api.conftest import Service, shared_service, signed_in
 from tests.api.test_verdict import make_poor
 from tests.api.test_why import FATIGUE, MISSING, NOTHING
 
@@ -35,7 +35,8 @@ def browser_client(service: Service) -> Iterator[httpx.Client]:
 @pytest.fixture(scope="module")
 def model(service: Service) -> str:
     model: str = service.play_test("S1")["model_id"]
-    soon(lambda: service.context.analyses.known(model, "diagnosis"))
+    with service.client() as client:
+        client.get(f"/v1/models/{model}/diagnosis")
     return model
 
 

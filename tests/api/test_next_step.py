@@ -74,9 +74,6 @@ TABLE: list[tuple[dict[str, Any], str, str, str]] = [
     # nothing starts
     ({"rig": "latched"}, "rearm", "needs a re-arm", ""),
     ({"rig": "uncertain"}, "rearm", "needs a re-arm", ""),
-    ({"archived_since": "today"}, "archived", "In the archive since today", "form"),
-    ({"archived_since": "today", **READY}, "archived", "no test starts", "form"),
-    ({"archived_since": "today", **RUNS}, "running", "is running", "/tests/T1"),
     ({"rig": "disconnected"}, "wait", "not connected", ""),
     ({"rig": "silent"}, "wait", "does not answer", ""),
 ]  # fmt: skip

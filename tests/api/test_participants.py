@@ -1,4 +1,4 @@
-"""The list of participants, the archive, side and muscle, and who ran a test."""
+"""The list of participants, side and muscle, and who ran a test."""
 
 from __future__ import annotations
 
@@ -25,31 +25,14 @@ def make(http: httpx.Client, code: str, **more: Any) -> None:
     assert http.post("/v1/participants", json={"code": code, **more}).status_code == 201
 
 
-def archive(http: httpx.Client, code: str, archived: bool = True) -> httpx.Response:
-    return http.put(f"/v1/participants/{code}/archived", json={"archived": archived})
-
-
-def test_an_archived_participant_is_left_alone_until_it_is_taken_out(service: Service, http: httpx.Client) -> None:
+def test_the_site_stays_while_a_test_of_the_participant_plays(service: Service, http: httpx.Client) -> None:
     make(http, "A1", side="left")
     service.rig.speed = 2.0
     test = http.post("/v1/tests", json={"participant": "A1"}).json()
-    for refused in (archive(http, "A1"), http.put("/v1/participants/A1/muscle", json={"side": "right"})):
-        assert refused.status_code == 409 and refused.json()["type"] == "/problems/participant-busy", "in a test"
+    refused = http.put("/v1/participants/A1/muscle", json={"side": "right"})
+    assert refused.status_code == 409 and refused.json()["type"] == "/problems/participant-busy", "in a test"
     service.rig.speed = 60.0
     assert wait_done(http, test["id"])["side"] == "left"
-    assert archive(http, "A1").json()["archived_utc"]
-    for path, body in (("/v1/tests", {"participant": "A1"}), ("/v1/participants/A1/calibration", {})):
-        refused = http.post(path, json=body)
-        assert refused.status_code == 409 and refused.json()["type"] == "/problems/archived", refused.text
-        assert "/archived" in refused.json()["detail"]
-    assert "A1" not in [row["code"] for row in http.get("/v1/participants", params={"archived": False}).json()]
-    assert [row["code"] for row in http.get("/v1/participants", params={"archived": True}).json()] == ["A1"]
-    assert archive(http, "A1", False).json()["archived_utc"] is None
-    assert run_test(http, "A1")["state"] == "completed"
-    trail = [entry["action"] for entry in http.get("/v1/audit").json()["entries"] if entry["subject"] == "A1"]
-    assert trail == ["create participant", "archive", "unarchive"]
-    seen = {"If-Match": http.get("/v1/participants/A1").headers["etag"]}
-    assert http.put("/v1/participants/nobody/archived", json={"archived": True}, headers=seen).status_code == 404
 
 
 def test_the_list_is_searched_and_most_recent_first(http: httpx.Client) -> None:

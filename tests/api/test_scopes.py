@@ -84,11 +84,9 @@ GET    /participants/x                                     run-test       404
 GET    /participants/x/next                                run-test       404
 GET    /participants/x/calibration                         run-test       404
 PUT    /v1/participants/x/muscle                           run-test       428
-PUT    /v1/participants/x/archived                         run-test       428
 GET    /v1/participants/x/notes                            run-test       404
 POST   /v1/participants/x/notes                            run-test       422
 POST   /v1/participants/x/notes/x/strike                   run-test       404
-PUT    /v1/tests/x/ran-by                                  run-test       428
 POST   /v1/participants/x/keys                             approve-model  428
 POST   /v1/rearm                                           rearm          428
 POST   /v1/models/x/approve                                approve-model  428

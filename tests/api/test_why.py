@@ -45,26 +45,6 @@ def make_slow(service: Service, progress: float = 0.5) -> Path:
 # ---- long work ----------------------------------------------------------------------------------------------
 
 
-def test_new_test_ends_the_diagnosis_in_the_background(client: httpx.Client, service: Service, participant: str):
-    make_slow(service)
-    model = run_test(client, participant)["model_id"]
-    analyses = service.context.analyses
-    job = soon(lambda: analyses.running.get((model, "diagnosis")))
-    soon(lambda: job.state == "running")
-    assert client.post("/v1/tests", json={"participant": participant}).status_code == 202
-    soon(lambda: job.state == "cancelled")
-    assert analyses.known(model, "diagnosis") is None
-
-
-def test_a_request_does_not_wait_for_low_priority(client: httpx.Client, service: Service, participant: str) -> None:
-    marker = make_slow(service, 0.2)
-    model = run_test(client, participant)["model_id"]
-    analyses = service.context.analyses
-    soon(lambda: (job := analyses.running.get((model, "diagnosis"))) and job.background and job.progress > 0.1)
-    marker.unlink()
-    assert client.get(f"/v1/models/{model}/diagnosis").json()["verdict"] == "effect_missing"
-
-
 def test_job_reports_progress_and_can_be_cancelled(client: httpx.Client, service: Service, participant: str) -> None:
     make_slow(service)
     model = run_test(client, participant)["model_id"]
@@ -309,7 +289,7 @@ def test_it_is_not_searched_anew_and_a_free_effect_has_the_form_that_was_found(
     client: httpx.Client, service: Service, model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     analyses, pool = service.context.analyses, service.context.pool
-    soon(lambda: analyses.known(model, "diagnosis"))
+    client.get(f"/v1/models/{model}/diagnosis")
     free = {"effect": "fatigue", "form": "fitness", "name": "Fatigue", "words": "", "parameters": {}}
     analyses._store_result(model, "diagnosis", {**LEFT, "missing": LEFT["missing"][:1], "free": [free]})
     submit, submitted = pool.submit, []

@@ -21,28 +21,23 @@ FIRST_ROWS = 50
 
 
 @router.get("/")
-async def home(request: Request, context: Ctx, q: str = "", archived: str = "", all: str = "") -> Response:
+async def home(request: Request, context: Ctx, q: str = "", all: str = "") -> Response:
     """Show participants and the rig; the sign-in form to who is not signed in."""
     try:
         principal = await identified(request)
     except ApiError:
         return await sign_in(request, context)
-    search: dict[str, Any] = {"q": q[:80].strip(), "archived": archived == "1"}
-    listed = None
+    q, listed = q[:80].strip(), None
     if principal.may(Scope.RUN_TEST):
-        listed = await asyncio.to_thread(list_participants, context, **search, limit=None if all == "1" else FIRST_ROWS)
-    return page(request, "home.html", search=search, listed=listed)
+        listed = await asyncio.to_thread(list_participants, context, q, None if all == "1" else FIRST_ROWS)
+    return page(request, "home.html", q=q, listed=listed)
 
 
-def list_participants(context: Context, q: str, archived: bool, limit: int | None) -> dict[str, Any]:
-    """Return the rows of the list, how many more match, and how many participants there are."""
-    matching = participants.matching(context.store, q, archived)
+def list_participants(context: Context, q: str, limit: int | None) -> dict[str, Any]:
+    """Return the rows of the list, and how many more match."""
+    matching = participants.matching(context.store, q)
     rows = participants.list_rows(context.store, context.versions, matching[:limit])
-    return {
-        "rows": rows,
-        "more": len(matching) - len(rows),
-        "count": participants.participant_counts(context.store),
-    }
+    return {"rows": rows, "more": len(matching) - len(rows)}
 
 
 @router.get("/sign-in")

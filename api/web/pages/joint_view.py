@@ -48,7 +48,6 @@ def _gather(context: Context, row: Participant, overview: dict[str, Any]) -> dic
     return {
         "range_rad": profiles.range_of(row.profile),
         "may_start": starting.calibrated(context, row).may_start,
-        "archived": row.archived_utc is not None,
         "held": [{**each, "deg": starting.allowed_deg(each["angle_rad"])} for each in overview["targets"]],
         "allowed": starting.allowed_deg(overview["next_rad"]),
         "recordings": [{"test": test, "picked": test.id in picked, "target_rad": target_of(test)} for test in rows],

@@ -22,7 +22,7 @@ from stimrig.api.web.pages import render, starting
 
 router = APIRouter(include_in_schema=False)
 Kind = Literal[
-    "running", "identifying", "look", "asked", "done", "archived", "rearm", "wait", "calibrating", "calibrate", "joint",
+    "running", "identifying", "look", "asked", "done", "rearm", "wait", "calibrating", "calibrate", "joint",
     "test", "again",
 ]  # fmt: skip
 BUSY = ("arming", "running", "stopping", "sealing", "calibrating", render.PASSIVE)
@@ -47,7 +47,7 @@ ENDED = {
 
 @dataclass(frozen=True)
 class Step:
-    """The line. `href` empty: the button calls REST (`test`, `calibrate`, `archived`), or there is none."""
+    """The line. `href` empty: the button calls REST (`test`, `calibrate`), or there is none."""
 
     kind: Kind
     words: str
@@ -73,7 +73,6 @@ def next_step(
     last_model: Literal["", "poor", "rejected"] = "",  # why none of today's models can be approved
     served_until: str = "",  # time of day until which the controller has an approved model
     lacks_key: Literal["", "mine", "another's"] = "",  # no controller has a key for it: whether who looks may make one
-    archived_since: str = "",
     needs_test: bool = False,  # the trials of the approved model ask for a new test
     unstored: bool = False,  # the rig keeps a finished calibration of theirs that the service could not store
 ) -> Step:
@@ -93,8 +92,6 @@ def next_step(
     if unstored or (rig == "calibrating" and holder == code):
         words = "A calibration waits to be stored." if unstored else "The calibration has begun."
         return Step("calibrating", words, "Go on with the calibration", f"{at}/calibration")
-    if archived_since:
-        return Step("archived", f"In the archive since {archived_since}: no test starts.", "Take out of the archive")
     ended = ENDED.get(state, "") if not trial or state != "failed" else "was not finished"
     ended = ended and f"The last {'trial' if trial else 'test'} {ended}. "
     if undecided:
@@ -177,7 +174,6 @@ def step(context: Context, row: Participant, principal: Principal) -> Step:
         last_model="poor" if poor else "rejected" if models and newest is None else "",
         served_until=local_time.until(served.expires_utc or context.clock.end_of_day_utc())[-5:] if served else "",
         lacks_key="" if not keyless else "mine" if principal.may(Scope.APPROVE_MODEL) else "another's",
-        archived_since=local_time.when(row.archived_utc) if row.archived_utc else "",
         needs_test=served is not None and context.tracked.new_test_reason(served.id) is not None,
         unstored=unstored is not None and unstored.participant == row.code,
     )

@@ -21,7 +21,6 @@ from stimrig.api.people.auth import Principal
 from stimrig.api.services import participants
 from stimrig.api.sessions import profiles
 from stimrig.api.sessions.joint_plan import HELD, KINDS, PASSIVE
-from stimrig.api.sessions.playing import refuse_archived
 from stimrig.api.sessions.previews import VALID_S
 from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store.tables import AuditEntry, Participant
@@ -73,7 +72,6 @@ async def start(
     Raises ApiError: 409 a test runs, or a calibration is needed first; 422 no such test; what the rig refuses.
     """
     row = await asyncio.to_thread(participants.find, context, code)
-    refuse_archived(row)
     context.runner.refuse_second()
     standing = await asyncio.to_thread(calibrated, context, row)
     if not standing.may_start:

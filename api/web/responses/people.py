@@ -101,7 +101,6 @@ class ParticipantOut(Document):
     side: Literal["left", "right"] | None = Field(description="of the body; null: nobody has said")
     muscle: str | None = Field(description="the muscle that is stimulated")
     placement: str | None = Field(description="of the electrodes: with side and muscle the site")
-    archived_utc: str | None = Field(description="since when it is archived: no test starts, nothing is deleted")
     version: int = Field(description="of all that is decided about the participant: its `ETag`")
 
 

@@ -1,8 +1,4 @@
-"""Participants: codes and a profile of limits, no names; their site, the archive, notes.
-
-Models, approvals and keys belong to one site. In the archive participants who do not come any more are out of the way,
-and nothing of theirs is deleted.
-"""
+"""Participants: codes and a profile of limits, no names; their site, to which models and keys belong; notes."""
 
 from __future__ import annotations
 
@@ -11,18 +7,11 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Query, Response
 
 from stimrig.api.services import notes, participants
-from stimrig.api.sessions.requests import Body, MuscleIn, NoteIn, ParticipantIn, ProfileIn
+from stimrig.api.sessions.requests import MuscleIn, NoteIn, ParticipantIn, ProfileIn
 from stimrig.api.store.tables import Participant
 from stimrig.api.web.dependencies import PROBLEM, Ctx, ParticipantDecision, Tester
 from stimrig.api.web.responses.base import describe_answer
 from stimrig.api.web.responses.people import ChangedOut, NoteOut, ParticipantOut
-
-
-class ArchivedIn(Body):
-    """Archive state of a participant."""
-
-    archived: bool
-
 
 router = APIRouter(prefix="/v1/participants", tags=["participants"], responses=PROBLEM)
 
@@ -40,10 +29,9 @@ def list_participants(
     context: Ctx,
     _principal: Tester,
     q: Annotated[str, Query(max_length=80, description="a part of the code, in any case")] = "",
-    archived: Annotated[bool | None, Query(description="only those that are archived, or that are not")] = None,
 ) -> list[dict[str, Any]]:
     """All participants, or those that are looked for; who was last tested, or made, comes first."""
-    return [row.as_dict() for row in participants.matching(context.store, q, archived)]
+    return [row.as_dict() for row in participants.matching(context.store, q)]
 
 
 @router.get("/{code}", **describe_answer(ParticipantOut))
@@ -82,14 +70,6 @@ async def set_muscle(
     controller, until it has its own. Tests keep the site that they were begun with.
     """
     return tagged(response, await participants.change_site(context, code, body, decision))
-
-
-@router.put("/{code}/archived", **describe_answer(ParticipantOut))
-async def set_archived(
-    context: Ctx, code: str, decision: ParticipantDecision, body: ArchivedIn, response: Response
-) -> dict[str, Any]:
-    """Put it into the archive, where it is listed no more by default and no test of it starts, or take it out."""
-    return tagged(response, await participants.put_archived(context, code, body.archived, decision))
 
 
 notes_router = APIRouter(prefix="/v1/participants/{code}/notes", tags=["notes"], responses=PROBLEM)

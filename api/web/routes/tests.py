@@ -15,7 +15,7 @@ from stimrig.api.errors import ApiError, forbidden
 from stimrig.api.people.auth import Principal, Scope
 from stimrig.api.services import tests
 from stimrig.api.sessions import controllers
-from stimrig.api.sessions.requests import RanByIn, TestIn
+from stimrig.api.sessions.requests import TestIn
 from stimrig.api.store.tables import Test
 from stimrig.api.web.dependencies import (
     PROBLEM,
@@ -24,7 +24,6 @@ from stimrig.api.web.dependencies import (
     LiveReader,
     ParticipantVersion,
     Tester,
-    TestVersion,
 )
 from stimrig.api.web.guards import refuse_outside, same_origin
 from stimrig.api.web.openapi import problem
@@ -67,21 +66,9 @@ def list_tests(
 
 
 @router.get("/{test_id}", **describe_answer(TestOut))
-def one_test(context: Ctx, _principal: LiveReader, test_id: str, response: Response) -> dict[str, Any]:
+def one_test(context: Ctx, _principal: LiveReader, test_id: str) -> dict[str, Any]:
     """A test: state, segment, progress, time left; at its end recording, model, summary and fit."""
-    row = tests.find(context, test_id)
-    response.headers["ETag"] = f'"{row.version}"'
-    return context.runner.document(row)
-
-
-@router.put("/{test_id}/ran-by", **describe_answer(TestOut))
-def set_ran_by(
-    context: Ctx, principal: Tester, test_id: str, tags: TestVersion, body: RanByIn, response: Response
-) -> dict[str, Any]:
-    """Say who ran a test at the rig, where that was not who asked for it."""
-    row = tests.change_ran_by(context, test_id, body.ran_by, principal.name, tags)
-    response.headers["ETag"] = f'"{row.version}"'
-    return context.runner.document(row)
+    return context.runner.document(tests.find(context, test_id))
 
 
 @router.post("/{test_id}/enough", **describe_answer(Extended))
