@@ -102,16 +102,16 @@ def test_recording_comes_back_byte_for_byte(client: httpx.Client, service: Servi
 
 def come_to_rest(pool: Any) -> None:
     """Wait until no worker has anything to do."""
-    soon(lambda: not (pool.queue or any(worker.job for worker in pool.all_workers)), 60)
+    soon(lambda: not (pool.queue or any(worker.job for worker in pool.workers)), 60)
 
 
 def test_comparison_and_diagnosis_are_made_once_and_kept(client: httpx.Client, service: Service, participant: str):
     model = run_test(client, participant)["model_url"]
-    diagnosis = client.get(f"{model}/diagnosis").json()  # begun with the test's end: nothing else is made after it
+    diagnosis = client.get(f"{model}/diagnosis").json()
     assert diagnosis["verdict"] == "effect_missing"
     comparison = client.get(f"{model}/comparison").json()
     pool = service.context.pool
-    come_to_rest(pool)  # a worker that still warms up, or ends the diagnosis begun ahead, counts too
+    come_to_rest(pool)  # a worker that still warms up counts, too
     done = pool.done_count
     assert client.get(f"{model}/comparison").json() == comparison
     assert client.get(f"{model}/diagnosis").json() == diagnosis
