@@ -10,7 +10,6 @@ from stimrig.identify.diagnosis import diagnose, structure_of
 from stimrig.identify.diagnosis.free import searched
 from stimrig.identify.diagnosis.result import diagnosis_of
 from stimrig.identify.diagnosis.search import MAX_EFFECTS, EffectSearch, Progress, Step, helpful, silent
-from stimrig.identify.diagnosis.thresholds import RISE
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import words
@@ -179,7 +178,7 @@ def _reason(search: EffectSearch, before: Step, step: Step, model: Model) -> str
     if not find_effect(step.added).predictable:
         reasons.append("It cannot be foreseen: it need not predict.")
     old, new = before.statistics, step.statistics
-    if old["held_out_by"] == HELD_OUT and new["held_out_rms_nm"] > RISE * old["held_out_rms_nm"]:
+    if old["held_out_by"] == HELD_OUT and new["held_out_rms_nm"] > old["held_out_rms_nm"]:
         reasons.append("On held-out pulses the error rises, but not by more than its standard error.")
     return " ".join(reasons)
 

@@ -28,7 +28,6 @@ class ResidualStructure:
     busy_nm: float  # residual while the muscle works
     ratio: float  # log-likelihood gained if rest and work each have their own noise: large if structure appears at work
     ideal: float  # log-likelihood if the noise were everywhere as it is at rest
-    slow_nm: float  # standard deviation of the slow part of the residual
     scale_nm: float  # the record's largest torque
 
     @property
@@ -56,7 +55,6 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
         busy_nm=float(np.sqrt(np.mean(work**2))),
         ratio=at_rest + at_work - _log_likelihood(residual, rests + works) if rests and works else 0.0,
         ideal=ideal,
-        slow_nm=fitted.noise.sd_nm * float(np.sqrt(min(fitted.noise.share, 1.0))),
         scale_nm=setup.scale_nm,
     )
 
@@ -104,17 +102,14 @@ class HeldOutError:
         return self.rms_nm / self.allowed_nm
 
 
-def held_out_error(
-    fitted: Fitted, form: float = FORM_ERROR, compared_with: Fitted | None = None
-) -> HeldOutError | None:
+def held_out_error(fitted: Fitted, compared_with: Fitted | None = None) -> HeldOutError | None:
     """The error of a model on the held-out intervals; None if there are too few, or if there is a tremor.
 
     Only rows count whose pulse widths, and those of the seconds before, are near fitted ones: elsewhere the recruitment
     curve is a guess. Efforts cannot be predicted, but they are rare: if one of the models has one, the median of the
     error counts instead of its root mean square.
 
-    `form` is the error allowed because the model's form is inexact, as a share of the largest torque;
-    `compared_with` a model that this one is compared with.
+    `compared_with`: a model that this one is compared with.
     """
     setup = fitted.problem.setup
     rows = np.isfinite(hold_out(fitted).error_nm)
@@ -125,7 +120,7 @@ def held_out_error(
     scaled = fitted.hessian * scale[:, None] * scale[None, :] + 1e-12 * np.eye(scale.size)
     slopes = fitted.slopes[:, rows] * scale[:, None]
     band = np.sum(slopes * np.linalg.solve(scaled, slopes), axis=0)
-    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (form * setup.scale_nm) ** 2)
+    allowed = np.sqrt(fitted.noise.sd_nm**2 + float(np.mean(band)) + (FORM_ERROR * setup.scale_nm) ** 2)
     if not any(
         find_effect(effect).sporadic
         for effect, _ in [*fitted.effects, *(compared_with.effects if compared_with else [])]
@@ -141,7 +136,7 @@ def vetoed(before: Fitted, after: Fitted) -> str | None:
     never speak for one.
     """
     old, new = hold_out(before), hold_out(after)
-    if difference(old, new).errors > -thresholds.BETTER or not new.rms_nm > thresholds.RISE * old.rms_nm:
+    if difference(old, new).errors > -thresholds.BETTER or not new.rms_nm > old.rms_nm:
         return None
     errors = f"{old.rms_nm:.3g}", f"{new.rms_nm:.3g}"
     return f"Held out, the error of a pulse interval's mean torque would rise from {errors[0]} to {errors[1]} N·m."

@@ -17,7 +17,7 @@ from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.residual import ResidualStructure, quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.dynamics.grid import Grid
-from stimrig.identify.effects import Effect, Form, Parameter, Scene, find_effect, form, registry
+from stimrig.identify.effects import Effect, Form, find_effect, registry
 from stimrig.identify.effects.base import replaced_by
 from stimrig.identify.errors import NotIdentifiable
 from stimrig.identify.estimation.effect_fit import (
@@ -94,7 +94,6 @@ class EffectSearch:
     steps: list[Step]  # the model of the examined structure, then one effect more in each
     quiet: np.ndarray  # intervals in which the muscle rests, bool, shape (K,)
     refused: tuple[Candidate, ...] = ()  # effects of a last round in which none was chosen, best first
-    free_gain: float = 0.0  # log evidence for a gain that varies without a law, beside the first model
 
     @property
     def record(self) -> Record:
@@ -175,8 +174,6 @@ def search_effects(
             steps.append(replace(steps[0], added=effect, searched=fitted, origin="detected"))
     search = EffectSearch(raw, rows, plain, steps, quiet_rows(steps[-1].searched))
     for number in range(max_effects):
-        if number and _exhausted(search):
-            break
         if not _add_best(search, progress or silent, number):
             break
         _exchange(search)
@@ -195,8 +192,6 @@ def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
     listed.sort(key=lambda effect: -len(effect.forms))
     tried = scan(last.searched, listed, before, lambda done, text: progress(0.1 + 0.3 * (number + done), text))
     candidates = sorted(map(_discounted, tried), key=_by_gain)
-    if not number and (lawless := try_effect(FREE_GAIN, last.searched)) is not None:
-        search.free_gain = lawless.gain
     accepted: list[tuple[float, Candidate]] = []
     for place, candidate in enumerate(candidates):
         if candidate.gain < search.margin(number) or (accepted and not last.searched.distrusted):
@@ -355,26 +350,6 @@ def _likeliest_forms(effect: Effect, before: Candidate | None) -> list[Form]:
     return [effect.form(name) for name in ranked[:FORMS]]
 
 
-KNOTS = 36
-
-
-@form(
-    "gain",
-    "w = g(t) f(u), log g linear between knots",
-    *(Parameter(f"log_gain_{i}", "1", -0.45, 0.45, 0.0, (0.0,), about="log gain at a knot") for i in range(KNOTS)),
-)
-def free(drive: np.ndarray, p: dict[str, Any], scene: Scene) -> np.ndarray:
-    """A gain without a law."""
-    place = np.clip(scene.time_s / max(scene.span_s, 1e-9), 0.0, 1.0) * (KNOTS - 1)
-    first = np.minimum(place.astype(np.int64), KNOTS - 2)
-    part = place - first
-    values = np.concatenate([p[f"log_gain_{i}"] for i in range(KNOTS)], axis=1)
-    return drive * np.exp(values[:, first] * (1.0 - part) + values[:, first + 1] * part)
-
-
-FREE_GAIN = Effect("free_gain", "Gain that varies without a law", (free,), "", (), "", "")
-
-
 # ---- what an effect must gain --------------------------------------------------------------------------------------
 
 
@@ -401,15 +376,6 @@ def _discounted(candidate: Candidate) -> Candidate:
     """The candidate with its gain reduced if it is an effort."""
     effort = candidate.effect.sporadic and not candidate.effect.band
     return replace(candidate, gain=thresholds.UNSURE * candidate.gain) if effort else candidate
-
-
-def _exhausted(search: EffectSearch) -> bool:
-    """Return True if no further effect can gain enough: the residual is nearly as small and white as noise can be."""
-    structure, last = search.residual, search.last
-    if last.noise.ar1 > thresholds.SLOWEST_AR1 and structure.slow_nm > structure.white_nm:
-        return False  # such slow noise may be a drift: the rests do not show how small the residual could be
-    near = thresholds.NEAR_IDEAL if last.noise.is_white else thresholds.NEXT_MARGIN
-    return structure.ideal - last.log_likelihood < near and structure.ratio < thresholds.NEXT_MARGIN
 
 
 def prior(effect: Effect) -> float:

@@ -10,12 +10,8 @@ from __future__ import annotations
 FIRST_MARGIN = 4.5
 """Log evidence that the first effect must gain."""
 NEXT_MARGIN = 10.0
-"""Log evidence that every further effect must gain, at least; log-likelihood by which work and rest must differ for
-structure to be left; and log evidence by which a gain without a law must beat the best effect, so that the cause is not
-in the library."""
-NEAR_IDEAL = 30.0
-"""Log-likelihood that the last model may fall short of the ideal by, where its residual is white: the size of the noise
-is known no better. Nothing further is then looked for."""
+"""Log evidence that every further effect must gain, at least, and log-likelihood by which work and rest must differ for
+structure to be left."""
 BETTER = 1.0
 """Standard errors by which the error on left-out blocks must fall with an effect, and by which it may rise with one
 that cannot be foreseen: such an effect need not predict, but it must not spoil what the muscle does."""
@@ -33,37 +29,20 @@ also the largest probability of an effect that may only repair the inexact form 
 do not appear at rest: the stimulation itself may cause them."""
 SHARE_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
-SLOWEST_AR1 = 0.97
-"""Correlation of neighbours above which slow noise may also be a drift."""
 TEMPERATURE = 2.0
 """Log evidence that the best form of a rival may lose by chance."""
 RELATIVE = 0.03
 """The same as a share of the gain: a form close to the true one explains most of the error, not all."""
-LEAST_EXPLAINED = 0.68
+LEAST_EXPLAINED = 0.75
 """Share of the explainable log-likelihood that effects must explain; otherwise another kind of structure is left."""
-LEAST_EXPLAINED_BY_EFFORTS = 0.8
-"""The same if efforts are found first: they repair every error a little."""
-LEAST_EXPLAINED_BY_BAND = 0.94
+LEAST_EXPLAINED_BY_BAND = 0.9
 """Share of the residual's power that a tremor must explain, if work and rest differ beside it."""
-MANY_EFFORTS = 4
-"""This many efforts, none of them at rest, are more likely caused by the stimulation."""
-EFFORTS_LAST = 0.33
-"""Share of the test above which efforts last too long to be efforts."""
-STRUCTURE_BESIDE_BAND = 60.0
-"""Log-likelihood by which work and rest must differ beside a tremor for structure to be left."""
 UNKNOWN_FORM = 0.04
 """Probability that is kept for what no form in the library describes; a rival that is less probable is not named."""
-EXPLAINED_BY_LAWS = 0.9
-"""If the effects explain this share, a better gain without a law does not count."""
 HELD_OUT_RATIO = 2.5
 """Error on held-out pulses, divided by what is allowed there, above which structure may be left."""
 HELD_OUT_SHARE = 0.5
 """The same as a share of the plain structure's error there: a law close to the true one takes most of it, not all."""
-REFUSED = 20.0
-"""Log evidence from which something is there that no effect can predict, if left-out blocks refuse what explains it."""
-RISE = 1.02
-"""Factor by which a held-out error must rise, and by more than `BETTER` of its standard errors, to speak against an
-effect: `improve` stops there."""
 DOUBTED = 0.45
 """Largest probability of an effect that something speaks against."""
 QUIET = 0.025
@@ -71,9 +50,7 @@ QUIET = 0.025
 CLOSE = 0.8
 """An effect that resembles the best one is named beside it from this share of its gain."""
 FORM_ERROR = 0.01
-"""Error, as a share of the largest torque, that a curve of few knots may leave on held-out pulses with no effect."""
-FORM_ERROR_WITH_EFFECTS = 0.003
-"""The same if an effect is named: its law must also hold on held-out pulses."""
+"""Error, as a share of the largest torque, that a curve of few knots may leave on held-out pulses."""
 LEAST_HELD_OUT_ROWS = 40
 """With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""
 NAMED_BUT = 1.3

@@ -56,21 +56,11 @@ def _nothing(candidates: Sequence[Candidate]) -> float:
     return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - thresholds.FIRST_MARGIN, 60.0))) for c in candidates))
 
 
-def _no_effort(search: EffectSearch, explained: float) -> bool:
+def _no_effort(search: EffectSearch) -> bool:
     """Return True if apparent efforts are more likely caused by the stimulation."""
-    if explained < thresholds.LEAST_EXPLAINED_BY_EFFORTS and search.residual.significant:
-        return True
     step = search.found[0][1]
     effort, holder = str(step.added), step.searched
-    parameters = holder.parameters_of(effort)
-    widths = [value for name, value in parameters.items() if name.startswith(("width_", "decay_"))]
-    setup = holder.problem.setup
-    if 2.0 * sum(widths) > thresholds.EFFORTS_LAST * float(setup.fitted.sum()) * setup.grid.step_s:
-        return True  # true efforts are rare
-    if not only_at_work(search.quiet, holder, effort):
-        return False
-    count = sum(name.startswith("centre_") for name in parameters)
-    return "resisting" in dict(holder.effects)[effort].name or count >= thresholds.MANY_EFFORTS
+    return only_at_work(search.quiet, holder, effort) and "resisting" in dict(holder.effects)[effort].name
 
 
 def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
@@ -80,9 +70,9 @@ def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
     return before is None or after.excess_nm > thresholds.HELD_OUT_SHARE * before.excess_nm
 
 
-def _held_out(search: EffectSearch, form: float, notes: list[str]) -> tuple[HeldOutError | None, bool]:
+def _held_out(search: EffectSearch, notes: list[str]) -> tuple[HeldOutError | None, bool]:
     """The last model's error on held-out pulses, and whether it shows that structure is left; then with a note."""
-    before, after = (held_out_error(fitted, form, search.last) for fitted in (_first(search), search.last))
+    before, after = (held_out_error(fitted, search.last) for fitted in (_first(search), search.last))
     contradicted = after is not None and _contradicted(before, after)
     if after is not None and contradicted:
         notes.append(
@@ -112,7 +102,7 @@ def _notes(search: EffectSearch) -> list[str]:
 def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
     """The verdict with free effects. They name nothing: what was `named` of the library's effects stays."""
     notes, there = _notes(search), search.names("detected", "library")
-    error = _held_out(search, thresholds.FORM_ERROR_WITH_EFFECTS, notes)[0]
+    error = _held_out(search, notes)[0]
     return replace(
         before,
         kind=before.kind if named else "unexplained_structure",
@@ -149,9 +139,7 @@ def judge(search: EffectSearch) -> Verdict:
         first = residual_structure(search.start.searched, search.quiet)
         power = max(first.busy_nm**2 - residual.white_nm**2, 1e-12)
         explained = 1.0 - max(residual.busy_nm**2 - residual.white_nm**2, 0.0) / power
-    # Naming an effect claims more than naming none, so less error is allowed.
-    form = thresholds.FORM_ERROR_WITH_EFFECTS if effects else thresholds.FORM_ERROR
-    error, contradicted = _held_out(search, form, notes)
+    error, contradicted = _held_out(search, notes)
     if contradicted or _strange(search, effects, explained):
         probabilities = {effect: min(p, thresholds.DOUBTED) for effect, p in probabilities.items()}
         kind, probability = "unexplained_structure", 0.9
@@ -190,15 +178,9 @@ def _strange(search: EffectSearch, effects: list[str], explained: float) -> bool
     residual, readings = search.residual, search.raw.readings
     if readings is not None and readings.held_s > LONGEST_HELD_S:
         return True
-    if not effects:
-        refused = max((c.gain for c in search.refused if c.refused), default=0.0)
-        return residual.significant or (refused > thresholds.REFUSED and not search.last.heavy_tails)
-    if explained < thresholds.LEAST_EXPLAINED and residual.significant:
+    required = thresholds.LEAST_EXPLAINED
+    if effects and find_effect(effects[0]).band:
+        required = thresholds.LEAST_EXPLAINED_BY_BAND
+    if explained < required and residual.significant:
         return True
-    gain = search.rounds[0][0].gain if search.rounds else np.inf
-    if search.free_gain > gain + thresholds.NEXT_MARGIN and explained < thresholds.EXPLAINED_BY_LAWS:
-        return True
-    if find_effect(effects[0]).band:
-        little = explained < thresholds.LEAST_EXPLAINED_BY_BAND
-        return little and residual.ratio > thresholds.STRUCTURE_BESIDE_BAND
-    return bool(search.found) and find_effect(str(search.found[0][1].added)).sporadic and _no_effort(search, explained)
+    return bool(search.found) and find_effect(str(search.found[0][1].added)).sporadic and _no_effort(search)

@@ -51,7 +51,7 @@ class Made:
         self.at_rest = 1.0
         self.rises: set[int] = set()
         self.unseen: list[HeldOutError | None] = [None, None]
-        self.forms: list[float] = []
+        self.asked = 0
         base = fitted(0.0)
         self.raw = SimpleNamespace(readings=None)
         self.left_by_first = self.left_by_last = self.left()
@@ -73,7 +73,7 @@ class Made:
         white_nm: float = 0.0,
         scale_nm: float = 9.0,
     ) -> ResidualStructure:
-        return ResidualStructure(white_nm, busy_nm, ratio, ideal, slow_nm=0.0, scale_nm=scale_nm)
+        return ResidualStructure(white_nm, busy_nm, ratio, ideal, scale_nm=scale_nm)
 
     def add(self, effect: str, gain: float, log_likelihood: float, rival: float = 0.0, **parameters: float) -> Made:
         """One effect more, that took the log-likelihood so far."""
@@ -117,10 +117,10 @@ class Made:
         assert after is self.search.steps[number + 1].searched
         return "the error would rise" if number in self.rises else None
 
-    def _unseen(self, fit: Any, form: float, beside: Any) -> HeldOutError | None:
+    def _unseen(self, _fit: Any, beside: Any) -> HeldOutError | None:
         assert beside is self.last
-        self.forms.append(form)
-        return self.unseen[0 if fit is self.search.plain and len(self.forms) == 1 else 1]
+        self.asked += 1
+        return self.unseen[(self.asked + 1) % 2]  # that of the first model is asked for first
 
 
 @pytest.fixture
@@ -163,7 +163,6 @@ def test_an_effect_missing(made: Made):
     assert found.rivals == {FIRST: shares([candidate(FIRST, 50.0), candidate("potentiation", 48.0)])}
     assert found.probabilities == {FIRST: found.rivals[FIRST][FIRST]}
     assert found.probability == found.probabilities[FIRST]
-    assert made.forms == [0.003, 0.003], "who names an effect is held to more"
 
 
 def test_what_was_added_later_stands_on_what_was_added_before(made: Made):
@@ -188,12 +187,6 @@ def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
 EFFORTS = {f"centre_{i}": 10.0 * i for i in range(3)} | {"width_0": 1.0, "decay_0": 1.0}
 
 
-def apart(made: Made, count: int) -> None:
-    """Efforts, none of them at rest."""
-    made.at_rest = 0.0
-    made.add(EFFORT, 50.0, 90.0, **{f"centre_{i}": 5.0 * i for i in range(count)})
-
-
 def trembling(made: Made, busy_nm: float, ratio: float) -> None:
     """Explained is what it took of the power above the white noise, 0.2 N·m here, of 0.3 N·m before."""
     made.left_by_first = made.left(busy_nm=0.3, white_nm=0.2)
@@ -214,27 +207,11 @@ RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any
     ),
     "effects explain too little": (
         lambda made, likelihood, ratio: made.add(FIRST, 50.0, likelihood).leaves(ratio=ratio),
-        [(67.0, 10.1)],
-        [(68.0, 10.1), (67.0, 10.0)],
-    ),
-    "a gain without a law explains more": (
-        lambda made, nameless, likelihood: setattr(made.add(FIRST, 50.0, likelihood).search, "free_gain", nameless),
-        [(60.1, 89.0)],
-        [(60.0, 89.0), (60.1, 90.0)],
+        [(74.0, 10.1)],
+        [(75.0, 10.1), (74.0, 10.0)],
     ),
     "readings are held": (Made.held, [(0.0501,)], [(0.05,)]),
-    "many efforts, none at rest": (apart, [(4,)], [(3,)]),
-    "efforts must explain more": (
-        lambda made, likelihood, ratio: made.add(EFFORT, 50.0, likelihood, **EFFORTS).leaves(ratio=ratio),
-        [(79.0, 10.1)],
-        [(80.0, 10.1), (79.0, 10.0)],
-    ),
-    "efforts last a third of the test": (
-        lambda made, name, width_s: made.add(EFFORT, 50.0, 90.0, **{name: width_s, "height_0": 1e3}),
-        [("width_1", 16.6), ("decay_2", 16.6)],
-        [("width_1", 16.5), ("decay_2", 16.5)],
-    ),
-    "a tremor takes most of the power": (trembling, [(0.0435**0.5, 60.1)], [(0.0425**0.5, 60.1), (0.0435**0.5, 60.0)]),
+    "a tremor takes most of the power": (trembling, [(0.0455**0.5, 10.1)], [(0.0445**0.5, 10.1), (0.0455**0.5, 10.0)]),
 }
 """By what is meant: how it is made, values at which something else is missing, and values at which nothing else is."""
 
@@ -294,7 +271,6 @@ def test_rows_not_seen_may_contradict(
             "On held-out pulses the error of the last model is 2.5 times what noise and its uncertainty allow: "
             "something is still missing."
         ]
-    assert made.forms[:2] == [0.01, 0.01]
 
 
 def test_half_of_what_the_plain_structure_leaves_is_not_too_much(made: Made):
@@ -302,7 +278,6 @@ def test_half_of_what_the_plain_structure_leaves_is_not_too_much(made: Made):
     made.unseen = [first, HeldOutError(3.0, 1.0)]  # both excesses squared: 32 and 8
     assert made.judged().notes == []
     made.unseen = [first, HeldOutError(3.01, 1.0)]
-    made.forms.clear()
     assert len(made.judged().notes) == 1
 
 
