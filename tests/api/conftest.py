@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cache, partial
+from multiprocessing.forkserver import set_forkserver_preload
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from stimrig.api.cli import main
 from stimrig.api.clock import Clock
+from stimrig.api.jobs import process, worker
 from stimrig.api.people import accounts
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, database
@@ -87,6 +89,15 @@ def databases_that_need_not_last() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(database, "_durable_sqlite", quick)
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_fork_server() -> Iterator[None]:
+    """It loads what any worker of a test needs: without it every process that a test starts would load that anew."""
+    with pytest.MonkeyPatch.context() as patch:
+        loaded = [worker.VERBS, "tests.api.stub_worker", "stimrig.api.cohort.record"]
+        patch.setattr(process._Context, "set_forkserver_preload", lambda *_: set_forkserver_preload(loaded))
         yield
 
 
@@ -416,10 +427,11 @@ def pages(service: Service) -> Iterator[httpx.Client]:
 
 def soon(found: Callable[[], Any], limit_s: float = 60.0) -> Any:
     """What is found, once it is something."""
-    end = time.monotonic() + limit_s
+    end, pause_s = time.monotonic() + limit_s, 0.005
     while not (value := found()):
         assert time.monotonic() < end, value
-        time.sleep(0.02)
+        time.sleep(pause_s)
+        pause_s = min(2 * pause_s, 0.05)
     return value
 
 

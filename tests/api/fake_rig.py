@@ -160,7 +160,7 @@ class FakeRig:
     async def _speak(self) -> None:
         """What the load cell says while no test is on."""
         while True:
-            await asyncio.sleep(FRAME_S)
+            await asyncio.sleep(4 * FRAME_S)
             if self.cell_speaks and not self.mute and self.state != "running":
                 self._send(m.LiveEvent(
                     test_id=None, segment=None, elapsed_s=0.0, duration_s=0.0, zero_s=0.0,

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import asyncio
+import re
 from collections.abc import AsyncGenerator
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
 import httpx
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from stimrig import identify
 from stimrig.api.errors import ApiError
+from stimrig.api.jobs import adaptive as verbs
 from stimrig.api.jobs.job import Job
 from stimrig.api.sessions import adaptive_follower, kinds
 from stimrig.api.sessions.adaptive import AdaptiveTests
@@ -25,7 +29,9 @@ from stimrig.identify.experiments.knowledge import LEAST_PERCENT, MOST_PERCENT, 
 from stimrig.rig import messages as m
 from stimrig.rig.messages import LiveEvent, PulseOutcomes, SegmentPlan
 from stimrig.rig.requests import EnoughRequest, ExtendRequest
+from tests.api.browser import participant
 from tests.api.conftest import Service, own_service, soon, wait_done
+from tests.harness.adaptive import PULSE_RATE_HZ, recorded, sigmoid
 
 service = own_service(speed=1.0)
 """Adaptive tests are decided in seconds of the rig: it plays at the speed of the world."""
@@ -104,12 +110,6 @@ def test_enough_ends_it_well_at_any_time(client: httpx.Client, service: Service,
     assert document["summary"]["duration_s"] == pytest.approx(answer.json()["boundary_s"])
     late = client.post(f"/v1/tests/{test_id}/enough")
     assert late.status_code == 409 and late.json()["type"] == "/problems/rig-late"
-
-
-def test_a_fixed_test_knows_no_enough(client: httpx.Client, participant: str) -> None:
-    test_id = client.post("/v1/tests", json={"participant": participant}).json()["id"]
-    assert client.post(f"/v1/tests/{test_id}/enough").status_code == 422
-    client.post("/v1/stop")
 
 
 def test_out_of_reach_is_said_before_the_first_pulse(client: httpx.Client, service: Service, participant: str) -> None:
@@ -343,3 +343,66 @@ def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan(monkeypatch: pytest.Mon
     status = followed(world, monkeypatch)
     assert status.state == "fixed" and "did not answer" in status.problem
     assert [request.segments for _, request in world.requests][1:] == [[]], "it plays on at once"
+
+
+# ---- What the adviser's worker keeps between its jobs, and which models it takes -------------------------------------
+
+
+BEGIN: dict[str, Any] = {
+    "target": {"curve_percent": 4.0, "step_percent": 4.0}, "playable_s": 44.0, "max_torque_time_nm_s": 360.0,
+    "largest_us": 300.0, "pulse_rate_hz": PULSE_RATE_HZ,
+}  # fmt: skip
+
+
+def test_a_model_that_cannot_be_read_here_keeps_nobody_from_a_test() -> None:
+    widths = np.array([0.0] * 20 + [7.5 * k for k in range(1, 41)] + [300.0] * 12 + [0.0] * 36 + [150.0] * 80)
+    noise_nm = 0.05 * np.random.default_rng(3).standard_normal(4000)
+    record = recorded(sigmoid(74), widths, ["opening"] * widths.size, noise_nm)
+    readable = identify.fit(record, recruitment="near-sigmoid").to_json()
+    assert verbs.known(["{}", readable]).model.to_json() == readable
+    assert verbs.known([readable, "{}"]) is verbs.known(["no JSON"]) is None  # an older one is not the last one
+
+
+def test_a_begin_that_failed_leaves_no_test_to_advise() -> None:
+    """Nor does the end of the worker's process, in which the test was."""
+
+    def quiet(*_: object) -> None: ...
+
+    assert verbs.adaptive_begin(quiet, **BEGIN) == {}
+    with pytest.raises(TypeError):
+        verbs.adaptive_begin(quiet, **BEGIN, models=7)
+    with pytest.raises(RuntimeError, match="started again during the test"):
+        verbs.adaptive_advise(quiet)
+
+
+# ---- The pages of a test that stops itself: the choice, the question, what is known by now, Enough.
+
+
+@pytest.mark.browser
+def test_a_test_that_stops_itself_on_its_page(tab: Any, service: Service) -> None:
+    service.rig.speed = 0.25  # slow enough to look at it from all sides
+    participant(tab, service, "X1")
+    tab.locator("[name=kind][value=adaptive]").check()
+    tab.locator("[name=target]").fill("0,2")
+    tab.locator("button.stimulate").first.click()
+    tab.get_by_text("The target should be reached").wait_for()
+    tab.locator("form.steps button.stimulate").click()
+    tab.locator("#knows").wait_for()
+    service.rig.speed = 1.0
+    tab.get_by_text("Stops once both are known within 0.2 %").wait_for()
+    tab.locator("#known-words", has_text=re.compile(r"known within \d\.\d %")).wait_for()
+    tab.locator("#dose-used", has_text=re.compile(r"[1-9]")).wait_for()
+    service.rig.speed = 0.1
+    tab.locator("#least-known", has_text="140 µs").wait_for()
+    with service.client() as client:
+        test_id = client.get("/v1/tests").json()[0]["id"]
+        box = tab.get_by_role("button", name="Enough").bounding_box()
+        assert box["y"] + box["height"] < 768  # of a small laptop
+        tab.get_by_role("button", name="Enough").click()
+        tab.locator("#enough").wait_for(state="hidden")
+        document = wait_done(client, test_id)
+    assert (document["state"], document["adaptive"]["ended"]) == ("completed", "enough")
+    after = tab.context.new_page()  # the running test's page goes on to the model by itself, at a moment of its own
+    after.goto(f"{service.url}/tests/{test_id}")
+    after.get_by_text("A person said that it is enough").wait_for()
+    assert tab.errors == []

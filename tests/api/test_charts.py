@@ -16,13 +16,14 @@ import pytest
 from stimrig import identify
 from stimrig.api.charts import diagnosis_charts, joint_charts, model_charts
 from stimrig.api.charts import figure as fig
-from stimrig.api.charts.figure import LIGHT, Axis, Figure, Line, Note
+from stimrig.api.charts.figure import LIGHT, SHEET, Axis, Figure, Line, Note
 from stimrig.api.charts.interactive import for_plotly
 from stimrig.api.charts.plot import plot
 from stimrig.api.jobs.curves import curves
 from stimrig.api.sessions import joint_plan
 from tests.api import made_up_joint
-from tests.api.conftest import Service, play_test, shared_service
+from tests.api.browser import chart, look_closer, open_tab
+from tests.api.conftest import HTML, Service, play_test, shared_service, soon
 from tests.api.fake_rig import default_widths, muscle
 
 
@@ -261,3 +262,181 @@ def test_reports_have_the_joint_and_pages_of_other_models_do_not(service: Servic
         page = client.get(f"/models/{model}").text
         assert page.count('data-figure="joint_') == count and ("joint_g.svg" in page) == bool(count)
         assert client.get(f"/models/{model}/report").text.count('class="still"') == 4 + count
+
+
+# ---- Every text can be read in light and in dark: contrast ratio and relative luminance as in WCAG 2.2.
+
+
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+SURFACES = ("card", "paper", "soft", "chart")
+TEXT = [
+    *((ink, surface) for surface in SURFACES for ink in ("ink", "dim", "accent")),
+    *((ink, kind + "-bg") for kind in ("good", "warn", "bad") for ink in (kind, "ink", "dim")),
+    ("on-strong", "stimulate"), ("on-strong", "stop"),
+    ("on-primary", "accent"), ("bad", "card"), ("mark", "chart"), ("on-worst", "worst"), ("card", "good"),
+]  # fmt: skip
+"""Ink and what it stands on."""
+SEEN = [
+    *((part, surface) for part in ("edge", "stop", "stimulate", "accent") for surface in ("card", "paper")),
+    *((part, "card") for part in ("good", "warn", "cursor")),
+    *((f"series-{k}", "chart") for k in (1, 2, 3, 4, 6)),
+    *((role, "chart") for role in ("measured", "model", "residual", "width", "limit", "worst")),
+]  # fmt: skip
+"""Parts whose shape has to be seen (WCAG 1.4.11)."""
+
+
+def contrast(*colours: str) -> float:
+    """WCAG's contrast ratio of two colours, `#rgb` or `#rrggbb`."""
+    luminances = []
+    for colour in colours:
+        digits = colour[1:] if len(colour) == 7 else "".join(2 * digit for digit in colour[1:])
+        parts = [int(digits[k : k + 2], 16) / 255 for k in (0, 2, 4)]
+        linear = (part / 12.92 if part <= 0.04045 else ((part + 0.055) / 1.055) ** 2.4 for part in parts)
+        luminances.append(sum(weight * part for weight, part in zip(LUMINANCE, linear, strict=True)))
+    return (max(luminances) + 0.05) / (min(luminances) + 0.05)
+
+
+@pytest.mark.parametrize("mode", [0, 1], ids=["light", "dark"])
+def test_text_stands_out_from_what_it_stands_on(mode: int) -> None:
+    body = SHEET.read_text("utf-8").partition(":root {")[2].partition("\n}")[0]
+    pairs = re.findall(r"--([\w-]+): (?:light-dark\((\S+), (\S+)\)|(\S+));", body)
+    colours = {name: both or (light, dark)[mode] for name, light, dark, both in pairs}
+    colours = {name: colours.get(value.removeprefix("var(--").rstrip(")"), value) for name, value in colours.items()}
+    assert contrast("#767676", "#fff") == pytest.approx(4.54, abs=0.01), "the measure is the published one"
+    for least, wanted in ((4.5, TEXT), (3.0, SEEN)):
+        found = {pair: round(contrast(*(colours[name] for name in pair)), 2) for pair in wanted}
+        assert {pair: ratio for pair, ratio in found.items() if ratio < least} == {}
+
+
+# ---- Charts in a real browser: stills as they are reached, the plot library on demand --------------------------------
+
+
+LAPTOP, TABLET = {"width": 1366, "height": 768}, {"width": 820, "height": 1180}
+
+
+STROKE = """() => getComputedStyle(document.querySelector('[data-figure=step] .scatterlayer .js-line')).stroke"""
+NAMED = """(name) => { const probe = document.createElement('i'); probe.style.color = `var(--${name})`;
+  document.body.append(probe); const found = getComputedStyle(probe).color; probe.remove(); return found; }"""
+
+
+@pytest.fixture(scope="module")
+def model(service: Service) -> str:
+    return service.play_test("B1")["model_id"]
+
+
+def drawn(page: Any, service: Service, model: str, name: str) -> None:
+    page.goto(f"{service.url}/models/{model}?diagnose=0")
+    page.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    look_closer(page, name)
+
+
+@pytest.mark.browser
+def test_charts_have_the_colours_of_the_system_and_of_paper(tab: Any, service: Service, model: str) -> None:
+    tab.set_viewport_size(LAPTOP)
+    drawn(tab, service, model, "step")
+    seen = {}
+    for scheme in ("light", "dark"):
+        tab.emulate_media(color_scheme=scheme)
+        seen[scheme] = soon(lambda: (line := tab.evaluate(STROKE)) == tab.evaluate(NAMED, "model") and line)
+    assert seen["light"] != seen["dark"]
+    tab.emulate_media(media="print")
+    assert tab.evaluate(NAMED, "card") == "rgb(255, 255, 255)", "paper is white"
+    assert soon(lambda: tab.evaluate(STROKE) == seen["light"])
+
+
+AT_REST = """() => new Promise((done) => { let last = scrollY, frames = 0;
+  const look = () => { frames = scrollY === last ? frames + 1 : 0; last = scrollY;
+    frames < 30 ? requestAnimationFrame(look) : done(scrollY); };
+  look(); })"""
+"""Where the page stands once it has stood there for thirty pictures."""
+
+
+def swipe(page: Any, chart: Any) -> None:
+    """A finger from the middle of the chart upwards and a little to the side."""
+    box = chart.locator(".nsewdrag").first.bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] - 20
+    hand = page.context.new_cdp_session(page)
+    for step in range(12):
+        points = [{"x": x + 8 * step, "y": y - 20 * step}]
+        kind = "touchMove" if step else "touchStart"
+        hand.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+        page.wait_for_timeout(16)
+    hand.send("Input.dispatchTouchEvent", {"type": "touchEnd", "touchPoints": []})
+
+
+@pytest.mark.browser
+def test_a_finger_scrolls_the_page_and_zooms_when_asked(browser: Any, service: Service, model: str) -> None:
+    for page in open_tab(browser, service, has_touch=True, is_mobile=True):
+        page.set_viewport_size(TABLET)
+        drawn(page, service, model, "residual")
+        chart = page.locator("[data-figure=residual]")
+        chart.scroll_into_view_if_needed()
+        before = page.evaluate(AT_REST)
+        swipe(page, chart)
+        assert page.evaluate(AT_REST) > before + 100
+        state = "() => document.querySelector('[data-figure=residual] .plot').layout.dragmode"
+        assert page.evaluate(state) is False
+        chart.locator(".modebar-btn[data-val=zoom]").click()
+        assert page.evaluate(state) == "zoom"
+        before = page.evaluate(AT_REST)
+        assert chart.locator(".nsewdrag").first.evaluate("(plane) => getComputedStyle(plane).touchAction") == "none"
+        swipe(page, chart)
+        assert page.evaluate(AT_REST) == before, "this finger draws a box"
+        page.wait_for_function(f"() => ({state})() === false")
+        assert chart.locator(".nsewdrag").first.evaluate("(plane) => getComputedStyle(plane).touchAction") == "auto"
+
+
+# ---- stills, and the plot library that comes when it is asked for ---------------------------------------------------
+
+PLOTLY = "plotly.min.js"
+SHAPE = """(name) => { const box = document.querySelector(`[data-figure=${name}]`), fold = box.closest("details");
+  return [box.clientWidth, box.clientHeight, fold.clientHeight]; }"""
+"""Of a chart and of the fold it stands in; above it a notice may come, for instance where the machine stood still."""
+
+
+WEIGHT = """['navigation', 'resource'].flatMap((kind) => performance.getEntriesByType(kind))
+  .reduce((sum, entry) => sum + entry.encodedBodySize, 0)"""
+
+
+@pytest.mark.browser
+def test_a_page_is_light_until_a_chart_is_taken_hold_of(tab: Any, service: Service, model: str) -> None:
+    tab.set_viewport_size(LAPTOP)
+    tab.goto(f"{service.url}/models/{model}?diagnose=0")
+    chart(tab, "overview")
+    for _ in range(2):  # it is never quiet: it asks what the rig does
+        tab.wait_for_event("request", lambda request: request.url.endswith("/rig/now"))
+    asked = [url for url in tab.requests if "/figures/" in url or PLOTLY in url]
+    assert asked == [], "the first chart stands in the page, and the others are folded"
+    assert tab.evaluate(WEIGHT) < 80_000, "with the curves of a real record about 90 kB"
+    assert "application/json" not in tab.content()
+    tab.locator("#curves > summary").click()
+    chart(tab, "recruitment")
+    chart(tab, "step")  # beside it: the fold has its height once both are there
+    before = tab.evaluate(SHAPE, "recruitment")
+    assert any("recruitment.html" in url for url in tab.requests) and not any(PLOTLY in url for url in tab.requests)
+    look_closer(tab, "recruitment")
+    assert tab.evaluate(SHAPE, "recruitment") == before, "nothing jumps"
+    assert tab.locator("[data-figure=recruitment] > svg.still").count() == 0
+    assert any("recruitment.json" in url for url in tab.requests) and any(PLOTLY in url for url in tab.requests)
+    assert not any("step.json" in url or "comparison" in url for url in tab.requests), "one chart's lines alone"
+
+
+def test_charts_are_private_kept_and_asked_about_again(service: Service, model: str) -> None:
+    with service.client() as http:
+        page = http.get(f"/models/{model}", headers=HTML).text
+        assert '<noscript><img class="still" src="' in page, "pictures where scripts are off"
+        at = f"/models/{model}/figures/comparison"
+        still = http.get(at + ".html?width=900")
+        assert still.headers["cache-control"] == "private, no-cache" and 'viewBox="0 0 900 720"' in still.text
+        again = http.get(at + ".html?width=900", headers={"If-None-Match": still.headers["etag"]})
+        assert again.status_code == 304 and not again.content
+        assert len(still.content) < 60_000 and "var(--" in still.text
+        kept = http.get(at + ".svg")
+        assert kept.headers["content-type"].startswith("image/svg+xml") and "var(--" not in kept.text
+        assert {"data", "layout", "config"} == set(http.get(at + ".json").json())
+        for wrong in ("none.svg", "comparison.exe", "comparison.pdf", "comparison"):
+            assert http.get(f"/models/{model}/figures/{wrong}").status_code == 404
+        assert http.get(at + ".svg?width=5").status_code == 422
+    with service.client(None) as http:
+        for kind in ("html", "svg", "json"):
+            assert http.get(f"{at}.{kind}", headers={"If-None-Match": still.headers["etag"]}).status_code == 401

@@ -1,4 +1,4 @@
-"""The verbs: what they print, what they refuse, and with which exit code."""
+"""The verbs: what they print, refuse and leave behind, with which exit code; what `doctor` finds; Ctrl-C."""
 
 from __future__ import annotations
 
@@ -6,22 +6,30 @@ import contextlib
 import csv
 import io
 import json
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
 from unittest.mock import Mock
 
+import httpx
 import numpy as np
 import pytest
 
 from bench.muscles import hidden_records
 from stimrig import identify
 from stimrig.api.cli import main
+from stimrig.api.cli.commands import doctor
+from stimrig.api.cli.commands.doctor import Finding, examine
 from stimrig.api.progress_bar import progress_bar
+from stimrig.api.settings import Settings
 from stimrig.identify.healing import place_words
+from tests.api.conftest import Service, soon
 from tests.api.test_jobs import made_up_csv
 from tests.api.test_schemas import unmet
 from tests.harness import few_effects
+from tests.harness.processes import READY_TIMEOUT_S
 
 pytestmark = pytest.mark.slow
 
@@ -190,15 +198,11 @@ def test_the_help_lists_the_verbs_line_by_line(given: str, capsys: pytest.Captur
         assert f"\n  {verb} " in out + err, verb
 
 
-def test_emulate_hands_everything_on() -> None:
-    done = subprocess.run([sys.executable, "-m", "stimrig", "emulate", "--help"], capture_output=True, text=True)
-    assert (done.returncode, done.stderr) == (0, "") and "--hidden SEED" in done.stdout
-
-
 def test_a_verb_does_not_wait_for_the_libraries_of_others() -> None:
-    code = "import sys; from stimrig.api.cli.main import build; build('diagnose'); print('sqlalchemy' in sys.modules)"
+    """Nor does that of cohorts load without the extra that it names."""
+    code = "import sys; from stimrig.api.cli.main import build; build('diagnose'); build('cohort'); print(*sys.modules)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
+    assert not {"sqlalchemy", "dask", "distributed", "pyarrow", "fsspec"} & set(done.stdout.split())
 
 
 def test_a_fit_of_two_is_of_both(parts: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -274,3 +278,149 @@ def test_the_verbs_mean_the_same_by_a_structure_and_give_one_verdict(tired: Path
     names = {f"{name}{kind}" for name in ("story-torque", "story-place", "falling") for kind in kinds}
     assert {path.name for path in figures.iterdir()} == names
     assert all(path.read_bytes().startswith(kinds[path.suffix]) for path in figures.iterdir())
+
+
+# ---- `stimrig doctor` says what is wrong and how to fix it -----------------------------------------------------------
+
+
+RIG = """data_dir = "{folder}"
+socket = "{folder}/rig.sock"
+[stimulator]
+device = "p24"
+port = "{port}"
+[load_cell]
+device = "can_load_cell"
+bus = {{ interface = "{interface}", channel = "{channel}" }}
+"""
+
+
+def rig_file(folder: Path, port: str = "/dev/null", interface: str = "slcan", channel: str = "/dev/null") -> Path:
+    path = folder / "rig.toml"
+    path.write_text(RIG.format(folder=folder, port=port, interface=interface, channel=channel))
+    return path
+
+
+def finding(name: str, **settings: object) -> Finding:
+    check = getattr(doctor, f"check_{name.replace(' ', '_')}")
+    return next(found for found in check(Settings(**settings)) if found.check == name)
+
+
+def test_sound_machine_exits_0_and_one_json_object(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.run(["doctor", "--data", str(tmp_path), "--rig", str(rig_file(tmp_path)), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    verdicts = {found["check"]: found["verdict"] for found in report["findings"]}
+    assert verdicts["rig file"] == verdicts["stimulator"] == verdicts["load cell"] == "ok"
+    assert set(verdicts) >= {"data folder", "disk", "priority", "database"}
+
+
+def test_missing_devices_exit_1_with_the_mend(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = rig_file(tmp_path, port=str(tmp_path / "not-there"), interface="socketcan", channel="can77")
+    assert main.run(["doctor", "--data", str(tmp_path), "--rig", str(path)]) == 1
+    out = capsys.readouterr().out
+    assert "not-there is not there" in out and "plug it in" in out
+    assert "there is no interface can77" in out and "stimrig-can@can77" in out
+
+
+def test_wrong_key_of_the_rig_file_is_named(tmp_path: Path) -> None:
+    path = rig_file(tmp_path)
+    path.write_text(path.read_text().replace("port =", "prot ="))
+    found = finding("rig file", rig_file=path, data_dir=tmp_path)
+    assert found.verdict == "fails" and "stimulator.port" in found.says
+
+
+def test_each_check_of_the_machine_finds_what_is_wrong(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Little room, a folder open to all, a check that breaks, no port."""
+    monkeypatch.setattr(doctor.shutil, "disk_usage", lambda _: Mock(free=0.1e9))
+    monkeypatch.setattr(doctor, "check_rights", Mock(side_effect=RuntimeError("no such thing")))
+    for mode, fix in ((0o755, "chmod o-rwx"), (0o750, "")):
+        tmp_path.chmod(mode)
+        found = {one.check: one for one in examine(Settings(data_dir=tmp_path))}
+        assert found["data folder"].fix.partition(" /")[0] == fix
+    assert found["disk"].verdict == "fails" and "no such thing" in found["rights"].says
+    assert doctor.examine_port("stimulator", Path(__file__)).verdict == "fails"
+
+
+def test_rig_that_is_not_there_or_stands_still(service: Service, client: httpx.Client, tmp_path: Path) -> None:
+    assert finding("rig", data_dir=tmp_path, rig_socket=tmp_path / "none.sock").verdict == "fails"
+    assert finding("rig", data_dir=tmp_path, rig_socket=service.rig.path).verdict == "ok"
+    client.post("/v1/stop")
+    found = finding("rig", data_dir=tmp_path, rig_socket=service.rig.path)
+    assert found.verdict == "fails" and "latched" in found.says and "re-arm" in found.fix
+
+
+def test_tampered_trail_is_found(service: Service) -> None:
+    assert finding("database", data_dir=service.data).verdict == "ok"
+    service.sql("UPDATE audit SET who = 'nobody' WHERE seq = 1")
+    assert finding("database", data_dir=service.data).verdict == "fails"
+
+
+# ---- Ctrl-C ends long work: the process is gone, its copies too, and no file is half-written -------------------------
+
+
+BUSY = """
+import signal, sys, time
+from stimrig import identify
+from stimrig.api.cli import main
+
+def hold(*_, **__):
+    print("computing", file=sys.stderr, flush=True)
+    while True:
+        try:
+            time.sleep(60)
+        except KeyboardInterrupt:
+            pass
+
+identify.explain = hold
+main.main(sys.argv[1:])
+"""
+"""As a library that calls us from its C code: the exception is dropped."""
+SLOW = """
+import sys, time
+
+class Slow:
+    def find_spec(name, *_):
+        if name == "numpy":
+            print("loading", file=sys.stderr, flush=True)
+            time.sleep(600)
+
+sys.meta_path.insert(0, Slow)
+sys.argv = ["stimrig", "diagnose", sys.argv[1]]
+from stimrig.__main__ import main
+main()
+"""
+
+
+def interrupted(log: Path, said: str, *words: object) -> tuple[int, str]:
+    """Begin a command, interrupt it once it has said something; its process group, and all that it said."""
+    with log.open("wb") as file:
+        process = subprocess.Popen([sys.executable, *map(str, words)], stdout=file, stderr=file, start_new_session=True)
+    soon(lambda: said in log.read_text() or process.poll() is not None, READY_TIMEOUT_S)
+    os.killpg(process.pid, signal.SIGINT)
+    assert process.wait(timeout=READY_TIMEOUT_S) == 130, log.read_text()
+    return process.pid, log.read_text()
+
+
+def test_ctrl_c_ends_a_verb_whatever_it_is_in(record: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out" / "MODEL.json"
+    output.parent.mkdir()
+    output.write_text("as it was")
+    _, said = interrupted(tmp_path / "log", "computing", "-c", BUSY, "explain", record, "-o", output)
+    assert "interrupted" in said and "Traceback" not in said
+    assert output.read_text() == "as it was" and [path.name for path in output.parent.iterdir()] == ["MODEL.json"]
+
+
+def test_ctrl_c_while_libraries_are_loaded_is_no_traceback(record: Path, tmp_path: Path) -> None:
+    assert "Traceback" not in interrupted(tmp_path / "log", "loading", "-c", SLOW, record)[1]
+
+
+def test_copies_of_a_search_end_with_it(record: Path, tmp_path: Path) -> None:
+    watched = ("-X", "importtime", "-m", "stimrig", "explain", record)
+    group, _ = interrupted(tmp_path / "log", "stimrig.identify.diagnosis.free", *watched)
+    soon(lambda: all(_group(path) != group for path in Path("/proc").glob("[0-9]*")), READY_TIMEOUT_S)
+
+
+def _group(process: Path) -> int:
+    try:
+        return int((process / "stat").read_text().rsplit(")", 1)[1].split()[2])
+    except (OSError, IndexError):
+        return 0

@@ -10,7 +10,7 @@ from tests.api.browser import NAME, PASSWORD, expected, open_tab, settled, there
 from tests.api.conftest import Service, shared_service
 
 pytestmark = pytest.mark.browser
-service = shared_service(speed=4.0)
+service = shared_service()
 FOCUSED = """() => { const e = document.activeElement, s = getComputedStyle(e), b = e.getBoundingClientRect();
   const label = e.labels && e.labels.length ? e.labels[0].textContent : e.getAttribute('aria-label') || e.textContent;
   return {names: [e.id, label.trim()], ring: s.outlineStyle !== 'none' && parseFloat(s.outlineWidth) >= 1,
@@ -76,11 +76,14 @@ def calibrate(hand: Hand) -> None:
     page.get_by_text("Start the pre-session test").first.wait_for()
 
 
-def play_and_approve(hand: Hand) -> None:
-    """From the participant's page to an approved model; the model's page comes by itself."""
+def play_and_approve(hand: Hand, service: Service) -> None:
+    """From the participant's page to an approved model; the model's page comes by itself once the test's is there."""
+    service.rig.speed = 1.0
     hand.press("Start the pre-session test")
     hand.page.get_by_role("heading", name="Start the pre-session test of").wait_for()
     hand.press("Start now")
+    hand.page.locator("#age", has_text="ms").wait_for()
+    service.rig.speed = 60.0
     hand.page.wait_for_url("**/models/*")
     hand.type("approve-password", PASSWORD)
     hand.enter()
@@ -103,7 +106,7 @@ def test_from_signing_in_to_an_approved_model(browser: Any, service: Service) ->
             page.keyboard.press("Tab")
             assert page.evaluate("document.activeElement.textContent.trim()") == name
         calibrate(hand)
-        play_and_approve(hand)
+        play_and_approve(hand, service)
         assert hand.count == 10, "name, password, in; code, create; begin; start, now; password, approve"
         hand.press("Sign out")
         page.get_by_role("heading", name="Sign in").wait_for()
@@ -113,5 +116,5 @@ def test_from_signing_in_to_an_approved_model(browser: Any, service: Service) ->
         hand.press("Calibrate")  # it holds for today; the next day the line begins it, as above
         page.get_by_role("heading", name="Begin").wait_for()
         page.go_back()
-        play_and_approve(hand)
+        play_and_approve(hand, service)
         assert hand.count <= 9, "the one that looks at the calibration stands for the one that begins it"

@@ -96,7 +96,7 @@ def test_killed_at_any_moment_nothing_acknowledged_is_lost(tmp_path: Path, short
                 soon(lambda more=people: len(kept.participants) > more, 120)  # else there is nothing to lose yet
                 if number < 2:
                     soon(lambda more=tests: len(kept.tests) > more, 120)
-                time.sleep(moments.uniform(0.3, 1.8))
+                time.sleep(moments.uniform(0.1, 0.6))
                 process.kill()
                 clinic.join(90)
                 assert not clinic.is_alive()

@@ -6,7 +6,6 @@ import asyncio
 import json
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
-from pathlib import Path
 from typing import Any
 
 import httpx
@@ -16,22 +15,24 @@ from websockets.sync.client import ClientConnection
 
 from stimrig.api.store.audit import digest
 from stimrig.api.store.tables import PageSession, Token
-from stimrig.api.web.routes.tests import _next
-from tests.api.conftest import PASSWORD, STUB, TOKEN, Service, person, run_service
+from stimrig.api.web.routes import tests
+from tests.api.conftest import PASSWORD, TOKEN, Service, person, shared_service
+
+served = shared_service(speed=0.02, idle_min=10)
+
+
+@pytest.fixture
+def service(served: Service, monkeypatch: pytest.MonkeyPatch) -> Service:
+    """Each channel looks five times a second whether it may go on; so fifteen frames are three looks."""
+    monkeypatch.setattr(tests, "LOOK_S", 0.2)
+    return served
 
 
 @pytest.fixture(scope="module")
-def service(tmp_path_factory: pytest.TempPathFactory, short_dir: Path) -> Iterator[Service]:
-    for service in run_service(tmp_path_factory.mktemp("watch"), short_dir, STUB, speed=0.02, idle_min=10):
-        with service.client() as admin:
-            admin.post("/v1/participants", json={"code": "P017"})
-        yield service
-
-
-@pytest.fixture(scope="module")
-def test_id(service: Service) -> str:
+def test_id(served: Service) -> str:
     """A test that outlasts this module."""
-    with service.client() as admin:
+    with served.client() as admin:
+        admin.post("/v1/participants", json={"code": "P017"})
         return admin.post("/v1/tests", json={"participant": "P017"}).json()["id"]
 
 
@@ -59,7 +60,7 @@ def last(socket: ClientConnection, code: int = 4401) -> dict[str, Any]:
 
 def goes_on(socket: ClientConnection) -> None:
     """All that has come, and a frame after it."""
-    for _ in range(60):
+    for _ in range(15):
         assert json.loads(socket.recv(20))["type"] in ("test", "live", "idle", "state")
 
 
@@ -147,7 +148,7 @@ def test_a_message_at_the_moment_of_closing_does_not_keep_the_channel_open(turns
 
         async def pump() -> None:
             while True:
-                await _next(queue)
+                await tests._next(queue)
 
         task = asyncio.create_task(pump())
         await asyncio.sleep(0.01)

@@ -10,7 +10,7 @@ import pytest
 from sqlalchemy import event
 
 from stimrig.api.store.tables import Participant
-from tests.api.conftest import Service, run_test, shared_service, signed_in, soon, wait_done
+from tests.api.conftest import Service, run_test, shared_service, soon, wait_done
 
 service = shared_service()
 
@@ -170,15 +170,3 @@ def test_what_is_no_note_is_refused(made: tuple[httpx.Client, dict[str, Any]], f
     answer = http.post("/v1/participants/N1/notes", json=fields)
     assert answer.status_code == 422 and len(answer.text) < 2000, answer.text[:500]
     assert len(http.get("/v1/participants/N1/notes").json()) == before
-
-
-def test_every_page_shows_the_same_fit(service: Service, client: httpx.Client) -> None:
-    client.post("/v1/participants", json={"code": "F1"})
-    first = run_test(client, "F1")["model_id"]
-    pages = ("/", "/participants/F1", "/participants/F1/trend", f"/models/{first}", f"/models/{first}/report")
-    with signed_in(service) as browser:
-        for place in pages:
-            page = browser.get(place).text
-            assert "97.9" in page, place
-            told = "On held-out pulses (not used for fitting)"
-            assert told in page or place not in ("/", "/participants/F1"), "a model's own page says it in words"

@@ -13,6 +13,7 @@ import pytest
 import stimrig
 from stimrig.api import errors
 from stimrig.api.sessions import runner
+from stimrig.api.store.tables import Model
 from stimrig.rig.messages import Problem as RigProblem
 from tests.api.conftest import Service, let_go, run_test, soon, wait_done
 
@@ -142,15 +143,6 @@ def test_upload_of_a_parquet_file(client: httpx.Client, participant: str, column
     assert kept.headers["content-type"].startswith(kind) and (kept.content == sent) == (not columns)
 
 
-def test_upload_of_a_table_with_a_wrong_name_is_one_line(client: httpx.Client, service: Service, participant: str):
-    where = f"/v1/participants/{participant}/recordings"
-    answer = client.post(where, content=GOOD_HEADER + "0,0,0,rest\n" * 9, params={"map": "torque_nm=Kraft:Nm"})
-    detail = problem(answer, 422)["detail"]
-    assert "the upload, line 1: no column 'Kraft:Nm' for torque_nm. It has: time_s, pulse_width_us" in detail
-    assert str(service.data) not in answer.text
-    assert list((service.data / "recordings").rglob("upload-*")) == []
-
-
 def test_upload_too_large_or_empty(client: httpx.Client, service: Service, participant: str) -> None:
     service.context.settings.max_upload_mb = 0.001
     problem(client.post(f"/v1/participants/{participant}/recordings", content=b"x" * 2000), 413)
@@ -161,3 +153,52 @@ def test_upload_too_large_or_empty(client: httpx.Client, service: Service, parti
 def test_unforeseen_error_is_a_problem_too(client: httpx.Client, service: Service, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(service.context.versions, "get", Mock(side_effect=RuntimeError("secret detail")))
     assert "secret detail" not in str(problem(client.get("/v1/models/M1"), 500))
+
+
+# ---- Damaged bytes of a stored model keep nobody from a test, and cost what is read off that model only.
+
+
+ASKED = {"participant": "P017"}
+
+
+def damage(service: Service, model_id: str) -> None:
+    """A bit that has turned on the disk."""
+    body = service.context.versions.get(model_id).document
+    service.change(Model, model_id, document=body.replace(b"1", b"2", 1))
+
+
+def test_everything_that_is_not_read_off_it_is_there(
+    client: httpx.Client, service: Service, pages: httpx.Client, approved: str
+) -> None:
+    test_id = client.get("/v1/tests").json()[0]["id"]
+    damage(service, approved)
+    assert client.post("/v1/preview", json=ASKED).json()["torque_time_nms"] is None, "the estimate alone is missing"
+    for path in ("tests", "participants/P017", "participants/P017/models", "participants/P017/trend"):
+        assert client.get(f"/v1/{path}").status_code == 200, path
+    assert client.get(f"/v1/tests/{test_id}").json()["fit"]["verdict"] == "usable", "kept beside it"
+    for path in ("/", "/participants/P017", "/participants/P017/next", "/participants/P017/trend",
+                 f"/tests/{test_id}"):  # fmt: skip
+        assert pages.get(path).status_code == 200, path
+    for path in (f"/models/{approved}", f"/models/{approved}/report"):
+        page = pages.get(path, headers={"Connection": "close"})
+        assert page.status_code == 500 and "The stored model is damaged" in page.text and approved in page.text
+    for path in ("", "/comparison", "/diagnosis"):
+        told: Any = problem(client.get(f"/v1/models/{approved}{path}"), 500)
+        assert told["type"] == "/problems/model-damaged" and "from a backup" in told["detail"]
+    assert run_test(client, "P017")["state"] == "completed", "the next test has a model of its own"
+
+
+def test_a_damaged_model_reaches_no_controller_and_is_not_approved(
+    client: httpx.Client, service: Service, approved: str
+) -> None:
+    seen = {"If-Match": client.get(f"/v1/models/{approved}").headers["etag"]}
+    damage(service, approved)
+    for answer in (
+        client.get("/v1/participants/P017/model"),
+        client.get(f"/v1/models/{approved}/file"),
+        client.post(f"/v1/models/{approved}/approve", json={"reason": "again"}, headers=seen),
+    ):
+        assert problem(answer, 500)["type"] == "/problems/model-damaged"
+    assert client.get("/metrics").status_code == 200
+    assert client.post(f"/v1/models/{approved}/reject", json={"reason": "damaged"}, headers=seen).status_code == 200
+    assert problem(client.get("/v1/participants/P017/model"), 404)["type"] == "/problems/no-approved-model"

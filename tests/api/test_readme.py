@@ -1,4 +1,4 @@
-"""The README's commands: those of the command line are run, those of make are in the Makefile, links lead somewhere."""
+"""README, tutorial and docs/python.md do what they say: commands and blocks run, targets of make and links exist."""
 
 from __future__ import annotations
 
@@ -10,33 +10,33 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
 
+import stimrig
+from bench.muscles import hidden_records
 from stimrig.api.cli import main
 from stimrig.api.cli.commands import test as test_verb
 from stimrig.api.cli.errors import InputError
+from tests.api.conftest import TOKEN, Service
+from tests.api.test_jobs import made_up_csv
 from tests.harness import few_effects
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text("utf-8")
 
 
-def blocks(language: str) -> list[str]:
-    """The lines of all fenced blocks in a language."""
-    found, inside = [], None
-    for line in README.splitlines():
-        if line.startswith("```"):
-            inside = line[3:] if inside is None else None
-        elif inside == language and line.strip():
-            found.append(line)
-    return found
+def blocks(language: str, text: str = README) -> list[str]:
+    """The fenced blocks of a page in a language."""
+    found = re.findall(r"^```(\w*)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    return [block for kind, block in found if kind == language]
 
 
 def test_make_commands_are_targets_of_the_makefile() -> None:
     targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
-    wanted = [words.split()[1] for words in blocks("") + re.findall(r"`(make [^`]*)`", README)]
+    wanted = [words.split()[1] for words in "".join(blocks("")).splitlines() + re.findall(r"`(make [^`]*)`", README)]
     assert {"demo", "test", "serve"} <= set(wanted) <= targets
 
 
@@ -53,7 +53,7 @@ def test_commands_do_what_they_are_said_to(tmp_path: Path, monkeypatch: pytest.M
     """The first test is played, shorter, and stands in for the other; a diagnosis has two effects to choose from."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("STIMRIG_WORKERS", "1")  # each loads and compiles for seconds before it is needed
-    commands = blocks("sh")
+    commands = "".join(blocks("sh")).splitlines()
     assert len(commands) >= 9
     with few_effects.only("fatigue", "output_saturation"):
         for command in commands:
@@ -75,3 +75,48 @@ def test_commands_do_what_they_are_said_to(tmp_path: Path, monkeypatch: pytest.M
             assert out.getvalue().strip(), command
     for name in ("first.h5", "MODEL.json", "predicted.csv", "report.html", "hidden.h5", "story.html", "better.json"):
         assert (tmp_path / "out" / name).stat().st_size > 1000, name
+
+
+# ---- docs/tutorial.md does what it says: its commands are run, its blocks executed in order --------------------------
+
+
+TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text("utf-8")
+STRANGE = re.compile(r"^## A muscle that no library holds\n.*?(?=^## )", re.MULTILINE | re.DOTALL)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("strange", [False, pytest.param(True, marks=pytest.mark.campaign)])
+def test_every_block_runs_in_order(tmp_path: Path, strange: bool) -> None:
+    """The section on a strange muscle takes a minute; tests/identify/test_free_effects.py has a short one."""
+    (command,) = blocks("sh", TUTORIAL)
+    program, words = command.split()[:3], command.split()[3:]
+    assert program == ["python", "-m", "bench.muscles.hidden_records"]
+    words[words.index("data")] = str(tmp_path)
+    assert hidden_records.main(words) == 0
+    (path,) = tmp_path.glob("*.csv")
+    scope: dict[str, Any] = {"path": path}
+    pieces = blocks("python", TUTORIAL if strange else STRANGE.sub("", TUTORIAL))
+    assert len(pieces) == (12 if strange else 8)
+    more = ("output_saturation", "free_gate", "free_speed") if strange else ()
+    with few_effects.only("asymmetric_relaxation", "fatigue", *more):
+        for piece in pieces:
+            exec(compile(piece, "tutorial.md", "exec"), scope)
+    if strange:
+        opened_ms, closed_ms = (int(one) for one in re.findall(r"(\d+) ms", scope["free"]["words"]))
+        assert 15 <= opened_ms <= 25 and 70 <= closed_ms <= 90, scope["free"]["words"]
+    assert [*stimrig.plot(scope["better"]).lines()] == ["fitted pulses", "held-out pulses"]
+
+
+PYTHON = (ROOT / "docs" / "python.md").read_text("utf-8")
+
+
+def test_every_block_of_the_page_on_python_runs_in_order(tmp_path: Path, service: Service) -> None:
+    pieces = blocks("python", PYTHON)
+    assert len(pieces) >= 9
+    path, other = made_up_csv(tmp_path / "first.csv"), tmp_path / "other.csv"
+    stimrig.save((record := stimrig.read(path)).with_torque(1.1 * record.torque_nm), other)
+    scope: dict[str, Any] = {"path": path, "other_path": other, "folder": tmp_path, "url": service.url, "token": TOKEN}
+    with few_effects.only("threshold_drift", "recruitment_hysteresis"):
+        for piece in pieces:
+            exec(compile(piece, "python.md", "exec"), scope)
+    assert (scope["run"]["ok"], scope["run"]["errors"]) == (1, 0)

@@ -6,22 +6,27 @@ import hashlib
 import json
 import math
 from collections.abc import Iterator
+from email.utils import parsedate_to_datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import httpx
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
+from stimrig.api import local_time
 from stimrig.api.errors import ApiError
 from stimrig.api.models import tracking
 from stimrig.api.models.tracked import TrackedVersions
-from stimrig.api.models.tracking import NEW_TEST, Limits
-from stimrig.api.store.tables import Approval, Model, Test, Tracked
+from stimrig.api.models.tracking import NEW_TEST, OUTCOMES, Limits, sentences
+from stimrig.api.sessions import trials as trials_module
+from stimrig.api.store.tables import Approval, Model, Recording, Test, Tracked
+from stimrig.api.web.responses.models import TrialOut
 from stimrig.rig.messages import FinishedEvent
 from tests.api import stub_worker
 from tests.api.clinic import Clinic
-from tests.api.conftest import STUB, Service, run_test, serving, soon, wait_done
+from tests.api.conftest import REAL, STUB, Service, run_test, serving, soon, wait_done
 
 WIDTHS = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": [100.0] * 40}}]
 MODEL, TRACKING = "/v1/participants/P017/model", "/v1/participants/P017/tracking"
@@ -270,9 +275,12 @@ def test_a_trial_that_is_told_twice_moves_nothing_twice(service: Service, client
     assert tracked(client).content == before.content and len(trials(client)) == 1
 
 
-def test_a_slow_worker_keeps_no_test_waiting(service: Service, client: httpx.Client, approved: str) -> None:
+def test_a_slow_worker_keeps_no_test_waiting(
+    service: Service, client: httpx.Client, approved: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Who fetches meanwhile gets what was known before."""
-    say(service, slow_s=6.0)
+    monkeypatch.setattr(trials_module, "PATIENCE_S", 0.2)
+    say(service, slow_s=3.0)
     play(client)
     assert trials(client) == [] and tracked(client).content == client.get(MODEL).content
     play(client)
@@ -377,3 +385,154 @@ def test_next_to_no_torque_asks_for_a_look_at_the_electrodes_first() -> None:
     said = tracking.new_test_reason(3, step("no-torque"), Limits().bounds(80.0))
     assert said is not None and said.startswith("In trial 3 the pulses gave next to no torque. Look at the electrodes")
     assert said.endswith(tracking.NEW_TEST)
+
+
+# ---- The page of a participant while a controller plays trials: what is seen, without reload, and what is asked.
+
+
+PAGE = "/participants/P017"
+
+
+def trial(number: int = 1, distance: float | None = 2.0, **levels: tuple[float, float, float]) -> dict[str, Any]:
+    usual = {"gain": (1.0, 0.96, 1.04), "threshold_shift_us": (0.0, -1.0, 1.0), "time_scale": (1.0, 0.95, 1.05)}
+    now = {name: dict(zip(("value", "low", "high"), level, strict=True)) for name, level in (usual | levels).items()}
+    at_utc = "2026-11-22T12:00:00.000Z"
+    return {"number": number, "now": now, "at_utc": at_utc, "outcome": "followed", "distance": distance}
+
+
+SINCE = "2026-11-22T11:05:00.000Z"
+
+
+@pytest.mark.parametrize(
+    ("levels", "words"),
+    [
+        ({"gain": (0.77, 0.75, 0.79)}, "In trial 2 the plateau is 23.0 % lower than on {}."),
+        ({"gain": (1.052, 1.01, 1.09)}, "In trial 2 the plateau is 5.2 % higher than on {}."),
+        ({"threshold_shift_us": (-3.0, -4.0, -2.0)}, "In trial 2 the threshold is 3.0 µs lower than on {}."),
+        ({"time_scale": (1.2, 1.1, 1.3)}, "In trial 2 the muscle is 20.0 % slower than on {}."),
+        ({}, "By trial 2 no change since {} is certain."),
+        ({"gain": (0.77, 0.5, 1.01)}, "By trial 2 no change since {} is certain."),
+    ],
+)
+def test_only_what_the_bands_are_sure_of_is_said(levels: Any, words: str) -> None:
+    (said,) = sentences([trial(), trial(2, **levels)], SINCE)
+    assert said == words.format(local_time.when(SINCE))
+
+
+def test_a_trial_that_taught_the_model_nothing_changes_no_sentence() -> None:
+    """What is known after it is what was expected before."""
+    learnt = trial(1, gain=(0.8, 0.78, 0.82))
+    for outcome in ("odd", "contradicts", "no-torque"):
+        unexplained = {**trial(2, distance=None, gain=(0.7, 0.6, 0.75)), "outcome": outcome}
+        assert sentences([learnt, unexplained], SINCE) == sentences([learnt], SINCE), outcome
+        assert sentences([unexplained], SINCE) == []
+
+
+def test_every_outcome_of_the_service_has_words() -> None:
+    told = get_args(TrialOut.model_fields["outcome"].annotation)
+    assert set(told) == set(OUTCOMES)
+    assert len(set(OUTCOMES.values())) == len(told)
+
+
+@pytest.mark.browser
+def test_the_card_is_renewed_while_trials_are_played(service: Service, client: httpx.Client, approved: str, tab: Any):
+    # while a trial runs something else is next, and the page would be loaded anew
+    tab.goto(service.url + PAGE)
+
+    def same_line(route: Any) -> None:
+        route.fulfill(json={**route.fetch().json(), "key": tab.locator("#next").get_attribute("data-next-key")})
+
+    tab.route(f"**{PAGE}/next", same_line)
+    tab.evaluate("window.same = true")
+    for number in (1, 2):
+        play(client)
+        tab.get_by_text(f"as of trial {number},").wait_for()
+    assert tab.evaluate("window.same") is True, "without reload"
+    tab.get_by_text("All trials as a table").click()
+    say(service, values={"gain": 0.7})
+    play(client)
+    asked = tab.locator("#trials .notice")
+    asked.wait_for()
+    tab.reload()
+    tab.get_by_text("See why").wait_for()
+    table = tab.locator("#trials details")
+    table.locator("summary").click()
+    say(service, reason="the record is too short")
+    play(client)
+    tab.get_by_text("the record is too short").wait_for()
+    assert tab.evaluate("document.activeElement.tagName") == "SUMMARY", "who opened the table stays there"
+    assert asked.get_attribute("role") is None, "the same question is read aloud once"
+    tab.unroute_all(behavior="ignoreErrors")
+    tab.get_by_role("button", name="Start the adaptive test").first.click()
+    tab.get_by_role("button", name="Start now").wait_for()
+    assert tab.errors == []
+
+
+# ---- The worker's side of tracking, with identify itself: recordings in, the model for the next trial out.
+
+
+# ---- What the muscle did between two trials: the service passes it on, the worker carries its effects through it
+
+
+def passed_on(service: Service, approval_id: int) -> list[list[str]]:
+    """For each trial that was followed, the recordings that the worker was given beside its own."""
+    store = service.context.store
+    names = {row.path: row.id for row in store.all(Recording)}
+    rows = service.context.tracked.rows(approval_id)
+    return [[names[path] for path in row.step["state"]["between"]] for row in rows if row.step is not None]
+
+
+def test_the_worker_is_given_what_was_played_since(service: Service, client: httpx.Client, participant: str) -> None:
+    tested = run_test(client, participant)
+    plain = tested["model_id"]
+    assert client.post(f"/v1/models/{plain}/approve").status_code == 200
+    first = play(client)
+    soon(lambda: passed_on(service, 1) == [[]])  # a model without effects
+    added = client.post(f"/v1/models/{plain}/effects", json={"effects": ["fatigue"]}).json()["id"]
+    assert client.post(f"/v1/models/{added}/approve").status_code == 200
+    play(client)
+    say(service, reason="It cannot be read.")
+    missed = play(client)
+    client.put(f"/v1/participants/{participant}/profile", json={"current_ma": 15.0})
+    play(client)  # at another current: nobody knows how much it tires
+    client.put(f"/v1/participants/{participant}/profile", json={"current_ma": 20.0})
+    play(client)
+    play(client)
+    expected = [[tested["recording_id"], first["recording_id"]], [missed["recording_id"]], []]
+    soon(lambda: passed_on(service, 2) == expected)
+
+
+# ---- from a trial to the tracked model that is served; nothing is stubbed but the rig ----------------------------
+
+PERSON = "/v1/participants/P1"
+TRIAL_US = np.r_[np.zeros(40), np.linspace(0, 160, 100), np.full(60, 160.0), np.linspace(160, 0, 100), np.zeros(40)]
+TRIAL = [{"name": "trial", "sequence": "widths", "settings": {"pulse_width_us": TRIAL_US.round().tolist()}}]
+BODY = {"participant": "P1", "kind": "sequence", "segments": TRIAL}
+
+
+def test_a_muscle_that_stays_is_followed_through_the_service(tmp_path: Path, short_dir: Path) -> None:
+    with serving(tmp_path, short_dir, REAL) as (_, client):
+        client.timeout = 300
+        client.post("/v1/participants", json={"code": "P1"})
+        test = run_test(client, "P1", 300)
+        assert client.post(f"/v1/models/{test['model_id']}/approve").status_code == 200
+        for number in (1, 2):
+            wait_done(client, client.post("/v1/tests", json=BODY).json()["id"], 300)
+            served = client.get(f"{PERSON}/model", params={"tracked": True})
+            for _ in range(60):  # a fetch waits two seconds at most, and the first trial may wait for the worker
+                if served.json().get("tracking", {}).get("trial") == number:
+                    break
+                served = client.get(f"{PERSON}/model", params={"tracked": True})
+        document, plain = served.json(), client.get(f"{PERSON}/model").json()
+        told = document["tracking"]
+        (one, two) = client.get(f"{PERSON}/tracking").json()["trials"]
+        assert told["trial"] == 2 and told["ask"] is None and two["outcome"] == "followed", (one, two)
+        gain = told["now"]["gain"]
+        assert gain["low"] < 1.0 < gain["high"] and gain["high"] - gain["low"] < 0.2
+        moved, approved = (np.array(d["recruitment"]["torque_nm"]) for d in (document, plain))
+        assert moved[-1] / approved[-1] == pytest.approx(told["coming"]["gain"]["value"], abs=0.02)
+        assert parsedate_to_datetime(served.headers["last-modified"]).isoformat()[:19] == two["at_utc"][:19]
+        wanted = {"reference_torque_nm": np.r_[np.zeros(20), np.full(60, 1.0)].tolist()}
+        widths = client.post(f"/v1/models/{document['model_id']}/widths", json=wanted)
+        assert widths.status_code == 200, widths.text
+        assert widths.json()["predicted_torque_nm"][-1] == pytest.approx(1.0, abs=0.1)

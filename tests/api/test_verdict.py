@@ -16,8 +16,7 @@ import pytest
 
 from stimrig import identify
 from stimrig.api.cli import main
-from stimrig.api.models import advice, explanation, registry, stored_model
-from stimrig.api.web.pages.environment import environment
+from stimrig.api.models import advice, registry, stored_model
 from stimrig.identify.estimation import quality
 from tests.api.conftest import REAL, Service, run_test, serving
 from tests.harness.patients import Patient, make_record
@@ -214,14 +213,6 @@ def test_a_torque_told_of_an_effect_says_when_it_counts_as_the_muscle_pulls(sign
     humming = record.with_torque(record.torque_nm + 0.3 * np.sin(2 * np.pi * 50.0 * record.time_s))
     hum = identify.fit(humming, effects=["mains_hum"]).effects[0]["parameters"]["sin_1_nm"]
     assert hum["value"] == pytest.approx(0.3, abs=0.02) and "direction" not in hum, "a number of the sensor"
-
-
-def test_the_page_says_it_too() -> None:
-    slope = {"value": 0.03, "sd": 0.01, "unit": "N·m/s"}
-    effect = environment.get_template("model_parts.html").make_module().effect  # type: ignore[attr-defined]
-    for more in ({}, {"direction": PULLS}):
-        entry = {"effect": "baseline_drift", "parameters": {"slope_nm_per_s": slope | more}}
-        assert (PULLS in effect(explanation.card(entry, {}, {}), {})) == bool(more)
 
 
 def test_threshold_plateau_and_validity_are_those_of_the_same_cell_mounted_upright() -> None:

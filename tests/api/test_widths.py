@@ -75,15 +75,6 @@ def test_the_muscle_follows_what_was_asked_for(served: tuple[Service, str]) -> N
     assert trial["settings"]["pulse_width_us"] == found["pulse_width_us"]
 
 
-def test_foretold_torque_is_the_muscles(client: httpx.Client, served: tuple[Service, str]) -> None:
-    widths = [0.0] * 20 + [200.0] * 60 + [90.0] * 60 + [0.0] * 40
-    found = client.post(f"/v1/models/{served[1]}/prediction", json={"pulse_width_us": widths}).json()
-    truth = np.array(muscle(widths, 400.0)).reshape(-1, 10).mean(axis=1)
-    assert len(found["torque_nm"]) == len(widths)
-    assert np.sqrt(np.mean((np.array(found["torque_nm"]) - truth) ** 2)) < 0.15
-    assert max(abs(value) for value in found["torque_nm"][:18]) < 0.02, "no pulse, no torque"
-
-
 @pytest.mark.parametrize(("rate_hz", "status"), [(None, 200), (49.9, 200), (20.0, 422), (60.0, 422), (1e300, 422)])
 def test_a_prediction_is_made_near_the_rate_of_the_model(
     client: httpx.Client, served: tuple[Service, str], rate_hz: float | None, status: int

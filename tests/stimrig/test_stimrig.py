@@ -68,13 +68,6 @@ def test_names_are_those_of_the_contract() -> None:
         stimrig.fitt  # noqa: B018
 
 
-def test_a_model_shows_itself_in_a_notebook(model: stimrig.Model) -> None:
-    html = model._repr_html_()
-    assert html.startswith("<table>") and html.count("<tr>") > 4
-    assert "N·m" in html and "<script" not in html
-    assert str(model).splitlines()[0] in html
-
-
 def test_a_model_draws_itself_beside_its_record(model: stimrig.Model, record: stimrig.Record) -> None:
     figure = model.plot(record)
     lines = figure.lines()
@@ -210,23 +203,7 @@ def test_an_answer_is_read_by_name_or_by_key_and_one_of_a_newer_service_is_kept(
     assert "later" in job and job["later"] == {"a": 1} and job.to_dict() == sent == {**job}
 
 
-# ---- docs/python.md does what it says: its blocks are run in order, against a served app; its table names every name
-
-
 TEXT = (Path(__file__).parents[2] / "docs" / "python.md").read_text("utf-8")
-
-
-def test_every_block_runs_in_order(tmp_path: Path, service: Service) -> None:
-    blocks = re.findall(r"^```python\n(.*?)^```", TEXT, re.MULTILINE | re.DOTALL)
-    assert len(blocks) >= 9
-    path, other = made_up_csv(tmp_path / "first.csv"), tmp_path / "other.csv"
-    head, *rows = path.read_text().splitlines()
-    cells = (row.split(",") for row in rows)
-    other.write_text("\n".join([head, *(f"{t},{u},{float(m) * 1.1:.6f},{s}" for t, u, m, s in cells)]) + "\n")
-    scope = {"path": path, "other_path": other, "folder": tmp_path, "url": service.url, "token": TOKEN}
-    with few_effects.only("threshold_drift", "recruitment_hysteresis"):
-        for block in blocks:
-            exec(compile(block, "python.md", "exec"), scope)
 
 
 def test_the_page_names_everything() -> None:

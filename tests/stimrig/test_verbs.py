@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 import stimrig
 from stimrig.api.cli import main
 from stimrig.errors import BadRequest
-from tests.api.conftest import PATIENCE_S, TOKEN, Service
+from stimrig.identify import paper
 from tests.api.test_jobs import made_up_csv
 from tests.harness import few_effects
 from tests.stimrig.verbs_table import COMMAND_ONLY, PAGE, function_of, page, verbs
@@ -65,9 +65,11 @@ DRAWN = ("model_id", "created")
 
 @pytest.mark.parametrize("verb", SAME)
 def test_a_function_gives_what_the_verb_prints(
-    verb: str, folder: Path, record: Any, model: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+    verb: str, folder: Path, record: Any, model: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:  # fmt: skip
     words, function = SAME[verb]
+    monkeypatch.setattr(paper.table1, "__defaults__", (100, None, paper.NOISE_NM[:1]))  # one noise level
     with few_effects.only(*EFFECTS):
         assert main.run([verb, *words.format(folder, tmp_path).split(), "--json"]) == 0
         found = function(record, model, folder)
@@ -97,19 +99,17 @@ def predicts(at: Path, _new: Path) -> None:
     assert [float(row.split(",")[2]) for row in rows] == pytest.approx(list(stimrig.predict(model, record)), abs=1e-6)
 
 
-def cohort_fits(at: Path, new: Path) -> None:
-    found = stimrig.cohort.fit([at / "record.csv"], new / "results.parquet", workers=1)
-    assert (found["ok"], found["errors"]) == (1, 0), found
-
-
 def emulates(_at: Path, new: Path) -> None:
-    with pytest.MonkeyPatch.context() as environment, contextlib.ExitStack() as stack:
-        environment.setenv("STIMRIG_RIG_FILE", "/a/rig/that/has/devices.toml")
-        client = stack.enter_context(stimrig.emulate("--patient changing", data=new))
-        assert client.health() and client.make_participant("P017")["code"] == "P017"
-        assert client.preview("P017")["duration_s"] > 10
-    with pytest.raises(stimrig.errors.Unreachable), stimrig.Client(client.url) as gone:
-        gone.health()
+    """What it starts: a rig without devices, whatever the environment names. tests/api/test_launcher.py starts it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("STIMRIG_RIG_FILE", "/a/rig/that/has/devices.toml")
+        patch.setattr("stimrig.api.cli.supervisor.Services", services := MagicMock())
+        services.return_value.__enter__.return_value.url = "http://rig.test"
+        with stimrig.emulate("--patient changing", data=new) as client:
+            assert client.http.base_url.host == "rig.test" and not services.return_value.__exit__.called
+    settings, options, _token = services.call_args.args
+    assert (settings.data_dir, settings.rig_file, options) == (new, None, ["--patient", "changing"])
+    assert services.return_value.__exit__.called
 
 
 def lists_effects(*_: Path) -> None:
@@ -123,25 +123,18 @@ def gives_a_schema(*_: Path) -> None:
 
 REST: dict[str, Callable[[Path, Path], Any]] = {
     "predict": predicts,
-    "cohort fit": cohort_fits,
     "emulate": emulates,
     "effects": lists_effects,
     "schema": gives_a_schema,
 }
-ELSEWHERE = ("test", "cohort diagnose", "cohort improve", "diagnose", "improve")
-"""Run by another one of these tests, as the parts of `explain`, or as the others of a cohort by `tests/api/cohort`."""
+ELSEWHERE = ("test", "cohort fit", "cohort diagnose", "cohort improve", "diagnose", "improve")
+"""Run by the blocks of docs/python.md (tests/api/test_readme.py), as the parts of `explain`, or by tests/api/cohort."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("verb", REST)
 def test_the_function_of_each_other_verb_runs(verb: str, folder: Path, tmp_path: Path) -> None:
     REST[verb](folder, tmp_path)
-
-
-def test_the_function_of_a_test_runs_it(service: Service) -> None:
-    with stimrig.Client(service.url, TOKEN, PATIENCE_S) as client:
-        client.make_participant("P017")
-        assert function_of("test")[1](client, "P017")["state"] == "completed"
 
 
 def test_no_verb_lacks_its_function_or_its_reason_and_its_test() -> None:

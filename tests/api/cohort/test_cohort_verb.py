@@ -72,15 +72,6 @@ def test_without_the_extra_it_says_what_to_install(
     assert "pip install stimrig[cohort]" in refusal(*fit)
 
 
-def test_the_verb_loads_without_the_extra() -> None:
-    code = (
-        "import sys; from stimrig.api.cli.main import build; build('cohort'); "
-        "print([name for name in ('dask', 'distributed', 'pyarrow', 'fsspec') if name in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "[]"
-
-
 @pytest.mark.parametrize(
     ("options", "named"),
     [
@@ -102,6 +93,12 @@ def test_wrong_options_are_one_line(
     assert named in refusal(*fit, *options)
 
 
+def in_this_process(workers: int) -> Any:
+    return LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=":0"
+    )
+
+
 def test_scheduler_that_is_not_there_or_has_no_workers(
     refusal: Callable[..., str], fit: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -109,8 +106,7 @@ def test_scheduler_that_is_not_there_or_has_no_workers(
     for address in ("tcp://127.0.0.1:9", "nonsense://x", "127.0.0.1:notaport"):
         words = refusal(*fit, "--scheduler", address)
         assert address in words and "no scheduler answers" in words
-    empty: Any = LocalCluster(n_workers=0, processes=False, protocol="tcp", dashboard_address=":0")
-    with empty:
+    with in_this_process(0) as empty:
         words = refusal(*fit, "--scheduler", empty.scheduler_address, "--wait", "0.5")
     assert "no worker within 0.5 s" in words
 
@@ -119,8 +115,9 @@ def test_reports(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     """One that could not be read ends the command with 1: a script goes on after an exit code 0."""
     output = str(tmp_path / "r.parquet")
     (tmp_path / "bad.h5").write_bytes(b"\x89HDF\r\n\x1a\nand nothing more")
-    words = [str(write(tmp_path / "a.h5", Session())), str(tmp_path / "bad.h5"), "-o", output, "--workers", "1"]
-    assert main.run(["cohort", "fit", *words, "--json"]) == 1
+    words = [str(write(tmp_path / "a.h5", Session())), str(tmp_path / "bad.h5"), "-o", output, "--json"]
+    with in_this_process(1) as here:
+        assert main.run(["cohort", "fit", *words, "--scheduler", here.scheduler_address]) == 1
     out, err = capsys.readouterr()
     report = json.loads(out)
     assert unmet("cohort", report) == [] and (report["ok"], report["errors"]) == (1, 1)
@@ -133,7 +130,7 @@ class Processes:
     def __init__(self, folder: Path) -> None:
         self.output = folder / "r.parquet"
         self.stack = ExitStack()
-        cohort(folder / "sessions", 8)
+        cohort(folder / "sessions", 5)
         self.fit = ("cohort", "fit", str(folder / "sessions"), "-o", str(self.output))
 
     def start(self, *words: str, out: int = subprocess.DEVNULL) -> subprocess.Popen[str]:

@@ -100,7 +100,7 @@ def test_mixed_folder_gives_a_row_for_each_file(client: Client, folder: Path, tm
 
 def test_diagnosis_and_improvement_name_what_is_missing(tmp_path: Path) -> None:
     tired = write(tmp_path / "t.h5", Session(muscle=1, effect="fatigue"))
-    with few_effects.only("fatigue", "output_saturation"):
+    with few_effects.only("fatigue"):
         diagnosis, improvement = (compute_row(tired, tired.name, {}, Task(verb)) for verb in ("diagnose", "improve"))
     assert diagnosis["verdict"] in ("effect_missing", "nothing_missing", "unexplained_structure")
     assert 0 <= diagnosis["probability"] <= 1 and diagnosis["fit_percent"] < diagnosis["ceiling_percent"] + 1
