@@ -11,6 +11,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.effect_fit import add_effects
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.plain import renewed_curve
@@ -114,6 +115,7 @@ def _fit_effects(
         progress(min(next(steps), len(wanted)) / (len(wanted) + 2), f"fitting {find_effect(effect).name.lower()}")
 
     base = add_effects(base, wanted, raw, report)
+    reasons = [reasons[0], *words(base, rows)]  # the effects have changed the noise
     if "knots" not in options and (renewed := renewed_curve(base)) is not base:
         base, size = renewed, renewed.problem.setup.basis.size
         reasons[0] = f"spline of {size} coefficients, chosen again with the rows in which the joint moves"

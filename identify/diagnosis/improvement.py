@@ -15,7 +15,7 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
-from stimrig.identify.estimation.left_out import difference
+from stimrig.identify.estimation.left_out import difference, from_to, hold_out
 from stimrig.identify.estimation.samples import Raw, prepare
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import HELD_OUT, Record
@@ -177,9 +177,13 @@ def _reason(search: EffectSearch, before: Step, step: Step, model: Model) -> str
     reasons = [f"Log evidence rises by {gain:.0f}; at least {margin:.3g} is required.", comparison.words]
     if not find_effect(step.added).predictable:
         reasons.append("It cannot be foreseen: it need not predict.")
-    old, new = before.statistics, step.statistics
-    if old["held_out_by"] == HELD_OUT and new["held_out_rms_nm"] > old["held_out_rms_nm"]:
-        reasons.append("On held-out pulses the error rises, but not by more than its standard error.")
+    old_nm, new_nm = before.statistics["held_out_rms_nm"], step.statistics["held_out_rms_nm"]
+    if before.statistics["held_out_by"] == HELD_OUT and new_nm > old_nm:
+        about_zero = difference(hold_out(before.fitted), hold_out(step.fitted))
+        reasons.append(
+            f"On held-out pulses the error {from_to(old_nm, new_nm)}; about the zero of each piece of them it "
+            f"{about_zero.change}."
+        )
     return " ".join(reasons)
 
 

@@ -16,7 +16,7 @@ from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import Effect, find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters, finish
-from stimrig.identify.estimation.left_out import difference
+from stimrig.identify.estimation.left_out import difference, from_to
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.solve import predict_fitted
 from stimrig.identify.estimation.still import moves
@@ -209,7 +209,7 @@ def _plain(search: EffectSearch, diagnosis: dict[str, Any]) -> list[str]:
         lines.append(text)
     if missing and diagnosis["verdict"] == "effect_missing":
         lines.append(
-            f"With {'it' if len(missing) == 1 else 'them'} the error on held-out pulses falls from "
-            f"{base['held_out_rms_nm']:.3g} to {named['held_out_rms_nm']:.3g} N·m."
+            f"With {'it' if len(missing) == 1 else 'them'} the error on held-out pulses "
+            f"{from_to(base['held_out_rms_nm'], named['held_out_rms_nm'])}."
         )
     return [*lines, *diagnosis["notes"], conclusion.advice]

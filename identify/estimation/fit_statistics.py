@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -11,7 +10,7 @@ from stimrig.identify.dynamics.grid import Grid, ends_of
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.repetition import repetition
 from stimrig.identify.estimation.samples import block_means
-from stimrig.identify.estimation.solve import Fitted, predict_fitted
+from stimrig.identify.estimation.solve import Fitted, once, predict_fitted
 from stimrig.identify.noise import whitened
 from stimrig.identify.records.readings import contrasts
 from stimrig.identify.records.record import HELD_OUT
@@ -164,14 +163,21 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     """The key `fit` of MODEL.json: errors, best-fit %, and the best fit that the noise allows."""
     setup = fitted.problem.setup
     grid = setup.grid
-    change = held_out_change(fitted)
+    change: np.ndarray | None = held_out_change(fitted)
+    if setup.fitted.sum() < fold_rows(grid):  # without their only fold nothing is left to fit
+        change = None
     predicted, predictable = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
     statistics = fit_statistics(grid, setup.fitted, predicted, noise, change, predictable)
     return statistics | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
 
 
-@lru_cache(maxsize=2)  # the statistics of a model and its covariance both ask for it
+def fold_rows(grid: Grid) -> int:
+    """Return the number of fitted intervals in a block of a fold."""
+    return max(round(BLOCK_S / grid.step_s), 2)
+
+
+@once  # the statistics of a model and its covariance both ask for it
 def held_out_change(fitted: Fitted) -> np.ndarray:
     """Change of the predicted torque in each fitted interval when its fold is left out of the fit, N·m, shape (K,).
 
@@ -184,8 +190,7 @@ def held_out_change(fitted: Fitted) -> np.ndarray:
     problem = fitted.problem
     setup, grid = problem.setup, problem.setup.grid
     rows = setup.fitted
-    block = max(round(BLOCK_S / grid.step_s), 2)
-    fold = (np.cumsum(rows) // block) % FOLDS
+    fold = (np.cumsum(rows) // fold_rows(grid)) % FOLDS
     refitted = np.delete(np.arange(problem.size), problem.initials)
     mean, precision = problem.prior
     pull = (precision @ (fitted.theta - mean))[refitted]

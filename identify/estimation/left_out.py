@@ -8,7 +8,7 @@ difference and its standard error; Roberts and others 2017 on blocks in place of
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -16,7 +16,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.rests import relaxed
-from stimrig.identify.estimation.solve import Fitted, Point, log_posterior, newton_step, solve
+from stimrig.identify.estimation.solve import Fitted, Point, log_posterior, newton_step, once, solve
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import FORGOTTEN_S
 
@@ -129,9 +129,8 @@ def leave_out(fitted: Fitted, block: np.ndarray | None = None) -> LeftOut:
     return _left_out(fitted) if block is None else _without(fitted, block)
 
 
-@lru_cache(maxsize=8)
+@once  # whoever trusts a model and whoever adds it ask the same
 def _left_out(fitted: Fitted) -> LeftOut:
-    """Each of the last models once: whoever trusts a model and whoever adds it ask the same."""
     setup = fitted.problem.setup
     return _without(fitted, blocks(setup.grid, setup.fitted))
 
@@ -216,19 +215,30 @@ class Difference:
         return self.gain / max(self.sd, 1e-9) if self.blocks > LEAST_BLOCKS else 0.0
 
     @property
-    def words(self) -> str:
-        """Change of the error on left-out parts, as a sentence."""
+    def change(self) -> str:
+        """In which direction the error changes, by how much, and in how many standard errors."""
         change, errors = 100.0 * abs(1.0 - np.exp(-self.gain)), abs(self.errors)
         # not "rises by 0 %: it must not rise"
         percent = f"{change:.0f}" if change >= 0.5 else f"{change:.2f}" if change >= 0.01 else "less than 0.01"
-        if self.gain < 0.0:
-            return f"On parts left out of the fit the error rises by {percent} % ({errors:.1f} standard errors)."
-        return f"On parts left out of the fit the error falls by {percent} % ({errors:.1f} standard errors)."
+        return f"{'rises' if self.gain < 0.0 else 'falls'} by {percent} % ({errors:.1f} standard errors)"
+
+    @property
+    def words(self) -> str:
+        """Change of the error on left-out parts, as a sentence."""
+        return f"On parts left out of the fit the error {self.change}."
 
     @property
     def words_of_choice(self) -> str:
         """The same of a form that was chosen among many by just this error."""
         return f"{self.words} It was chosen among many by these parts: on pulses of another kind it may gain less."
+
+
+def from_to(before_nm: float, after_nm: float) -> str:
+    """Say in which direction an error changes, and between which values."""
+    before, after = f"{before_nm:.3g}", f"{after_nm:.3g}"
+    if before == after:
+        return f"stays at {after} N·m"
+    return f"{'rises' if after_nm > before_nm else 'falls'} from {before} to {after} N·m"
 
 
 def difference(before: LeftOut, after: LeftOut) -> Difference:

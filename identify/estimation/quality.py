@@ -15,6 +15,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.problem.joint_surface import JointEffect, Surfaces
 from stimrig.identify.problem.predict import refuse_rate
 from stimrig.identify.problem.pulses import Motion, above_rest
+from stimrig.identify.records.readings import flat_top
 from stimrig.identify.records.record import Record
 from stimrig.identify.yardstick import held_out_pulses
 
@@ -295,15 +296,17 @@ def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:
-    """Check for clipping of the sensor: many samples in a row at exactly the largest (or smallest) torque."""
+    """Check for clipping of the sensor while the muscle is stimulated."""
     torque = grid.record.torque_nm
     span = float(np.ptp(torque))
     if not span > 0:
         return _gate(False, "refuse", "the torque never changes")
-    for edge in (float(np.max(torque)), float(np.min(torque))):
-        at_edge = torque == edge
-        in_a_row = np.max(np.diff(np.flatnonzero(np.r_[True, ~at_edge, True])) - 1, initial=0)
-        driven = at_edge & (grid.pulse_width_us[grid.interval] > 0)
-        if in_a_row >= 20 and driven.any() and abs(edge - baseline_nm) > 0.2 * span:
-            return _gate(False, "care", f"the load cell clips at {edge:.3g} N·m ({int(at_edge.sum())} samples)")
+    for sign in (1.0, -1.0):
+        top_nm = flat_top(sign * torque)
+        if top_nm is None or abs(sign * top_nm - baseline_nm) <= 0.2 * span:
+            continue
+        at_edge = torque == sign * top_nm
+        if np.any(at_edge & (grid.pulse_width_us[grid.interval] > 0)):
+            message = f"the load cell clips at {sign * top_nm:.3g} N·m ({int(at_edge.sum())} samples)"
+            return _gate(False, "care", message)
     return _gate(True, "care", "")

@@ -21,15 +21,20 @@ def rest_levels(grid: Grid, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Torque at rest in each part of a record, and how far the part's zero may be from it, N·m.
 
     The median over the relaxed rows, and their robust scatter: of a zero that wanders, its spread. A part without a
-    rest has its zero somewhere in the range of its torque.
+    rest has its zero somewhere in the range of its torque. Of a part that is held out as a whole nothing but its rests
+    is looked at; without them it has the zero of the others.
     """
     for strongest_us in (0.0, IDLE_SHARE * float(np.max(grid.pulse_width_us))):
         since_s = grid.step_s * since_pulse(grid, strongest_us)
         if np.max(since_s[rows]) >= 2.0 * RELAXED_S:
             break
     levels = [_level(grid.torque_nm, since_s, rows & (grid.part == part)) for part in range(grid.begins.size)]
-    known = [pair for pair in levels if pair is not None]
-    level_nm, sd_nm = np.array([pair or known[0] for pair in levels]).T
+    known = next(pair for pair in levels if pair is not None)
+    level_nm, sd_nm = np.array([pair or known for pair in levels]).T
+    for part in np.setdiff1d(grid.part, grid.part[grid.fitted]):
+        at_rest = grid.comparable & (grid.part == part) & (since_s >= RELAXED_S)
+        if at_rest.any():
+            level_nm[part] = np.median(grid.torque_nm[at_rest])
     return level_nm, sd_nm
 
 

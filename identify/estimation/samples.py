@@ -14,14 +14,13 @@ from stimrig.identify.records.readings import (
     Readings,
     calm_samples,
     find_readings,
+    flat_top,
     noise_of_readings,
     smoothed_readings,
 )
 from stimrig.identify.records.record import HELD_OUT, Record
 
 LEAST_ROWS = 8
-LEAST_EQUAL = 20
-"""Number of samples at exactly the largest (or smallest) value from which they count as clipping."""
 LEAST_LINE = 30.0
 """A line counts as hum if its power is this many times the mean power of its neighbours."""
 FOLLOWED_S = 1.0
@@ -102,7 +101,7 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
     own_s = record.time_s - (record.time_s[0] if start_s is None else start_s)
     usable = ~record.held_out if record.doubted is None else ~record.held_out & ~record.doubted
     torque = record.torque_nm
-    ceiling, floor = _flat(torque[usable]), _flat(-torque[usable])
+    ceiling, floor = flat_top(torque[usable]), flat_top(-torque[usable])
     known = runs(usable)
     hum = find_hum(record, own_s, usable, known)
     if hum is not None:
@@ -111,21 +110,6 @@ def inspect(record: Record, start_s: float | None = None) -> Raw:
     noise, readings = white_noise(record, usable, torque)
     noise = min(noise, float(np.std(torque[usable])))  # jumps alone may seem more
     return Raw(torque, noise, hum, ceiling, None if floor is None else -floor, readings)
-
-
-def _flat(torque: np.ndarray) -> float | None:
-    """The largest value, if it occurs far too often for a noisy signal; else None."""
-    top = float(torque.max())
-    equal = int(np.sum(torque == top))
-    if equal < LEAST_EQUAL or top == float(torque.min()):
-        return None
-    # With coarse quantisation every value repeats: a ceiling must repeat far more often than the values below it.
-    values, counts = np.unique(torque[torque > top - 0.25 * (top - float(np.median(torque)))], return_counts=True)
-    below = counts[values < top]
-    # A quiet record that rests at its largest value is not clipped.
-    if below.size == 0 or equal < 4 * np.max(below):
-        return None
-    return top
 
 
 def white_noise(record: Record, rows: np.ndarray, torque_nm: np.ndarray) -> tuple[float, Readings | None]:

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, wraps
+from typing import TypeVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numba import njit
@@ -140,6 +143,22 @@ class Fitted:
     def written(self) -> Fitted:
         """With the narrow band of its noise written as the effect `tremor`; itself without a band."""
         return band_as_effect(self)
+
+
+Result = TypeVar("Result")
+
+
+def once(compute: Callable[[Fitted], Result]) -> Callable[[Fitted], Result]:
+    """Let a function compute its result once for each fit; the result is kept for as long as the fit."""
+    results: WeakKeyDictionary[Fitted, Result] = WeakKeyDictionary()
+
+    @wraps(compute)
+    def result_of(fitted: Fitted) -> Result:
+        if fitted not in results:
+            results[fitted] = compute(fitted)
+        return results[fitted]
+
+    return result_of
 
 
 def knows_joint(fitted: Fitted) -> bool:

@@ -6,6 +6,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, runs
 from stimrig.identify.errors import BadRequest, NotIdentifiable
+from stimrig.identify.estimation.plain import pilot
 from stimrig.identify.estimation.samples import rows_of
 
 
@@ -36,8 +37,8 @@ QUIET_AFTER_S = 4.0
 
 
 def quiet_level(grid: Grid) -> float:
-    """Baseline at zero torque, N·m: from the time before the first pulse, else 4 s after a pulse, else the lowest
-    torque.
+    """Baseline at zero torque, N·m: from the time before the first pulse, else 4 s after a pulse, else that of a pilot
+    fit, which knows where the muscle pulls.
 
     2 s after a pulse are not enough: an underdamped muscle with a time constant of 0.5 s still oscillates then.
     """
@@ -49,8 +50,8 @@ def quiet_level(grid: Grid) -> float:
     quiet = still & grid.fitted & ((np.arange(grid.size) - last_pulse) * grid.step_s > QUIET_AFTER_S)
     if quiet.sum() >= 4:
         return float(np.mean(grid.torque_nm[quiet]))
-    some = grid.fitted & still if (grid.fitted & still).any() else grid.fitted
-    return float(np.percentile(grid.torque_nm[some], 5))
+    first = pilot(grid, grid.fitted)
+    return float(first.problem.setup.to_record(first.physical[first.problem.baselines.start]))
 
 
 def with_past(rows: np.ndarray, lead: int) -> np.ndarray:

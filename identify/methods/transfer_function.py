@@ -36,7 +36,6 @@ class OutputError:
     b: np.ndarray
     a: np.ndarray
     delay_samples: int
-    baseline_nm: float  # constant in the output
     bic: float  # smaller is better
 
     def block(self, step_s: float, centre: float) -> Discrete:
@@ -93,6 +92,7 @@ def output_error(
 ) -> OutputError:
     """Minimise (12) over b, a and a baseline, for a given order (l, n, d): poles, zeros, delay.
 
+    `torque`: relative to its zero, since rows that are not fitted count as zero in filtered signals.
     `start`: for A; by default from (25), improved by the iteration of Steiglitz and McBride.
 
     Raises NotIdentifiable: the input never changes.
@@ -128,18 +128,13 @@ def output_error(
         return (at.cost - trial.cost) / max(at.cost, 1e-300) if trial.cost <= at.cost else None
 
     if start is None:
-        rough = equation_error(torque - _rest_level(torque, drive, rows), drive, rows, order)[1]
+        rough = equation_error(target, drive, rows, order)[1]
         start = _steiglitz_mcbride(target, drive, rows, order, stable(rough), lambda a: solve(a).cost)
     search = Search(DAMPING, trials, gain, lambda gained, _step: not gained > 1e-9)
     optimum = descend(search, solve(start), max_steps if poles else 0)[0]
     theta, count, free = optimum.theta, int(rows.sum()), poles + zeros + 2
     bic = count * np.log(max(optimum.cost / count, 1e-300)) + free * np.log(count)
-    return OutputError(theta[:-1], optimum.a, delay, float(theta[-1]), float(bic))
-
-
-def _rest_level(torque: np.ndarray, drive: np.ndarray, rows: np.ndarray) -> float:
-    still = rows & (drive == 0) & np.isfinite(torque)
-    return float(np.percentile(torque[still], 10)) if still.any() else 0.0
+    return OutputError(theta[:-1], optimum.a, delay, float(bic))
 
 
 def _steiglitz_mcbride(
@@ -204,7 +199,7 @@ def general(
     """Two stages with the linear part of equations (1) to (3)."""
     centre = float(np.mean(grid.fraction))
     earliest = 1 if centre < 1e-6 else 0
-    torque, reasons = np.nan_to_num(grid.torque_nm), []
+    torque, reasons = np.nan_to_num(grid.torque_nm - quiet_level(grid)), []
     drive = straight_drive(grid, prbs) if prbs is not ramp else joint_drive(grid, prbs)
     fitted = near_rest(grid, prbs)
 
@@ -212,24 +207,23 @@ def general(
         drive = grid.interval_means(drive)
         if literal:
             chosen = requested if isinstance(requested, tuple) else (2, 1, 1)
-            b, a = equation_error(torque - baseline, drive, rows, chosen)
+            b, a = equation_error(torque, drive, rows, chosen)
             gain_free = output_error(torque, drive, rows, chosen, start=stable(a), max_steps=0)
-            return replace(gain_free, b=b, a=stable(a), baseline_nm=baseline, bic=0.0)
+            return replace(gain_free, b=b, a=stable(a), bic=0.0)
         if isinstance(requested, tuple):
             return output_error(torque, drive, rows, requested)
         best, why = choose_order(torque, drive, rows, earliest)
         reasons.extend(why)
         return best
 
-    baseline = quiet_level(grid)
     linear_fit = linear_part(drive, fitted, order)
     chosen = (len(linear_fit.a) - 1, len(linear_fit.b) - 1, linear_fit.delay_samples)
     rows = near_rest(grid, ramp)
     both = fitted | rows
-    curve = _curve_through(grid, linear_fit.block(grid.step_s, centre), rows, knots, baseline, inverse)
+    curve = _curve_through(grid, torque, linear_fit.block(grid.step_s, centre), rows, knots, inverse)
     for _ in range(iterations):
         linear_fit = linear_part(curve(grid.pulse_width_us), both, chosen)
-        curve = _curve_through(grid, linear_fit.block(grid.step_s, centre), rows, knots, baseline, inverse)
+        curve = _curve_through(grid, torque, linear_fit.block(grid.step_s, centre), rows, knots, inverse)
     reasons.append(f"linear part (l, n, d) = {chosen}")
     return finish_discrete(method_id, grid, both, linear_fit.block(grid.step_s, centre), curve, reasons)
 
@@ -249,22 +243,20 @@ def joint_drive(grid: Grid, rows: np.ndarray) -> np.ndarray:
 
 
 def _curve_through(
-    grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float, inverse: bool
+    grid: Grid, torque: np.ndarray, block: Discrete, rows: np.ndarray, knots: int, inverse: bool
 ) -> Curve:
     """The recruitment spline for a given discrete linear block: fitted to its output, or by inverting it."""
     if inverse:
-        return _from_inverse(grid, block, rows, knots, baseline_nm)
+        return _from_inverse(grid, torque, block, rows, knots)
     # Least squares on the output: the columns of the spline are filtered, the torque is not.
-    target = grid.torque_nm[rows] - baseline_nm
-    return _penalised(grid, lambda columns: block.filter(grid.interval_means(columns))[rows], target, knots)
+    return _penalised(grid, lambda columns: block.filter(grid.interval_means(columns))[rows], torque[rows], knots)
 
 
-def _from_inverse(grid: Grid, block: Discrete, rows: np.ndarray, knots: int, baseline_nm: float) -> Curve:
+def _from_inverse(grid: Grid, torque: np.ndarray, block: Discrete, rows: np.ndarray, knots: int) -> Curve:
     """Equations (26) to (28) as printed: w = G⁻¹ y, then the spline by least squares on w.
 
     The inverse diverges if G has a zero on or outside the unit circle; it is then limited to ±1e6 N·m.
     """
-    torque = np.nan_to_num(grid.torque_nm) - baseline_nm
     b = np.asarray(block.b) / block.b[0]
     moved = np.r_[torque[block.delay_samples :], np.zeros(block.delay_samples)]
     driven = np.convolve(moved, block.a)[: moved.size] / block.b[0]

@@ -1,4 +1,4 @@
-"""Independent readings behind the samples of a record: recorders hold, round, interpolate and smooth.
+"""Independent readings behind the samples of a record: recorders hold, round, interpolate, smooth and clip.
 
 The white noise of a sample is estimated from differences of neighbours. Most differences of held or interpolated
 samples are zero, those of smoothed ones nearly so: there the noise is that of the readings behind them.
@@ -31,6 +31,10 @@ LEAST_DIFFERENCES = 64
 BLOCK = 32
 WIDEST = 256
 """Samples between those that are compared, at most."""
+LEAST_EQUAL = 20
+"""Number of samples at exactly the largest (or smallest) value from which they count as clipping."""
+REPEATS = 4
+"""The largest value counts as clipping if it repeats so many times as often as those near it."""
 
 
 @dataclass(frozen=True)
@@ -155,3 +159,30 @@ def noise_of_readings(torque_nm: np.ndarray, calm: np.ndarray, readings: Reading
     blocks = np.array_split(size, max(size.size // BLOCK, 1))
     power = float(np.median([np.mean(block**2) for block in blocks]))
     return float(np.sqrt(max(power, readings.count_nm**2 / 12.0)))
+
+
+def flat_top(torque: np.ndarray) -> float | None:
+    """Return the largest value if the sensor clips there, else None.
+
+    Where the converter's step hides the noise, a muscle that holds its torque (or rests) comes to its largest value by
+    single steps and stays there, as it stays elsewhere, too: that is not clipping.
+    """
+    top = float(torque.max())
+    changes = np.flatnonzero(np.diff(torque)) + 1
+    if not changes.size:
+        return None
+    # Of equal values in a row, but for the first, which nothing leads to.
+    lasts, values = np.diff(np.r_[changes, torque.size]), torque[changes]
+    step_nm = np.abs(values - torque[changes - 1])
+    flat = values == top
+    equal = int(lasts[flat].sum())
+    if equal < LEAST_EQUAL:
+        return None
+    # With coarse quantisation every value repeats: a ceiling must repeat far more often than the values below it.
+    near = torque[(torque > top - 0.25 * (top - float(np.median(torque)))) & (torque < top)]
+    # A quiet record that rests at its largest value is not clipped.
+    if not near.size or equal < REPEATS * np.max(np.unique(near, return_counts=True)[1]):
+        return None
+    by_one = flat & (step_nm < 1.5 * step_nm.min())
+    hidden = np.max(lasts[~flat], initial=0) >= LEAST_EQUAL
+    return None if hidden and 2 * lasts[by_one].sum() > equal else top

@@ -17,6 +17,7 @@ from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.bases import SplineBasis
 from stimrig.identify.recruitment.smoothing import choose_weight, spline_roughness
 from tests.harness.patients import Patient, make_record
+from tests.identify import hidden_muscles
 
 NOISY = 0.05
 
@@ -95,6 +96,22 @@ def test_cross_validation_agrees_with_refits_of_the_same_design(ar1: float):
         again = solve(part, fitted_all.theta, fitted_all.noise, tolerance=1e-6)
         honest = (fitted_all.residual_nm - again.residual_nm)[out]
         assert np.linalg.norm(change[out] - honest) < 0.15 * np.linalg.norm(honest)
+
+
+def test_a_record_with_a_single_fold_has_no_held_out_error():
+    """Left out it would leave nothing to fit: the error of the fit itself was given as that of left-out parts."""
+    record, _ = make_record(Patient(), np.random.default_rng(9), rate_hz=40, noise_nm=0.05, validate=False)
+    short = fitted(record.take((record.time_s > 0.9) & (record.time_s < 2.8)))[0]
+    assert short.fit["held_out_by"] == "none" and short.fit["held_out_rms_nm"] is None
+
+
+def test_effects_leave_no_warning_of_the_plain_fit():
+    """A line takes what the plain fit has to take for the slowest noise there is."""
+    record = hidden_muscles.record("baseline_drift")
+    warning = "The slow noise is as slow as it may be"
+    assert any(warning in reason for reason in identify.fit(record).reasons), "else nothing is tried"
+    model = identify.fit(record, effects=["baseline_drift:linear"])
+    assert model.noise.ar1 == 0.0 and not any(warning in reason for reason in model.reasons)
 
 
 @pytest.mark.parametrize("noise_nm", [0.02, 0.1])

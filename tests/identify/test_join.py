@@ -341,3 +341,14 @@ def test_the_zeros_of_parts_may_be_far_apart(apart_nm: float) -> None:
     fits = [fit_plain(prepare(record)[0], prepare(record)[0].fitted) for record in (together, away)]
     assert fits[1].log_evidence == pytest.approx(fits[0].log_evidence, abs=0.5)
     assert fits[1].problem.setup.scale_nm == pytest.approx(fits[0].problem.setup.scale_nm, rel=1e-3)
+
+
+def test_a_part_that_is_held_out_as_a_whole_has_its_own_zero() -> None:
+    fitted, unseen = (
+        make_record(Patient(), np.random.default_rng(seed), rate_hz=40, noise_nm=0.02)[0] for seed in (1, 2)
+    )
+    all_held_out = Record.from_arrays(
+        unseen.time_s, unseen.pulse_width_us, unseen.torque_nm + 5.0, np.full(unseen.time_s.size, "validate")
+    )
+    model = identify.fit(join([fitted, all_held_out], begun_s=[0.0, 200.0]))
+    assert model.fit["held_out_rms_nm"] < 0.05

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import re
+import weakref
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -12,7 +15,7 @@ from bench.muscles.bout_records import record_of_bouts
 from bench.muscles.hidden_records import generate
 from bench.muscles.physics_records import record_of_physics
 from stimrig import identify
-from stimrig.identify.diagnosis import search, thresholds
+from stimrig.identify.diagnosis import improvement, search, thresholds
 from stimrig.identify.diagnosis.residual import vetoed
 from stimrig.identify.diagnosis.search import required_errors
 from stimrig.identify.dynamics.grid import make_grid
@@ -20,7 +23,8 @@ from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation import left_out
 from stimrig.identify.estimation.candidates import similar_bout_rows
 from stimrig.identify.estimation.effect_fit import Candidate, fitted_with
-from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, hold_out, leave_out
+from stimrig.identify.estimation.fit_statistics import held_out_change
+from stimrig.identify.estimation.left_out import LeftOut, blocks, bouts, difference, from_to, hold_out, leave_out
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.problem.problem import Problem
@@ -86,6 +90,16 @@ def test_a_left_out_block_is_not_seen(plain_record):
     assert np.max(np.abs(first.error_nm[seen] - after.error_nm[seen])) > 1.0
 
 
+def test_what_is_computed_once_lives_no_longer_than_its_fit(plain_record):
+    grid, _ = prepare(plain_record)
+    fitted = fit_plain(grid, fitted_rows(grid, None))
+    assert leave_out(fitted) is leave_out(fitted) and held_out_change(fitted) is held_out_change(fitted)
+    alive = weakref.ref(fitted)
+    del fitted
+    gc.collect()
+    assert alive() is None
+
+
 def test_one_block_alone_tells_nothing_and_what_all_say_counts():
     alone = difference(*pair([1.0] * 10, [0.1] + [1.0] * 9, floor_nm=1.0))
     assert alone.errors < 2.0
@@ -98,6 +112,25 @@ def test_what_is_below_the_noise_does_not_count_and_blocks_at_noise_tell_little(
     assert abs(difference(*pair([0.1] * 10, [0.001] * 10, floor_nm=1.0)).gain) < 0.01
     few = difference(*pair([0.1] * 8 + [5.0, 6.0], [0.1] * 8 + [1.0, 1.1], floor_nm=0.1))
     assert few.errors > 2.0 and few.blocks < 3.0
+
+
+def test_a_held_out_error_that_rises_is_said_to_rise(monkeypatch: pytest.MonkeyPatch):
+    """Of a zero that drifts, so that the pieces' own zeros tell another story than the error itself."""
+    left_out = pair([2.0, 1.0] * 5, [1.1, 0.45] * 5)
+    monkeypatch.setattr(improvement, "hold_out", lambda fitted: left_out[fitted])
+    steps = [
+        SimpleNamespace(
+            added="baseline_drift", origin="library", left_out=left_out[number], fitted=number,
+            tried=[SimpleNamespace(effect=find_effect("baseline_drift"), gain=50.0)],
+            statistics={"held_out_by": "validate", "held_out_rms_nm": rms_nm},
+        )
+        for number, rms_nm in enumerate((0.341, 0.488))
+    ]  # fmt: skip
+    search = SimpleNamespace(margin=lambda _number: 4.5, names=lambda _origin: ["baseline_drift"])
+    reason = improvement._reason(search, *steps, None)  # type: ignore
+    assert "On held-out pulses the error rises from 0.341 to 0.488 N·m; about the zero" in reason
+    assert re.search(r"of them it falls by \d+ % \(\d+\.\d standard errors\)\.$", reason)
+    assert from_to(0.488, 0.341) == "falls from 0.488 to 0.341 N·m"
 
 
 def test_a_zero_that_wanders_is_no_fault_of_a_model():

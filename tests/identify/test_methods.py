@@ -12,7 +12,7 @@ from stimrig.identify.dynamics.linear import Discrete, SecondOrder
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.methods import Method, method_of, methods
 from stimrig.identify.methods.transfer_function import choose_order
-from tests.harness.patients import Patient, make_record, prbs
+from tests.harness.patients import Patient, make_record, prbs, ramp
 
 ALL = ("maximum-likelihood", "narx", "ramp-deconvolution", "separable-least-squares", "two-stage")
 
@@ -122,6 +122,44 @@ def test_narx_is_scored_in_free_run(clean_record):
     assert recipe["terms"]
     # Free run: the measured torque has no part in the prediction.
     assert np.array_equal(identify.predict(model, record.with_torque(record.torque_nm * 0)), predicted)
+
+
+def without_rests(seed: int) -> tuple[identify.Record, np.ndarray]:
+    """A record that begins with a pulse, rests for 0.2 s at most, and is fitted before and after held-out pulses."""
+    rng = np.random.default_rng(seed)
+    parts = {"prbs": prbs(15.0, 300.0, rng), "validate": np.full(120, 150.0), "ramp": ramp(10.0)}
+    parts["prbs"][:8] = 300.0
+    pulses = np.concatenate(list(parts.values())), [name for name, part in parts.items() for _ in part]
+    return make_record(Patient(time_constant_s=0.3), rng, rate_hz=40, noise_nm=0.03, pulses=pulses)
+
+
+@pytest.mark.parametrize(
+    ("method", "options"),
+    [
+        ("two-stage", {"order": "2,1,1"}),
+        ("two-stage", {"order": "2,1,1", "linear": "equation-error"}),
+        ("maximum-likelihood", {"order": "auto"}),
+        ("ramp-deconvolution", {}),
+        ("narx", {}),
+    ],
+)
+def test_turned_torque_with_another_zero_gives_the_same_model(method: str, options: dict[str, str]):
+    """Also without a rest that shows the zero: the pilot fit knows where the muscle pulls."""
+    record, _ = without_rests(1)
+    turned = record.with_torque(3.0 - record.torque_nm)
+    first_nm, turned_nm = (
+        identify.predict(identify.fit(each, method=method, **options), each) for each in (record, turned)
+    )
+    assert np.max(np.abs(3.0 - turned_nm - first_nm)) < 1e-5
+
+
+def test_the_zero_is_no_jump_at_rows_that_are_not_fitted():
+    """Filtered by 1/A, rows of `validate` count as zero torque: the search for A began far away from the muscle."""
+    record, clean = without_rests(2)
+    far = record.with_torque(record.torque_nm + 1000.0)
+    predicted = identify.predict(identify.fit(far, order="2,1,0"), far) - 1000.0
+    assert np.max(np.abs(predicted - identify.predict(identify.fit(record, order="2,1,0"), record))) < 1e-4
+    assert np.sqrt(np.mean((predicted - clean) ** 2)) < 0.02
 
 
 @pytest.mark.parametrize("recruitment", ["spline", "power-series", "sigmoid"])

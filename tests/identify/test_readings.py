@@ -92,6 +92,18 @@ def test_rounding_is_part_of_the_noise(times: float):
     assert quiet_nm == pytest.approx(0.1 / 12**0.5, rel=0.3)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("rate_hz", [40, 200])
+def test_coarse_counts_are_no_clipping(rate_hz: float, sign: float):
+    """Of a muscle that holds its largest torque; the same torque with its noise, cut off, is clipped."""
+    quick = Patient.with_rise(40.0, 100.0, gain=7.0, time_constant_s=0.1, damping=1.0)
+    record, _ = make_record(quick, np.random.default_rng(4), rate_hz=rate_hz, noise_nm=0.03)
+    coarse = inspect(record.with_torque(sign * np.round(record.torque_nm / 0.5) * 0.5))
+    assert coarse.ceiling_nm is None and coarse.floor_nm is None
+    cut = inspect(record.with_torque(sign * np.minimum(np.round(record.torque_nm / 0.01) * 0.01, 5.0)))
+    assert (cut.ceiling_nm, cut.floor_nm) == ((5.0, None) if sign > 0 else (None, -5.0))
+
+
 def test_held_and_coarse():
     noise_nm, readings = found_in(made(77, change=lambda torque, rng: held(5)(rounded(SD_NM)(torque, rng), rng)))
     assert readings.samples_each == 5.0
