@@ -24,3 +24,9 @@ def make(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[.
     yield of
     for live in made:
         live.close()
+
+
+@pytest.fixture
+def live(make: Callable[..., LiveRig]) -> LiveRig:
+    """One that is ready."""
+    return make()

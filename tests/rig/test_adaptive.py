@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,11 @@ from tests.rig.test_damaged import blocks_of
 pytestmark = pytest.mark.slow
 
 
+@pytest.fixture
+def rig(tmp_path: Path) -> VirtualRig:
+    return adaptive(tmp_path)
+
+
 def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(tmp_path: Path):
     rig = adaptive(tmp_path)
     result = rig.execute()
@@ -47,8 +51,7 @@ def test_if_nobody_extends_it_the_fixed_plan_plays_and_a_second_without_pulses(t
     assert same.recording().attributes["adaptive"] == 0
 
 
-def test_an_answer_to_an_old_boundary_is_refused_and_so_is_the_same_one_twice(tmp_path: Path):
-    rig = adaptive(tmp_path)
+def test_an_answer_to_an_old_boundary_is_refused_and_so_is_the_same_one_twice(rig: VirtualRig):
     found: list[RigError] = []
     rig.at(0.2, lambda: extend(rig, 20, [hold("once")]))
     rig.at(0.21, lambda: found.extend(refusals(lambda: extend(rig, 20, [hold("again")]))))
@@ -60,8 +63,7 @@ def test_an_answer_to_an_old_boundary_is_refused_and_so_is_the_same_one_twice(tm
 
 
 @pytest.mark.parametrize("early", [True, False])
-def test_the_boundary_is_decided_two_periods_before_it(tmp_path: Path, early: bool):
-    rig = adaptive(tmp_path)
+def test_the_boundary_is_decided_two_periods_before_it(rig: VirtualRig, early: bool):
     at_s = 0.5 - AHEAD / PULSES_HZ + (-0.001 if early else 0.001)
     ask = lambda: extend(rig, 20, [hold("added")])  # noqa: E731
     rig.at(at_s, ask if early else lambda: found.extend(refusals(ask)))
@@ -88,8 +90,7 @@ def test_while_an_extension_is_checked_the_test_goes_on(tmp_path: Path, takes_s:
     assert rig.recording().names == ["rest", *([] if late else ["a"]), "first", "ramp", "rest"]
 
 
-def test_enough_twice_may_only_end_it_sooner(tmp_path: Path):
-    rig = adaptive(tmp_path)
+def test_enough_twice_may_only_end_it_sooner(rig: VirtualRig):
     score = rig.run.score
     for at_s, at_once in ((0.7, False), (0.8, False), (1.0, True), (1.1, True), (1.2, False)):
         rig.at(at_s, lambda at_once=at_once: score.enough("me", at_once))
@@ -113,8 +114,7 @@ def test_enough_right_before_a_boundary_begins_no_further_segment(tmp_path: Path
     assert result.summary["duration_s"] == pytest.approx(0.5 + pulses / PULSES_HZ + 1.0)
 
 
-def test_enough_before_the_first_pulse_sends_none(tmp_path: Path):
-    rig = adaptive(tmp_path)
+def test_enough_before_the_first_pulse_sends_none(rig: VirtualRig):
     rig.run.score.enough("me", at_once=True)
     result = rig.execute()
     assert (result.outcome, rig.stimulator.sent, result.summary["duration_s"]) == ("completed", [], pytest.approx(1.0))
@@ -122,9 +122,8 @@ def test_enough_before_the_first_pulse_sends_none(tmp_path: Path):
 
 
 @pytest.mark.parametrize("cause", ["stopped", "fault"])
-def test_a_stop_is_a_stop(tmp_path: Path, cause: Any):
+def test_a_stop_is_a_stop(rig: VirtualRig, cause: Any):
     """During the fall of the torque and after it nothing is laid, and no pulse follows."""
-    rig = adaptive(tmp_path)
     score, found = rig.run.score, []
     rig.at(0.3, lambda: extend(rig, 20, [hold("added", on_s=3.0)]))
     rig.at(1.0, lambda: rig.halt.set(cause, "that hurts"))
@@ -143,8 +142,7 @@ def test_a_stop_is_a_stop(tmp_path: Path, cause: Any):
     assert rig.path.stat().st_size == size
 
 
-def test_each_segment_is_in_the_journal_before_its_first_pulse(tmp_path: Path):
-    rig = adaptive(tmp_path)
+def test_each_segment_is_in_the_journal_before_its_first_pulse(rig: VirtualRig):
     rig.at(0.2, lambda: extend(rig, 20, [hold("added")]))
     rig.at(1.7, lambda: rig.run.score.enough("me", at_once=True))
     rig.execute()
@@ -270,8 +268,7 @@ def test_the_charge_of_a_second_holds_across_a_boundary(tmp_path: Path):
     assert rig.recording().names == ["rest", "a", "rest", "c", "rest"]
 
 
-def test_the_rise_is_counted_from_the_last_pulse_that_is_laid(tmp_path: Path):
-    rig = adaptive(tmp_path)
+def test_the_rise_is_counted_from_the_last_pulse_that_is_laid(rig: VirtualRig):
     down = {"from_pulse_width_us": 300.0, "to_pulse_width_us": 120.0}
     extend(rig, 20, [hold("up"), SegmentPlan(name="down", sequence="sweep", settings=down)])
     up = {"from_pulse_width_us": 170.0, "to_pulse_width_us": 300.0}
@@ -335,8 +332,7 @@ def test_the_torque_time_is_counted_from_rest_and_through_lost_samples(tmp_path:
     assert result.summary["torque_time_nms"] == pytest.approx(6.0 * 2.0, rel=0.05)
 
 
-def test_only_so_many_are_checked_for_one_boundary(tmp_path: Path):
-    rig = adaptive(tmp_path)
+def test_only_so_many_are_checked_for_one_boundary(rig: VirtualRig):
     wrong = [hold(max_pulse_width_us=1000.0)]
     found = refusals(*[lambda: extend(rig, 20, wrong)] * (MAX_CHECKED + 3), lambda: extend(rig, 20, [hold()]))
     assert [type(error) for error in found] == [RefusedError] * MAX_CHECKED + [BusyError] * 4
@@ -453,8 +449,7 @@ def ask_more(live: LiveRig, *which: Any, **key: str) -> Extended:
     return live.ask(live.rig.player.extend(request(*which, **key)))
 
 
-def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: Callable[..., LiveRig]):
-    live = make()
+def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(live: LiveRig):
     for short in ("", "15 characters!!"):
         with pytest.raises(PlanError, match="at least 16 characters"):
             live.start(bounded(live), short)
@@ -499,17 +494,15 @@ def test_from_start_to_sealed_file_with_one_that_extends_and_says_enough(make: C
         assert KEY not in str(dict(file.attrs))
 
 
-def test_a_fixed_test_and_a_calibration_are_not_extended(make: Callable[..., LiveRig]):
-    live = make()
+def test_a_fixed_test_and_a_calibration_are_not_extended(live: LiveRig):
     live.start(live.plan("one", hold_s=20.0), KEY)
     for ask in (lambda: ask_more(live, 840), lambda: live.ask(live.rig.player.enough(EnoughRequest(test_id="one")))):
         with pytest.raises(PlanError, match="fixed plan"):
             ask()
 
 
-def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make: Callable[..., LiveRig]):
+def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(live: LiveRig):
     """The fixed plan would not stimulate for a minute, an extension might after half a second."""
-    live = make()
     live.play("before", hold_s=0.5)
     rested = Profile(rest_between_tests_s=30.0)
     quiet = [rest(0.5), rest(60.0)]
@@ -521,8 +514,7 @@ def test_the_rest_between_tests_is_counted_to_the_first_pulse_that_may_come(make
         live.start(bounded(live, profile=rested, segments=[*quiet, *added()], max_duration_s=90.0), KEY)
 
 
-def test_the_day_must_last_as_long_as_the_bound(make: Callable[..., LiveRig]):
-    live = make()
+def test_the_day_must_last_as_long_as_the_bound(live: LiveRig):
     midnight_s = end_of_day_s(live.clock.unix_s())
     live.clock.set_unix_ahead(midnight_s - 10.0 - live.clock.unix_s())
     day = Profile(
@@ -537,9 +529,8 @@ def test_the_day_must_last_as_long_as_the_bound(make: Callable[..., LiveRig]):
     assert live.start(bounded(live, profile=day, max_duration_s=30.0), KEY).state == "arming"
 
 
-def test_until_a_tests_clock_runs_nothing_is_told_of_it(make: Callable[..., LiveRig]):
+def test_until_a_tests_clock_runs_nothing_is_told_of_it(live: LiveRig):
     """Its samples have no time on it yet, and the gate still holds what became of the last test's pulses."""
-    live = make()
     live.play("before", hold_s=0.5)
     live.start(live.plan("one", hold_s=2.0))
     told = []

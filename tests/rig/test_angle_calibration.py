@@ -319,8 +319,7 @@ def test_a_clinics_rig_needs_a_calibration_for_an_angle(angled: Angled):
         live.start(live.plan("h", **HELD))
 
 
-def test_without_a_sensor_poses_and_angles_are_refused(make: Callable[..., LiveRig]):
-    live = make()
+def test_without_a_sensor_poses_and_angles_are_refused(live: LiveRig):
     assert live.rig.status().angle.present is False
     with pytest.raises(PlanError, match="angle_pose: this rig has no angle sensor"):
         live.ask(live.rig.angle_pose(AnglePoseRequest(angle_rad=1.0, by="nurse")))

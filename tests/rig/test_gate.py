@@ -48,8 +48,13 @@ class Setup:
         return self.gate.fire(0, Pulse(width_us, current_ma), self.clock.now_s(), latest_s)
 
 
-def test_shut_means_shut(tmp_path: Path):
-    setup = Setup(tmp_path)
+@pytest.fixture
+def setup(tmp_path: Path) -> Setup:
+    """An open gate."""
+    return Setup(tmp_path)
+
+
+def test_shut_means_shut(setup: Setup):
     assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED
     setup.gate.shut()
     assert setup.fire(100) == PulseStatus.REFUSED
@@ -57,25 +62,22 @@ def test_shut_means_shut(tmp_path: Path):
     assert not setup.gate.is_open
 
 
-def test_the_intent_is_written_before_the_command(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_the_intent_is_written_before_the_command(setup: Setup):
     on_disk: list[list[Kind]] = []
     setup.stimulator.on_send = lambda _: on_disk.append([kind for kind, _ in journal.read(setup.path).blocks])
     setup.fire(100)
     assert on_disk == [[Kind.EVENT, Kind.INTENT]]
 
 
-def test_an_intent_that_cannot_be_written_sends_nothing(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_an_intent_that_cannot_be_written_sends_nothing(setup: Setup):
     setup.journal._failure = "disk full"
     with pytest.raises(Exception, match="disk full"):
         setup.fire(100)
     assert setup.stimulator.sent == []
 
 
-def test_one_pulse_at_most_is_on_its_way(tmp_path: Path):
+def test_one_pulse_at_most_is_on_its_way(setup: Setup):
     """A line that holds what it is given may hold one pulse, and lets go a burst of one."""
-    setup = Setup(tmp_path)
     setup.stimulator.ack_delay_s = 0.090
     statuses = []
     for _ in range(5):
@@ -94,10 +96,7 @@ def test_one_pulse_at_most_is_on_its_way(tmp_path: Path):
 
 
 @pytest.mark.parametrize("ack_delay_s", [0.001, 0.012, 0.0169, 0.0171, 0.024])
-def test_the_interval_counts_from_the_ack_since_the_pulse_may_have_been_felt_as_late(
-    tmp_path: Path, ack_delay_s: float
-):
-    setup = Setup(tmp_path)
+def test_the_interval_counts_from_the_ack_since_the_pulse_may_have_been_felt_as_late(setup: Setup, ack_delay_s: float):
     setup.stimulator.ack_delay_s = ack_delay_s
     for _ in range(20):
         setup.fire(100)
@@ -110,8 +109,7 @@ def test_the_interval_counts_from_the_ack_since_the_pulse_may_have_been_felt_as_
     )
 
 
-def test_a_stop_settles_what_was_on_its_way_and_says_so_until_then(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_a_stop_settles_what_was_on_its_way_and_says_so_until_then(setup: Setup):
     setup.stimulator.ack_delay_s = None
     setup.fire(100)
     setup.wait(0.08)
@@ -144,8 +142,7 @@ def test_whatever_is_asked_nothing_outside_reaches_the_device(tmp_path: Path, as
     setup.journal.close()
 
 
-def test_acks_and_errors_are_matched_by_number(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_acks_and_errors_are_matched_by_number(setup: Setup):
     setup.stimulator.ack_delay_s = None
     setup.fire(100)
     assert setup.gate.on_its_way is not None
@@ -158,8 +155,7 @@ def test_acks_and_errors_are_matched_by_number(tmp_path: Path):
     assert len(setup.events()) == 1, "neither late nor unasked for"
 
 
-def test_disconnecting_stops_first_and_never_raises(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_disconnecting_stops_first_and_never_raises(setup: Setup):
     setup.stimulator.silent = True
     setup.machine.run(setup.gate.disconnect())
     assert setup.stimulator.stops == 1
@@ -187,8 +183,7 @@ def test_a_new_gate_is_shut_and_empty(tmp_path: Path):
     assert setup.faults == ["unplugged"]
 
 
-def test_a_reset_forgets_the_test_before(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_a_reset_forgets_the_test_before(setup: Setup):
     setup.fire(100)
     setup.wait(0.001)
     setup.fire(100)
@@ -201,8 +196,7 @@ def test_a_reset_forgets_the_test_before(tmp_path: Path):
     assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED, "the interval of the test before counts no more"
 
 
-def test_each_test_has_limits_of_its_own(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_each_test_has_limits_of_its_own(setup: Setup):
     assert setup.fire(100) == PulseStatus.UNACKNOWLEDGED
     narrow = limits.tightened(limits.HARD_LIMITS, "pulse_width_us", 99.0, "rig file")
     setup.machine.run(setup.gate.open(setup.journal, narrow, lambda: False))
@@ -210,8 +204,7 @@ def test_each_test_has_limits_of_its_own(tmp_path: Path):
     assert (setup.fire(100), setup.fire(99)) == (PulseStatus.REFUSED, PulseStatus.UNACKNOWLEDGED)
 
 
-def test_lateness_charge_and_delay_are_those_of_the_pulses_sent(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_lateness_charge_and_delay_are_those_of_the_pulses_sent(setup: Setup):
     setup.stimulator.ack_delay_s = 0.004
     now_s = setup.clock.now_s()
     setup.gate.fire(3, Pulse(100.7, 20.0), now_s - 0.002, now_s)
@@ -229,9 +222,8 @@ def test_lateness_charge_and_delay_are_those_of_the_pulses_sent(tmp_path: Path):
     assert [jn.ACKED.unpack(p) for p in blocks(setup, Kind.ACKED)] == [(3, pytest.approx(now_s + 0.004))]
 
 
-def test_who_follows_a_test_learns_what_became_of_each_pulse(tmp_path: Path):
+def test_who_follows_a_test_learns_what_became_of_each_pulse(setup: Setup):
     """As it was sent and acknowledged; one that is on its way is not told yet."""
-    setup = Setup(tmp_path)
     written = []
     for index, width_us in ((3, 100.7), (4, 120.0)):
         written.append(setup.clock.now_s())
@@ -255,8 +247,7 @@ def test_who_follows_a_test_learns_what_became_of_each_pulse(tmp_path: Path):
         (301.0, 20.0, PulseStatus.REFUSED),
     ],
 )
-def test_what_comes_to_no_pulse_is_a_rest(tmp_path: Path, width_us: float, current_ma: float, status: PulseStatus):
-    setup = Setup(tmp_path)
+def test_what_comes_to_no_pulse_is_a_rest(setup: Setup, width_us: float, current_ma: float, status: PulseStatus):
     assert setup.fire(width_us, current_ma) == status
     assert len(setup.stimulator.sent) == (status == PulseStatus.UNACKNOWLEDGED)
     skipped = status != PulseStatus.UNACKNOWLEDGED and width_us > 0  # of a planned rest nothing is written
@@ -264,9 +255,8 @@ def test_what_comes_to_no_pulse_is_a_rest(tmp_path: Path, width_us: float, curre
     assert setup.gate.dropped == 0
 
 
-def test_no_second_holds_more_pulses_than_the_highest_rate(tmp_path: Path):
+def test_no_second_holds_more_pulses_than_the_highest_rate(setup: Setup):
     """Small pulses, so that neither their charge nor their interval forbids them: the rate alone does."""
-    setup = Setup(tmp_path)
     statuses = []
     for _ in range(250):
         statuses.append(setup.fire(10, 1.0))
@@ -305,8 +295,7 @@ def test_no_test_gets_more_charge_than_a_test_may(tmp_path: Path):
     assert setup.events()[-1]["reason"].startswith("charge_per_test_uc 24 µC is outside 0 … 20 (rig file")
 
 
-def test_the_journal_says_of_each_pulse_that_was_not_sent_why(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_the_journal_says_of_each_pulse_that_was_not_sent_why(setup: Setup):
     setup.gate.fire(0, Pulse(100, 20), T0_S, T0_S)
     setup.wait(0.005)
     now_s = setup.clock.now_s()
@@ -341,8 +330,7 @@ def test_the_journal_says_of_each_pulse_that_was_not_sent_why(tmp_path: Path):
 
 
 @pytest.mark.parametrize("number", [0, 5])
-def test_an_ack_that_nobody_asked_for_is_written_and_told(tmp_path: Path, number: int):
-    setup = Setup(tmp_path)
+def test_an_ack_that_nobody_asked_for_is_written_and_told(setup: Setup, number: int):
     setup.stimulator.on_ack(Ack(number, 1000.5))
     assert setup.faults == ["stimulator: it acknowledged a pulse that it was not sent; is the line disturbed?"]
     assert setup.events()[1:] == [{"event": "unasked_ack", "time_s": 1000.5}]
@@ -353,8 +341,7 @@ def test_an_ack_that_nobody_asked_for_is_written_and_told(tmp_path: Path, number
 
 
 @pytest.mark.parametrize("speed", [1.0, 4.0])
-def test_late_acks_are_noted_by_real_time(tmp_path: Path, speed: float):
-    setup = Setup(tmp_path)
+def test_late_acks_are_noted_by_real_time(setup: Setup, speed: float):
     setup.clock.speed = speed
     for number, real_s in ((1, 0.014), (2, 0.016)):
         setup.stimulator.ack_delay_s = None
@@ -380,8 +367,7 @@ def test_an_ack_after_exactly_the_time_allowed_is_not_late(tmp_path: Path):
     assert len(setup.events()) == 1, "arm alone"
 
 
-def test_a_pulse_that_becomes_late_while_its_intent_is_written_is_dropped(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_a_pulse_that_becomes_late_while_its_intent_is_written_is_dropped(setup: Setup):
     append = setup.journal.append
 
     def slow(kind: Kind, payload: bytes) -> None:
@@ -395,8 +381,7 @@ def test_a_pulse_that_becomes_late_while_its_intent_is_written_is_dropped(tmp_pa
     assert [jn.SKIPPED.unpack(p) for p in blocks(setup, Kind.SKIPPED)] == [(7, PulseStatus.DROPPED, T0_S + 0.5)]
 
 
-def test_pulses_are_rounded_to_the_steps_of_the_device_behind_the_gate(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_pulses_are_rounded_to_the_steps_of_the_device_behind_the_gate(setup: Setup):
     setup.stimulator.steps = limits.Steps(pulse_width_us=4.0, current_ma=2.0, shortest_us=20.0)
     assert setup.fire(19.0) == PulseStatus.REST
     assert setup.fire(103.0, 19.9) == PulseStatus.UNACKNOWLEDGED
@@ -415,8 +400,7 @@ def test_a_pulse_exactly_a_second_old_no_longer_counts(tmp_path: Path):
     assert setup.fire(400, 100.0) != PulseStatus.UNACKNOWLEDGED
 
 
-def test_after_its_release_a_journal_gets_nothing_more(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_after_its_release_a_journal_gets_nothing_more(setup: Setup):
     setup.stimulator.ack_delay_s = None
     setup.fire(100)
     before = setup.path.read_bytes()
@@ -428,25 +412,22 @@ def test_after_its_release_a_journal_gets_nothing_more(tmp_path: Path):
     assert setup.gate.on_its_way is None, "the ack still settles what was on its way"
 
 
-def test_an_ack_that_cannot_be_written_is_a_fault(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_an_ack_that_cannot_be_written_is_a_fault(setup: Setup):
     setup.fire(100)
     setup.journal._failure = "disk full"
     setup.wait(0.01)
     assert setup.faults == ["disk full"]
 
 
-def test_a_watchdog_is_fed_while_the_gate_is_open_alone(tmp_path: Path):
-    setup = Setup(tmp_path)
+def test_a_watchdog_is_fed_while_the_gate_is_open_alone(setup: Setup):
     setup.gate.feed()
     setup.gate.shut()
     setup.gate.feed()
     assert setup.stimulator.fed_s == [T0_S]
 
 
-def test_a_new_test_does_not_wait_for_an_ack_of_the_one_before(tmp_path: Path):
+def test_a_new_test_does_not_wait_for_an_ack_of_the_one_before(setup: Setup):
     """Arming is answered in order: what was on its way before has gone through, or is lost."""
-    setup = Setup(tmp_path)
     setup.stimulator.ack_delay_s = None
     setup.fire(100)
     setup.gate.release()

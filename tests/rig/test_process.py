@@ -111,8 +111,7 @@ def test_in_a_real_terminal():
     assert b"stopped" in said
 
 
-def test_the_rig_stops_by_it_and_latches(make: Callable[..., LiveRig]):
-    live = make()
+def test_the_rig_stops_by_it_and_latches(live: LiveRig):
     live.start(live.plan("one", hold_s=20.0))
     live.wait_pulses(5)
     live.ask(program._stop_by_key(live.rig))

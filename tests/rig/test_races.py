@@ -40,6 +40,12 @@ FEW = 20
 CALIBRATION = CalibrateStartRequest(calibration_id="c", participant="P", by="t")
 
 
+@pytest.fixture
+def live(make: Make) -> LiveRig:
+    """On a disk that outlives it."""
+    return make(disk=SimulatedDisk(World(0)))
+
+
 def moments(
     make: Make,
     begin: Callable[[LiveRig], Coroutine[Any, Any, Any]],
@@ -202,9 +208,8 @@ def test_a_start_that_was_asked_while_stopped_is_not_played_once_rearmed(make: M
         assert live.stimulator.sent == []
 
 
-def test_a_latch_that_the_disk_refused_is_written_once_it_takes_it(make: Make):
+def test_a_latch_that_the_disk_refused_is_written_once_it_takes_it(live: LiveRig):
     """Else a rig that dies later would start as if nobody had stopped it (the simulator's seed 700251)."""
-    live = make(disk=SimulatedDisk(World(0)), clock=None)
     disk: Any = live.machine.disk
     disk.failing = True
     assert live.stop("somebody pressed").confirmed
@@ -220,9 +225,8 @@ def test_a_latch_that_the_disk_refused_is_written_once_it_takes_it(make: Make):
         remembered(live)
 
 
-def test_a_rearm_that_waits_its_turn_releases_no_stop_that_came_meanwhile(make: Make):
+def test_a_rearm_that_waits_its_turn_releases_no_stop_that_came_meanwhile(live: LiveRig):
     """Two people re-arm at once, and somebody presses stop before the second one's turn."""
-    live = make(disk=SimulatedDisk(World(0)), clock=None)
     live.stop("first")
     one, two = (live.begin(live.rig.rearm(name, live.rig.state.latch)) for name in ("nurse", "doctor"))
     live.machine.wait(0.001)
@@ -248,8 +252,7 @@ AGAIN = {
 
 
 @pytest.mark.parametrize("again", AGAIN)
-def test_a_rearm_by_who_has_not_seen_the_last_stop_is_refused(make: Make, again: str):
-    live = make(disk=SimulatedDisk(World(0)), clock=None)
+def test_a_rearm_by_who_has_not_seen_the_last_stop_is_refused(live: LiveRig, again: str):
     live.stop("first")
     seen = live.rig.status().latch
     AGAIN[again](live)
@@ -322,8 +325,7 @@ def test_a_stop_is_remembered_by_the_next_process_once_it_is_answered(make: Make
             live.machine.wait(0.001)
 
 
-def test_a_bug_while_a_tests_files_are_made_leaves_a_rig_that_can_be_stopped(make: Make, monkeypatch: Any):
-    live = make(disk=SimulatedDisk(World(0)), clock=None)
+def test_a_bug_while_a_tests_files_are_made_leaves_a_rig_that_can_be_stopped(live: LiveRig, monkeypatch: Any):
     monkeypatch.setattr(live.rig.store, "begin", Mock(side_effect=ValueError("a mistake in this program")))
     with pytest.raises(ValueError, match="mistake"):
         live.start(live.plan("one"))
@@ -331,8 +333,7 @@ def test_a_bug_while_a_tests_files_are_made_leaves_a_rig_that_can_be_stopped(mak
     assert live.stop("now").confirmed
 
 
-def test_nothing_begins_while_the_rig_shuts_down(make: Make):
-    live = make(disk=SimulatedDisk(World(0)), clock=None)
+def test_nothing_begins_while_the_rig_shuts_down(live: LiveRig):
     closing = live.begin(live.rig.close())
     live.machine.wait(0.001)
     with pytest.raises(BusyError, match="shutting down"):
@@ -341,8 +342,7 @@ def test_nothing_begins_while_the_rig_shuts_down(make: Make):
     assert live.stimulator.sent == []
 
 
-def test_a_stimulator_that_can_still_stimulate_is_not_rearmed(make: Make, monkeypatch: Any):
-    live = make(disk=SimulatedDisk(World(0)), clock=None)
+def test_a_stimulator_that_can_still_stimulate_is_not_rearmed(live: LiveRig, monkeypatch: Any):
     live.stop("now")
 
     async def state() -> tuple[bool, str]:
@@ -402,8 +402,7 @@ def test_one_that_has_begun_ends_only_where_that_is_asked(make: Make, begun: boo
         assert "withdrawn" in [event["event"] for event in json.loads(str(file.attrs["events"]))]
 
 
-def test_it_holds_for_a_test_that_the_rig_has_not_heard_of_yet(make: Make):
-    live = make()
+def test_it_holds_for_a_test_that_the_rig_has_not_heard_of_yet(live: LiveRig):
     reply = live.ask(answer(live.rig, b'{"kind": "withdraw", "id": 3, "test_id": "one", "reason": "signed out"}'))
     assert reply.ok and reply.body == {"withdrawn": True}
     with pytest.raises(WithdrawnError, match="test one: withdrawn: signed out; ask for a new test"):
@@ -417,8 +416,7 @@ def test_it_holds_for_a_test_that_the_rig_has_not_heard_of_yet(make: Make):
         withdraw(live, "../one")
 
 
-def test_of_one_that_is_over_nothing_is_withdrawn(make: Make):
-    live = make()
+def test_of_one_that_is_over_nothing_is_withdrawn(live: LiveRig):
     live.start(live.plan("one", hold_s=0.5))
     live.wait("sealing")
     assert not withdraw(live, begun=True)
@@ -427,8 +425,7 @@ def test_of_one_that_is_over_nothing_is_withdrawn(make: Make):
     assert live.finished.outcome == "completed"
 
 
-def test_a_stop_outranks_it(make: Make):
-    live = make(disk=SimulatedDisk(World(0)))
+def test_a_stop_outranks_it(live: LiveRig):
     live.start(live.plan("one", hold_s=5.0))
     live.wait_pulses(5)
     assert withdraw(live, begun=True)

@@ -24,8 +24,7 @@ from tests.rig.live import SPEED, WORK_S, LiveRig
 Make = Callable[..., LiveRig]
 
 
-def test_from_ready_to_ready_with_a_sealed_file(make: Make):
-    live = make()
+def test_from_ready_to_ready_with_a_sealed_file(live: LiveRig):
     assert live.start(live.plan("one")).state in ("arming", "running")
     live.wait("running")
     with pytest.raises(BusyError, match="test one of participant P"):
@@ -50,8 +49,7 @@ def test_from_ready_to_ready_with_a_sealed_file(make: Make):
             live.start(live.plan(name))
 
 
-def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
-    live = make()
+def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(live: LiveRig):
     live.play("one", hold_s=0.5)
     rested = Profile(rest_between_tests_s=60.0)
     with pytest.raises(
@@ -62,9 +60,8 @@ def test_the_rest_between_two_tests_is_asked_for_and_says_how_long(make: Make):
     assert live.preview(live.plan("p", profile=rested)).duration_s == 3.0
 
 
-def test_no_plan_is_previewed_beside_a_test_and_only_so_many_wait(make: Make):
+def test_no_plan_is_previewed_beside_a_test_and_only_so_many_wait(live: LiveRig):
     """The next one is built once the one before is; a start waits for one, and those behind it are refused."""
-    live = make()
 
     def previews(count: int) -> list[Task[Preview]]:
         return [live.begin(live.rig.preview(PreviewRequest(plan=live.plan("p")))) for _ in range(count)]
@@ -95,8 +92,7 @@ def test_a_calibration_does_not_shorten_the_rest_after_a_test(make: Make):
         live.step("up")
 
 
-def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
-    live = make()
+def test_midnight_ends_nothing_in_its_middle_without_a_reason(live: LiveRig):
     midnight_s = end_of_day_s(live.clock.unix_s())
     live.clock.set_unix_ahead(midnight_s - 10.0 - live.clock.unix_s())
     with pytest.raises(PlanError, match="none is open"):
@@ -127,15 +123,13 @@ def test_midnight_ends_nothing_in_its_middle_without_a_reason(make: Make):
     assert live.rig.status().state == "ready"
 
 
-def test_a_test_of_which_the_stimulator_would_send_nothing_is_refused(make: Make):
-    live = make()
+def test_a_test_of_which_the_stimulator_would_send_nothing_is_refused(live: LiveRig):
     assert live.rig.status().stimulator["shortest_us"] == live.rig.pair.steps.shortest_us
     with pytest.raises(PlanError, match=r"300 µs at 0.4 mA would stimulate nothing"):
         live.start(live.plan("weak", profile=Profile(current_ma=0.4)))
 
 
-def test_a_mistake_in_a_driver_is_told_as_one(make: Make):
-    live = make()
+def test_a_mistake_in_a_driver_is_told_as_one(live: LiveRig):
     live.start(live.plan("one", hold_s=20.0))
     live.wait_pulses(5)
     live.cell.broken = True
@@ -144,8 +138,7 @@ def test_a_mistake_in_a_driver_is_told_as_one(make: Make):
     assert live.rearm().state == "ready"
 
 
-def test_a_device_that_is_gone_is_told_and_opened_anew_by_rearming(make: Make):
-    live = make()
+def test_a_device_that_is_gone_is_told_and_opened_anew_by_rearming(live: LiveRig):
     live.cell.gone = True
     assert "the bus is gone" in live.wait("disconnected")
     assert live.rig.trouble() is None  # told, and waiting for a person: nothing that a restart would mend
@@ -157,8 +150,7 @@ def test_a_device_that_is_gone_is_told_and_opened_anew_by_rearming(make: Make):
     assert live.rearm().state == "ready"
 
 
-def test_a_stop_of_a_deaf_device_is_not_called_confirmed(make: Make):
-    live = make()
+def test_a_stop_of_a_deaf_device_is_not_called_confirmed(live: LiveRig):
     live.stimulator.silent = True
     assert not live.stop("check").confirmed
     assert live.rig.status().state == "latched"
@@ -202,8 +194,7 @@ def test_a_damaged_journal_is_sealed_and_kept(make: Make, tmp_path: Path):
     assert not (tmp_path / "journals" / "dead.journal").exists()
 
 
-def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(make: Make):
-    live = make()
+def test_a_wall_clock_that_jumps_in_a_test_changes_nothing(live: LiveRig):
     live.start(live.plan("one"))
     live.wait_pulses(10)
     for hours in (1, -2):
@@ -246,9 +237,8 @@ def test_what_hangs_or_died_is_trouble(make: Make, monkeypatch: pytest.MonkeyPat
     assert rig.trouble() == "the torque receiver has ended"
 
 
-def test_a_rest_counts_from_when_a_stalled_line_has_answered_again(make: Make):
+def test_a_rest_counts_from_when_a_stalled_line_has_answered_again(live: LiveRig):
     """The pulse that it held may have been felt only then."""
-    live = make()
     live.start(live.plan("held"))
     live.wait("running")
     live.wait_pulses(10)
@@ -261,8 +251,7 @@ def test_a_rest_counts_from_when_a_stalled_line_has_answered_again(make: Make):
         live.start(live.plan("soon", segments=[SegmentPlan(name="hold", sequence="steps", settings={"on_s": 1.0})]))
 
 
-def test_a_stop_is_confirmed_though_the_disk_is_slow(make: Make):
-    live = make()
+def test_a_stop_is_confirmed_though_the_disk_is_slow(live: LiveRig):
     live.start(live.plan("slow"))
     live.wait_pulses(5)
     live.machine.work_s = 1.0
@@ -273,8 +262,7 @@ def test_a_stop_is_confirmed_though_the_disk_is_slow(make: Make):
     live.wait("latched")
 
 
-def test_the_watch_of_the_configuration_is_the_one_that_waits(make: Make):
-    live = make()
+def test_the_watch_of_the_configuration_is_the_one_that_waits(live: LiveRig):
     assert live.config.watch.stale_torque_s == 0.5
     live.start(live.plan("one", hold_s=20.0))
     live.wait_pulses(10)
