@@ -13,6 +13,7 @@ from collections import deque
 
 from stimrig.rig.acquire.health import Health
 from stimrig.rig.acquire.receiver import Receiver
+from stimrig.rig.acquire.stream import POLL_S
 from stimrig.rig.gate import Gate
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.machine import Machine
@@ -27,7 +28,6 @@ RECOVERY_S = 0.5
 """Real seconds more within which all must be whole again, however often it stood still meanwhile."""
 LONG_S, MOST_LONG, WITHIN_S = 0.9, 3, 10.0
 """So many standstills, each nearly as long as the longest, within so many real seconds end the test."""
-POLL_S = 0.005
 
 
 class Pauses:
@@ -63,7 +63,7 @@ class Pauses:
 
         The stimulator is asked beside it: who stops waits for no answer of it.
         """
-        longest_s, cause = stood_s, self._machine.blocked_by(stood_s)
+        longest_s, looked_s, cause = stood_s, 0.0, self._machine.blocked_by(stood_s)
         changing = self._tasks.spawn(self._gate.changed(), "stimulator after a pause")
         while True:
             suspicion = self._health.suspicion() if first else None
@@ -74,15 +74,16 @@ class Pauses:
                 and self._health.fault() is None
             ):
                 break
-            waited_s = self._since(due_s)
-            if suspicion is not None and waited_s >= min(suspicion[1], LONGEST_S + RECOVERY_S):
+            is_over = self._since(due_s) > LONGEST_S + RECOVERY_S
+            if suspicion is not None and (is_over or looked_s >= suspicion[1]):
                 return suspicion[0]
-            if waited_s > LONGEST_S + RECOVERY_S:
+            if is_over:
                 return self._health.fault() or "not everything was in order again soon after the computer was blocked"
-            looked_s = self._clock.now_s()
-            if await self._tasks.sleep(POLL_S, self._halt):
+            now_s = self._clock.now_s()
+            looked_s += await self._receiver.look_again(self._halt)
+            if self._halt.is_set():
                 return None
-            again_s = self._since(looked_s) - POLL_S
+            again_s = self._since(now_s) - POLL_S
             if again_s > BLOCKED_S:  # it stood still once more
                 longest_s = max(longest_s, again_s)
                 if (wrong := self._too_much(again_s, due_s)) is not None:

@@ -143,8 +143,10 @@ def test_a_single_bus_error_delays_a_start_and_does_not_refuse_it(tmp_path: Path
     assert rig.stimulator.sent[0][0] - 1003.0 > 0.1 + 0.1 - 0.02
 
 
-def test_a_computer_that_stands_still_while_it_arms_has_not_waited_for_the_cell(tmp_path: Path):
+@pytest.mark.parametrize("at_s", [0.05, 0.095])  # it is armed, and its first pulse is due after 0.1 s
+def test_a_computer_that_stands_still_has_not_waited_for_the_cell(tmp_path: Path, at_s: float):
     rig = rig_of(tmp_path)
-    rig.clock.call_at(1003.001, lambda: rig.clock.advance(0.8))
+    rig.clock.call_at(1003.0 + at_s, lambda: rig.clock.advance(0.8))
+    rig.cell.held = lambda now_s: 0.0 < now_s - (1003.0 + at_s) < 0.82  # what waits is read a moment later
     result = play(rig, 3.0)
     assert result.outcome == "completed", result.reason
