@@ -27,9 +27,13 @@ class Tasks:
         if not task.cancelled() and (error := task.exception()) is not None:
             self._log.error("a background task failed", exc_info=error)
 
-    async def close(self) -> None:
+    def cancel(self) -> None:
         """Cancel all of them."""
-        running = list(self._running)
-        for task in running:
+        for task in self._running:
             task.cancel()
+
+    async def close(self) -> None:
+        """Cancel all of them, and wait for their end."""
+        running = list(self._running)
+        self.cancel()
         await asyncio.gather(*running, return_exceptions=True)

@@ -60,9 +60,8 @@ class Follower(Watcher):
         """Pulses that are laid before the boundary that was asked about."""
         self._deciding: asyncio.Task[None] | None = None
 
-    async def _listen(self) -> None:
+    def start(self) -> None:
         self._deciding = self.begin(self._begin())
-        await super()._listen()
 
     async def _begin(self) -> None:
         await self.adviser.submit("adaptive_begin", **self.how).result
@@ -70,7 +69,7 @@ class Follower(Watcher):
     def give_up(self, why: str) -> None:
         """As `Watcher`; the fixed plan plays on at once, without rest for somebody who would choose."""
         super().give_up(why)
-        self._tasks.begin(self._release(-1 if self._newest is None else self._newest.laid))
+        self.tasks.begin(self._release(-1 if self._newest is None else self._newest.laid))
 
     async def _release(self, after: int) -> None:
         with contextlib.suppress(ApiError):  # without this request the test continues after the rig's timeout

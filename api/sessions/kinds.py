@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 from collections.abc import Callable, Coroutine
 from dataclasses import asdict, dataclass, field
@@ -14,7 +13,7 @@ from stimrig.api.errors import ApiError
 from stimrig.api.jobs.tasks import Tasks
 from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.requests import TestIn
-from stimrig.api.sessions.rig_client import RigClient, events_of
+from stimrig.api.sessions.rig_client import RigClient, no_rig
 from stimrig.api.store.tables import Test
 from stimrig.rig.messages import AnglePlan, FinishedEvent, LiveEvent, TestPlan
 
@@ -80,6 +79,9 @@ class Kind:
     def said_enough(self, test_id: str) -> None:
         """A person has ended it well."""
 
+    def hear(self, event: LiveEvent | None) -> None:
+        """Take the newest samples of the rig; None: the connection to it broke."""
+
     def unwatch(self) -> None:
         """Watch no test any more."""
 
@@ -143,17 +145,21 @@ class Watched(Kind):
         super().__init__(rig)
         self.clock, self.versions, self.send = clock, versions, send
         self.watcher: Watcher | None = None
-        self._task: asyncio.Task[None] | None = None
 
     def watch(self, watcher: Watcher) -> None:
         """Watch this test."""
         self.unwatch()
-        self.watcher, self._task = watcher, asyncio.create_task(watcher.run())
+        self.watcher = watcher
+        watcher.start()
 
     @property
     def is_watching(self) -> bool:
         """Return whether a test is being watched."""
-        return self._task is not None and not self._task.done()
+        return self.watcher is not None and self.watcher.listens
+
+    def hear(self, event: LiveEvent | None) -> None:
+        if self.watcher is not None and (event is None or event.test_id == self.watcher.plan.test_id):
+            self.watcher.take(event)
 
     def publish(self) -> None:
         """Send its state to the pages."""
@@ -166,15 +172,15 @@ class Watched(Kind):
             self.publish()
 
     def unwatch(self) -> None:
-        if self._task is not None:
-            self._task.cancel()
-        self._task, self.watcher = None, None
+        if self.watcher is not None:
+            self.watcher.tasks.cancel()
+        self.watcher = None
 
     async def close(self) -> None:
-        task = self._task
+        watcher = self.watcher
         self.unwatch()
-        if task is not None:
-            await asyncio.gather(task, return_exceptions=True)
+        if watcher is not None:
+            await watcher.tasks.close()
 
     def outcome(self, row: Test, event: FinishedEvent) -> dict[str, Any]:
         by, status = str(event.summary.get("ended_by") or event.outcome), self._status(row)
@@ -210,19 +216,22 @@ class Watcher:
     def __init__(self, plan: TestPlan, kind: Watched) -> None:
         self.plan, self.kind, self.rig, self.clock = plan, kind, kind.rig, kind.clock
         self.status: Any = kind.status_type(kind.watching)
-        self._tasks = Tasks(self.log)
+        self.tasks, self.listens = Tasks(self.log), True
 
-    async def run(self) -> None:
-        """Watch it to its end."""
+    def start(self) -> None:
+        """Begin what has to be done before the first sample."""
+
+    def take(self, event: LiveEvent | None) -> None:
+        """Take an event of this test; None: the connection to the rig broke, and samples are missing."""
+        if not self.listens:
+            return
         try:
-            await self._guarded(self._listen())
-        finally:
-            await self._tasks.close()
-
-    async def _listen(self) -> None:
-        async with contextlib.aclosing(events_of(self.rig.path, self.plan.test_id)) as events:
-            async for event in events:
-                self.hear(event)
+            if event is None:
+                raise no_rig("It closed the connection.")
+            self.hear(event)
+        except Exception as error:
+            self.listens = False
+            self._fail(error)
 
     def hear(self, event: LiveEvent) -> None:
         """Take the samples since the last event."""
@@ -230,16 +239,19 @@ class Watcher:
 
     def begin(self, work: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
         """Run it in the background, so that no sample is missed."""
-        return self._tasks.begin(self._guarded(work))
+        return self.tasks.begin(self._guarded(work))
 
     async def _guarded(self, work: Coroutine[Any, Any, None]) -> None:
         try:
             await work
-        except ApiError as error:
-            self.give_up(f"{error.title}. {error.detail}")
         except Exception as error:
-            self.log.exception("a test is not watched any more")
-            self.give_up(f"{type(error).__name__}.")
+            self._fail(error)
+
+    def _fail(self, error: Exception) -> None:
+        expected = isinstance(error, ApiError)
+        if not expected:
+            self.log.error("a test is not watched any more", exc_info=error)
+        self.give_up(f"{error.title}. {error.detail}" if expected else f"{type(error).__name__}.")
 
     def give_up(self, why: str) -> None:
         """Watch no more."""

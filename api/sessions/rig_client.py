@@ -7,7 +7,7 @@ import contextlib
 import json
 import logging
 import re
-from collections.abc import AsyncGenerator, Callable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -227,29 +227,3 @@ def no_rig(detail: str) -> ApiError:
     """503: the rig cannot be reached."""
     words = re.sub(r"^\[Errno \d+\] ", "", detail).rstrip(".")
     return ApiError(503, "rig-unreachable", "The rig cannot be reached", f"{words}. Is its process running?")
-
-
-async def events_of(path: Path | None, test_id: str) -> AsyncGenerator[messages.LiveEvent, None]:
-    """Yield the live events of a test until it has ended.
-
-    On a connection of its own, which nothing else delays: the rig leaves out events for a slow reader.
-
-    Raises ApiError: 503 the rig cannot be reached, or the connection broke before the end.
-    """
-    try:
-        reader, writer = await asyncio.open_unix_connection(str(path), limit=LINE_LIMIT)
-        try:
-            writer.write(line_of(requests.SubscribeRequest()))
-            while line := await reader.readline():
-                message = json.loads(line)
-                if message.get("ok") is False:
-                    raise no_rig("It refuses to send its samples.")
-                if message.get("test_id") == test_id and message["event"] == "finished":
-                    return
-                if message.get("test_id") == test_id and message["event"] == "live":
-                    yield messages.LiveEvent.model_validate(message)
-        finally:
-            writer.close()
-    except (OSError, ValueError) as error:
-        raise no_rig(str(error)) from error
-    raise no_rig("It closed the connection.")

@@ -286,6 +286,8 @@ class Runner(Playing):
     def _on_news(self, news: News) -> None:
         if isinstance(news, messages.LiveEvent):
             self.hub.live(news)
+            for kind in self.kinds.all:
+                kind.hear(news)
         elif isinstance(news, messages.FinishedEvent):
             self._follow(news.test_id, self._finish(news))
         elif isinstance(news, messages.StateEvent):
@@ -296,6 +298,8 @@ class Runner(Playing):
             self._look_for_end(news, MISSED_POLLS)
         else:
             self.hub.send({"type": "link", "connected": news})
+            for kind in () if news else self.kinds.all:
+                kind.hear(None)
             if news and self.rig.status is not None:
                 self._look_for_end(self.rig.status, 1)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import AsyncGenerator
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -18,7 +17,7 @@ from stimrig import identify
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs import adaptive as verbs
 from stimrig.api.jobs.job import Job
-from stimrig.api.sessions import adaptive_follower, kinds
+from stimrig.api.sessions import adaptive_follower
 from stimrig.api.sessions.adaptive import AdaptiveTests
 from stimrig.api.sessions.adaptive_follower import AdaptiveStatus, Follower
 from stimrig.api.sessions.kinds import Planned
@@ -239,25 +238,26 @@ class World:
             await asyncio.sleep(0)
         return answer
 
-    async def events(self, _path: object, test_id: str) -> AsyncGenerator[LiveEvent, None]:
+    async def play(self, follower: Follower) -> None:
+        follower.start()
         while self.now_s < FIRST_S:
             self.now_s += 0.02
             self.laid = 30 if self.now_s < FIRST_S - 0.05 else 50
-            yield LiveEvent(
-                test_id=test_id, segment="opening", elapsed_s=self.now_s, duration_s=45.0, zero_s=0.0, torque="",
+            follower.take(LiveEvent(
+                test_id="T1", segment="opening", elapsed_s=self.now_s, duration_s=45.0, zero_s=0.0, torque="",
                 torque_age_s=0.0, lost_samples=0, dropped_pulses=0, laid=self.laid,
                 boundary_s=FIRST_S + (self.laid - 30),
                 outcomes=PulseOutcomes(
                     index=[4], pulse_width_us=[0.0], written_time_s=[None], acknowledged_time_s=[None], status=[2]
                 ),
                 laid_segments=[m.LaidSegment(name="opening", start_s=0.0, end_s=FIRST_S, by="plan")],
-            )  # fmt: skip
+            ))  # fmt: skip
             for _ in range(5):
                 await asyncio.sleep(0)
+        await follower.tasks.close()
 
 
-def followed(world: World, monkeypatch: pytest.MonkeyPatch, rate_hz: float = 40.0) -> AdaptiveStatus:
-    monkeypatch.setattr(kinds, "events_of", world.events)
+def follower_of(world: World, rate_hz: float = 40.0) -> Follower:
     opening = SegmentPlan(name="opening", sequence="widths", settings={"pulse_width_us": [0.0] * round(3 * rate_hz)})
     plan = m.TestPlan(
         test_id="T1", participant="P017",
@@ -266,37 +266,41 @@ def followed(world: World, monkeypatch: pytest.MonkeyPatch, rate_hz: float = 40.
         adaptive=m.AdaptivePlan(max_duration_s=45.0, max_torque_time_nms=360.0),
     )  # fmt: skip
     whole: Any = world
-    follower = Follower(Planned(plan), AdaptiveTests(whole, whole, MagicMock(), whole, MagicMock()), whole)
-    asyncio.run(follower.run())
+    return Follower(Planned(plan), AdaptiveTests(whole, whole, MagicMock(), whole, MagicMock()), whole)
+
+
+def followed(world: World, rate_hz: float = 40.0) -> AdaptiveStatus:
+    follower = follower_of(world, rate_hz)
+    asyncio.run(world.play(follower))
     return follower.status
 
 
 @pytest.mark.parametrize("rate_hz", [10.0, 40.0])
-def test_the_answer_is_sent_at_once_and_before_the_rig_decides(monkeypatch: pytest.MonkeyPatch, rate_hz: float) -> None:
+def test_the_answer_is_sent_at_once_and_before_the_rig_decides(rate_hz: float) -> None:
     world = World(SAID)
-    assert followed(world, monkeypatch, rate_hz).problem == ""
+    assert followed(world, rate_hz).problem == ""
     [(at_s, request)] = world.requests
     assert isinstance(request, ExtendRequest) and request.after == 30
     assert at_s == pytest.approx(FIRST_S - m.AHEAD / rate_hz - adaptive_follower.ASK_S, abs=0.03)
 
 
-def test_an_answer_for_a_boundary_that_has_passed_is_noted_and_not_sent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_answer_for_a_boundary_that_has_passed_is_noted_and_not_sent() -> None:
     world = World({**SAID, "late": True})
-    status = followed(world, monkeypatch)
+    status = followed(world)
     assert [row["late"] for row in status.decisions] == [True] and world.requests == []
 
 
-def test_the_end_is_told_with_what_it_was_decided_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_is_told_with_what_it_was_decided_on() -> None:
     known = {"curve_percent": 1.5, "step_percent": 1.0}
     world = World({**SAID, "kind": "enough", "segments": [], "knowledge": known})
-    status = followed(world, monkeypatch)
+    status = followed(world)
     assert [type(request) for _, request in world.requests] == [EnoughRequest]
     assert (status.ended, status.knowledge, len(world.asked)) == ("known-enough", known, 1)
 
 
-def test_the_adviser_is_told_what_became_of_all_pulses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_adviser_is_told_what_became_of_all_pulses() -> None:
     world = World(SAID)
-    followed(world, monkeypatch)
+    followed(world)
     told = world.asked[0]["outcomes"]
     assert set(told["index"]) == {4} and set(told["status"]) == {2} and len(told["index"]) > 100, "all since the start"
     assert told.keys() == PulseOutcomes.model_fields.keys()
@@ -309,7 +313,7 @@ def test_no_question_is_asked_before_the_record_is_long_enough(
     """Of slow pulses the last whole one may have begun long ago; the answer would be the first look once more."""
     monkeypatch.setattr(adaptive_follower, "ASK_S", 2.0)
     world = World(SAID)
-    followed(world, monkeypatch, rate_hz)
+    followed(world, rate_hz)
     assert world.asked[0]["measured_s"] == pytest.approx(least_s, abs=0.03)
 
 
@@ -322,27 +326,40 @@ def test_no_question_is_asked_before_the_record_is_long_enough(
         (ApiError(503, "worker-died", "Worker died", "The worker process died."), "The worker process died"),
     ],
 )
-def test_an_answer_that_cannot_be_used_is_told_and_the_fixed_plan_plays_at_once(
-    monkeypatch: pytest.MonkeyPatch, answer: Any, why: str
-) -> None:
+def test_an_answer_that_cannot_be_used_is_told_and_the_fixed_plan_plays_at_once(answer: Any, why: str) -> None:
     world = World(answer)
-    status = followed(world, monkeypatch)
+    status = followed(world)
     assert status.state == "fixed" and status.problem.startswith("The fixed plan plays on: ") and why in status.problem
     assert [(request.after, request.segments) for _, request in world.requests] == [(30, [])]
 
 
-def test_what_the_rig_refuses_is_noted_and_the_fixed_plans_next_piece_plays(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_rig_refuses_is_noted_and_the_fixed_plans_next_piece_plays() -> None:
     world = World(SAID, refusal=ApiError(409, "rig-late", "Too late", "More was laid."))
-    status = followed(world, monkeypatch)
+    status = followed(world)
     assert (status.state, status.decisions[0]["refused"], len(world.requests)) == ("choosing", "More was laid.", 1)
 
 
-def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan() -> None:
     """Whether the rig laid it is not known; a record with the wrong widths would mislead."""
     world = World(SAID, refusal=no_rig("It did not answer within 5 s."))
-    status = followed(world, monkeypatch)
+    status = followed(world)
     assert status.state == "fixed" and "did not answer" in status.problem
     assert [request.segments for _, request in world.requests][1:] == [[]], "it plays on at once"
+
+
+def test_samples_that_are_missed_end_in_the_fixed_plan() -> None:
+    world = World()
+    follower = follower_of(world)
+
+    async def lose_the_link() -> None:
+        follower.start()
+        follower.take(None)
+        await asyncio.sleep(0)
+        await follower.tasks.close()
+
+    asyncio.run(lose_the_link())
+    assert follower.status.state == "fixed" and "closed the connection" in follower.status.problem
+    assert not follower.listens and [request.segments for _, request in world.requests] == [[]]
 
 
 # ---- What the adviser's worker keeps between its jobs, and which models it takes -------------------------------------
