@@ -178,7 +178,7 @@ BY_TURNS = ("begun in the PRBS", "a gap of 0.5 s", "every second sample")
     ("hidden", "relation"),
     whole_grid(
         [(hidden, relation) for hidden in HIDDEN[1:] for relation in BY_TURNS],
-        {(hidden, BY_TURNS[place]) for place, hidden in enumerate(HIDDEN[1:4])},
+        set(zip(("fatigue", "threshold_drift", "electromechanical_delay"), BY_TURNS, strict=True)),
     ),
 )
 def test_fit_with_the_effect_hardly_depends_on_the_samples(hidden, relation):

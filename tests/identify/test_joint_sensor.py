@@ -139,8 +139,8 @@ def test_angles_of_a_trial_are_smoothed_and_a_plan_stays_as_it_is():
 def recorded_by(sensor: AngleSensor) -> Record:
     """An isometric test, a passive and a moving one, joined."""
     arm = arm_patient(ARM)
-    made = [record(arm, "isometric", 1, sensor=sensor), record(arm, "passive", 1, duration_s=30.0, sensor=sensor)]
-    made.append(record(arm, "moving", 1, duration_s=25.0, sensor=sensor))
+    made = [record(arm, "isometric", 1, sensor=sensor), record(arm, "passive", 1, duration_s=24.0, sensor=sensor)]
+    made.append(record(arm, "moving", 1, duration_s=20.0, sensor=sensor))
     return join([as_record(one) for one in made], [0.0, 120.0, 240.0])
 
 

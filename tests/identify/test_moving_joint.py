@@ -44,7 +44,12 @@ ARM = 12
 def recorded_tests() -> tuple[dict[str, Any], ...]:
     arm = arm_patient(ARM)
     held = record(arm, "held", 1, angle_rad=float(np.mean(arm.range_rad)))
-    return (record(arm, "isometric", 1), record(arm, "passive", 1), held, record(arm, "moving", 1, duration_s=30.0))
+    return (
+        record(arm, "isometric", 1),
+        record(arm, "passive", 1, duration_s=36.0),
+        held,
+        record(arm, "moving", 1, duration_s=30.0),
+    )
 
 
 def joined(made: Any, order: Any = None) -> Record:
@@ -126,7 +131,8 @@ def test_at_its_own_angle_where_most_was_stimulated_at_rest_g_is_one_and_h_is_ze
 def test_another_scale_zero_and_start_of_the_cell_change_nothing():
     scale = -2.0
     tests = [changed(made, scale=scale, offset_nm=-7.0, start_s=1.3) for made in recorded_tests()]
-    other = surfaces(identify.fit(joined(tests), effects=MOVING_JOINT))
+    forms = [f"{entry['id']}:{entry['form']}" for entry in model().effects]
+    other = surfaces(identify.fit(joined(tests), effects=forms))
     x, v = seen(model(), "h")
     h = surfaces(model()).h_nm(x, v)
     assert np.max(np.abs(other.h_nm(x, v) / scale - h)) < 0.03 * np.ptp(h)
@@ -231,7 +237,7 @@ def bent_arm() -> ArmPatient:
 
 @cache
 def whole() -> Record:
-    made = [record(bent_arm(), "isometric", BENT), record(bent_arm(), "passive", BENT)]
+    made = [record(bent_arm(), "isometric", BENT), record(bent_arm(), "passive", BENT, duration_s=36.0)]
     return joined([*made, record(bent_arm(), "moving", BENT, duration_s=30.0)])
 
 
