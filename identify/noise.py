@@ -12,8 +12,8 @@ from numba import njit
 
 MEAN_OF_SLOW = 0.27
 """Largest correlation of neighbouring innovations that the mean over an interval causes."""
-SHORTEST = 0.006
-"""1 - ar1 of the slowest noise (a memory of 4 s at 40 pulses/s); anything slower is a drift, which has a cause."""
+SLOWEST_S = 25.0 / 6.0
+"""Memory of the slowest noise; anything slower is a drift, which has a cause."""
 Stretches = tuple[np.ndarray, np.ndarray]
 """Starts and ends of runs of intervals; noise is correlated only within a run."""
 LOWEST_HZ, HIGHEST_HZ = 2.8, 14.5
@@ -30,6 +30,7 @@ class NoiseLevel:
     turn: float = 0.0  # of a narrow band: angle per step, rad
     decay: float = 0.0  # of it: decay factor per step
     band: float = 0.0  # of it: share of the variance; 0: no band
+    shortest: float = 0.006  # 1 - ar1 of the slowest noise (`of_steps`); by default at 40 pulses/s
     slowest: float = 0.02  # smallest angle, rad
     fastest: float = 2.6  # largest angle, rad
     white_only: bool = False
@@ -38,7 +39,11 @@ class NoiseLevel:
     @property
     def at_bound(self) -> bool:
         """Return true for the slowest noise: anything slower is a drift, and levels cost the likelihood nothing."""
-        return min(self.share, 1.0) > 0.05 and self.ar1 >= 1.0 - 1.01 * SHORTEST
+        return min(self.share, 1.0) > 0.05 and self.ar1 >= 1.0 - 1.01 * self.shortest
+
+    def of_steps(self, step_s: float) -> NoiseLevel:
+        """The same on a grid of such steps, on which the slowest noise has a memory of `SLOWEST_S`."""
+        return replace(self, shortest=step_s / SLOWEST_S)
 
     @property
     def is_white(self) -> bool:
@@ -70,12 +75,12 @@ def profile(
         fitted = np.concatenate([residual[start:stop] for start, stop in zip(*stretches, strict=True)])
         sd = max(float(np.sqrt(np.mean(fitted**2))), 1e-9)
         return replace(near, sd_nm=sd), -0.5 * fitted.size * (np.log(2 * np.pi * sd * sd) + 1.0)
-    slow = np.log(1.0 - min(near.ar1, 1.0 - SHORTEST))
+    slow = np.log(1.0 - min(near.ar1, 1.0 - near.shortest))
     if near.band > 0.0:
         share = min(near.share / max(1.0 - near.band, 1e-9), 1.0)
         x = np.array([slow, share, near.turn, np.log(1.0 - min(near.decay, 0.9999)), near.band])
-        return _profile_band(residual, stretches, x, 0.15, 0.03, (near.slowest, near.fastest))
-    bounds = np.array([[np.log(SHORTEST), 0.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0, 0.0]])
+        return _profile_band(residual, stretches, x, 0.15, 0.03, near)
+    bounds = np.array([[np.log(near.shortest), 0.0, 0.0, 0.0, 0.0], [0.0, 2.0, 0.0, 0.0, 0.0]])
     starts = np.array([[slow, near.share, 0.0, 0.0, 0.0]])
     if wide:
         guesses = SLOW_GUESSES.copy()
@@ -83,12 +88,13 @@ def profile(
         starts = np.concatenate([starts, guesses])
     step = np.array([0.6, 0.2, 0.0, 0.0, 0.0]) * (1.0 if wide else 0.25)
     x, sd, log_likelihood = _search(residual, *stretches, starts, bounds, step, SLOW_STEPS, 0.01 / step[0], 1e-9)
-    return NoiseLevel(float(1.0 - np.exp(x[0])), float(x[1]), max(float(sd), 1e-9)), log_likelihood
+    ar1, share = float(1.0 - np.exp(x[0])), float(x[1])
+    return replace(near, ar1=ar1, share=share, sd_nm=max(float(sd), 1e-9)), log_likelihood
 
 
-def correlation(residual: np.ndarray, stretches: Stretches) -> float:
+def correlation(residual: np.ndarray, stretches: Stretches, step_s: float) -> float:
     """Correlation of neighbours of the slow part of a residual, N·m, shape (K,); 0 where it is white."""
-    return profile(residual, stretches, WHITE_AND_SLOW)[0].correlation
+    return profile(residual, stretches, WHITE_AND_SLOW.of_steps(step_s))[0].correlation
 
 
 def _profile_band(
@@ -97,25 +103,32 @@ def _profile_band(
     x: np.ndarray,
     wide: float,
     smallest_step: float,
-    turns: tuple[float, float],
+    near: NoiseLevel,
 ) -> tuple[NoiseLevel, float]:
     bounds = np.array(
-        [[np.log(SHORTEST), 0.0, turns[0], np.log(0.0008), 0.001], [0.0, 1.0, turns[1], np.log(0.12), 0.999]]
+        [
+            [np.log(near.shortest), 0.0, near.slowest, np.log(0.0008), 0.001],
+            [0.0, 1.0, near.fastest, np.log(0.12), 0.999],
+        ]
     )
     step = wide * np.array([1.5, 0.4, 0.12, 1.5, 0.4])
     x, sd, log_likelihood = _search(residual, *stretches, x[None, :], bounds, step, BAND_STEPS, smallest_step, 1e-7)
     ar1, share, decay = float(1.0 - np.exp(x[0])), float(x[1] * (1.0 - x[4])), float(1.0 - np.exp(x[3]))
-    return NoiseLevel(ar1, share, max(float(sd), 1e-9), float(x[2]), decay, float(x[4]), *turns), log_likelihood
+    level = replace(
+        near, ar1=ar1, share=share, sd_nm=max(float(sd), 1e-9), turn=float(x[2]), decay=decay, band=float(x[4])
+    )
+    return level, log_likelihood
 
 
 def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tuple[NoiseLevel, float]:
     """The most likely noise with a narrow band between 2.8 and 14.5 Hz, and its log-likelihood."""
     turns = (2 * np.pi * LOWEST_HZ * step_s, 2 * np.pi * min(HIGHEST_HZ, 0.42 / step_s) * step_s)
+    near = replace(WHITE_AND_SLOW.of_steps(step_s), slowest=turns[0], fastest=turns[1])
     candidates = []
     for frequency_hz in _peaks(residual, stretches, step_s):
         for width_hz in (0.1, 0.7):
             x = np.array([np.log(0.3), 0.5, 2 * np.pi * frequency_hz * step_s, np.log(np.pi * width_hz * step_s), 0.5])
-            candidates.append(_profile_band(residual, stretches, x, 1.0, 0.05, turns))
+            candidates.append(_profile_band(residual, stretches, x, 1.0, 0.05, near))
     return max(candidates, key=lambda candidate: candidate[1])
 
 

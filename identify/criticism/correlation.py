@@ -37,7 +37,7 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
     residual = np.where(known, block_means(grid, residual_nm), 0.0)
     residual = residual - residual[known].mean()
     torque = np.where(known, grid.torque_nm, 0.0)
-    white, ar1 = _innovations(residual, known)
+    white, ar1 = _innovations(residual, known, grid.step_s)
     # At the times at which the pulses truly came: late pulses on even slots would spread a correlation over lags.
     width = grid.pulse_width_us
     signals = {"u": grid.interval_means(width), "u2": grid.interval_means(width**2), "y": torque - residual}
@@ -66,9 +66,9 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _innovations(residual: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, float]:
+def _innovations(residual: np.ndarray, known: np.ndarray, step_s: float) -> tuple[np.ndarray, float]:
     """The residual without slow noise: cross-correlations of coloured noise become large by chance."""
-    noise, _ = profile(residual, ends_of(runs(known)), WHITE_AND_SLOW)
+    noise, _ = profile(residual, ends_of(runs(known)), WHITE_AND_SLOW.of_steps(step_s))
     lag_one = noise.ar1 * noise.share
     if abs(lag_one) < 0.08:
         return residual, 0.0

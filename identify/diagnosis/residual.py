@@ -44,7 +44,9 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
     residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
     white = max(setup.grid.mean_noise_nm(setup.fitted), 1e-6 * setup.scale_nm)
     rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)
-    at_rest, at_work = _log_likelihood(residual, rests), _log_likelihood(residual, works)
+    at_rest, at_work, together = (
+        _log_likelihood(residual, parts, setup.grid.step_s) for parts in (rests, works, rests + works)
+    )
     total, resting = int(setup.fitted.sum()), sum(run.stop - run.start for run in rests)
     ideal = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
     if resting >= LEAST_RESTING:
@@ -53,7 +55,7 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
     return ResidualStructure(
         white_nm=white,
         busy_nm=float(np.sqrt(np.mean(work**2))),
-        ratio=at_rest + at_work - _log_likelihood(residual, rests + works) if rests and works else 0.0,
+        ratio=at_rest + at_work - together if rests and works else 0.0,
         ideal=ideal,
         scale_nm=setup.scale_nm,
     )
@@ -63,9 +65,9 @@ def _long(flags: np.ndarray, min_rows: int) -> list[slice]:
     return [run for run in runs(flags) if run.stop - run.start >= min_rows]
 
 
-def _log_likelihood(residual: np.ndarray, parts: list[slice]) -> float:
+def _log_likelihood(residual: np.ndarray, parts: list[slice], step_s: float) -> float:
     """Of some rows alone, with the noise that is most likely there."""
-    return profile(residual, ends_of(parts), WHITE_AND_SLOW)[1] if parts else 0.0
+    return profile(residual, ends_of(parts), WHITE_AND_SLOW.of_steps(step_s))[1] if parts else 0.0
 
 
 def quiet_rows(fitted: Fitted) -> np.ndarray:

@@ -194,7 +194,9 @@ def finish_discrete(
         pulse_rate_hz=1.0 / grid.step_s,
         sample_rate_hz=grid.record.sample_rate_hz,
         baseline_nm=baseline,
-        noise=Noise(block_sd_nm=float(np.sqrt(spread)), ar1=correlation(residual - baseline, ends_of(runs(rows)))),
+        noise=Noise(
+            block_sd_nm=float(np.sqrt(spread)), ar1=correlation(residual - baseline, ends_of(runs(rows)), grid.step_s)
+        ),
         reasons=tuple(reasons),
         extra=extra or {},
     )

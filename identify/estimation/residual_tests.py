@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.estimation.solve import Fitted
-from stimrig.identify.noise import MEAN_OF_SLOW, SHORTEST, NoiseLevel
+from stimrig.identify.noise import MEAN_OF_SLOW, NoiseLevel
 
 LAGS = 20
 ALARM = 0.01
@@ -102,7 +102,7 @@ def correlation_slopes(noise: NoiseLevel, lags: int) -> np.ndarray:
     names = []
     if slow:
         names += ["share"] if noise.share < 2.0 else []
-        names += ["ar1"] if noise.ar1 < 1.0 - SHORTEST - LEAST_SHARE else []
+        names += ["ar1"] if noise.ar1 < 1.0 - noise.shortest - LEAST_SHARE else []
     if noise.band > 0.0:
         names += ["band", "turn", "decay"]
     rows = []

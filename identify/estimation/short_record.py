@@ -16,7 +16,7 @@ from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUND
 from stimrig.identify.estimation.curve_posterior import CurvePosterior, Mode, Quadratic
 from stimrig.identify.estimation.earlier import Earlier
 from stimrig.identify.estimation.solve import gram
-from stimrig.identify.noise import NoiseLevel, profile, whitened
+from stimrig.identify.noise import WHITE_AND_SLOW, NoiseLevel, profile, whitened
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.problem.setup import Setup
 from stimrig.identify.recruitment.bases import SplineBasis
@@ -196,7 +196,9 @@ class _Search:
         residual = np.nan_to_num(problem.setup.target_nm) - mean
         sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
         white = replace(self.quiet, sd_nm=max(sd, self.quiet.sd_nm))
-        slow, likelihood = profile(residual, self.stretches, NoiseLevel(0.5, 0.5, near.sd_nm), True)
+        slow, likelihood = profile(
+            residual, self.stretches, replace(WHITE_AND_SLOW, sd_nm=near.sd_nm).of_steps(self.grid.step_s), True
+        )
         flat = -0.5 * float(self.rows.sum()) * (np.log(2 * np.pi * sd * sd) + 1.0)
         return replace(slow, sd_nm=max(slow.sd_nm, white.sd_nm)) if likelihood > flat + CORRELATED else white
 

@@ -189,6 +189,7 @@ def solve(
     where the log evidence `floor` is out of reach. `profiled`: the noise is estimated at each step, from `noise` on;
     else it stays as given.
     """
+    noise = noise.of_steps(problem.setup.grid.step_s)
     start = _at(problem, np.clip(theta, problem.lower, problem.upper), noise, wide=True, profiled=profiled)
     assert start is not None
 

@@ -45,7 +45,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     curve = fit_points(width[ramp], drive[ramp])
     residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
     rows = near_rest(grid, ramp)
-    ar1 = correlation(residual, ends_of(runs(rows)))
+    ar1 = correlation(residual, ends_of(runs(rows)), grid.step_s)
     model = Model(
         method=METHOD.id,
         recruitment=curve,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from stimrig.identify.estimation.fit_statistics import BLOCK_S, FOLDS, best_fit_
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.estimation.solve import solve
+from stimrig.identify.noise import SLOWEST_S
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.records.record import Record
 from stimrig.identify.recruitment.bases import SplineBasis
@@ -103,6 +106,14 @@ def test_a_record_with_a_single_fold_has_no_held_out_error():
     record, _ = make_record(Patient(), np.random.default_rng(9), rate_hz=40, noise_nm=0.05, validate=False)
     short = fitted(record.take((record.time_s > 0.9) & (record.time_s < 2.8)))[0]
     assert short.fit["held_out_by"] == "none" and short.fit["held_out_rms_nm"] is None
+
+
+@pytest.mark.parametrize("pulse_rate_hz", [20.0, 40.0])
+def test_the_slowest_noise_has_the_same_memory_at_each_pulse_rate(pulse_rate_hz: float):
+    """A zero that drifts is slower than any noise may be."""
+    grid, _ = prepare(replace(hidden_muscles.record("baseline_drift"), pulse_rate_hz=pulse_rate_hz))
+    noise = fit_plain(grid, grid.fitted).noise
+    assert noise.at_bound and noise.ar1 == pytest.approx(1.0 - 1.0 / (SLOWEST_S * pulse_rate_hz), abs=1e-6)
 
 
 def test_effects_leave_no_warning_of_the_plain_fit():
