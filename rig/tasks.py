@@ -28,6 +28,11 @@ Worker = Callable[[Callable[[], Any], Outcome], None]
 """Runs an action elsewhere and hands its result, or what it raised, to the outcome, in the tasks' own thread."""
 
 
+POLL_S = 0.005
+LONGEST_LOOK_S = 0.05
+"""Real seconds that count at most between two looks: a computer that stood still has not waited for a device."""
+
+
 class Signal:
     """Wakes who waits for it, once it is set."""
 
@@ -155,6 +160,12 @@ class Tasks:
     async def sleep(self, real_s: float, *signals: Signal) -> bool:
         """Wait for so many real seconds, or until one of the signals is set."""
         return await self.wait(self.clock.now_s() + real_s * self.clock.speed, *signals)
+
+    async def look_again(self, *signals: Signal) -> float:
+        """Let what comes come for a moment; return how many real seconds of it count as waiting."""
+        looked_s = self.clock.now_s()
+        await self.sleep(POLL_S, *signals)
+        return min((self.clock.now_s() - looked_s) / self.clock.speed, LONGEST_LOOK_S)
 
     async def join(self, task: Task[T]) -> T:
         """Wait until a task has ended; gives what it returned, raises what it raised."""

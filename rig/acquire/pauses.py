@@ -13,12 +13,11 @@ from collections import deque
 
 from stimrig.rig.acquire.health import Health
 from stimrig.rig.acquire.receiver import Receiver
-from stimrig.rig.acquire.stream import POLL_S
 from stimrig.rig.gate import Gate
 from stimrig.rig.journal import Journal, Kind
 from stimrig.rig.machine import Machine
 from stimrig.rig.messages import Pause
-from stimrig.rig.tasks import Signal
+from stimrig.rig.tasks import POLL_S, Signal
 
 BLOCKED_S = 0.1
 """Real seconds: a sender that is later was kept from running."""
@@ -80,7 +79,7 @@ class Pauses:
             if is_over:
                 return self._health.fault() or "not everything was in order again soon after the computer was blocked"
             now_s = self._clock.now_s()
-            looked_s += await self._receiver.look_again(self._halt)
+            looked_s += await self._tasks.look_again(self._halt)
             if self._halt.is_set():
                 return None
             again_s = self._since(now_s) - POLL_S

@@ -214,7 +214,7 @@ class TestRun:
                 self._fault(self._angle.fault() or "angle sensor: no angle arrived before the test; check its cable")
             if waited_s >= SETTLE_S:
                 self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
-            waited_s += await self._receiver.look_again(self.halt.signal)
+            waited_s += await self._tasks.look_again(self.halt.signal)
         return False
 
     async def _open_gate(self) -> bool:

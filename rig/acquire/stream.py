@@ -32,9 +32,6 @@ SILENCE_S = 1.0
 then use a whole processor."""
 LONGEST_READ_S = 0.25
 """Real seconds for which one reading counts at most: a machine that stood still did not read."""
-POLL_S = 0.005
-LONGEST_LOOK_S = 0.05
-"""Real seconds that count at most between two looks: a computer that stood still has not waited for a device."""
 SETTLING_S = 0.1
 SETTLE_S = 3.0
 """Real seconds to wait until a backlog in buffers has been read, and no errors come."""
@@ -150,12 +147,6 @@ class Stream:
         """Age of the newest sample, infinite before the first."""
         last_s = self.last_s
         return np.inf if last_s is None else now_s - last_s
-
-    async def look_again(self, *signals: Signal) -> float:
-        """Let samples come for a moment; return how many real seconds of it count as waiting."""
-        looked_s = self._clock.now_s()
-        await self._tasks.sleep(POLL_S, *signals)
-        return min((self._clock.now_s() - looked_s) / self._clock.speed, LONGEST_LOOK_S)
 
     def settled(self) -> bool:
         """Return whether samples are current: they arrive at the device's own rate, not faster, and not behind.

@@ -131,5 +131,5 @@ class Pair:
         while receiver.age_s(asked_s) >= 0 or not receiver.settled():
             if waited_s > (FRESH_S + SETTLE_S if receiver.age_s(asked_s) < 0 else FRESH_S):
                 return False
-            waited_s += await receiver.look_again()
+            waited_s += await self._tasks.look_again()
         return True

@@ -294,9 +294,10 @@ class LineStimulator(Generic[S]):
         Raises DeviceError: no ack in time, or an unexpected answer.
         """
         answered, packets, timeout_s = Signal(), list[Packet](), self._settings.reply_timeout_s
-        number = self._send(self._frame(command, data))
+        number, waited_s = self._send(self._frame(command, data)), 0.0
         self._waiting[number] = answered, packets
-        await self._tasks.sleep(timeout_s, answered)
+        while waited_s < timeout_s and not answered.is_set():
+            waited_s += await self._tasks.look_again(answered)
         if self._waiting.get(number, (None,))[0] is answered:
             del self._waiting[number]
         if not packets:

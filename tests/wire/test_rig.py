@@ -28,7 +28,7 @@ RATE_HZ = 40.0
 SAME_CLOCK_S = 2e-4
 """Two processes read the same clock; between the device's doing and its answer is at least this."""
 WIDTHS = "pulse_width_us", "sent_pulse_width_us"
-FAULTS = {"cell_silent": "stale", "stimulator_unplugged": "stimulator"}
+FAULTS = {"cell_silent": "load cell", "stimulator_unplugged": "stimulator"}
 STEPS = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.4}},
     {"name": "steps", "sequence": "steps", "settings": {"on_s": 30.0, "off_s": 0.0}},
