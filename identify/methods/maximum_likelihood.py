@@ -24,8 +24,8 @@ from stimrig.identify.methods.common import flag, order_option
 from stimrig.identify.methods.transfer_function import general
 from stimrig.identify.model import Model
 from stimrig.identify.noise import WHITE_AND_SLOW
-from stimrig.identify.recruitment import Basis, basis_at
-from stimrig.identify.recruitment.bases import PowerBasis
+from stimrig.identify.recruitment import Basis
+from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis
 from stimrig.identify.recruitment.smoothing import KNOTS
 
 HIGHEST_POWER = 9
@@ -63,7 +63,7 @@ def sigmoid(first: Fitted) -> Fitted:
     lower, upper = [np.log(0.5 / largest), 0.0], [np.log(2000.0 / largest), 1.2]
 
     def at(x: np.ndarray) -> Fitted:
-        return with_basis(first, basis_at(x[0], x[1] * largest, largest))
+        return with_basis(first, SigmoidBasis.at(x[0], x[1] * largest, largest))
 
     start = np.clip([steep, middle / largest], np.array(lower) + 1e-9, np.array(upper) - 1e-9)
     optimum = least_squares(

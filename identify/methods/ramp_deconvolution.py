@@ -20,8 +20,8 @@ from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import near_rest, quiet_level, segment_rows
 from stimrig.identify.model import Model, Noise
 from stimrig.identify.noise import correlation
-from stimrig.identify.recruitment import fit_points
-from stimrig.identify.recruitment.bases import SplineBasis
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import SigmoidBasis, SplineBasis, fit_sigmoid
 from stimrig.identify.recruitment.smoothing import choose_weight
 
 NATURAL_FREQUENCY_RAD_S = 0.85 * np.pi
@@ -42,7 +42,14 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     drive, baseline = deconvolved(grid, ramp, linear)
     width, slope = grid.pulse_width_us, np.gradient(grid.pulse_width_us)
     halves = {"rising": ramp & (slope > 0), "falling": ramp & (slope < 0)}
-    curve = fit_points(width[ramp], drive[ramp])
+
+    ramp_us = width[ramp]
+
+    def with_gain(basis: SigmoidBasis) -> Curve:
+        column = basis.design(ramp_us)[:, 0]
+        return Curve(basis, np.array([column @ drive[ramp] / max(float(column @ column), 1e-300)]))
+
+    curve = with_gain(fit_sigmoid(lambda s: drive[ramp] - with_gain(s)(ramp_us), ramp_us, float(np.max(ramp_us))))
     residual = np.nan_to_num(grid.torque_nm) - baseline - linear.on_grid(grid, curve(width))
     rows = near_rest(grid, ramp)
     ar1 = correlation(residual, ends_of(runs(rows)), grid.step_s)

@@ -19,8 +19,8 @@ from stimrig.identify.estimation.samples import fitted_rows
 from stimrig.identify.methods import Method
 from stimrig.identify.methods.common import shifted
 from stimrig.identify.model import Model
-from stimrig.identify.recruitment import Curve, fit_shape
-from stimrig.identify.recruitment.bases import SigmoidBasis
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import SigmoidBasis, fit_sigmoid
 
 TAPS = 41
 
@@ -73,5 +73,5 @@ def separate(grid: Grid, rows: np.ndarray, taps: int) -> tuple[SigmoidBasis, np.
         weights = np.linalg.solve(gram + ridge, columns.T @ torque)
         return weights, torque - columns @ weights
 
-    basis = fit_shape(lambda shape: solve(shape)[1], float(np.max(width)), width[rows])
+    basis = fit_sigmoid(lambda shape: solve(shape)[1], width[rows], float(np.max(width)))
     return basis, solve(basis)[0][:-1]

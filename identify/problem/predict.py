@@ -5,13 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from typing import Any, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from stimrig.identify import model_schema
 from stimrig.identify.dynamics.grid import Grid, make_grid
-from stimrig.identify.dynamics.linear import Discrete, Linear, SecondOrder, run_narx
+from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
 from stimrig.identify.effects import depend_on_joint, find_effect
 from stimrig.identify.effects.base import Form, replaced_by
 from stimrig.identify.errors import BadModel, BadRequest, RunsAway
@@ -20,7 +20,9 @@ from stimrig.identify.problem.problem import Problem
 from stimrig.identify.problem.setup import Setup
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment import Curve
+
+if TYPE_CHECKING:  # a model predicts by this module
+    from stimrig.identify.model import Model
 
 LARGEST_RATE_CHANGE = 0.25
 GROWN, LEAST_USUAL_NM = 1e6, 1.0
@@ -29,35 +31,7 @@ MOVES_RAD = 0.1
 """Smallest range of the angle in an earlier trial: a smaller one shows the sensor's noise, not the movement."""
 
 
-class Muscle(Protocol):
-    """The attributes of a model that its simulation needs."""
-
-    @property
-    def recruitment(self) -> Curve: ...
-
-    @property
-    def linear(self) -> Linear: ...
-
-    @property
-    def pulse_rate_hz(self) -> float: ...
-
-    @property
-    def baseline_nm(self) -> float: ...
-
-    @property
-    def initial(self) -> tuple[float, float]: ...
-
-    @property
-    def effects(self) -> tuple[dict[str, Any], ...]: ...
-
-    @property
-    def data(self) -> dict[str, Any]: ...
-
-    @property
-    def extra(self) -> dict[str, Any]: ...
-
-
-def predict(model: Muscle, record: Record, earlier_trial: Record | None = None) -> np.ndarray:
+def predict(model: Model, record: Record, earlier_trial: Record | None = None) -> np.ndarray:
     """Torque that the model predicts for the record's pulse widths, N·m, shape (N,).
 
     No measured torque is used: a controller would predict the same. The angle is smoothed both ways, as a whole record
@@ -101,7 +75,7 @@ def _tells_movement(angle_rad: np.ndarray) -> bool:
     return known.size > 0.5 * angle_rad.size and float(np.ptp(np.percentile(known, (5.0, 95.0)))) > MOVES_RAD
 
 
-def _refuse_runaway(model: Muscle, record: Record, torque_nm: np.ndarray) -> np.ndarray:
+def _refuse_runaway(model: Model, record: Record, torque_nm: np.ndarray) -> np.ndarray:
     """The same torque. Raises RunsAway where it is none: rates that switch can make it grow without limit."""
     widths_us = np.unique(record.pulse_width_us)
     usual_nm = max(float(np.max(np.abs(model.recruitment(widths_us)))), abs(model.baseline_nm), LEAST_USUAL_NM)
@@ -117,7 +91,7 @@ def _moved(problem: Problem, motion: JointMotion, **changes: float) -> Problem:
     )
 
 
-def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
+def predict_on(model: Model, grid: Grid) -> np.ndarray:
     """As `predict`, for a record on its grid."""
     if isinstance(model.linear, Discrete) and not model.effects:
         linear, widths_us, narx = model.linear, grid.pulse_width_us, model.extra.get("narx")
@@ -127,7 +101,7 @@ def predict_on(model: Muscle, grid: Grid) -> np.ndarray:
     return _predict_samples(model, grid.record, *problem_of(model, grid))
 
 
-def _predict_samples(model: Muscle, record: Record, problem: Problem, theta: np.ndarray) -> np.ndarray:
+def _predict_samples(model: Model, record: Record, problem: Problem, theta: np.ndarray) -> np.ndarray:
     """Torque at the samples; on held-out pulses of its own record without what cannot be foreseen."""
     whole, unpredictable = problem.at_samples(theta), unpredictable_torque(model)
     if not unpredictable or not same_data(model, record):
@@ -138,7 +112,7 @@ def _predict_samples(model: Muscle, record: Record, problem: Problem, theta: np.
     return np.where(record.held_out, predictable_nm, whole)
 
 
-def unpredictable_torque(model: Muscle) -> dict[str, tuple[float, float]]:
+def unpredictable_torque(model: Model) -> dict[str, tuple[float, float]]:
     """Return the torque of each effect that cannot be predicted on another record: mean and root mean square, N·m.
 
     Both are taken over the fitted rows of the model's own record. The mean stays as a zero.
@@ -150,7 +124,7 @@ def unpredictable_torque(model: Muscle) -> dict[str, tuple[float, float]]:
 
 
 def problem_of(
-    model: Muscle, grid: Grid, further: Sequence[tuple[Form, Sequence[float]]] = ()
+    model: Model, grid: Grid, further: Sequence[tuple[Form, Sequence[float]]] = ()
 ) -> tuple[Problem, np.ndarray]:
     """The model as a `Problem` on a record, and its parameters there; on another record than its own without effects
     that cannot be foreseen.
@@ -231,7 +205,7 @@ def sensor_cost_nm(problem: Problem, theta: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(difference_nm))))
 
 
-def states_of(model: Muscle) -> dict[str, float]:
+def states_of(model: Model) -> dict[str, float]:
     """By effect id, where its slow state is at the begin of what is predicted; rested effects need not be there.
 
     Raises BadModel: a state is not a number from 0 to 1.
@@ -242,7 +216,7 @@ def states_of(model: Muscle) -> dict[str, float]:
     return states
 
 
-def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:
+def slopes(model: Model, grid: Grid, names: Sequence[str]) -> np.ndarray:
     """Derivatives of each interval's mean torque by named parameters of the model, shape (K, len(names)).
 
     On another record than the fitted one, the initial state is zero and one baseline holds for all parts.
@@ -262,7 +236,7 @@ def slopes(model: Muscle, grid: Grid, names: Sequence[str]) -> np.ndarray:
     return np.stack([known.get(name, np.zeros(grid.size)) for name in names], axis=1)
 
 
-def refuse_rate(model: Muscle, record: Record) -> None:
+def refuse_rate(model: Model, record: Record) -> None:
     """Refuse a record whose pulse rate is outside the model's range.
 
     Raises BadModel: the rates differ by more than 25 %.
@@ -275,7 +249,7 @@ def refuse_rate(model: Muscle, record: Record) -> None:
         )
 
 
-def same_data(model: Muscle, record: Record) -> bool:
+def same_data(model: Model, record: Record) -> bool:
     """Return True if the record is the one that the model was fitted on."""
     return bool(model.data.get("fingerprint")) and model.data["fingerprint"] == fingerprint(record)
 

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stimrig.identify.errors import BadModel
 from stimrig.identify.problem.joint_surface import Surfaces
-from stimrig.identify.problem.predict import Muscle, predict
+from stimrig.identify.problem.predict import predict
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
+
+if TYPE_CHECKING:
+    from stimrig.identify.model import Model
 
 REST_S = 1.0
 SAMPLES_A_PULSE = 8
@@ -49,7 +52,7 @@ class Motion:
 
 
 def above_rest(
-    model: Muscle, pulse_width_us: np.ndarray, pulse_rate_hz: float, motion: Motion | None = None
+    model: Model, pulse_width_us: np.ndarray, pulse_rate_hz: float, motion: Motion | None = None
 ) -> np.ndarray:
     """Mean torque in each pulse's period, N·m, after one second of rest, effects included; shape (K,).
 

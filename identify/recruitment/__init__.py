@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -147,76 +146,3 @@ def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[st
 
 def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:
     return None if covariance is None else float(np.sqrt(max(slopes @ covariance @ slopes, 0.0)))
-
-
-def basis_at(steepness_log: float, middle_us: float, largest_us: float) -> SigmoidBasis:
-    """The sigmoid with a given log steepness and middle, µs: parameters that suit a numerical search.
-
-    Parameters
-    ----------
-    steepness_log : float
-        Log of the steepness.
-    middle_us : float
-        Of the sigmoid, µs.
-    largest_us : float
-        Largest pulse width, µs.
-    """
-    a2 = float(np.exp(steepness_log))
-    return SigmoidBasis(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
-
-
-def fit_shape(
-    residual_of: Callable[[SigmoidBasis], np.ndarray], largest_us: float, seen_us: np.ndarray
-) -> SigmoidBasis:
-    """Least-squares estimate of the two shape parameters: a coarse scan, then a bounded trust-region search.
-
-    `residual_of` gives the residual for a shape, with all linear parameters solved for. The widths that were applied,
-    `seen_us`, bound the middle.
-
-    Parameters
-    ----------
-    residual_of : callable
-        Residual for a shape, with all linear parameters solved for.
-    largest_us : float
-        Largest pulse width, µs.
-    seen_us : ndarray
-        Widths that were applied, µs; they bound the middle.
-    """
-    from scipy.optimize import least_squares
-
-    top = max(float(np.max(seen_us)), 1e-6)
-
-    def residual(x: np.ndarray) -> np.ndarray:
-        return residual_of(basis_at(x[0], x[1] * top, largest_us))
-
-    scan = [
-        np.array([np.log(steep / top), share])
-        for steep in (3.0, 6.0, 12.0, 25.0, 60.0)
-        for share in (0.15, 0.3, 0.45, 0.6, 0.8)
-    ]
-    best = scan[int(np.argmin([float(np.sum(residual(x) ** 2)) for x in scan]))]
-    bounds = ([np.log(0.5 / top), 0.0], [np.log(2000.0 / top), 1.2])
-    x = least_squares(residual, best, bounds=bounds, x_scale=[0.3, 0.05], xtol=1e-12, ftol=1e-14, gtol=1e-14).x
-    return basis_at(x[0], x[1] * top, largest_us)
-
-
-def fit_points(width_us: np.ndarray, torque_nm: np.ndarray) -> Curve:
-    """The sigmoid fitted to points of a curve, µs and N·m, with its gain.
-
-    Parameters
-    ----------
-    width_us : ndarray
-        Pulse widths, µs.
-    torque_nm : ndarray
-        Torques, N·m.
-    """
-
-    def gain(basis: SigmoidBasis) -> float:
-        column = basis.design(width_us)[:, 0]
-        return float(column @ torque_nm / max(float(column @ column), 1e-300))
-
-    def residual(basis: SigmoidBasis) -> np.ndarray:
-        return torque_nm - gain(basis) * basis.design(width_us)[:, 0]
-
-    basis = fit_shape(residual, float(np.max(width_us)), width_us)
-    return Curve(basis, np.array([gain(basis)]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -123,6 +124,12 @@ class SigmoidBasis:
     largest_us: float = 300.0  # largest pulse width it was fitted on, µs
     size: int = field(default=1, init=False)
 
+    @classmethod
+    def at(cls, log_steepness: float, middle_us: float, largest_us: float) -> SigmoidBasis:
+        """The sigmoid by the log of its steepness and its middle, µs: parameters that suit a numerical search."""
+        a2 = float(np.exp(log_steepness))
+        return cls(a2, float(max(np.exp(min(a2 * middle_us, 600.0)) - 2.0, -0.999)), largest_us)
+
     def design(self, pulse_width_us: np.ndarray, derivative: int = 0) -> np.ndarray:
         """Shape (..., 1); derivatives by the closed form, up to the second."""
         decay = np.exp(-self.a2_per_us * np.maximum(np.asarray(pulse_width_us, float), 0.0))
@@ -136,3 +143,26 @@ class SigmoidBasis:
 
     def to_dict(self) -> dict:
         return {"kind": "sigmoid", "a2_per_us": self.a2_per_us, "a3": self.a3, "largest_us": self.largest_us}
+
+
+def fit_sigmoid(
+    residual_of: Callable[[SigmoidBasis], np.ndarray], widths_us: np.ndarray, largest_us: float
+) -> SigmoidBasis:
+    """Least-squares estimate of the two shape parameters: a coarse scan, then a bounded trust-region search.
+
+    `residual_of` gives the residual for a shape, with all linear parameters solved for. The widths that were applied
+    bound the middle.
+    """
+    from scipy.optimize import least_squares
+
+    top = max(float(np.max(widths_us)), 1e-6)
+
+    def residual(x: np.ndarray) -> np.ndarray:
+        return residual_of(SigmoidBasis.at(x[0], x[1] * top, largest_us))
+
+    steep, middle = (3.0, 6.0, 12.0, 25.0, 60.0), (0.15, 0.3, 0.45, 0.6, 0.8)
+    scan = [np.array([np.log(rate / top), share]) for rate in steep for share in middle]
+    best = scan[int(np.argmin([float(np.sum(residual(x) ** 2)) for x in scan]))]
+    bounds = ([np.log(0.5 / top), 0.0], [np.log(2000.0 / top), 1.2])
+    x = least_squares(residual, best, bounds=bounds, x_scale=[0.3, 0.05], xtol=1e-12, ftol=1e-14, gtol=1e-14).x
+    return SigmoidBasis.at(x[0], x[1] * top, largest_us)
