@@ -20,7 +20,7 @@ from bench.muscles.arm_patient import ArmPatient, arm_patient
 from bench.muscles.arm_records import record
 from stimrig.identify.fitting import fit
 from stimrig.identify.model import Model
-from stimrig.identify.problem.pulses import Motion, above_rest
+from stimrig.identify.problem.pulses import above_rest
 
 sys.path.insert(0, str(ROOT / "examples"))
 from ilc_controller import Reference
@@ -63,8 +63,7 @@ class Simulated:
 
     def foretell(self, model: dict[str, Any], widths_us: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:
         """Predict the torque along these angles, N·m above rest."""
-        motion = Motion.of(angle_rad, 40.0) if model.get("joint") else None
-        return above_rest(self.model, widths_us, 40.0, motion)
+        return above_rest(self.model, widths_us, 40.0, angle_rad if model.get("joint") else None)
 
 
 def learn_arm(job: tuple[int, int]) -> dict[str, Any]:
@@ -80,7 +79,7 @@ def learn_arm(job: tuple[int, int]) -> dict[str, Any]:
         service = Simulated(arm, model, seed)
         planned_rad = service.movement((np.arange(shape.torque_nm.size) + 0.5) / 40)
         # The reference is added to the passive torque of the joint, as a therapist would set it.
-        passive = above_rest(whole, np.zeros(planned_rad.size), 40.0, Motion.of(planned_rad, 40.0))
+        passive = above_rest(whole, np.zeros(planned_rad.size), 40.0, planned_rad)
         reference = Reference(shape.torque_nm * np.clip(arm.g(planned_rad, 0.0), 0.2, 1.0) + passive)
         done = learn_moving(service, model.to_dict(), reference, planned_rad, trials)
         errors[name] = [trial.error_percent * reference.rms_nm / shape.rms_nm for trial in done]

@@ -133,13 +133,13 @@ def forecast(
 
     `angle_rad`: of the joint in each pulse's period, where it moves.
     """
-    from stimrig.identify.problem.pulses import Motion, above_rest
+    from stimrig.identify.problem.pulses import above_rest
 
     progress(0.1, "predicting")
     model = identify.Model.from_json(model_json)
     rate_hz = pulse_rate_hz or model.pulse_rate_hz
-    motion = None if angle_rad is None else Motion.of(np.asarray(angle_rad, float), rate_hz)
-    torque = above_rest(model, np.asarray(pulse_width_us, float), rate_hz, motion)
+    angle = None if angle_rad is None else np.asarray(angle_rad, float)
+    torque = above_rest(model, np.asarray(pulse_width_us, float), rate_hz, angle)
     return {"pulse_rate_hz": rate_hz, "torque_nm": torque.round(6).tolist()}
 
 

@@ -13,8 +13,8 @@ from numba import njit
 
 from stimrig.identify.dynamics.second_order import step_matrix, through
 
-PARTS, LEVEL_PARTS = 3, 5
-"""Number of steps within a pulse interval in which a speed law, or the level of an activation, is evaluated."""
+PARTS = 3
+"""Number of steps within a pulse interval in which a speed law is evaluated."""
 
 
 class Lag(IntEnum):
@@ -31,20 +31,12 @@ class SpeedLaw(IntEnum):
     y is the torque, w the drive, a the state between the two lags, all as shares of y_max.
     """
 
-    RATIO_BY_DRIVE = 0  # log ratio while the drive is below the torque
-    RATIO_BY_RATE = 1  # log ratio while the torque falls
-    TORQUE = 2  # linear in torque
-    DRIVE = 3  # linear in drive
-    EXPONENTIAL = 4  # exponential in torque
-    INVERSE_TORQUE = 5  # inverse linear in torque
-    INVERSE_DRIVE = 6  # inverse linear in drive
-    ACTIVATION = 7  # linear in activation, the state between the two lags
-    LEVEL = 8  # power of 0.5 + 1.5 y/y_max; slower to rise and quicker to fall at high levels
-    SATURATING_DRIVE = 9  # linear in a drive that saturates
-    CALCIUM = 10  # linear in bound calcium, which follows with the other lag whether there is drive
-    PUMP = 11  # of two lags in a row the first: a pump that saturates, linear in a and in drive
-    SECOND_ACTIVATION = 12  # of two lags in a row the second: linear in its input a
-    SECOND_ATTACHED = 13  # the same: inverse linear in torque
+    RATIO = 0  # log ratio while the drive is below the torque
+    LEVEL = 1  # power of 0.5 + 1.5 y/y_max; slower to rise and quicker to fall at high levels
+    EXPONENTIAL = 2  # exponential in torque
+    PUMP = 3  # of two lags in a row the first: a pump that saturates, linear in a and in drive
+    SECOND_ACTIVATION = 4  # of two lags in a row the second: linear in its input a
+    SECOND_ATTACHED = 5  # the same: inverse linear in torque
 
 
 @njit(cache=True, nogil=True)
@@ -54,20 +46,8 @@ def _line(slope, x):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _below(log_ratio, gap):  # pragma: no cover
-    """The ratio where a gap, in units of a soft edge, is negative; 1 where it is positive."""
-    return np.exp(log_ratio * 0.5 * (1.0 - gap / np.sqrt(1.0 + gap * gap))) if log_ratio != 0.0 else 1.0
-
-
-@njit(cache=True, nogil=True)
 def _share(x):  # pragma: no cover
     return min(max(x, 0.0), 1.2)
-
-
-@njit(cache=True, nogil=True)
-def _uptake(slope, w, a):  # pragma: no cover
-    """Factor on the lag of a saturating uptake, where w/(1 + s w) - a/(1 + s a) drives a towards w."""
-    return _line(slope, _share(w)) * _line(slope, _share(a)) if slope != 0.0 else 1.0
 
 
 @njit(cache=True, nogil=True)
@@ -76,25 +56,22 @@ def _bounded(factor):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def _factor(law, w, y, v, scale_nm, lag_s, bound):  # pragma: no cover
+def _factor(law, w, y, v, scale_nm, lag_s):  # pragma: no cover
     """Factor on T or on one lag; `law` holds a value for each `SpeedLaw`, y follows a with `lag_s`."""
-    level, part = abs(y) / scale_nm, abs(w) / scale_nm
-    lacking, rising = (w - y) / (0.02 * scale_nm), v / (0.1 * scale_nm)
-    a = (y + lag_s * v) / scale_nm
-    f = _below(law[SpeedLaw.RATIO_BY_DRIVE], lacking) * _below(law[SpeedLaw.RATIO_BY_RATE], rising)
-    f = f * _line(law[SpeedLaw.TORQUE], level) * _line(law[SpeedLaw.DRIVE] * abs(w) / scale_nm, 1.0)
+    level, f = abs(y) / scale_nm, 1.0
+    lacking = (w - y) / (0.02 * scale_nm)
+    side = lacking / np.sqrt(1.0 + lacking * lacking)  # -1 where the drive is below the torque, 1 where it is above
+    if law[SpeedLaw.RATIO] != 0.0:
+        f *= np.exp(law[SpeedLaw.RATIO] * 0.5 * (1.0 - side))
+    if law[SpeedLaw.LEVEL] != 0.0:
+        f *= np.exp(law[SpeedLaw.LEVEL] * np.log(0.5 + 1.5 * min(level, 1.2)) * side)
     if law[SpeedLaw.EXPONENTIAL] != 0.0:
         f *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)
-    f *= 1.0 / _line(law[SpeedLaw.INVERSE_TORQUE], level)
-    f *= 1.0 / _line(law[SpeedLaw.INVERSE_DRIVE] * abs(w) / scale_nm, 1.0)
-    f *= _line(law[SpeedLaw.ACTIVATION], _share(a))
-    if law[SpeedLaw.LEVEL] != 0.0:
-        side = np.log(0.5 + 1.5 * min(level, 1.2)) * lacking / np.sqrt(1.0 + lacking * lacking)
-        f *= np.exp(law[SpeedLaw.LEVEL] * side)
-    if law[SpeedLaw.SATURATING_DRIVE] != 0.0:
-        f *= max(1.0 + law[SpeedLaw.SATURATING_DRIVE] * 1.15 * part / (part + 0.15), 0.08)
-    f = f * _line(law[SpeedLaw.CALCIUM], bound)
-    return _bounded(f * _uptake(law[SpeedLaw.PUMP], w / scale_nm, a))
+    if law[SpeedLaw.PUMP] != 0.0:  # w/(1 + s w) - a/(1 + s a) drives a towards w
+        f *= _line(law[SpeedLaw.PUMP], _share(w / scale_nm)) * _line(
+            law[SpeedLaw.PUMP], _share((y + lag_s * v) / scale_nm)
+        )
+    return _bounded(f)
 
 
 @njit(cache=True, nogil=True)
@@ -132,9 +109,8 @@ def run_core(drive, time_constant_s, damping, law, begins, initial, scale_nm, st
         both, slow, quick = law[m, Lag.BOTH], law[m, Lag.SLOW], law[m, Lag.QUICK]
         on_both, on_slow, on_quick = np.any(both != 0.0), np.any(slow != 0.0), np.any(quick != 0.0)
         same_law = m > 0 and base == time_constant_s[0] and damping[m] == damping[0] and np.all(law[m] == law[0])
-        y, v, bound, part = 0.0, 0.0, 0.0, 0
+        y, v, part = 0.0, 0.0, 0
         slow_second, quick_second, last = _is_second(slow), _is_second(quick), 1.0
-        forget = np.exp(-step_s / PARTS / max(quick_s if slow[SpeedLaw.CALCIUM] != 0.0 else slow_s, 1e-4))
         kind = 1 if same_law and varied else 0
         if kind or not (on_both or on_slow or on_quick):
             kinds[m] = kind
@@ -150,9 +126,9 @@ def run_core(drive, time_constant_s, damping, law, begins, initial, scale_nm, st
             p11, p12, p21, p22 = 1.0, 0.0, 0.0, 1.0
             # The law is evaluated several times in an interval, since its sign may change within it.
             for _ in range(PARTS):
-                f = _factor(both, w, y, v, scale_nm, slow_s, bound) if on_both else 1.0
-                d = _factor(slow, w, y, v, scale_nm, quick_s, bound) if on_slow else 1.0
-                q = _factor(quick, w, y, v, scale_nm, slow_s, bound) if on_quick else 1.0
+                f = _factor(both, w, y, v, scale_nm, slow_s) if on_both else 1.0
+                d = _factor(slow, w, y, v, scale_nm, quick_s) if on_slow else 1.0
+                q = _factor(quick, w, y, v, scale_nm, slow_s) if on_quick else 1.0
                 turned = 1.0
                 if slow_second or quick_second:
                     second_law, lag_s = (slow, last * slow_s) if slow_second else (quick, last * quick_s)
@@ -173,8 +149,6 @@ def run_core(drive, time_constant_s, damping, law, begins, initial, scale_nm, st
                     q21 * p11 + q22 * p21,
                     q21 * p12 + q22 * p22,
                 )
-                goal = abs(w) / (abs(w) + 0.05 * scale_nm)
-                bound = goal + (bound - goal) * forget
             if m == 0:
                 varied = True
                 first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22
@@ -188,35 +162,3 @@ def run_core(drive, time_constant_s, damping, law, begins, initial, scale_nm, st
                 count += 1
         through(drive, torque, rate, alike[:count], even, first if kind else none, begins, initial)
     return torque, rate
-
-
-@njit(cache=True, nogil=True)
-def activate(
-    drive: np.ndarray, rise_s: np.ndarray, fall_s: np.ndarray, step_s: float, full_nm: float = 0.0
-) -> np.ndarray:  # pragma: no cover
-    """Mean over each interval of a, from 0; a' = (w - a)/τ, τ = rise if w > a, else fall; shapes (M, K), (M,).
-
-    With τ = 0, a follows w at once. With a full torque, N·m, τ depends on the level a, as a share of it:
-    rise (0.5 + 1.5 a), fall/(0.5 + 1.5 a), evaluated several times in an interval.
-    """
-    rows, size = drive.shape
-    parts = LEVEL_PARTS if full_nm > 0.0 else 1
-    out, h = np.empty((rows, size)), step_s / parts
-    for m in range(rows):
-        a = 0.0
-        for k in range(size):
-            w, total = drive[m, k], 0.0
-            for _ in range(parts):
-                tau = rise_s[m] if w > a else fall_s[m]
-                if full_nm > 0.0:
-                    level = 0.5 + 1.5 * min(abs(a) / full_nm, 1.2)
-                    tau = tau * level if w > a else tau / level
-                if tau <= 0.0:
-                    a = w
-                    total += w
-                else:
-                    decay = np.exp(-h / tau)
-                    total += w + (a - w) * (1.0 - decay) * tau / h
-                    a = w + (a - w) * decay
-            out[m, k] = total / parts
-    return out

@@ -113,23 +113,12 @@ def depend_on_joint(names: Iterable[str]) -> bool:
     return any(find_effect(name).moves_with_joint for name in names)
 
 
-def any_free(names: Iterable[str]) -> bool:
-    """Return True if one of the effects is free: it describes the error and names no cause.
-
-    Parameters
-    ----------
-    names : iterable of str
-        Ids of effects.
-    """
-    return any(find_effect(name).shape for name in names)
-
-
 def library() -> list[dict[str, Any]]:
     """The library as dicts, for `stimrig effects` and the page."""
     return [effect.to_dict() for effect in registry().values()]
 
 
 __all__ = [
-    "BadEffect", "Effect", "Form", "Parameter", "Scene", "any_free", "depend_on_joint", "find_effect", "form",
+    "BadEffect", "Effect", "Form", "Parameter", "Scene", "depend_on_joint", "find_effect", "form",
     "known_form", "library", "registry",
 ]  # fmt: skip

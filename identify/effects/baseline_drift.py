@@ -14,10 +14,7 @@ def _shift(name: str, reach: float, about: str = "", start: float = 0.0, unit: s
     return Parameter(name, unit, -reach, reach, 0.0, (start,), relative="torque", about=about)
 
 
-_SLOPE = _shift("slope_nm_per_s", 0.04, "drift per second", unit="N·m/s")
-
-
-@basis("y + slope·t", _SLOPE)
+@basis("y + slope·t", _shift("slope_nm_per_s", 0.04, "drift per second", unit="N·m/s"))
 def linear(_p: Values, scene: Scene) -> Columns:
     return {"slope_nm_per_s": scene.time_s}
 
@@ -29,22 +26,6 @@ def linear(_p: Values, scene: Scene) -> Columns:
 )
 def warming(p: Values, scene: Scene) -> Columns:
     return {"shift_nm": -np.expm1(-scene.time_s / p["time_constant_s"])}
-
-
-@basis("y + slope·t + bend (t/60)²", _SLOPE, _shift("bend_nm", 1.8, "curvature over one minute"))
-def bent(_p: Values, scene: Scene) -> Columns:
-    return {"slope_nm_per_s": scene.time_s, "bend_nm": (scene.time_s / 60.0) ** 2}
-
-
-@basis(
-    "y + cos·(cos(2πt/period) - 1) + sin·sin(2πt/period)",
-    Parameter("period_s", "s", 9.0, 90.0, 30.0, (12.0, 25.0, 50.0), "log", about="period of a slow wave"),
-    _shift("cos_nm", 0.22, start=0.003),
-    _shift("sin_nm", 0.22, start=0.003),
-)
-def wave(p: Values, scene: Scene) -> Columns:
-    turn = 2 * np.pi * scene.time_s / p["period_s"]
-    return {"cos_nm": np.cos(turn) - 1.0, "sin_nm": np.sin(turn)}
 
 
 _KNOTS = tuple(_shift(f"knot_{i}_nm", 0.3, f"shift at {i}/{KNOTS} of the record") for i in range(1, KNOTS + 1))
@@ -62,7 +43,7 @@ def wander(_p: Values, scene: Scene) -> Columns:
 EFFECT = Effect(
     id="baseline_drift",
     name="Drift of the baseline",
-    forms=(linear, warming, bent, wave, wander),
+    forms=(linear, warming, wander),
     signature="The rests do not return to the same torque; the error does not depend on the stimulation.",
     resembles=("voluntary_effort", "fatigue", "mixed_fibres", "passive_torque"),
     separated_by="Rests at zero pulse width before and after each part.",
@@ -71,5 +52,5 @@ EFFECT = Effect(
     source="Warm-up of load cells, settling of the limb",
     predictable=False,
     muscle=False,
-    main={"slope_nm_per_s": "slope", "shift_nm": "shift", "period_s": "period", "knot_1_nm": "first shift"},
+    main={"slope_nm_per_s": "slope", "shift_nm": "shift", "knot_1_nm": "first shift"},
 )

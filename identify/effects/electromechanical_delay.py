@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import njit
 
-from stimrig.identify.dynamics.variable_speed import activate
 from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 
@@ -17,28 +17,17 @@ def delay(_: None, p: Values, _scene: Scene) -> np.ndarray:
     return p["delay_s"]
 
 
-def _lagging(drive: np.ndarray, tau: np.ndarray, scene: Scene) -> np.ndarray:
-    return activate(np.ascontiguousarray(drive), tau, tau, scene.step_s)
-
-
-@form(
-    "gain",
-    "a' = (w - a)/lag: a distributed delay, one more pole",
-    Parameter("lag_s", "s", 0.0, 0.12, 0.0, (0.03,), about="mean of the distributed delay"),
-)
-def lag(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    return _lagging(drive, p["lag_s"][:, 0], scene)
-
-
-@form(
-    "gain",
-    "three equal lags in series, lag in total",
-    Parameter("lag_s", "s", 0.0, 0.2, 0.0, (0.06,), about="mean of the distributed delay"),
-)
-def chain(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    for _ in range(3):
-        drive = _lagging(drive, p["lag_s"][:, 0] / 3.0, scene)
-    return drive
+@njit(cache=True, nogil=True)
+def _lagging(drive: np.ndarray, lag_s: np.ndarray, step_s: float) -> np.ndarray:  # pragma: no cover
+    """Mean over each interval of a, from 0; a' = (w - a)/lag; shapes (M, K), (M,). With a lag of 0, a is w."""
+    out = np.empty(drive.shape)
+    for m in range(len(drive)):
+        a, decay = 0.0, np.exp(-step_s / lag_s[m]) if lag_s[m] > 0.0 else 0.0
+        for k in range(drive.shape[1]):
+            w = drive[m, k]
+            out[m, k] = w + (a - w) * (1.0 - decay) * lag_s[m] / step_s
+            a = w + (a - w) * decay
+    return out
 
 
 @form(
@@ -55,13 +44,13 @@ def spread(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
         part = np.clip(steps, 0.0, 1.0)
         late = late - part * (late - np.concatenate([np.zeros_like(late[:, :1]), late[:, :-1]], axis=1))
         steps = steps - part
-    return _lagging(late, p["lag_s"][:, 0], scene)
+    return _lagging(np.ascontiguousarray(late), p["lag_s"][:, 0], scene.step_s)
 
 
 EFFECT = Effect(
     id="electromechanical_delay",
     name="Electromechanical delay",
-    forms=(delay, lag, chain, spread),
+    forms=(delay, spread),
     signature="The model is too early at every change: the residual looks like the rate of the torque.",
     resembles=("series_compliance", "mixed_fibres", "asymmetric_relaxation"),
     separated_by="Single pulses, sampled at 400 Hz or faster.",

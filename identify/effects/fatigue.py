@@ -22,12 +22,6 @@ EFFECT = Effect(
             source="Riener, Quintern, Schmidt 1996, muscle fitness",
         ),
         _form(
-            "compartments",
-            "w = (1 - depth·x) f(u); x' = a(1 - x)/onset - x/recovery",
-            constant=True,
-            source="Ding et al. 2003 (A falls with force, recovers with one time constant); Xia, Frey-Law 2008",
-        ),
-        _form(
             "by_pulses",
             "w = μ f(u); μ = 1 - depth·x; x' = a(1 - x)/onset - (1 - a) x/recovery; a = 1 under pulses of any width, "
             "else 0",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib.util
 import re
 import traceback
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,8 +23,6 @@ ROWS = 80
 """Pulse intervals on which a form is tried."""
 MAX_STARTS = 32
 """Each is a fit."""
-Faults = Iterator[tuple[str, str]]
-"""What is wrong, and what to do."""
 
 
 class BadEffect(IdentifyError):
@@ -64,81 +61,69 @@ def _place(path: Path, error: BaseException) -> str:
 
 def checked(effect: Any, place: str, path: Path | None = None) -> Effect:
     """An effect that can be fitted. Raises BadEffect: what of it cannot be."""
-    _refuse(place, _effect_faults(effect))
+
+    def refuse(wrong: bool, message: str, fix: str) -> None:
+        if wrong:
+            raise BadEffect(message, place=where, fix=fix)
+
+    where = place
+    refuse(
+        not isinstance(effect, Effect),
+        f"EFFECT is a {type(effect).__name__}, not an Effect",
+        "Give EFFECT = Effect(...).",
+    )
+    named = isinstance(effect.id, str) and re.fullmatch(ID, effect.id)
+    refuse(not named, f"id {effect.id!r}", "Use small letters, digits and _, beginning with a letter.")
+    fix = "Give forms=(Form(...),), with a comma before the closing bracket."
+    refuse(not effect.forms or not _is_tuple_of(effect.forms, Form), "forms is no tuple of Form", fix)
+    needs_known = isinstance(effect.needs, tuple) and JOINT_COLUMNS.issuperset(effect.needs)
+    fix = f"Give a tuple of {' and '.join(sorted(JOINT_COLUMNS))}, or leave it out."
+    refuse(not needs_known, f"needs {effect.needs!r}", fix)
+    is_finite = isinstance(effect.prior, int | float) and np.isfinite(effect.prior)
+    refuse(not is_finite, f"prior {effect.prior!r}", "Give a finite number.")
+    twice = _repeated([form.name for form in effect.forms])
+    refuse(twice is not None, f"two forms are called {twice!r}", "Name each form once.")
     for form in effect.forms:
         where = f"{place}, form {form.name!r}"
-        _refuse(where, _form_faults(form))
-        for parameter in form.parameters:
-            _refuse(f"{where}, parameter {parameter.name!r}", _parameter_faults(parameter))
-        if form.stage not in ("branch", "filter"):
-            _try_out(form, where, path)
-    return effect
-
-
-def _refuse(place: str, faults: Faults) -> None:
-    for message, fix in faults:
-        raise BadEffect(message, place=place, fix=fix)
-
-
-def _effect_faults(effect: Any) -> Faults:
-    if not isinstance(effect, Effect):
-        yield f"EFFECT is a {type(effect).__name__}, not an Effect", "Give EFFECT = Effect(...)."
-    if not isinstance(effect.id, str) or not re.fullmatch(ID, effect.id):
-        yield f"id {effect.id!r}", "Use small letters, digits and _, beginning with a letter."
-    if not effect.forms or not _is_tuple_of(effect.forms, Form):
-        yield "forms is no tuple of Form", "Give forms=(Form(...),), with a comma before the closing bracket."
-    if not isinstance(effect.needs, tuple) or not JOINT_COLUMNS.issuperset(effect.needs):
-        columns = " and ".join(sorted(JOINT_COLUMNS))
-        yield f"needs {effect.needs!r}", f"Give a tuple of {columns}, or leave it out."
-    if not isinstance(effect.prior, (int, float)) or not np.isfinite(effect.prior):
-        yield f"prior {effect.prior!r}", "Give a finite number."
-    if twice := _repeated([form.name for form in effect.forms]):
-        yield f"two forms are called {twice[0]!r}", "Name each form once."
-
-
-def _form_faults(form: Form) -> Faults:
-    if form.stage not in OWN_STAGES:
-        yield f"no stage is called {form.stage!r}", f"Give one of {', '.join(OWN_STAGES)}."
-    if not _is_tuple_of(form.parameters, Parameter):
+        stages = ", ".join(OWN_STAGES)
+        refuse(form.stage not in OWN_STAGES, f"no stage is called {form.stage!r}", f"Give one of {stages}.")
         fix = "Give parameters=(Parameter(...),), with a comma before the closing bracket."
-        yield "parameters is no tuple of Parameter", fix
-    names = [parameter.name for parameter in form.parameters]
-    if wrong := [name for name in (form.name, *names) if not isinstance(name, str)]:
-        yield f"a name that is {wrong[0]!r}", "Give a text."
-    if twice := _repeated(names):
-        yield f"two parameters are called {twice[0]!r}", "Name each parameter once."
-    if form.apply is None:
-        yield "no apply", "Give apply=, a function of (x, p, scene)."
-
-
-def _parameter_faults(parameter: Parameter) -> Faults:
-    if parameter.scale not in SCALES or parameter.relative not in RELATIVE:
-        fix = f"scale is one of {', '.join(SCALES)}; relative one of {', '.join(RELATIVE[1:])}, or left out."
-        yield f"scale {parameter.scale!r}, relative {parameter.relative!r}", fix
-    starts = parameter.start if isinstance(parameter.start, tuple) else ()
-    values = [parameter.lower, parameter.upper, *starts]
-    if not all(isinstance(value, (int, float)) for value in (*values, parameter.neutral)):
-        yield "a bound or a start that is no number", "Give lower, upper, neutral, and a tuple of starts."
-    if len(starts) > MAX_STARTS:
-        yield f"{len(starts)} starts", f"Give {MAX_STARTS} at most: each is a fit."
-    if not np.isfinite(values).all() or not parameter.lower < parameter.upper or not starts:
-        fix = "Give finite bounds, the lower one first, and at least one start."
-        yield f"bounds {parameter.lower} to {parameter.upper}, starts {parameter.start}", fix
-    if not all(parameter.lower <= value <= parameter.upper for value in starts):
-        yield (
-            f"a start of {parameter.start} is not within {parameter.lower} and {parameter.upper}",
-            "Start within them.",
-        )
-    if parameter.scale == "log" and not parameter.lower > 0:
-        yield "a logarithmic scale from 0 or below", "Give a lower bound above 0."
+        refuse(not _is_tuple_of(form.parameters, Parameter), "parameters is no tuple of Parameter", fix)
+        names = [parameter.name for parameter in form.parameters]
+        wrong = [name for name in (form.name, *names) if not isinstance(name, str)]
+        refuse(bool(wrong), f"a name that is {wrong[:1]}", "Give a text.")
+        twice = _repeated(names)
+        refuse(twice is not None, f"two parameters are called {twice!r}", "Name each parameter once.")
+        refuse(form.apply is None, "no apply", "Give apply=, a function of (x, p, scene).")
+        for p in form.parameters:
+            where = f"{place}, form {form.name!r}, parameter {p.name!r}"
+            fix = f"scale is one of {', '.join(SCALES)}; relative one of {', '.join(RELATIVE[1:])}, or left out."
+            unknown = p.scale not in SCALES or p.relative not in RELATIVE
+            refuse(unknown, f"scale {p.scale!r}, relative {p.relative!r}", fix)
+            starts = p.start if isinstance(p.start, tuple) else ()
+            values = [p.lower, p.upper, *starts]
+            numbers = all(isinstance(value, int | float) for value in (*values, p.neutral))
+            fix = "Give lower, upper, neutral, and a tuple of starts."
+            refuse(not numbers, "a bound or a start that is no number", fix)
+            refuse(len(starts) > MAX_STARTS, f"{len(starts)} starts", f"Give {MAX_STARTS} at most: each is a fit.")
+            fix = "Give finite bounds, the lower one first, and at least one start."
+            bounded = np.isfinite(values).all() and p.lower < p.upper and starts
+            refuse(not bounded, f"bounds {p.lower} to {p.upper}, starts {p.start}", fix)
+            outside = not all(p.lower <= value <= p.upper for value in starts)
+            refuse(outside, f"a start of {p.start} is not within {p.lower} and {p.upper}", "Start within them.")
+            below = p.scale == "log" and not p.lower > 0
+            refuse(below, "a logarithmic scale from 0 or below", "Give a lower bound above 0.")
+        if form.stage not in ("branch", "filter"):
+            _try_out(form, f"{place}, form {form.name!r}", path)
+    return effect
 
 
 def _is_tuple_of(values: object, kind: type) -> bool:
     return isinstance(values, tuple) and all(isinstance(value, kind) for value in values)
 
 
-def _repeated(names: list[str]) -> list[str]:
-    return [name for name in names if names.count(name) > 1]
+def _repeated(names: list[str]) -> str | None:
+    return next((name for name in names if names.count(name) > 1), None)
 
 
 def _try_out(form: Form, where: str, path: Path | None) -> None:

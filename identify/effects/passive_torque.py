@@ -39,18 +39,6 @@ def linear(_p: Values, scene: Scene) -> Columns:
 
 
 @basis(
-    "y + stiffness (exp(k·Δ) - 1)/k + viscosity·velocity",
-    _STIFF,
-    Parameter("steepness_per_rad", "1/rad", 0.3, 10.0, 2.0, (2.0,), "log", about="k"),
-    _VISCOUS,
-    source="(exp(4(l - 1)/0.6) - 1)/(e⁴ - 1), De Groote et al. 2016, and viscous",
-)
-def exponential(p: Values, scene: Scene) -> Columns:
-    k = p["steepness_per_rad"]
-    return {_STIFF.name: np.expm1(np.clip(k * scene.away_rad, -30.0, 8.0)) / k, _VISCOUS.name: scene.speed}
-
-
-@basis(
     "y + stiffness·Δ + bend·Δ² + hardening·Δ³ + viscosity·velocity",
     _STIFF,
     _part("bend_nm_per_rad2", "N·m/rad²", 3.0, "one-sided part"),
@@ -161,7 +149,7 @@ relaxing = Form(
 EFFECT = Effect(
     id="passive_torque",
     name="Passive torque of the joint",
-    forms=(linear, exponential, two_sided, surface, relaxing),
+    forms=(linear, two_sided, surface, relaxing),
     signature="Torque that follows the movement, also without stimulation.",
     resembles=("baseline_drift", "torque_velocity"),
     separated_by="Passive movement without stimulation.",

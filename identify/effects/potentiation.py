@@ -17,7 +17,6 @@ EFFECT = Effect(
     name="Potentiation",
     forms=(
         _form("by_level", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - (1 - a) x/recovery; a = |f|/f_max"),
-        _form("steady_decay", "w = (1 + gain·x) f(u); x' = a(1 - x)/onset - x/recovery; a = |f|/f_max", constant=True),
         _form("by_pulses", "as by_level, with a = 1 under pulses of any width, else 0", by_pulses=True),
     ),
     signature="Torque below the model early in the stimulation and above it late: the opposite of fatigue.",

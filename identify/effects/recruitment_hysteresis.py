@@ -7,13 +7,6 @@ from numba import njit
 
 from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
-_HALF = Parameter("half_width_us", "µs", 0.0, 45.0, 0.0, (8.0, 20.0), about="half the distance between the two curves")
-_REACH = Parameter(
-    "reach_us", "µs", 1.0, 80.0, 10.0, (4.0, 25.0), "log", about="change of width after which the other curve holds"
-)
-_EACH_WAY = "Durfee, MacLean 1989: a curve for each direction"
-_LEVELS = (0.1, 0.25, 0.4, 0.55, 0.7, 0.85)
-
 
 @njit(cache=True, nogil=True)
 def _play(width_us: np.ndarray, half_us: np.ndarray, growth_per_us: np.ndarray) -> np.ndarray:  # pragma: no cover
@@ -53,20 +46,10 @@ def _dahl(width_us: np.ndarray, reach_us: np.ndarray) -> np.ndarray:  # pragma: 
     return out
 
 
-def _direction(width: np.ndarray, p: Values) -> np.ndarray:
-    return _dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
-
-
-@form("pulse_width", "w = f(p); p = max(u - r, min(u + r, p_before)), r = half_width", _HALF)
-def play(width: np.ndarray, p: Values, _scene: Scene) -> np.ndarray:
-    half = p["half_width_us"][:, 0]
-    return _play(np.ascontiguousarray(width), half, np.zeros_like(half))
-
-
 @form(
     "pulse_width",
-    "as play, with r = half_width (1 + growth·u/u_max)",
-    _HALF,
+    "w = f(p); p = max(u - r, min(u + r, p_before)), r = half_width (1 + growth·u/u_max)",
+    Parameter("half_width_us", "µs", 0.0, 45.0, 0.0, (8.0, 20.0), about="half the distance between the two curves"),
     Parameter("growth", "1", -0.9, 4.0, 0.0, (1.0, 0.0), about="wider at larger widths"),
 )
 def widening(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
@@ -75,78 +58,24 @@ def widening(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 
 @form(
     "pulse_width",
-    "w = f(u + share (p - u)), p: mean of five play operators with r up to half_width",
-    Parameter("share", "1", 0.0, 1.6, 0.0, (0.4, 0.9), about="share of motor units with hysteresis"),
-    Parameter("half_width_us", "µs", 3.0, 150.0, 20.0, (50.0, 15.0), "log", about="widest play"),
-    source="Prandtl and Ishlinskii; Preisach's plane with an even distribution",
-)
-def distributed(width: np.ndarray, p: Values, _scene: Scene) -> np.ndarray:
-    half, rows = p["half_width_us"], np.ascontiguousarray(width)
-    even = np.zeros(rows.shape[0])
-    plays = (_play(rows, share * half[:, 0], even) for share in (0.2, 0.4, 0.6, 0.8, 1.0))
-    return rows + p["share"] * (sum(plays, np.zeros_like(rows)) / 5.0 - rows)
-
-
-@form(
-    "pulse_width",
-    "w = f(u - half_width·z); dz = (du - z|du|)/reach",
-    _HALF,
-    _REACH,
-    source="Dahl's friction as direction memory; Bouc, Wen",
-)
-def memory(width: np.ndarray, p: Values, _scene: Scene) -> np.ndarray:
-    return np.where(width > 0, width - p["half_width_us"] * _direction(width, p), width)
-
-
-@form(
-    "pulse_width",
     "w = f(u - z (half_width + tilt (s - 1/2) + bend (s - 1/2)²)), s = u/u_max; dz = (du - z|du|)/reach",
     Parameter("half_width_us", "µs", -45.0, 45.0, 0.0, (8.0,), about="half the distance in the middle"),
     Parameter("tilt_us", "µs", -60.0, 60.0, 0.0, (0.0,), about="wider towards large widths"),
     Parameter("bend_us", "µs", -120.0, 120.0, 0.0, (0.0,), about="wider at both ends"),
-    _REACH,
-    source=_EACH_WAY,
+    Parameter("reach_us", "µs", 1.0, 80.0, 10.0, (4.0, 25.0), "log", about="change until the other curve holds"),
+    source="Durfee, MacLean 1989: a curve for each direction",
 )
 def two_curves(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    z = _direction(width, p)
+    z = _dahl(np.ascontiguousarray(width), p["reach_us"][:, 0])
     part = width / scene.largest_us
     half = p["half_width_us"] + p["tilt_us"] * (part - 0.5) + p["bend_us"] * (part - 0.5) ** 2
     return np.where(width > 0, width - half * z, width)
 
 
-@form(
-    "gain",
-    "w = f(u) - z·gap(f), gap: linear between six levels of torque; dz = (du - z|du|)/reach",
-    *(
-        Parameter(f"gap_{i}_nm", "N·m", -0.2, 0.2, 0.0, (0.02,), "linear", "torque", f"at {level:.0%}")
-        for i, level in enumerate(_LEVELS)
-    ),
-    _REACH,
-    source=_EACH_WAY,
-)
-def difference(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    """Two curves whose difference is free at six levels of torque."""
-    level = drive / scene.scale_nm
-    gap = np.zeros_like(drive)
-    for i, centre in enumerate(_LEVELS):
-        gap = gap + p[f"gap_{i}_nm"] * np.maximum(1.0 - np.abs(level - centre) / 0.15, 0.0)
-    return drive - _direction(np.broadcast_to(scene.pulse_width_us, drive.shape), p) * gap
-
-
-@form(
-    "gain",
-    "w = (1 - share·z) f(u); dz = (du - z|du|)/reach",
-    Parameter("share", "1", -0.6, 0.6, 0.0, (0.08, -0.08), about="half the difference"),
-    _REACH,
-)
-def gain(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    return drive * (1.0 - p["share"] * _direction(np.broadcast_to(scene.pulse_width_us, drive.shape), p))
-
-
 EFFECT = Effect(
     id="recruitment_hysteresis",
     name="Hysteresis of recruitment",
-    forms=(play, widening, distributed, memory, two_curves, difference, gain),
+    forms=(widening, two_curves),
     signature="At equal pulse widths: torque below the model while the width rises, above it while it falls.",
     resembles=("voluntary_effort", "threshold_drift", "fatigue", "asymmetric_relaxation"),
     separated_by="Two ramps of different speed: hysteresis is equal in both; a slow muscle or fatigue is not.",
@@ -154,5 +83,5 @@ EFFECT = Effect(
     "the controller's error is the distance between the two curves.",
     source="Durfee, MacLean 1989: deconvolution of a ramp gives one curve for each direction",
     prior=-2.5,
-    main={"half_width_us": "half width", "share": "share", "gap_0_nm": "gap at small widths"},
+    main={"half_width_us": "half width"},
 )

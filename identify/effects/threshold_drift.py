@@ -11,7 +11,6 @@ from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 _TIME = Parameter("time_constant_s", "s", 5.0, 90.0, 15.0, (10.0,), "log", about="time constant of the shift")
 _SLOPE = Parameter("slope_us_per_s", "µs/s", -4.0, 4.0, 0.0, (0.5, -0.5), about="shift of the threshold per second")
 _SHIFT = Parameter("shift_us", "µs", -80.0, 80.0, 0.0, (15.0, -15.0), about="final shift")
-_SCALE = Parameter("slope_per_s", "1/s", -0.02, 0.02, 0.0, (0.003, -0.003), about="share of the width lost per second")
 _SHARE = Parameter("share", "1", -0.7, 0.7, 0.0, (0.1, -0.1), about="share of the width lost in the end")
 
 
@@ -40,11 +39,6 @@ def settling(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     return _moved(width, p["shift_us"] * _settled(p, scene))
 
 
-@form("pulse_width", "w = f(u (1 - slope·t))", _SCALE)
-def scaling(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    return width * (1.0 - p["slope_per_s"] * scene.time_s)
-
-
 @form(
     "pulse_width",
     "w = f(u (1 - share (exp(-t_ref/time_constant) - exp(-t/time_constant))))",
@@ -56,16 +50,10 @@ def fading(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     return width * (1.0 - p["share"] * _settled(p, scene))
 
 
-@form("pulse_width", "w = f(u - slope·∫u dt/u_max) where u > 0", _SLOPE)
-def by_charge(width: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    used = np.cumsum(scene.pulse_width_us) * scene.step_s / scene.largest_us
-    return _moved(width, p["slope_us_per_s"] * used)
-
-
 EFFECT = Effect(
     id="threshold_drift",
     name="Drift of the recruitment threshold",
-    forms=(linear, settling, scaling, fading, by_charge),
+    forms=(linear, settling, fading),
     signature="The recruitment curve moves along the pulse width: the error is large where it is steep, and grows "
     "with time.",
     resembles=("fatigue", "potentiation", "voluntary_effort", "recruitment_hysteresis"),
@@ -74,5 +62,5 @@ EFFECT = Effect(
     "warms, or an electrode moves. Weak pulses change most, strong ones hardly. Check the electrodes.",
     source="Electrode and skin impedance; no single source, see docs/diagnosis.md",
     prior=-2.5,
-    main={"slope_us_per_s": "slope", "shift_us": "shift", "slope_per_s": "slope", "share": "share"},
+    main={"slope_us_per_s": "slope", "shift_us": "shift", "share": "share"},
 )

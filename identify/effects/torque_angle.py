@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form, weighted
@@ -26,16 +24,6 @@ KNOTS = 8
 def parabola(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     away = scene.away_rad
     return y * np.maximum(1.0 + p["slope_per_rad"] * away + p["bend_per_rad2"] * away * away, 0.0)
-
-
-drive = replace(
-    parabola,
-    name="drive",
-    stage="gain",
-    scales=False,
-    equation="w = f(u) (1 + slope·Δ + bend·Δ²): acts on the force, before the dynamics",
-    source="",
-)
 
 
 @form(
@@ -101,7 +89,7 @@ def smooth(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 EFFECT = Effect(
     id="torque_angle",
     name="Torque depends on angle",
-    forms=(parabola, cubic, bell, curve, smooth, drive),
+    forms=(parabola, cubic, bell, curve, smooth),
     signature="The error follows the measured angle, but only under stimulation.",
     resembles=("torque_velocity", "fatigue"),
     separated_by="Isometric tests at three angles.",

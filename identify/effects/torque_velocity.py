@@ -11,11 +11,6 @@ _SHAPE = Parameter("shape", "1", 0.1, 2.0, 0.25, (0.25,), "log", about="Hill's a
 _TOP = Parameter("top", "1", 1.05, 1.9, 1.4, (1.4,), about="largest torque when lengthening, divided by isometric")
 
 
-@form("output", "y (1 - slope·velocity)", _SIDE, scales=True)
-def linear(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    return y * np.maximum(1.0 - p["slope_s_per_rad"] * scene.speed, 0.0)
-
-
 def _hyperbola(y: np.ndarray, p: Values, v: np.ndarray) -> np.ndarray:
     """Hill's hyperbola for shortening, continued to a plateau for lengthening."""
     shape = p["shape"]
@@ -57,20 +52,6 @@ def surface(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 
 @form(
     "output",
-    "y + gain·θ exp(-decay·θ) θ' under stimulation",
-    Parameter("gain_nm_s_per_rad2", "N·m·s/rad²", -0.9, 0.9, 0.0, (0.03, -0.03), "linear", "torque", "V1"),
-    Parameter("decay_per_rad", "1/rad", 0.0, 4.0, 1.3, (1.0,), about="V2"),
-    source="Marion, Wexler, Hull: V1 θ exp(-V2 θ) θ'",
-)
-def marion(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    angle = np.abs(scene.angle)
-    return y + p["gain_nm_s_per_rad2"] * angle * np.exp(-p["decay_per_rad"] * angle) * scene.speed * np.minimum(
-        np.abs(y) / (0.2 * scene.scale_nm), 1.0
-    )
-
-
-@form(
-    "output",
     "y (1 - slope·x exp(1 - x)·θ'), x = decay·θ",
     _SIDE,
     Parameter("decay_per_rad", "1/rad", 0.3, 4.0, 1.3, (1.3,), "log", about="V2"),
@@ -78,7 +59,7 @@ def marion(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     scales=True,
 )
 def bell(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
-    """As `marion`, but as a share of the torque; the slope is the largest one over all angles."""
+    """The slope is the largest one over all angles."""
     place = p["decay_per_rad"] * np.abs(scene.angle)
     share = p["slope_s_per_rad"] * place * np.exp(1.0 - place) * scene.speed
     return y * np.maximum(1.0 - share, 0.0)
@@ -87,7 +68,7 @@ def bell(y: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
 EFFECT = Effect(
     id="torque_velocity",
     name="Torque depends on velocity",
-    forms=(linear, hill, surface, marion, bell),
+    forms=(hill, surface, bell),
     signature="The error follows the measured velocity, but only under stimulation.",
     resembles=("torque_angle", "passive_torque"),
     separated_by="The same movement with stimulation and without.",
@@ -95,5 +76,5 @@ EFFECT = Effect(
     "while the limb is held still.",
     source="Hill 1938; Marion et al. 2010; De Groote et al. 2016",
     needs=("angle_rad", "velocity_rad_s"),
-    main={"slope_s_per_rad": "slope", "gain_nm_s_per_rad2": "gain"},
+    main={"slope_s_per_rad": "slope"},
 )

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
-from stimrig.identify.effects import any_free
+from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.left_out import bouts, difference, leave_out, near_widths
 from stimrig.identify.estimation.rests import relaxed
 from stimrig.identify.estimation.solve import Fitted, knows_joint, solve
@@ -65,7 +65,7 @@ def trusted(base: Fitted) -> Fitted:
     noise = base.noise
     if noise.white_only or noise.band or min(noise.share, 1.0) < SLOW_SHARE or noise.ar1 < SLOW:
         return base
-    if not (any_free(name for name, _ in base.effects) or knows_joint(base)):
+    if not (any(find_effect(name).shape for name, _ in base.effects) or knows_joint(base)):
         return base
     white = solve(base.problem, base.theta, WHITE)
     refitted = solve(white.problem, white.theta, NoiseLevel(0.0, 0.5, white.noise.sd_nm))

@@ -14,7 +14,7 @@ from stimrig.identify.errors import RunsAway
 from stimrig.identify.model import Model
 from stimrig.identify.problem.joint_surface import JointEffect, Surfaces
 from stimrig.identify.problem.predict import refuse_rate
-from stimrig.identify.problem.pulses import Motion, above_rest
+from stimrig.identify.problem.pulses import above_rest
 from stimrig.identify.records.readings import flat_top
 from stimrig.identify.records.record import Record
 from stimrig.identify.yardstick import held_out_pulses
@@ -163,9 +163,9 @@ def _tame(model: Model) -> bool:
     rng, joint = np.random.default_rng(0), Surfaces.of(model.effects)
     widths_us = np.repeat(rng.uniform(0.0, model.recruitment.basis.largest_us, PROBES), rng.integers(1, 40, PROBES))
     curve_nm = float(np.ptp(model.recruitment(np.linspace(0.0, model.recruitment.basis.largest_us, 101))))
-    motion = None if joint is None else Motion.still(joint.reference_rad, widths_us.size)
+    angle_rad = None if joint is None else np.full(widths_us.size, joint.reference_rad)
     try:
-        return bool(np.max(np.abs(above_rest(model, widths_us, model.pulse_rate_hz, motion))) < TAME * curve_nm)
+        return bool(np.max(np.abs(above_rest(model, widths_us, model.pulse_rate_hz, angle_rad))) < TAME * curve_nm)
     except RunsAway:
         return False
 

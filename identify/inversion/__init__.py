@@ -131,10 +131,11 @@ def invert(
         A limit is not a positive number.
     """
     plant = Plant.of(model, reference, largest_us, rise_us, whole, shortest_us)
-    wanted, motion, rate_hz = plant.sign * reference.torque_nm, reference.motion, reference.pulse_rate_hz
+    wanted, angle, rate_hz = plant.sign * reference.torque_nm, reference.angle_rad, reference.pulse_rate_hz
     gain, passive_nm = np.ones(wanted.size), np.zeros(wanted.size)
     if (surfaces := Surfaces.of(model.effects)) is not None:
-        passive_nm = plant.sign * above_rest(model, passive_nm, rate_hz, motion)
+        passive_nm = plant.sign * above_rest(model, passive_nm, rate_hz, angle)
+        motion = reference.motion
         assert motion is not None  # `above_rest` has refused
         gain = np.maximum(surfaces.g(motion.angle_rad, motion.velocity_rad_s), LEAST_GAIN)
     needed = (wanted - passive_nm) / gain  # what the muscle has to give at the model's own angle
@@ -143,7 +144,7 @@ def invert(
     for _ in range(TURNS):
         planned = best_demand(plant.a, plant.b, target, plant.largest_nm, plant.rises(planned))
         planned_us = plant.widths(planned)
-        expected = plant.sign * above_rest(model, planned_us, rate_hz, motion)
+        expected = plant.sign * above_rest(model, planned_us, rate_hz, angle)
         rms_nm = float(np.sqrt(np.mean((wanted - expected) ** 2)))
         idle = idle + 1 if rms_nm > GAIN * least_rms_nm else 0
         if rms_nm < least_rms_nm:

@@ -13,7 +13,7 @@ from stimrig.identify.errors import BadModel, BadRequest
 from stimrig.identify.inversion.reference import Reference
 from stimrig.identify.model import Model
 from stimrig.identify.problem.joint_surface import Surfaces
-from stimrig.identify.problem.pulses import SAMPLES_A_PULSE, Motion, above_rest
+from stimrig.identify.problem.pulses import SAMPLES_A_PULSE, above_rest
 
 OWED = 0.05
 """Most that one pulse leaves to those after it, as a share of the largest torque."""
@@ -165,7 +165,7 @@ def _later(model: Model, rate_hz: float, widest_us: float) -> float:
     plain = model.with_(effects=())
     half_s = []
     surfaces = Surfaces.of(model.effects)
-    at_reference = None if surfaces is None else Motion.still(surfaces.reference_rad, size)
+    at_reference = None if surfaces is None else np.full(size, surfaces.reference_rad)
     for variant in (model, plain):
         step = np.abs(above_rest(variant, np.full(size, widest_us), rate_hz, at_reference))
         peak = int(np.argmax(step))

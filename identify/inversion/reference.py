@@ -11,9 +11,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from stimrig.identify.errors import BadRecord, BadRequest
-from stimrig.identify.problem.pulses import Motion
+from stimrig.identify.problem.pulses import motion_of
 from stimrig.identify.records.cells import is_number
 from stimrig.identify.records.csv import COMMENTS, encoding_of, text_lines
+from stimrig.identify.records.joint_motion import JointMotion
 
 LONGEST_S = 300.0
 MOST_SAMPLES = 60_000
@@ -42,9 +43,9 @@ class Reference:
     angle_rad: np.ndarray | None = None  # of the joint, where it moves, mean over each pulse interval, shape (K,)
 
     @property
-    def motion(self) -> Motion | None:
+    def motion(self) -> JointMotion | None:
         """Motion of the joint; None where the reference has no angle."""
-        return None if self.angle_rad is None else Motion.of(self.angle_rad, self.pulse_rate_hz)
+        return None if self.angle_rad is None else motion_of(self.angle_rad, self.pulse_rate_hz)
 
     @classmethod
     def of(

@@ -59,7 +59,9 @@ def predict(model: Model, record: Record, earlier_trial: Record | None = None) -
         return _refuse_runaway(model, record, predict_on(model, grid))
     if len(earlier_trial.parts) > 1:
         raise BadRequest("the earlier trial is several recordings", fix="Give one of them.")
-    if earlier_trial.angle_rad is None or not _tells_movement(earlier_trial.angle_rad):
+    known = np.zeros(0) if earlier_trial.angle_rad is None else earlier_trial.angle_rad
+    known = known[np.isfinite(known)]  # most readings, nine tenths of which span a movement
+    if known.size <= 0.5 * earlier_trial.time_s.size or np.ptp(np.percentile(known, (5.0, 95.0))) <= MOVES_RAD:
         raise BadRequest("in the earlier trial no joint moves", fix="Give a trial of the same movement and sensor.")
     problem, theta = problem_of(model, grid)
     first = [part.first for part in record.parts]
@@ -67,12 +69,6 @@ def predict(model: Model, record: Record, earlier_trial: Record | None = None) -
     motion = JointMotion.until_then(record.time_s, record.angle_rad, first, earlier_movement)
     moved = _moved(problem, motion.extrapolated(problem.setup.angle_late_s), angle_late_s=0.0)
     return _refuse_runaway(model, record, _predict_samples(model, record, moved, theta))
-
-
-def _tells_movement(angle_rad: np.ndarray) -> bool:
-    """Return True if most readings are present and nine tenths of them span a movement."""
-    known = angle_rad[np.isfinite(angle_rad)]
-    return known.size > 0.5 * angle_rad.size and float(np.ptp(np.percentile(known, (5.0, 95.0)))) > MOVES_RAD
 
 
 def _refuse_runaway(model: Model, record: Record, torque_nm: np.ndarray) -> np.ndarray:

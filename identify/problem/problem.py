@@ -290,48 +290,30 @@ class _StagePass:
             ]
         branches = [(self.grown(part), self.grown(slower)) for part, slower in branches]
         self.cores, initial = self.grown(core), self.grown(initial)
-        if lags and np.any(np.concatenate([values for _, values in lags], axis=None)):
-            return self.respond_freely(branches, self.free_laws(lags, len(initial)), initial)
-        law = np.zeros((len(initial), len(Lag), len(SpeedLaw)))
-        for chosen, values in speeds:
+        free = bool(lags) and bool(np.any(np.concatenate([values for _, values in lags], axis=None)))
+        law = np.zeros((len(initial), len(FreeLaw)) if free else (len(initial), len(Lag), len(SpeedLaw)))
+        for chosen, values in lags if free else speeds:
             p = self.named(chosen, self.grown(values))
-            on_log_scale = {parameter.name for parameter in chosen.parameters if parameter.scale == "log"}
+            logs = set() if free else {parameter.name for parameter in chosen.parameters if parameter.scale == "log"}
             for column, name in chosen.form.law.items():
-                value = p[str(name)][:, 0]
-                law[:, *column] += np.log(value) if name in on_log_scale else value
-        return self.respond(branches, law, initial)
+                value = p[name][:, 0] if isinstance(name, str) else name
+                law[:, *np.atleast_1d(column)] += np.log(value) if name in logs else value
+        return self.respond(branches, law, initial, free)
 
-    def respond_freely(self, branches: list, laws: np.ndarray, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `respond`, where the rates of both lags are free."""
-        setup = self.setup
-        begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
-        shared = setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
-        torque, rate = np.zeros((2, len(initial), setup.grid.size + 1))
-        for part, slower in branches:
-            core = self.cores * np.c_[slower, np.ones_like(slower)]
-            drive = np.ascontiguousarray(part)
-            response = run_free(drive, setup.present, setup.scene.rest_s, core, laws, *shared)
-            torque, rate = torque + response[0], rate + response[1]
-        return torque, rate
-
-    def free_laws(self, lags: list[tuple[Chosen, np.ndarray]], rows: int) -> np.ndarray:
-        """Sum of the laws of all forms of the stage "lags", shape (M, len(FreeLaw))."""
-        laws = np.zeros((rows, len(FreeLaw)))
-        for chosen, values in lags:
-            p = self.named(chosen, self.grown(values))
-            for column, value in chosen.form.law.items():
-                laws[:, column] += p[value][:, 0] if isinstance(value, str) else value
-        return laws
-
-    def respond(self, branches: list, law: np.ndarray, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Sum of the responses of all branches; each starts with its share of the initial state."""
-        setup, (time_constant_s, damping) = self.setup, np.ascontiguousarray(self.cores.T)
+    def respond(
+        self, branches: list, law: np.ndarray, initial: np.ndarray, free: bool
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Sum of the responses of all branches, each from its share of the initial state; `free`: of free lags."""
+        setup, responses = self.setup, []
         begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
         shared = law, setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
-        responses = [
-            run_core(np.ascontiguousarray(part), time_constant_s * slower[:, 0], damping, *shared)
-            for part, slower in branches
-        ]
+        for part, slower in branches:
+            drive, core = np.ascontiguousarray(part), self.cores * np.c_[slower, np.ones_like(slower)]
+            if free:
+                responses.append(run_free(drive, setup.present, setup.scene.rest_s, core, *shared))
+            else:
+                time_constant_s, damping = np.ascontiguousarray(core.T)
+                responses.append(run_core(drive, time_constant_s, damping, *shared))
         if len(responses) == 1:
             return responses[0]
         return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore

@@ -126,6 +126,8 @@ def _backward(time_s, states, spreads, innovations):  # pragma: no cover
             lv, la = lv + t * lx, la + t * lv + 0.5 * t * t * lx
 
 
+NO_STATES = tuple(np.empty((0, width)) for width in (3, 6, 5))
+"""In place of what `_forward` writes, where only the likelihood is asked for."""
 Pace = tuple[float, float]
 """Feedback of velocity and acceleration on the jerk, 1/s² and 1/s."""
 
@@ -208,14 +210,14 @@ def pace_of(time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: f
     from scipy.optimize import minimize  # here: its import takes longer than a fit, which mostly does not need it
 
     known = np.isfinite(angle_rad)
-    at_s, read_rad, nothing = time_s[known], angle_rad[known], [np.empty((0, size)) for size in (3, 6, 5)]
+    at_s, read_rad = time_s[known], angle_rad[known]
     every = max(int(BLOCK_S / max(np.median(np.diff(at_s)), 1e-9)), 1) if at_s.size > LEAST_BLOCKS else 1
     at_s, read_rad = at_s[::every], read_rad[::every]
     noise = np.full(at_s.size, noise_rad**2)
 
     def deviance(logs: np.ndarray) -> float:
         intensity, spring, drag = np.exp(np.clip(logs, *LOGS))
-        spread, squares, _ = _forward(at_s, read_rad, noise, intensity, (spring, drag), UNKNOWN, *nothing)
+        spread, squares, _ = _forward(at_s, read_rad, noise, intensity, (spring, drag), UNKNOWN, *NO_STATES)
         return spread + squares
 
     if not jerk > 0.0 or at_s.size <= LEAST_BLOCKS:
@@ -224,7 +226,7 @@ def pace_of(time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: f
     best_fit = min(
         (minimize(deviance, begin, method="Nelder-Mead", options=SETTLED) for begin in begins), key=lambda fit: fit.fun
     )
-    steady = _forward(at_s, read_rad, noise, jerk, STEADY, UNKNOWN, *nothing)
+    steady = _forward(at_s, read_rad, noise, jerk, STEADY, UNKNOWN, *NO_STATES)
     if not best_fit.fun < steady[0] + steady[1]:
         return jerk, STEADY
     intensity, spring, drag = np.exp(np.clip(best_fit.x, *LOGS)).tolist()
@@ -242,14 +244,16 @@ def sensor_of(time_s: np.ndarray, angle_rad: np.ndarray, step_rad: float = 0.0) 
     first = np.flatnonzero(np.diff(block, prepend=-1.0) > 0)
     count = np.diff(np.r_[first, at_s.size])
     least_variance = max(LEAST_NOISE_RAD, UNIFORM * step_rad) ** 2
-    if first.size <= LEAST_BLOCKS or _rests(read_rad, step_rad):
+    if first.size <= LEAST_BLOCKS or (
+        # held: the angle rests and moves over a few steps of the sensor only
+        np.ptp(read_rad) <= FEW_STEPS * step_rad and np.mean(np.diff(read_rad) == 0) > RESTS
+    ):
         return float(np.sqrt(least_variance)), 0.0
     at_s, mean_rad = np.add.reduceat(at_s, first) / count, np.add.reduceat(read_rad, first) / count
-    nothing = np.empty((0, 3)), np.empty((0, 6)), np.empty((0, 5))
 
     def profile_deviance(log_ratio: float) -> tuple[float, float, float]:
         ratio = float(np.exp(log_ratio))
-        logs, squares, readings = _forward(at_s, mean_rad, 1.0 / count, ratio, STEADY, UNKNOWN, *nothing)
+        logs, squares, readings = _forward(at_s, mean_rad, 1.0 / count, ratio, STEADY, UNKNOWN, *NO_STATES)
         variance = max(squares / readings, least_variance)
         return logs + readings * np.log(variance) + squares / variance, log_ratio, variance
 
@@ -276,12 +280,6 @@ def step_of(parts_rad: Sequence[np.ndarray]) -> float:
     step_rad = float(np.median(apart / whole))
     even = np.all(np.abs(apart / step_rad - whole) < WHOLE)
     return step_rad if even and step_rad < LARGEST_STEP_RAD else 0.0
-
-
-def _rests(angle_rad: np.ndarray, step_rad: float) -> bool:
-    """Return true if the joint was held: the angle rests and moves over a few steps of the sensor only."""
-    few = np.ptp(angle_rad) <= FEW_STEPS * step_rad
-    return bool(few and np.mean(np.diff(angle_rad) == 0) > RESTS)
 
 
 def _without_held(time_s: np.ndarray, angle_rad: np.ndarray) -> np.ndarray:

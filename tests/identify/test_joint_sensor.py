@@ -19,7 +19,7 @@ from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.fitting import MOVING_JOINT
 from stimrig.identify.model import Model
 from stimrig.identify.problem.predict import predict
-from stimrig.identify.problem.pulses import Motion
+from stimrig.identify.problem.pulses import motion_of
 from stimrig.identify.records.join import join
 from stimrig.identify.records.joint_motion import STEADY, JointMotion, smooth
 from stimrig.identify.records.record import Record
@@ -129,10 +129,10 @@ def test_readings_that_are_missing_late_or_uneven_are_bridged():
 
 def test_angles_of_a_trial_are_smoothed_and_a_plan_stays_as_it_is():
     _, angle, velocity = moved(40.0)
-    planned = Motion.of(angle, 40.0)
+    planned = motion_of(angle, 40.0)
     assert rms(planned.angle_rad - angle) < 1e-5 and rms(planned.velocity_rad_s - velocity) < 0.005
     read = angle + np.radians(0.3) * np.random.default_rng(4).normal(size=angle.size)
-    assert rms(Motion.of(read, 40.0).velocity_rad_s - velocity) < 0.2 * rms(np.gradient(read, 1 / 40) - velocity)
+    assert rms(motion_of(read, 40.0).velocity_rad_s - velocity) < 0.2 * rms(np.gradient(read, 1 / 40) - velocity)
 
 
 @cache

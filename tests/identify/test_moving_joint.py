@@ -28,7 +28,7 @@ from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.methods.maximum_likelihood import start
 from stimrig.identify.model import Model
 from stimrig.identify.problem.joint_surface import Surfaces
-from stimrig.identify.problem.pulses import Motion, above_rest
+from stimrig.identify.problem.pulses import above_rest, motion_of
 from stimrig.identify.records.join import join
 from stimrig.identify.records.record import Record
 from tests.harness import few_effects
@@ -177,22 +177,21 @@ def test_widths_follow_a_torque_while_the_joint_moves():
     arm = arm_patient(ARM)
     low, high = arm.range_rad
     angle = 0.5 * (low + high) + 0.3 * (high - low) * np.sin(0.8 * at_s)
-    motion = Motion.of(angle, 40.0)
-    passive = above_rest(model(), np.zeros(400), 40.0, motion)
+    motion = motion_of(angle, 40.0)
+    passive = above_rest(model(), np.zeros(400), 40.0, angle)
     bell = np.sin(np.pi * np.clip(at_s - 0.5, 0.0, 9.0) / 9.0) ** 2
     wanted = passive + 0.4 * surfaces(model()).g(motion.angle_rad, motion.velocity_rad_s) * 8.0 * bell
     found = invert(model(), Reference.of(wanted, angle_rad=angle))
     assert found.fit_percent > 97.0
-    still = Motion.still(float(angle[0]), 400)
-    as_if_still = above_rest(model(), found.pulse_width_us, 40.0, still)
-    moving = above_rest(model(), found.pulse_width_us, 40.0, motion)
+    as_if_still = above_rest(model(), found.pulse_width_us, 40.0, np.full(400, angle[0]))
+    moving = above_rest(model(), found.pulse_width_us, 40.0, angle)
     assert np.sqrt(np.mean((as_if_still - wanted) ** 2)) > 5 * np.sqrt(np.mean((moving - wanted) ** 2))
 
 
 def test_what_only_the_joint_gives_is_no_reason_to_stimulate():
     """The muscle pulls one way: where the passive torque alone is above what is wanted, no pulse is sent."""
     angle = np.linspace(*arm_patient(ARM).range_rad, 200)
-    passive = above_rest(model(), np.zeros(200), 40.0, Motion.of(angle, 40.0))
+    passive = above_rest(model(), np.zeros(200), 40.0, angle)
     found = invert(model(), Reference.of(passive - 0.5, angle_rad=angle))
     assert np.max(found.pulse_width_us) == 0.0
     assert {one.reason for one in found.unreachable} == {"below-zero"}

@@ -111,7 +111,7 @@ def of_two_parts() -> Setup:
     return fit_plain(grid, grid.fitted).problem.setup
 
 
-@pytest.mark.parametrize("effect", ["sensor_clipping:both", "activation_dependent_speed:torque", ""])
+@pytest.mark.parametrize("effect", ["sensor_clipping:both", "activation_dependent_speed:exponential", ""])
 def test_derivatives_on_two_parts_are_those_of_central_differences(of_two_parts: Setup, effect: str):
     name, _, form = effect.partition(":")  # "": the base
     problem = Problem(of_two_parts, [(name, find_effect(name).form(form))] if effect else [])
