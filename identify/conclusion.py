@@ -93,13 +93,10 @@ def is_likely(row: Mapping[str, Any]) -> bool:
 
 def _missing_title(missing: Sequence[Mapping[str, Any]]) -> str:
     """Title with the number of missing effects and their certainty; beside likely ones, possible ones do not count."""
-    count = sum(map(is_likely, missing))
-    if count:
-        return "An effect is missing in this model" if count == 1 else f"{count} effects are missing in this model"
-    count = len(missing)
-    if count == 1:
-        return "An effect is possibly missing in this model"
-    return f"{count} effects are possibly missing in this model"
+    likely = sum(map(is_likely, missing))
+    count = likely or len(missing)
+    subject = "An effect is" if count == 1 else f"{count} effects are"
+    return f"{subject} {'' if likely else 'possibly '}missing in this model"
 
 
 def _advise_effects(diagnosis: Mapping[str, Any], missing: Sequence[Mapping[str, Any]]) -> str:

@@ -59,13 +59,13 @@ def predict(model: Model, record: Record, earlier_trial: Record | None = None) -
         return _refuse_runaway(model, record, predict_on(model, grid))
     if len(earlier_trial.parts) > 1:
         raise BadRequest("the earlier trial is several recordings", fix="Give one of them.")
-    known = np.zeros(0) if earlier_trial.angle_rad is None else earlier_trial.angle_rad
-    known = known[np.isfinite(known)]  # most readings, nine tenths of which span a movement
-    if known.size <= 0.5 * earlier_trial.time_s.size or np.ptp(np.percentile(known, (5.0, 95.0))) <= MOVES_RAD:
+    read_rad = np.full(1, np.nan) if earlier_trial.angle_rad is None else earlier_trial.angle_rad
+    known_rad = read_rad[np.isfinite(read_rad)]  # of most readings, nine tenths of which span a movement
+    if known_rad.size <= 0.5 * read_rad.size or np.ptp(np.percentile(known_rad, (5.0, 95.0))) <= MOVES_RAD:
         raise BadRequest("in the earlier trial no joint moves", fix="Give a trial of the same movement and sensor.")
     problem, theta = problem_of(model, grid)
     first = [part.first for part in record.parts]
-    earlier_movement = earlier_trial.time_s, earlier_trial.angle_rad
+    earlier_movement = earlier_trial.time_s, read_rad
     motion = JointMotion.until_then(record.time_s, record.angle_rad, first, earlier_movement)
     moved = _moved(problem, motion.extrapolated(problem.setup.angle_late_s), angle_late_s=0.0)
     return _refuse_runaway(model, record, _predict_samples(model, record, moved, theta))

@@ -64,7 +64,7 @@ def test_of_a_residual_beyond_numbers_no_small_noise_is_said(residual, wide):
     "names",
     [
         ["fatigue:fitness", "output_saturation:knee"],
-        ["recruitment_hysteresis:memory", "electromechanical_delay:delay"],
+        ["recruitment_hysteresis:two_curves", "electromechanical_delay:delay"],
         ["mixed_fibres:parallel", "baseline_drift:warming"],
         ["series_compliance:series"],
     ],
