@@ -240,10 +240,7 @@ class _StagePass:
         for chosen, p in self.joined("filter"):
             torque, rate = chosen.form.call((self.grown(torque), self.grown(rate)), p, self.setup.scene_at_ends)
         for chosen in self.forms("output"):
-            present, values = len(self.owners) + 1, self.join(chosen.places)
-            torque, rate = self.grown(torque), self.grown(rate)
-            bend = self.scale if chosen.form.scales else self.bend
-            torque, rate = bend(chosen, torque, rate, values, present)
+            torque, rate = self.shaped(chosen, torque, rate)
         return torque, rate, self.grown(delay), np.arange(len(torque))
 
     def gained(self, states: dict[str, float] | None = None) -> np.ndarray:
@@ -318,31 +315,24 @@ class _StagePass:
             return responses[0]
         return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore
 
-    def scale(
-        self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray, present: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """An output stage that multiplies: rows with the same parameters, the first `present` ones, share a factor."""
-        ends, distinct = self.setup.scene_at_ends, np.r_[0, np.arange(present, len(values))]
-        factor = np.asarray(
-            chosen.form.call(np.ones((1, ends.time_s.size)), self.named(chosen, values[distinct]), ends)
-        )
-        scaled = []
-        for rows in (torque, rate):
-            rows = rows.copy()
-            rows[:present] *= factor[:1]
-            rows[present:] *= factor[1:]
-            scaled.append(rows)
-        return scaled[0], scaled[1]
-
-    def bend(
-        self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray, values: np.ndarray, _present: int
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """A static output stage at the boundary states; the rate follows by a numerical chain rule."""
-        form, ends, p = chosen.form, self.setup.scene_at_ends, self.named(chosen, values)
+    def shaped(self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A static output stage at the boundary states."""
+        present, values = len(self.owners) + 1, self.join(chosen.places)
+        torque, rate = self.grown(torque), self.grown(rate)
+        form, ends = chosen.form, self.setup.scene_at_ends
+        if form.scales:  # rows with the same parameters, the first `present` ones, share a factor
+            p = self.named(chosen, values[np.r_[0, present : len(values)]])
+            factor = np.asarray(form.call(np.ones((1, ends.time_s.size)), p, ends))
+            torque, rate = torque.copy(), rate.copy()
+            for rows in (torque, rate):
+                rows[:present] *= factor[:1]
+                rows[present:] *= factor[1:]
+            return torque, rate
+        p = self.named(chosen, values)
         bent = np.asarray(form.call(torque, p, ends))
         if np.array_equal(bent, torque):
             return bent, rate
-        lead_s = self.setup.grid.step_s / 32.0
+        lead_s = self.setup.grid.step_s / 32.0  # the rate follows by a numerical chain rule
         later = np.asarray(form.call(torque + lead_s * rate, p, ends))
         sooner = np.asarray(form.call(torque - lead_s * rate, p, ends))
         return bent, (later - sooner) / (2 * lead_s)

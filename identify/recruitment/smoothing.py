@@ -108,12 +108,6 @@ class Choice:
     variance: float  # noise variance at that weight, N²m²
 
 
-def straight_lines(roughness: np.ndarray) -> int:
-    """Dimension of the shapes that are not penalised; from the penalty, as the data do not cover all shapes."""
-    size = np.sqrt(np.maximum(np.diag(roughness), 1e-300))  # of close knots much larger than of others
-    return int(np.sum(np.linalg.eigvalsh(roughness / size / size[:, None]) <= 1e-13))
-
-
 def choose_weight(
     gram: np.ndarray, moment: np.ndarray, energy: float, rows: int, roughness: np.ndarray, free: int = 0
 ) -> Choice:
@@ -125,7 +119,10 @@ def choose_weight(
     `gram`, `moment`, `energy`: Z'Z, Z'y and y'y of `rows` whitened rows; `free` columns without a penalty are already
     projected out. `roughness`: R.
     """
-    size, straight = len(gram), straight_lines(roughness)
+    size = len(gram)
+    scale = np.sqrt(np.maximum(np.diag(roughness), 1e-300))  # of close knots much larger than of others
+    # Shapes that are not penalised; from the penalty, as the data do not cover all shapes.
+    straight = int(np.sum(np.linalg.eigvalsh(roughness / scale / scale[:, None]) <= 1e-13))
     freedom_left = max(rows - free - straight, 1)
     balance = np.trace(gram) / max(np.trace(roughness), 1e-300)
     floor = 1e-11 * balance
