@@ -104,7 +104,7 @@ def holding(*effects: tuple[str, str]) -> identify.Model:
 @pytest.mark.campaign
 def test_neither_the_order_of_the_effects_nor_the_counting_matters_to_a_weak_and_a_strong_one() -> None:
     """The weak one, fitted alone, took what belongs to the strong one; and the best of both was never found."""
-    weak, strong = ("recruitment_hysteresis", "difference"), ("fatigue", "compartments")
+    weak, strong = ("recruitment_hysteresis", "two_curves"), ("fatigue", "fitness")
     fine = fine_session(muscle(5133), 5133, "third")  # a third effect, too, that the earlier model does not have
     record = as_record({name: column[::8] for name, column in fine.items()})  # at 200 Hz
     wanted = said(record, holding(weak, strong))
