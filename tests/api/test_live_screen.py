@@ -15,12 +15,13 @@ import pytest
 from stimrig.api.charts import model_charts
 from stimrig.api.jobs.curves import recorded
 from stimrig.api.sessions.live import frame_of
-from stimrig.api.store.tables import Test
+from stimrig.api.store.audit import digest
+from stimrig.api.store.tables import PageSession, Test
 from stimrig.api.web.pages.views import limits_of
 from stimrig.identify.records import live
 from stimrig.rig.messages import TORQUE_ROW, Bound, LiveEvent, PulseOutcomes, Status
 from stimrig.rig.signals import SAMPLE
-from tests.api.browser import expected, participant, start
+from tests.api.browser import enter, expected, participant, start
 from tests.api.conftest import Service, shared_service, signed_in
 from tests.api.test_stop_right import stops_noted
 
@@ -56,6 +57,41 @@ def test_what_flows_is_told_and_esc_stops_also_where_a_space_is_a_space(tab: Any
     assert tab.locator("#remark").input_value() == "arm moved " and service.rig.state == "running"
     tab.keyboard.press("Escape")
     tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+
+
+TOLD_TWICE = """() => new Promise((done) => { let left = 2;
+  addEventListener('rig-now', ({ detail }) => { if (detail.ended && !--left) done(); }); })"""
+"""The page heard that its session has ended, and half a second later it is there to hear it again."""
+
+
+@pytest.mark.browser
+def test_the_end_of_a_session_takes_no_stop_key_away(tab: Any, service: Service) -> None:
+    """The running test's page stays; the sign-in stops by Esc; a page whose stop waits for its answer stays."""
+
+    def end_session() -> None:
+        (cookie,) = tab.context.cookies()
+        service.change(PageSession, digest(cookie["value"]), expires_unix_s=1.0)
+        tab.evaluate(TOLD_TWICE)
+
+    participant(tab, service, "V2")
+    participant_page = tab.url
+    start(tab)
+    tab.locator("#segment", has_text="Random pulses").wait_for()
+    running, stops = tab.url, service.rig.stops
+    end_session()
+    assert tab.url == running
+    tab.goto(f"{service.url}/sign-in")
+    tab.get_by_role("heading", name="Sign in").wait_for()
+    tab.keyboard.press("Escape")
+    tab.get_by_text("The rig confirms that stimulation is off.").wait_for()
+    assert service.rig.stops == stops + 1
+
+    enter(tab, service)
+    tab.goto(participant_page)
+    tab.evaluate("""() => { document.addEventListener('submit', (event) => event.preventDefault());
+        document.getElementById('stop-form').requestSubmit(); }""")  # its answer is long in coming
+    end_session()
+    assert tab.url == participant_page
 
 
 def test_the_tightest_torque_limit_is_the_one_shown() -> None:

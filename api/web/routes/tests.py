@@ -183,7 +183,7 @@ async def _until_gone(socket: WebSocket) -> None:
 
 
 async def _until_refused(socket: WebSocket, context: Context) -> None:
-    """Check again and again whether who watches still may: not after a sign-out, a lock or a revoked token."""
+    """Check again and again whether who watches still may: not after the end of the session or a revoked token."""
     while True:
         await asyncio.sleep(LOOK_S)
         try:

@@ -14,6 +14,9 @@ if (document.getElementById("sign-out")) {
   }
 
   for (const kind of ["pointerdown", "pointermove", "keydown", "wheel", "touchstart"]) addEventListener(kind, acted, { passive: true, capture: true });
-  // Nothing of a participant stays on the screen.
-  addEventListener("rig-now", ({ detail }) => { if (detail.ended) location.replace("/sign-in?next=" + encodeURIComponent(act.here())); });
+  // Nothing of a participant stays on the screen. A page with stop keys stays until the rig is ready, and a stop that was sent leads on by itself.
+  const stimulates = ({ ready }) => !ready && document.querySelector("[data-stop-keys]") !== null;
+  let stopping = false;
+  addEventListener("submit", (event) => { if (event.target.id === "stop-form") stopping = true; });
+  addEventListener("rig-now", ({ detail }) => { if (detail.ended && !stopping && !stimulates(detail)) location.replace("/sign-in?next=" + encodeURIComponent(act.here())); });
 }
