@@ -31,7 +31,7 @@ class SchemaError(Exception):
 def migrate(engine: Engine) -> None:
     """Bring the tables to the newest revision in one transaction; a SQLite file is copied before.
 
-    Raises SchemaError: the database is newer than the software, lacks a column, or cannot be copied.
+    Raises SchemaError: the database is newer than the software, its columns do not fit, or it cannot be copied.
     """
     config = Config()
     config.set_main_option("script_location", str(REVISIONS).replace("%", "%%"))
@@ -79,9 +79,17 @@ def copied_before(database: str | None, current: str | None) -> Iterator[None]:
 
 
 def refuse_incomplete(connection: Connection) -> None:
-    """Raise SchemaError if a column of `stimrig.api.store.tables` is missing in the database."""
+    """Raise SchemaError if a column of `stimrig.api.store.tables` is missing, or an unknown one refuses new rows."""
     inspected = inspect(connection).get_multi_columns()
-    existing = {f"{table}.{column['name']}" for (_, table), columns in inspected.items() for column in columns}
+    existing = {f"{table}.{column['name']}": column for (_, table), columns in inspected.items() for column in columns}
     expected = [str(column) for table in Table.metadata.sorted_tables for column in table.columns]
     if missing := [column for column in expected if column not in existing]:
         raise SchemaError(f"there is no column {missing[0]}; restore the database from a backup")
+    for name, column in existing.items():
+        if name in expected or name.split(".")[0] not in Table.metadata.tables:
+            continue
+        if not column["nullable"] and column["default"] is None:
+            raise SchemaError(
+                f"the column {name} is of another stimrig and refuses new rows; "
+                "install the stimrig that wrote it, or set STIMRIG_DATA_DIR to another folder"
+            )

@@ -20,7 +20,7 @@ from stimrig.api.cli import main
 from stimrig.api.cli.commands import backup
 from stimrig.api.errors import ApiError
 from stimrig.api.store import Store, copies, migrations
-from stimrig.api.store.tables import Participant, Recording, Table
+from stimrig.api.store.tables import Participant, Recording, Table, Test
 from stimrig.api.whole_file import sha256_of
 from stimrig.rig.control.memory import LatchFile
 from tests.api.test_schemas import unmet
@@ -28,6 +28,7 @@ from tests.simulator.virtual_time import VirtualMachine
 
 ROOT = Path(__file__).parents[2]
 NEWER = "UPDATE alembic_version SET version_num = '0900'"
+WITH_VERSION = ", ".join([*Test.__table__.columns.keys(), "version BIGINT NOT NULL"])
 NEXT = """
 import sqlalchemy as sa
 from alembic import op
@@ -117,11 +118,15 @@ def test_an_upgrade_that_fails_or_cannot_be_copied_leaves_the_database_as_it_was
         (NEWER, "it is of version 0900, .* install the stimrig that wrote it"),
         ("ALTER TABLE models DROP COLUMN etag", "no column models.etag"),
         ("DROP TABLE notes", "no column notes.id"),
+        (
+            f"DROP TABLE tests; CREATE TABLE tests ({WITH_VERSION})",
+            "the column tests.version is of another stimrig .* set STIMRIG_DATA_DIR to another folder",
+        ),
     ],
-    ids=["newer", "column-gone", "table-gone"],
+    ids=["newer", "column-gone", "table-gone", "column-too-many"],
 )
 def test_what_does_not_fit_is_refused(database: Path, statement: str, words: str) -> None:
-    execute(database, statement)
+    execute(database, *statement.split("; "))
     before = database.read_bytes()
     with pytest.raises(ApiError, match=words):
         Store(f"sqlite:///{database}")
