@@ -147,10 +147,12 @@ class Watched(Kind):
         self.watcher: Watcher | None = None
 
     def watch(self, watcher: Watcher) -> None:
-        """Watch this test."""
+        """Watch this test. Without a link to the rig it is left to its plan: the loss was reported before."""
         self.unwatch()
         self.watcher = watcher
         watcher.start()
+        if not self.rig.connected:
+            watcher.take(None)
 
     @property
     def is_watching(self) -> bool:

@@ -505,6 +505,15 @@ class RigThread:
 
         self._run(become())
 
+    def cut_link(self) -> None:
+        """The lasting connection breaks; a new one is taken."""
+
+        async def cut() -> None:
+            for writer in list(self.rig._subscribers):
+                writer.close()
+
+        self._run(cut())
+
     def __exit__(self, *_: object) -> None:
         if self.thread.is_alive():
             self._run(self.rig.close())

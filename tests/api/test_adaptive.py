@@ -111,6 +111,22 @@ def test_enough_ends_it_well_at_any_time(client: httpx.Client, service: Service,
     assert late.status_code == 409 and late.json()["type"] == "/problems/rig-late"
 
 
+def test_a_broken_link_leaves_the_test_to_its_fixed_plan(
+    client: httpx.Client, service: Service, participant: str
+) -> None:
+    test_id = start(client, target={"curve_percent": 0.2, "step_percent": 0.2}).json()["id"]
+
+    def adaptive() -> dict[str, Any]:
+        return client.get(f"/v1/tests/{test_id}").json()["adaptive"]
+
+    soon(lambda: client.get(f"/v1/tests/{test_id}").json()["elapsed_s"] > 1)
+    assert adaptive()["state"] == "choosing"
+    service.rig_thread.cut_link()
+    soon(lambda: adaptive()["state"] == "fixed", 10)
+    assert "closed the connection" in adaptive()["problem"]
+    client.post("/v1/stop")
+
+
 def test_out_of_reach_is_said_before_the_first_pulse(client: httpx.Client, service: Service, participant: str) -> None:
     refused = start(client, max_torque_time_nm_s=10.0)
     assert refused.status_code == 422 and refused.json()["type"] == "/problems/out-of-reach"
@@ -207,7 +223,7 @@ class World:
     """Clock, rig and adviser in one: the time is that of the newest event. An answer of None never comes, one that is
     late after the boundary."""
 
-    path, laid = None, 30
+    path, laid, connected = None, 30, True
 
     def __init__(self, *answers: Any, refusal: ApiError | None = None) -> None:
         self.now_s, self.answers, self.refusal = 0.0, list(answers), refusal
@@ -347,13 +363,17 @@ def test_a_lost_answer_of_the_rig_ends_in_the_fixed_plan() -> None:
     assert [request.segments for _, request in world.requests][1:] == [[]], "it plays on at once"
 
 
-def test_samples_that_are_missed_end_in_the_fixed_plan() -> None:
+@pytest.mark.parametrize("connected", [True, False])
+def test_samples_that_are_missed_end_in_the_fixed_plan(connected: bool) -> None:
+    """The link breaks, or is down from the beginning."""
     world = World()
+    world.connected = connected
     follower = follower_of(world)
 
     async def lose_the_link() -> None:
-        follower.start()
-        follower.take(None)
+        follower.kind.watch(follower)
+        if connected:
+            follower.kind.hear(None)
         await asyncio.sleep(0)
         await follower.tasks.close()
 
