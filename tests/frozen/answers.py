@@ -34,8 +34,7 @@ VOLATILE = (
     (re.compile(r"stimrig-error-\d+"), "stimrig-error-<id>"),
     (
         re.compile(
-            r"\b(look|test|again|running|identifying|done|asked|calibrate|calibrating|wait|rearm|archived|trial) "
-            r"[0-9a-f]{8}\b"
+            r"\b(look|test|again|running|identifying|done|asked|calibrate|calibrating|wait|rearm|trial) [0-9a-f]{8}\b"
         ),
         r"\1 <id>",
     ),
