@@ -16,6 +16,8 @@ from stimrig.api.logs import current_test
 log = logging.getLogger("stimrig.jobs")
 MOST_QUEUED = 50
 """Jobs that wait; more are refused, but urgent ones."""
+FOR_PAGES = ("comparison", "curves")
+"""Urgent jobs that wait behind the other urgent ones: many pages must not keep a test's fit waiting."""
 
 
 class Pool:
@@ -48,7 +50,8 @@ class Pool:
             raise problem
         job = Job(kind, arguments, urgent, on_progress)
         job.result.add_done_callback(lambda result: self.cancel(job) if result.cancelled() else None)
-        self.queue.insert(0 if urgent else len(self.queue), job)
+        behind = [other for other in self.queue if other.urgent and other.kind not in FOR_PAGES]
+        self.queue.insert(len(self.queue) if not urgent else len(behind) if kind in FOR_PAGES else 0, job)
         self._dispatch()
         return job
 

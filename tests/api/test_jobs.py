@@ -103,6 +103,14 @@ async def test_the_fit_after_a_test_goes_first_and_has_a_worker_kept_free(pool: 
 
 
 @pooled()
+async def test_the_curves_of_pages_wait_behind_a_fit_and_before_a_diagnosis(pool: Pool) -> None:
+    pool.submit("fit", data="x", effects=["slow"])
+    for kind in ("diagnosis", "fit", "curves", "comparison"):
+        pool.submit(kind, urgent=kind != "diagnosis", data="x")
+    assert [job.kind for job in pool.queue] == ["fit", "comparison", "curves", "diagnosis"]
+
+
+@pooled()
 async def test_a_job_that_nobody_awaits_any_more_is_cancelled(pool: Pool) -> None:
     running, queued = (asyncio.ensure_future(wait_for(pool)) for _ in range(2))
     await asyncio.sleep(0)
