@@ -75,6 +75,8 @@ log = logging.getLogger("rig.run")
 
 LEAD_S = 0.1
 """Real seconds between arming and the first deadline."""
+MOST_BLOCKED_S = 2.0
+"""Real seconds that the computer may stand still, in all, while a test waits for whole samples."""
 
 
 @dataclass(slots=True)
@@ -203,7 +205,7 @@ class TestRun:
 
     async def _arm(self, health: Health) -> bool:
         """Wait until every sensor that this test relies on gives whole samples of now."""
-        waited_s = 0.0
+        begun_s, waited_s = self._clock.now_s(), 0.0
         while not self.halt.signal.is_set():
             suspicion, has_angle = health.suspicion(), self._angle.fresh()
             if suspicion is None and has_angle and self._receiver.settled():
@@ -215,6 +217,9 @@ class TestRun:
             if waited_s >= SETTLE_S:
                 self._fault("load cell: samples arrive much faster than sample_rate_hz; check rig file and bus")
             waited_s += await self._tasks.look_again(self.halt.signal)
+            blocked_s = (self._clock.now_s() - begun_s) / self._clock.speed - waited_s
+            if not (blocked_s <= MOST_BLOCKED_S):  # who asked for the test may have gone since
+                self._fault(f"the computer was blocked for {blocked_s:.1f} s before the test began; start it again")
         return False
 
     async def _open_gate(self) -> bool:

@@ -68,7 +68,7 @@ class Joint:
                 self._rescale()
             else:
                 log.warning("%s: made with another sensor; take two poses again", self._file.path)
-        except (OSError, ValueError, KeyError) as error:
+        except (OSError, ValueError, KeyError, ArithmeticError) as error:
             log.error("%s: not readable (%s); take two poses again", self._file.path, " ".join(str(error).split()))
 
     def _rescale(self) -> None:

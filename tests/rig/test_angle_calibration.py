@@ -114,6 +114,8 @@ def test_two_poses_give_offset_direction_and_scale_kept_for_this_sensor_alone(po
         {"poses": []},
         {"poses": [{"angle_rad": 0.4, "raw": 10.0}] * 2},
         {"poses": [{"angle_rad": 0.4, "raw": math.nan}, {"angle_rad": 1.6, "raw": 80.0}]},
+        {"poses": [{"angle_rad": 0.4, "raw": math.inf}, {"angle_rad": 1.6, "raw": 80.0}]},
+        {"poses": [{"angle_rad": 0.4, "raw": -1e308}, {"angle_rad": 1.6, "raw": 1e308}]},
     ],
 )
 def test_a_file_that_says_something_else_than_its_poses_is_no_calibration(

@@ -10,7 +10,7 @@ import pytest
 
 from stimrig.rig.adapters.machine import Driver
 from stimrig.rig.clock import MonotonicClock
-from stimrig.rig.tasks import Signal, Turn
+from stimrig.rig.tasks import LONGEST_LOOK_S, POLL_S, Signal, Turn
 from tests.rig.fakes import slow_work
 from tests.simulator.virtual_time import VirtualClock, VirtualMachine
 
@@ -53,6 +53,12 @@ def test_a_sleep_lasts_so_many_real_seconds(machine: VirtualMachine):
     machine.clock.speed = 4.0
     machine.run(machine.tasks.sleep(2.0))
     assert machine.clock.now_s() == 8.0
+
+
+def test_a_computer_that_stood_still_has_hardly_waited(machine: VirtualMachine):
+    machine.clock.call_at(0.002, lambda: machine.clock.advance(0.8))
+    assert machine.run(machine.tasks.look_again()) == LONGEST_LOOK_S
+    assert machine.run(machine.tasks.look_again()) == pytest.approx(POLL_S)
 
 
 def test_a_signal_wakes_all_who_wait_and_their_times_wake_them_no_more(machine: VirtualMachine, told: OnMessage):
