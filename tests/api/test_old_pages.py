@@ -80,6 +80,16 @@ def test_the_stop_button_stays_and_says_that_it_did_not_get_through(paced: Any, 
     paced.get_by_text(CONFIRMED).wait_for()
 
 
+def test_a_stop_is_sent_until_a_service_that_has_just_died_is_back(tab: Any, service: Service) -> None:
+    """The page does not know yet that nobody answers; it stays, with its button."""
+    go(tab, service.url + "/participants/O2")
+    tab.route("**/stop", lambda route: route.abort())
+    press_stop(tab)
+    doubt(tab).to_contain_text("Stop is being sent")
+    tab.unroute("**/stop")
+    tab.get_by_text(CONFIRMED).wait_for()
+
+
 def test_a_stop_gets_through_where_only_the_state_is_not_heard_of(tab: Any, service: Service) -> None:
     """The page believes that nobody answers; what it sends all the same stops."""
     service.rig.speed = 0.5

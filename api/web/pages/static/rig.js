@@ -2,7 +2,7 @@
 // The page asks (the service does not push): an answer is newer than its question, also after a laptop has slept.
 "use strict";
 {
-  const EVERY_MS = 500, TIMEOUT_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000;
+  const EVERY_MS = 500, TIMEOUT_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000, AGAIN_MS = 250;
   const DOUBTS = {
     stopping: "Stop is being sent, but the service does not answer. Use the emergency switch on the stimulator.",
     not_stopped: "No answer to stop came. Use the emergency switch on the stimulator. Then press stop again.",
@@ -108,19 +108,24 @@
 
   addEventListener("submit", (event) => {
     if (event.target.id !== "stop-form") return;
+    event.preventDefault(); // where nobody answers a browser would leave the page, its stop button with it, for a page of its own
     stopTimer ||= setTimeout(notStopped, STOP_MS); // counted from the first press: who presses on must not wait longer
-    if (!old()) return; // the service answers: the form by itself, as without scripts
-    event.preventDefault();
     send(event.target);
   });
 
-  async function send(form) { // a browser would leave the page, its stop button with it, for a page of its own
-    stop = "stopping"; show();
-    try { // not given up: it may still stop, late
-      const answer = await fetch(form.action, { method: "POST", body: new URLSearchParams(new FormData(form)), headers: { Accept: "text/html" } });
-      clearTimeout(stopTimer); stopTimer = 0;
-      if (answer.redirected) location.assign(answer.url); else form.submit();
-    } catch { notStopped(); }
+  async function send(form) {
+    const body = new URLSearchParams(new FormData(form)), stopping = () => { stop = "stopping"; show(); };
+    if (old()) stopping();
+    while (stopTimer) {
+      try { // not given up: it may still stop, late
+        const answer = await fetch(form.action, { method: "POST", body, headers: { Accept: "text/html" } });
+        clearTimeout(stopTimer); stopTimer = 0;
+        if (answer.redirected) location.assign(answer.url); else form.submit();
+      } catch { // a service that died is started again: so is the stop
+        stopping();
+        await new Promise((again) => setTimeout(again, AGAIN_MS));
+      }
+    }
   }
 
   function notStopped() { clearTimeout(stopTimer); stopTimer = 0; stop = "not_stopped"; show(); }
