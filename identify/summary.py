@@ -169,8 +169,10 @@ def torque(figures: Mapping[str, Any], key: str) -> str:
 
 
 def certainty(diagnosis: Mapping[str, Any]) -> str:
-    """The probability of a verdict, behind its title; empty where none is sure or each effect has its own."""
-    if conclude(diagnosis).kind == "unsure" or len(diagnosis.get("missing") or []) > 1:
+    """The probability of a verdict, behind its title; empty where none is sure or effects have their own."""
+    missing = diagnosis.get("missing") or []
+    doubted = missing and diagnosis["verdict"] == "unexplained_structure"
+    if doubted or len(missing) > 1 or conclude(diagnosis).kind == "unsure":
         return ""
     return f" (probability {probability(diagnosis['probability'])})"
 

@@ -17,7 +17,7 @@ from stimrig import identify
 from stimrig.identify.estimation.uncertainty import prediction_band
 from stimrig.identify.methods import methods
 from stimrig.identify.model_schema import SCHEMA
-from stimrig.identify.summary import quantity
+from stimrig.identify.summary import certainty, quantity
 from tests.harness import few_effects
 from tests.identify import hidden_muscles
 
@@ -245,3 +245,8 @@ def test_nothing_missing_names_no_worst_place_and_says_when_the_record_is_too_po
     assert "error in" not in calm and "may show what is missing" not in calm
     poor = str(dataclasses.replace(found, base={**base, "held_out_rms_nm": 20 * found.noise_sd_nm}))
     assert "may show what is missing" in poor
+
+
+def test_a_name_that_is_doubted_has_not_the_probability_that_structure_is_left():
+    doubted = {"verdict": "unexplained_structure", "probability": 0.9, "missing": [{"probability": 0.45}]}
+    assert certainty(doubted) == ""
