@@ -23,6 +23,10 @@ CONFIG: dict[str, Any] = {
 }  # fmt: skip
 
 
+NOTE_PX, BOTTOM_PX = 18, 48
+"""Height of a line of notes above the plot, and of what stands below it."""
+
+
 def for_plotly(figure: Figure, file_name: str) -> dict[str, Any]:
     """Return `data`, `layout` and `config`; a picture that is saved gets the file name."""
     data, shapes, notes = [], [], []
@@ -54,10 +58,14 @@ def for_plotly(figure: Figure, file_name: str) -> dict[str, Any]:
                         "font": {"color": _colour("on-worst" if ground else "mark")}}  # fmt: skip
                 notes.append(note | ({"bgcolor": _colour(ground), "borderpad": 3, "name": "place"} if ground else {}))
     legend = sum(trace["showlegend"] for trace in data) > 1
+    notes_px = NOTE_PX if any("bgcolor" not in note for note in notes) else 0  # between the plot and its legend
+    top_px = notes_px + (34 if legend else 14)
+    inner_px = figure.height - top_px - BOTTOM_PX
     layout = {
         "height": figure.height, "showlegend": legend, "shapes": shapes, "annotations": notes,
-        "margin": {"l": 64, "r": Figures.TOOLS_PX, "t": 34 if legend else 14, "b": 48},
-        "legend": {"orientation": "h", "x": 0, "y": 1.02, "yanchor": "bottom", "traceorder": "normal"},
+        "margin": {"l": 64, "r": Figures.TOOLS_PX, "t": top_px, "b": BOTTOM_PX},
+        "legend": {"orientation": "h", "x": 0, "y": 1.0 + (notes_px + 4) / inner_px, "yanchor": "bottom",
+                   "traceorder": "normal"},
         "font": {"family": "system-ui, 'DejaVu Sans', sans-serif", "size": 13, "color": _colour("ink")},
         "paper_bgcolor": _colour("chart"), "plot_bgcolor": _colour("chart"),
         "modebar": {"orientation": "v", "bgcolor": "rgba(0,0,0,0)", "color": _colour("dim"),

@@ -213,6 +213,8 @@ def test_plotly_gets_the_lines_in_roles_without_links_and_without_its_upload() -
     assert len(shown["layout"]["shapes"]) == 2 and len(shown["layout"]["annotations"]) == 1
     upper, lower = (shown["layout"][name]["domain"] for name in ("yaxis", "yaxis2"))
     assert upper[1] == 1.0 and upper[0] > lower[1] and upper[1] - upper[0] == pytest.approx(2 * (lower[1] - lower[0]))
+    margin, above = shown["layout"]["margin"], shown["layout"]["legend"]["y"] - 1.0
+    assert above * (400 - margin["t"] - margin["b"]) > 18, "the legend stands above the notes"
     assert shown["config"]["showSendToCloud"] is False and shown["config"]["plotlyServerURL"] == ""
     assert shown["config"]["modeBarButtons"] == [["toImage"], ["zoom2d", "pan2d", "resetScale2d"]]
 
