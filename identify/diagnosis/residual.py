@@ -12,7 +12,7 @@ from stimrig.identify.dynamics.grid import ends_of, runs
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.left_out import FLOOR_SHARE, difference, hold_out
 from stimrig.identify.estimation.solve import Fitted
-from stimrig.identify.noise import WHITE_AND_SLOW, band_part, profile
+from stimrig.identify.noise import WHITE_AND_SLOW, NoiseLevel, band_part, profile
 
 LEAST_RESTING = 40
 """Fewer intervals at rest do not show how large the noise is."""
@@ -44,9 +44,8 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
     residual = fitted.residual_nm - band_part(fitted.residual_nm, setup.stretches, fitted.noise)
     white = max(setup.grid.mean_noise_nm(setup.fitted), 1e-6 * setup.scale_nm)
     rests, works = _long(setup.fitted & quiet, 8), _long(setup.fitted & ~quiet, 4)
-    at_rest, at_work, together = (
-        _log_likelihood(residual, parts, setup.grid.step_s) for parts in (rests, works, rests + works)
-    )
+    noise = WHITE_AND_SLOW.of_steps(setup.grid.step_s)
+    at_rest, at_work = (_log_likelihood(residual, parts, noise) for parts in (rests, works))
     total, resting = int(setup.fitted.sum()), sum(run.stop - run.start for run in rests)
     ideal = -0.5 * total * (np.log(2 * np.pi * white * white) + 1.0)
     if resting >= LEAST_RESTING:
@@ -55,7 +54,7 @@ def residual_structure(fitted: Fitted, quiet: np.ndarray) -> ResidualStructure:
     return ResidualStructure(
         white_nm=white,
         busy_nm=float(np.sqrt(np.mean(work**2))),
-        ratio=at_rest + at_work - together if rests and works else 0.0,
+        ratio=at_rest + at_work - _log_likelihood(residual, rests + works, noise) if rests and works else 0.0,
         ideal=ideal,
         scale_nm=setup.scale_nm,
     )
@@ -65,9 +64,9 @@ def _long(flags: np.ndarray, min_rows: int) -> list[slice]:
     return [run for run in runs(flags) if run.stop - run.start >= min_rows]
 
 
-def _log_likelihood(residual: np.ndarray, parts: list[slice], step_s: float) -> float:
+def _log_likelihood(residual: np.ndarray, parts: list[slice], kind: NoiseLevel) -> float:
     """Of some rows alone, with the noise that is most likely there."""
-    return profile(residual, ends_of(parts), WHITE_AND_SLOW.of_steps(step_s))[1] if parts else 0.0
+    return profile(residual, ends_of(parts), kind)[1] if parts else 0.0
 
 
 def quiet_rows(fitted: Fitted) -> np.ndarray:

@@ -163,9 +163,8 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     """The key `fit` of MODEL.json: errors, best-fit %, and the best fit that the noise allows."""
     setup = fitted.problem.setup
     grid = setup.grid
-    change: np.ndarray | None = held_out_change(fitted)
-    if setup.fitted.sum() < fold_rows(grid):  # without their only fold nothing is left to fit
-        change = None
+    one_fold = setup.fitted.sum() < fold_rows(grid)  # without it nothing is left to fit
+    change = None if one_fold else held_out_change(fitted)
     predicted, predictable = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
     statistics = fit_statistics(grid, setup.fitted, predicted, noise, change, predictable)
