@@ -33,6 +33,6 @@ EFFECT = Effect(
     separated_by="The ramp repeated after stimulation, and once more after a rest.",
     plain="The muscle tires: the longer it has worked, the less torque the same pulse gives. It recovers at rest. "
     "After a stroke, muscles tire sooner. Late in a session the muscle needs more charge, or longer rests.",
-    source="Riener et al. 1996; Ding et al. 2003",
+    source="Riener et al. 1996",
     main={"depth": "depth"},
 )

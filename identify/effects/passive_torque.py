@@ -154,7 +154,7 @@ EFFECT = Effect(
     resembles=("baseline_drift", "torque_velocity"),
     separated_by="Passive movement without stimulation.",
     plain="The joint resists movement also without stimulation: stiffness and, after a stroke, spasticity.",
-    source="De Groote et al. 2016; Riener et al. 1996",
+    source="Riener et al. 1996",
     needs=("angle_rad",),
     main={"stiffness_nm_per_rad": "stiffness", "elastic_1_nm": "elastic torque over the angle"},
 )
