@@ -59,11 +59,10 @@ def _bounded(factor):  # pragma: no cover
 def _factor(law, w, y, v, scale_nm, lag_s):  # pragma: no cover
     """Factor on T or on one lag; `law` holds a value for each `SpeedLaw`, y follows a with `lag_s`."""
     level, f = abs(y) / scale_nm, 1.0
-    lacking = (w - y) / (0.02 * scale_nm)
-    side = lacking / np.sqrt(1.0 + lacking * lacking)  # -1 where the drive is below the torque, 1 where it is above
-    if law[SpeedLaw.RATIO] != 0.0:
+    if law[SpeedLaw.RATIO] != 0.0 or law[SpeedLaw.LEVEL] != 0.0:
+        lacking = (w - y) / (0.02 * scale_nm)
+        side = lacking / np.sqrt(1.0 + lacking * lacking)  # -1 where the drive is below the torque, 1 where it is above
         f *= np.exp(law[SpeedLaw.RATIO] * 0.5 * (1.0 - side))
-    if law[SpeedLaw.LEVEL] != 0.0:
         f *= np.exp(law[SpeedLaw.LEVEL] * np.log(0.5 + 1.5 * min(level, 1.2)) * side)
     if law[SpeedLaw.EXPONENTIAL] != 0.0:
         f *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)

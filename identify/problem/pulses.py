@@ -36,7 +36,8 @@ def above_rest(
 
     Raises BadModel: as `predict`; the model depends on the joint, and nothing says where that is.
     """
-    widths = np.r_[np.zeros(round(REST_S * pulse_rate_hz)), np.asarray(pulse_width_us, float)]
+    rest = round(REST_S * pulse_rate_hz)
+    widths = np.r_[np.zeros(rest), np.asarray(pulse_width_us, float)]
     time_s = np.arange(widths.size * SAMPLES_A_PULSE) / (SAMPLES_A_PULSE * pulse_rate_hz)
     if angle_rad is None and Surfaces.of(model.effects) is not None:
         fix = "Give the angle at each pulse."
@@ -45,7 +46,7 @@ def above_rest(
     def torque_of(widths_us: np.ndarray, angle: np.ndarray | None) -> np.ndarray:
         sampled_us, nothing = np.repeat(widths_us, SAMPLES_A_PULSE), np.zeros(time_s.size)
         record = Record.from_arrays(time_s, sampled_us, nothing, angle_rad=angle, pulse_rate_hz=pulse_rate_hz)
-        return predict(model, record).reshape(-1, SAMPLES_A_PULSE).mean(axis=1)[-len(pulse_width_us) :]
+        return predict(model, record).reshape(-1, SAMPLES_A_PULSE).mean(axis=1)[rest:]
 
     moving = still = None
     if angle_rad is not None:

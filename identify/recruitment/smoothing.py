@@ -136,7 +136,7 @@ def choose_weight(
     smallest = 1e-14 * energy
 
     def bottom(weight: np.ndarray) -> np.ndarray:
-        return np.maximum(1.0 + (weight - floor)[:, None] * bent, 1e-12)
+        return 1.0 + (weight - floor)[:, None] * bent
 
     weight = balance * np.exp(np.linspace(np.log(LOWEST), np.log(HIGHEST), 73))
     squares = np.maximum(energy - (part / bottom(weight)).sum(axis=1), smallest + 1e-300)
