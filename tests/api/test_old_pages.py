@@ -80,10 +80,11 @@ def test_the_stop_button_stays_and_says_that_it_did_not_get_through(paced: Any, 
     paced.get_by_text(CONFIRMED).wait_for()
 
 
-def test_a_stop_is_sent_until_a_service_that_has_just_died_is_back(tab: Any, service: Service) -> None:
+@pytest.mark.parametrize("proxy", [False, True])
+def test_a_stop_is_sent_until_a_service_that_has_just_died_is_back(tab: Any, service: Service, proxy: bool) -> None:
     """The page does not know yet that nobody answers; it stays, with its button."""
     go(tab, service.url + "/participants/O2")
-    tab.route("**/stop", lambda route: route.abort())
+    tab.route("**/stop", lambda route: route.fulfill(status=502, body="Bad Gateway") if proxy else route.abort())
     press_stop(tab)
     doubt(tab).to_contain_text("Stop is being sent")
     tab.unroute("**/stop")

@@ -2,7 +2,7 @@
 // The page asks (the service does not push): an answer is newer than its question, also after a laptop has slept.
 "use strict";
 {
-  const EVERY_MS = 500, TIMEOUT_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000, AGAIN_MS = 250;
+  const EVERY_MS = 500, TIMEOUT_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000, AGAIN_MS = 250, HANGS_MS = 2500;
   const DOUBTS = {
     stopping: "Stop is being sent, but the service does not answer. Use the emergency switch on the stimulator.",
     not_stopped: "No answer to stop came. Use the emergency switch on the stimulator. Then press stop again.",
@@ -113,21 +113,26 @@
     send(event.target);
   });
 
+  // Until it is answered: one that hangs is not given up, since it may still stop, late; another is sent beside it.
   async function send(form) {
-    const body = new URLSearchParams(new FormData(form)), stopping = () => { stop = "stopping"; show(); };
     if (old()) stopping();
-    while (stopTimer) {
-      try { // not given up: it may still stop, late
-        const answer = await fetch(form.action, { method: "POST", body, headers: { Accept: "text/html" } });
-        clearTimeout(stopTimer); stopTimer = 0;
-        if (answer.redirected) location.assign(answer.url); else form.submit();
-      } catch { // a service that died is started again: so is the stop
-        stopping();
-        await new Promise((again) => setTimeout(again, AGAIN_MS));
-      }
+    while (stopTimer) await Promise.race([attempt(form), pause(HANGS_MS)]);
+  }
+
+  async function attempt(form) {
+    try {
+      const answer = await fetch(form.action, { method: "POST", body: new URLSearchParams(new FormData(form)), headers: { Accept: "text/html" } });
+      if (answer.status >= 500 && !answer.redirected) throw new Error("a proxy, without the service");
+      clearTimeout(stopTimer); stopTimer = 0;
+      if (answer.redirected) location.assign(answer.url); else form.submit();
+    } catch { // a service that died is started again: so is the stop
+      if (stopTimer) stopping();
+      await pause(AGAIN_MS);
     }
   }
 
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  function stopping() { stop = "stopping"; show(); }
   function notStopped() { clearTimeout(stopTimer); stopTimer = 0; stop = "not_stopped"; show(); }
 
   // ---- when it looks -----------------------------------------------------------------------------------------------

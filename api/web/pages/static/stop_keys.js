@@ -1,4 +1,5 @@
 // Esc or Space press the red stop button, on a page that holds [data-stop-keys]: the same form, the same answer.
+// [data-stop-keys="Escape"]: Esc alone, where Space presses other buttons.
 "use strict";
 {
   const AGAIN_MS = 1500; // a key that is held presses once; one that is pressed again, because nothing happened, presses again
@@ -6,7 +7,8 @@
   let pressed = -Infinity;
 
   const writes = (node) => node instanceof HTMLTextAreaElement || (node instanceof HTMLInputElement && !NO_TEXT.includes(node.type)) || (node instanceof HTMLElement && node.isContentEditable);
-  const stops = (event) => (event.key === "Escape" || (event.key === " " && !writes(event.target))) && document.querySelector("[data-stop-keys]") !== null;
+  const keys = () => document.querySelector("[data-stop-keys]")?.dataset.stopKeys;
+  const stops = (event) => (event.key === "Escape" && keys() !== undefined) || (event.key === " " && keys() === "" && !writes(event.target));
 
   addEventListener("keydown", (event) => {
     if (!stops(event)) return;
