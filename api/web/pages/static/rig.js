@@ -2,7 +2,7 @@
 // The page asks (the service does not push): an answer is newer than its question, also after a laptop has slept.
 "use strict";
 {
-  const EVERY_MS = 500, TIMEOUT_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000, AGAIN_MS = 250, HANGS_MS = 2500;
+  const EVERY_MS = 500, TIMEOUT_MS = 1500, OLD_MS = 2000, LONG_MS = 300000, TORQUE_OLD_S = 1.0, READ_MS = 2000, STOP_MS = 5000, AGAIN_MS = 250;
   const DOUBTS = {
     stopping: "Stop is being sent, but the service does not answer. Use the emergency switch on the stimulator.",
     not_stopped: "No answer to stop came. Use the emergency switch on the stimulator. Then press stop again.",
@@ -113,10 +113,10 @@
     send(event.target);
   });
 
-  // Until it is answered: one that hangs is not given up, since it may still stop, late; another is sent beside it.
+  // Until it is answered. One that waits is not given up, nor is another sent beside it: the rig may need seconds to confirm it.
   async function send(form) {
     if (old()) stopping();
-    while (stopTimer) await Promise.race([attempt(form), pause(HANGS_MS)]);
+    while (stopTimer) await attempt(form);
   }
 
   async function attempt(form) {
