@@ -1,6 +1,6 @@
 """Score what `improve` learns of muscles that are not in the library, on a record that was not fitted.
 
-    python -m bench.strange --set physics|further|places|plain --seeds 1000:1004
+    python -m bench.strange --set physics|further|places|plain --seeds 1000:1004 [--protocol full|paper|short]
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. Errors are over the noise's standard
 deviation, on a second record of the muscle that no fit was given, tared on its first rest.
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from bench.common import bench_parser, in_processes, line, table, write_json
-from bench.muscles.physics_records import DISTURBED, SETS, record_of_physics
+from bench.muscles.physics_records import DISTURBED, FULL, SETS, TESTS, record_of_physics
 from stimrig import identify
 from stimrig.identify.diagnosis import side_by_side as workers
 from tests.harness.carried_sessions import as_record
@@ -42,10 +42,10 @@ def score(generated: dict[str, Any], model: identify.Model) -> float:
     return rms(off - np.mean(off[unseen["time_s"] < REST_S])) / generated["truth"]["noise_sd_nm"]
 
 
-def identify_record(job: tuple[str, int, bool]) -> dict[str, Any]:
+def identify_record(job: tuple[str, int, str, bool]) -> dict[str, Any]:
     """Score one record of a set and a seed: its plain fit, `improve` and, where wanted, the names of `diagnose`."""
-    kind, seed, with_names = job
-    generated = record_of_physics(kind, seed)
+    kind, seed, protocol, with_names = job
+    generated = record_of_physics(kind, seed, protocol=protocol)
     workers.WORKERS = 1
     record = as_record(generated)
     began = time.perf_counter()
@@ -124,17 +124,18 @@ def main() -> None:
     """Score every record and print the table."""
     parser = bench_parser(__doc__, "1000:1004")
     parser.add_argument("--set", choices=SETS, required=True)
+    parser.add_argument("--protocol", choices=TESTS, default=FULL, help="test of the first record")
     parser.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     options = parser.parse_args()
-    jobs = [(options.set, seed, not options.no_names) for seed in options.seeds]
+    jobs = [(options.set, seed, options.protocol, not options.no_names) for seed in options.seeds]
     results = in_processes(identify_record, jobs, options.jobs) if options.jobs > 1 else map(identify_record, jobs)
     rows = []
     print(*table(HEADS, []), sep="\n", flush=True)
     for row in results:
         rows.append(row)
         print(line(cells(row)), flush=True)
-    title = f"\n{options.set}, seeds {options.seeds.start} to {options.seeds.stop - 1}"
+    title = f"\n{options.set}, protocol {options.protocol}, seeds {options.seeds.start} to {options.seeds.stop - 1}"
     print(title, *summary_lines(options.set, rows), sep="\n")
     write_json(options.json, rows)
 

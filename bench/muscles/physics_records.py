@@ -1,8 +1,9 @@
 """Records of muscles of other physics, each with a second record that no fit is given.
 
-The first is one test of 47 s at 40 pulses/s: rest, PRBS, ramp, rest, multi-level `validate`; white noise of 0.05 N·m,
-in some a slow zero and hum. The second, unseen, is of the same muscle, rested: other levels, held otherwise, with its
-noise-free torque. Seeds take the kinds of a set in turn. Seeds 0 to 99 are for development.
+The first is the design `full` (47 s at 40 pulses/s: rest, PRBS, ramp, rest, multi-level `validate`) or a protocol of
+the rig; white noise of 0.05 N·m, in some a slow zero and hum. The second, unseen, is of the same muscle, rested: other
+levels, held otherwise, with its noise-free torque. Seeds take the kinds of a set in turn. Seeds 0 to 99 are for
+development.
 """
 
 from __future__ import annotations
@@ -17,9 +18,14 @@ from bench.muscles.other_physics import SETS, PhysicsMuscle, draw_muscle
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S, Design, levels, make_design
 from stimrig.hardware_sim.hidden.kernels import Floats
 from stimrig.hardware_sim.hidden.scenario import rng_of
+from stimrig.rig import limits, plan, protocols
+from stimrig.rig.messages import Profile, TestPlan
 
 DISTURBED = {"hum": "mains_hum", "slow zero": "baseline_drift", "breath": ""}
 """Disturbances of a record, and the library's name of each, where it has one."""
+FULL = "full"
+TESTS = (FULL, *protocols.LIBRARY)
+"""Tests of the first record."""
 NOISE_SD_NM = 0.05
 RATE_HZ = 400.0
 UNSEEN_S = 22.0
@@ -27,7 +33,9 @@ FURTHER_SEED_OFFSET = 1_000_000
 """Added to the seed of the disturbances of a further record."""
 
 
-def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None = None) -> dict[str, Any]:
+def record_of_physics(
+    kinds: str, seed: int, disturbed: tuple[str, ...] | None = None, protocol: str = FULL
+) -> dict[str, Any]:
     """A record, and one more of the same muscle.
 
     Parameters
@@ -39,6 +47,8 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     disturbed
         What of `DISTURBED` lies over the first record. None: in `plain` one of them or all in turn, otherwise hum and
         slow zero in a third of the records each.
+    protocol
+        One of `TESTS`; the muscle, its disturbances and the second record are the same with each.
 
     Returns
     -------
@@ -56,7 +66,9 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     rng = rng_of(seed, "physics", kinds)
     muscle = draw_muscle(kinds, seed, rng)
     top_us = float(muscle.base.largest_width_us)
-    design = make_design("full", rng, top_us)
+    design = make_design(FULL, rng, top_us)
+    if protocol != FULL:
+        design = protocol_design(protocol, top_us)
     columns = sampled(muscle, design, RATE_HZ, np.zeros)
     chance = rng.random(2)
     over = disturbed if disturbed is not None else _disturbances(kinds, seed, chance)
@@ -66,6 +78,15 @@ def record_of_physics(kinds: str, seed: int, disturbed: tuple[str, ...] | None =
     truth = _truth(kinds, muscle) | {"seed": seed, "disturbed": list(over), "noise_sd_nm": NOISE_SD_NM}
     truth["true"] = sorted({*truth["true"], *(DISTURBED[disturbance] for disturbance in over)} - {""})
     return columns | {"unseen": sampled(muscle, unseen_design(seed, top_us), RATE_HZ, np.zeros), "truth": truth}
+
+
+def protocol_design(protocol: str, largest_us: float) -> Design:
+    """Return a protocol's pulses at the default rate, as the rig builds them."""
+    profile = Profile(max_pulse_width_us=largest_us)
+    request = TestPlan(test_id="bench", participant="P", profile=profile, protocol=protocol)
+    test = plan.build(request, limits.for_plan(limits.HARD_LIMITS, request))
+    names = np.concatenate([np.full(part.end - part.start, part.name, "<U20") for part in test.segments])
+    return Design(np.floor(test.pulse_width_us), names)
 
 
 def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Floats) -> dict[str, Any]:
