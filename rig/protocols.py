@@ -15,6 +15,9 @@ from stimrig.rig.errors import PlanError
 from stimrig.rig.messages import SegmentPlan
 
 LOWER = 0.75
+CHIPS = {"min_hold_s": 0.075, "max_hold_s": 0.4, "zero_share": 0.25, "seed": 33}
+"""Random levels in place of a PRBS. With this seed a quarter of the time is without pulses in both tests."""
+LOWEST = 0.12
 
 
 def paper(_max_pulse_width_us: float) -> list[SegmentPlan]:
@@ -25,15 +28,28 @@ def paper(_max_pulse_width_us: float) -> list[SegmentPlan]:
     0.6 s. About half of its pulses are at the full width. During the rest after it the torque of the slowest muscle
     falls to a few percent before the ramp (10 s) begins. Held-out levels: 7 s.
     """
-    return [
-        _rest(2.0),
-        _segment("prbs"),
-        _rest(3.0),
-        _segment("ramp"),
-        _rest(2.0),
-        _segment("validate", "multilevel"),
-        _rest(2.0),
-    ]
+    return _with_ramp([_segment("prbs")])
+
+
+def levels(max_pulse_width_us: float) -> list[SegmentPlan]:
+    """Random levels, a triangular ramp and held-out levels: the paper's test without its two-level PRBS.
+
+    38.7 s at 40 pulses/s, of which 12.7 s are levels between 12 and 100 % of the largest width, held for 3 to 16
+    pulses. A PRBS shows a muscle only at rest and at full strength; random levels also show how the torque goes from
+    one level to another. `two-stage` finds no segment with two levels in it.
+    """
+    return _with_ramp([_levels(12.7, max_pulse_width_us)])
+
+
+def mixed(max_pulse_width_us: float) -> list[SegmentPlan]:
+    """PRBS and random levels of half the length each, a triangular ramp and held-out levels.
+
+    38.7 s at 40 pulses/s: as `paper`, with a PRBS of 6.3 s and levels of 6.4 s. The PRBS is one whole period of 6 bits
+    with the paper's chip of 4 pulses: a chip of 2 pulses would put half of its power above the 4 Hz that a muscle
+    follows, and half a period of 7 bits is not balanced. It comes first, because the straight line through two levels
+    says nothing of the state in which other levels would leave the muscle.
+    """
+    return _with_ramp([_segment("prbs", bits=6), _levels(6.4, max_pulse_width_us)])
 
 
 def short(max_pulse_width_us: float) -> list[SegmentPlan]:
@@ -58,7 +74,12 @@ def short(max_pulse_width_us: float) -> list[SegmentPlan]:
 
 
 DEFAULT = "paper"
-LIBRARY: dict[str, Callable[[float], list[SegmentPlan]]] = {"paper": paper, "short": short}
+LIBRARY: dict[str, Callable[[float], list[SegmentPlan]]] = {
+    "paper": paper,
+    "short": short,
+    "levels": levels,
+    "mixed": mixed,
+}
 """By their ids, the default first."""
 
 
@@ -75,6 +96,17 @@ def segments(protocol_id: str, max_pulse_width_us: float) -> list[SegmentPlan]:
 def described() -> dict[str, str]:
     words = {name: inspect.getdoc(protocol) or "" for name, protocol in LIBRARY.items()}
     return {name: " ".join(doc.partition("\n\n")[0].split()) for name, doc in words.items()}
+
+
+def _with_ramp(first: list[SegmentPlan]) -> list[SegmentPlan]:
+    """Return the paper's test with these segments for its PRBS."""
+    ramp, held_out = _segment("ramp"), _segment("validate", "multilevel")
+    return [_rest(2.0), *first, _rest(3.0), ramp, _rest(2.0), held_out, _rest(2.0)]
+
+
+def _levels(duration_s: float, max_pulse_width_us: float) -> SegmentPlan:
+    lowest_us = float(math.floor(LOWEST * max_pulse_width_us))
+    return _segment("levels", "multilevel", **CHIPS, duration_s=duration_s, min_pulse_width_us=lowest_us)
 
 
 def _segment(name: str, sequence: str = "", /, **settings: Any) -> SegmentPlan:

@@ -19,7 +19,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.errors import BadRequest
+from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.plain import curve_at, final_spline, fit_from, plain_setup, start_at
 from stimrig.identify.estimation.solve import Fitted, solve
@@ -33,6 +33,10 @@ from stimrig.identify.recruitment.bases import PowerBasis, SplineBasis
 from stimrig.identify.recruitment.smoothing import KNOTS, PILOT_KNOTS, spline_roughness
 
 STARTS_S = (0.06, 0.15, 0.35, 0.8)
+LEVEL = 0.02
+"""Pulse widths closer than this share of the largest are one level."""
+TWO_LEVELS = 0.5
+"""Share of the intervals at the two most frequent levels: 1 in a PRBS, 0.75 in the two PRBS of `short`."""
 
 
 def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
@@ -42,6 +46,7 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
         message = "two-stage needs two segments, the first for the dynamics, the second for the recruitment"
         raise BadRequest(message, place="fit_on", fix="Give, for example, prbs,ramp.")
     prbs = segment_rows(grid, names[:1], METHOD.id)
+    refuse_levels(grid.pulse_width_us[prbs], names[0])
     ramp = segment_rows(grid, names[1:], METHOD.id)
     iterations = int(options.get("iterations", 1))
     knots = int(options.get("knots", KNOTS))
@@ -66,6 +71,18 @@ METHOD = Method(
     },
     fit,
 )
+
+
+def refuse_levels(width_us: np.ndarray, name: str) -> None:
+    """Refuse a segment for the dynamics that two levels do not fill for the most part.
+
+    A few other widths do no harm, because the dynamics are estimated once more with the curve. Raises NotIdentifiable.
+    """
+    _, counts = np.unique(np.round(width_us / (LEVEL * max(float(np.max(width_us)), 1e-300))), return_counts=True)
+    if np.sort(counts)[-2:].sum() < TWO_LEVELS * width_us.size:
+        message = f"two-stage needs two levels of pulse width in {name}; it has {counts.size}"
+        fix = "Name a PRBS first in fit_on, or use maximum-likelihood, which takes any."
+        raise NotIdentifiable(message, fix=fix)
 
 
 def physical(

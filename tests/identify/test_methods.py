@@ -80,6 +80,18 @@ def test_two_stage_takes_the_users_own_segments(noisy_record):
     assert model.linear == identify.fit(record, method="two-stage").linear
 
 
+def test_two_stage_takes_the_two_levels_of_a_mixed_test_and_refuses_levels_alone():
+    rng = np.random.default_rng(23)
+    levels = np.repeat(rng.permutation(np.linspace(0, 300, 32)), 8)
+    parts = [("rest", np.zeros(80)), ("prbs", prbs(6.3, 300, rng)), ("levels", levels), ("rest", np.zeros(120))]
+    parts += [("ramp", ramp()), ("rest", np.zeros(80)), ("validate", levels)]
+    pulses = np.concatenate([part for _, part in parts]), [name for name, part in parts for _ in part]
+    record, clean = make_record(Patient(), rng, rate_hz=40, noise_nm=0.02, pulses=pulses)
+    assert min(scores(record, clean, "two-stage")[1:]) > 99.5
+    with pytest.raises(identify.NotIdentifiable, match="two-stage needs two levels of pulse width in levels; it has"):
+        identify.fit(record, method="two-stage", fit_on=("levels", "ramp"))
+
+
 def test_ramp_deconvolution_gives_two_curves_and_good_ramps_alone(clean_record):
     model, ramp, unseen = scores(*clean_record, "ramp-deconvolution")
     assert isinstance(model.linear, SecondOrder)

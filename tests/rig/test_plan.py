@@ -160,7 +160,8 @@ def built_of(protocol: str, **more: float) -> plan.PlannedTest:
 def test_every_protocol_fits_every_comfort_maximum(protocol: str, comfort_us: float):
     test = built_of(protocol, max_pulse_width_us=comfort_us)
     assert test.pulse_width_us.max() == comfort_us
-    assert {"prbs", "ramp", "validate"} <= {segment.name for segment in test.segments}
+    names = {segment.name for segment in test.segments}
+    assert {"ramp", "validate"} <= names and names & {"prbs", "levels"}
     for segment in test.segments:
         assert segment.name != "rest" or not test.pulse_width_us[segment.start : segment.end].any()
     held_out = next(segment for segment in test.segments if segment.name == "validate")
@@ -170,7 +171,8 @@ def test_every_protocol_fits_every_comfort_maximum(protocol: str, comfort_us: fl
 
 def test_what_is_told_is_what_is_played_and_the_default_is_the_papers():
     told = plan.library()
-    assert [(one.id, round(one.duration_s, 6)) for one in told.protocols] == [("paper", 38.7), ("short", 26.2)]
+    durations_s = {one.id: round(one.duration_s, 6) for one in told.protocols}
+    assert durations_s == {"paper": 38.7, "short": 26.2, "levels": 38.7, "mixed": 38.7}
     for one in told.protocols:
         test = built_of(one.id)
         assert test.duration_s == pytest.approx(one.duration_s)
@@ -187,9 +189,20 @@ def test_the_two_prbs_of_the_short_test_have_two_mean_levels():
     assert 1.2 < high.mean() / low.mean() < 1.5
 
 
+@pytest.mark.parametrize("protocol", ["levels", "mixed"])
+def test_levels_are_random_a_quarter_without_pulses_and_of_no_higher_dose(protocol: str):
+    test = built_of(protocol)
+    levels_us = next(test.pulse_width_us[s.start : s.end] for s in test.segments if s.name == "levels")
+    assert levels_us[levels_us > 0].min() >= 36 and levels_us.max() > 280
+    assert np.mean(levels_us == 0) == pytest.approx(0.25, abs=0.02)
+    held = np.diff(np.flatnonzero(np.diff(levels_us)))
+    assert held.min() >= 3 and np.median(held) < 12 and np.unique(levels_us).size > 15
+    assert test.charge_uc < built_of("paper").charge_uc
+
+
 def test_an_unknown_protocol_is_refused_with_those_there_are():
     for protocol in ("", "../paper"):
-        with pytest.raises(PlanError, match="is unknown; use one of paper, short"):
+        with pytest.raises(PlanError, match="is unknown; use one of paper, short, levels, mixed"):
             built_of(protocol)
 
 
