@@ -152,7 +152,9 @@ class TestPlan(Labels, Message):
     kind: str = "pre-session"
     profile: Profile
     segments: list[SegmentPlan] | None = Field(None, description="None: those of the protocol")
-    protocol: str = Field(default="paper", description="id of a protocol in rig.protocols, for a plan without segments")
+    protocol: str | None = Field(
+        None, description="id in rig.protocols, for a plan without segments; None: the default"
+    )
     pulse_rate_hz: float = 40.0
     max_pulse_width_us: float | None = Field(default=None, description="for this test only, if tighter, µs")
     max_torque_nm: float | None = Field(default=None, description="for this test only, if tighter, N·m")

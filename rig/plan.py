@@ -127,7 +127,9 @@ def build(plan: TestPlan, table: dict[str, Limit]) -> PlannedTest:
     _check_angle(plan, table)
     chosen = plan.segments
     if chosen is None:
-        chosen = protocols.segments(plan.protocol, min(table["pulse_width_us"].hi, plan.largest_us))
+        protocol = protocols.DEFAULT if plan.protocol is None else plan.protocol
+        plan = plan.model_copy(update={"protocol": protocol})
+        chosen = protocols.segments(protocol, min(table["pulse_width_us"].hi, plan.largest_us))
     if not chosen:
         raise PlanError("plan.segments is empty; leave it out for the default test, or give at least one segment")
     if len(chosen) > MAX_SEGMENTS:

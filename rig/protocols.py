@@ -15,9 +15,8 @@ from stimrig.rig.errors import PlanError
 from stimrig.rig.messages import SegmentPlan
 
 LOWER = 0.75
-CHIPS = {"min_hold_s": 0.075, "max_hold_s": 0.4, "zero_share": 0.25, "seed": 33}
+CHIPS = {"min_hold_s": 0.075, "max_hold_s": 0.4, "zero_share": 0.25, "min_share": 0.12, "seed": 33}
 """Random levels in place of a PRBS. With this seed a quarter of the time is without pulses in both tests."""
-LOWEST = 0.12
 
 
 def paper(_max_pulse_width_us: float) -> list[SegmentPlan]:
@@ -31,17 +30,17 @@ def paper(_max_pulse_width_us: float) -> list[SegmentPlan]:
     return _with_ramp([_segment("prbs")])
 
 
-def levels(max_pulse_width_us: float) -> list[SegmentPlan]:
+def levels(_max_pulse_width_us: float) -> list[SegmentPlan]:
     """Random levels, a triangular ramp and held-out levels: the paper's test without its two-level PRBS.
 
     38.7 s at 40 pulses/s, of which 12.7 s are levels between 12 and 100 % of the largest width, held for 3 to 16
     pulses. A PRBS shows a muscle only at rest and at full strength; random levels also show how the torque goes from
     one level to another. `two-stage` finds no segment with two levels in it.
     """
-    return _with_ramp([_levels(12.7, max_pulse_width_us)])
+    return _with_ramp([_levels(12.7)])
 
 
-def mixed(max_pulse_width_us: float) -> list[SegmentPlan]:
+def mixed(_max_pulse_width_us: float) -> list[SegmentPlan]:
     """PRBS and random levels of half the length each, a triangular ramp and held-out levels.
 
     38.7 s at 40 pulses/s: as `paper`, with a PRBS of 6.3 s and levels of 6.4 s. The PRBS is one whole period of 6 bits
@@ -49,7 +48,7 @@ def mixed(max_pulse_width_us: float) -> list[SegmentPlan]:
     follows, and half a period of 7 bits is not balanced. It comes first, because the straight line through two levels
     says nothing of the state in which other levels would leave the muscle.
     """
-    return _with_ramp([_segment("prbs", bits=6), _levels(6.4, max_pulse_width_us)])
+    return _with_ramp([_segment("prbs", bits=6), _levels(6.4)])
 
 
 def short(max_pulse_width_us: float) -> list[SegmentPlan]:
@@ -104,9 +103,8 @@ def _with_ramp(first: list[SegmentPlan]) -> list[SegmentPlan]:
     return [_rest(2.0), *first, _rest(3.0), ramp, _rest(2.0), held_out, _rest(2.0)]
 
 
-def _levels(duration_s: float, max_pulse_width_us: float) -> SegmentPlan:
-    lowest_us = float(math.floor(LOWEST * max_pulse_width_us))
-    return _segment("levels", "multilevel", **CHIPS, duration_s=duration_s, min_pulse_width_us=lowest_us)
+def _levels(duration_s: float) -> SegmentPlan:
+    return _segment("levels", "multilevel", duration_s=duration_s, **CHIPS)
 
 
 def _segment(name: str, sequence: str = "", /, **settings: Any) -> SegmentPlan:

@@ -102,12 +102,11 @@ class Runner(Playing):
 
     def _plan(self, body: TestIn, participant: Participant) -> messages.TestPlan:
         segments = [messages.SegmentPlan(**segment.model_dump()) for segment in body.segments or ()] or None
-        protocol: dict[str, Any] = {} if body.protocol is None else {"protocol": body.protocol}
         return messages.TestPlan(
             test_id=self._new_id(),
             **{name: getattr(body, name) for name in messages.LABELS},
             segments=segments,
-            **protocol,
+            protocol=body.protocol,
             pulse_rate_hz=body.pulse_rate_hz,
             **limits_of(body, participant.profile),
         )

@@ -18,6 +18,7 @@ JUMPS = True
 class Settings(SequenceSettings):
     max_pulse_width_us: float = Field(300.0, description="highest level c, µs")
     min_pulse_width_us: float = Field(0.0, ge=0, description="lowest level that is not zero, µs")
+    min_share: float = Field(0.0, ge=0, le=1, description="the same as a share of c; the higher of both counts")
     duration_s: float = Field(7.0, gt=0, le=600, description="length, s")
     min_hold_s: float = Field(0.3, gt=0, le=600, description="shortest time on a level, s")
     max_hold_s: float = Field(1.0, gt=0, le=600, description="longest time on a level, s")
@@ -44,6 +45,7 @@ def pulse_widths(settings: Settings, pulse_rate_hz: float) -> NDArray[np.float64
     n_zero = round(settings.zero_share * len(hold_pulses))
     n_levels = len(hold_pulses) - n_zero
     bands = (rng.permutation(n_levels) + rng.random(n_levels)) / max(n_levels, 1)
-    span_us = settings.max_pulse_width_us - settings.min_pulse_width_us
-    levels_us = rng.permutation(np.concatenate([settings.min_pulse_width_us + bands * span_us, np.zeros(n_zero)]))
+    lowest_us = max(settings.min_pulse_width_us, settings.min_share * settings.max_pulse_width_us)
+    span_us = settings.max_pulse_width_us - lowest_us
+    levels_us = rng.permutation(np.concatenate([lowest_us + bands * span_us, np.zeros(n_zero)]))
     return np.repeat(levels_us, hold_pulses)[:total]

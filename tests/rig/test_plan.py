@@ -179,7 +179,7 @@ def test_what_is_told_is_what_is_played_and_the_default_is_the_papers():
         assert [segment.name for segment in test.segments] == one.segments
     assert [segment.name for segment in told.default] == told.protocols[0].segments
     assert told.protocols[0].segments == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
-    assert TestPlan.model_fields["protocol"].default == "paper"
+    assert built().plan.protocol == protocols.DEFAULT == told.protocols[0].id
 
 
 def test_the_two_prbs_of_the_short_test_have_two_mean_levels():
