@@ -1,6 +1,6 @@
 """Score what `improve` learns of muscles that are not in the library, on a record that was not fitted.
 
-    python -m bench.strange --set physics|further|places|plain --seeds 1000:1004 [--protocol full|paper|short]
+    python -m bench.strange --set SET --seeds 1000:1004 [--protocol full|paper|short]
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. Errors are over the noise's standard
 deviation, on a second record of the muscle that no fit was given, tared on its first rest.
@@ -25,7 +25,6 @@ from tests.harness.carried_sessions import as_record
 SURE_PROBABILITY = 0.9
 """Probability from which an effect counts as named for sure."""
 WORSE, CLOSE = 1.02, 1.3
-PICTURE = {"enters": "where they enter", "driven_by": "what drives them"}
 REST_S = 1.9
 HEADS = ("record", "plain", "improved", "added", "names and probabilities", "verdict", "seconds")
 
@@ -65,28 +64,23 @@ def identify_record(job: tuple[str, int, str, bool]) -> dict[str, Any]:
         "named": named,
         "untrue": [name for name in sure_names if name not in generated["truth"]["true"]],
         "verdict": improved.verdict,
-        "pictured": pictured(generated, improved.models[-1]),
+        "place": generated["truth"]["place"],
+        "term": first_term(improved.models[-1]),
         "seconds": seconds,
     }
 
 
-def pictured(generated: dict[str, Any], model: identify.Model) -> dict[str, Any]:
-    """Return for each key of `PICTURE` the answer of a model's first free effect and the right ones; empty without."""
-    shape = next((effect["shape"] for effect in model.effects if "shape" in effect), None)
-    truth = generated["truth"]
-    if shape is None:
-        return {}
-    return {key: (shape[key], truth[key]) for key in PICTURE}
+def first_term(model: identify.Model) -> dict[str, Any] | None:
+    """Return the first term of the model's free effect: its `place` and `driver`; None without one."""
+    return next((effect["term"] for effect in model.effects if "term" in effect), None)
 
 
-def picture_lines(rows: list[dict[str, Any]]) -> Iterable[str]:
-    """Count the right answers of free effects, beside the score of the one word that is right most often."""
-    pictures = [row["pictured"] for row in rows if row["pictured"]]
-    for key, words in PICTURE.items() if pictures else ():
-        right = sum(answer in truth for answer, truth in (picture[key] for picture in pictures))
-        words_there = {word for picture in pictures for word in picture[key][1]}
-        always = max((sum(word in picture[key][1] for picture in pictures) for word in words_there), default=0)
-        yield f"free effects {len(pictures)}: {words} right in {right}; with the best one word every time {always}"
+def place_line(rows: list[dict[str, Any]]) -> str:
+    """Count the first terms that stand at the right place, over the muscles that have one."""
+    placed = [row for row in rows if row["place"]]
+    terms = [row for row in placed if row["term"]]
+    right = sum(row["term"]["place"] in row["place"] for row in terms)
+    return f"first term at the true place: {right} of {len(placed)} with a true place, {len(terms)} of them with a term"
 
 
 def summary_lines(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
@@ -96,7 +90,7 @@ def summary_lines(kind: str, rows: list[dict[str, Any]]) -> Iterable[str]:
     yield f"within {CLOSE} ×: plain {np.sum(plain <= CLOSE)}, improved {np.sum(improved <= CLOSE)} of {len(rows)}"
     yield f"improved worse than plain by over 2 %: {np.sum(improved > WORSE * plain)} of {len(rows)}"
     yield f"improved better by 10 % and more: {np.sum(improved <= 0.9 * plain)} of {len(rows)}"
-    yield from picture_lines(rows)
+    yield place_line(rows)
     untrue_count = sum(bool(row["untrue"]) for row in rows)
     yield f"records with a name that is untrue with {SURE_PROBABILITY} and more: {untrue_count}"
     if kind == "plain":

@@ -14,26 +14,30 @@ from numpy.random import Generator
 from stimrig.hardware_sim.hidden.base import Base
 from stimrig.hardware_sim.hidden.kernels import Kernel, kernel
 
-ENTERS = ("drive", "rate of rise", "rate of fall", "output", "zero")
-"""Where the plain structure, a static curve before linear dynamics, can be departed from."""
-DRIVEN_BY = ("width", "activation", "torque", "time since", "sum of the past", "angle")
-"""Inputs of a departure. Activation: the recruited share, or calcium; time since: the last pulse or train."""
+TERM_PLACES = (
+    "width that acts",
+    "strength",
+    "rate of the first lag",
+    "rate of the second lag",
+    "torque at the cell",
+)
+"""Where a term of the free effect may stand; torque at the cell: added or as a factor."""
 
 
 @dataclass(frozen=True)
 class Mechanism:
     """A kernel whose p[0] scales its torque, p[1:] are drawn between bounds (log-uniform where both are positive).
 
-    `true` are the effects of a library that are in it by its equations; another name is untrue. `enters`, of `ENTERS`,
-    and `driven_by`, of `DRIVEN_BY`, are the right answers to where it departs from the plain structure, and by what.
+    `true` are the effects of a library that are in it by its equations; another name is untrue. `place`, of
+    `TERM_PLACES`, is where it departs from the plain structure: two where either can be defended, none where it departs
+    in more.
     """
 
     kernel: Kernel
     source: str
     draws: Mapping[str, tuple[float, float]]
     true: frozenset[str]
-    enters: frozenset[str]
-    driven_by: frozenset[str]
+    place: frozenset[str]
 
     def draw(self, rng: Generator, base: Base) -> dict[str, float]:
         """Draw its numbers, as its kernel takes them.
@@ -57,11 +61,10 @@ def by_name(*mechanisms: Mechanism) -> dict[str, Mechanism]:
 
 
 def mechanism(
-    source: str, true: str, enters: str, driven_by: str, **draws: tuple[float, float]
+    source: str, true: str, place: str, **draws: tuple[float, float]
 ) -> Callable[[Callable[..., float]], Mechanism]:
-    """Make a function the kernel of a mechanism; `true` by spaces, `enters` and `driven_by` by commas."""
-    where, what = frozenset(enters.split(", ")), frozenset(driven_by.split(", "))
-    if not (where <= set(ENTERS) and what <= set(DRIVEN_BY)):
-        raise ValueError(f"{enters}; {driven_by}: words of {', '.join(ENTERS)}; {', '.join(DRIVEN_BY)}")
-    true_names = frozenset(true.split())
-    return lambda function: Mechanism(kernel("dynamics")(function), source, draws, true_names, where, what)
+    """Make a function the kernel of a mechanism; `true` by spaces, `place` by commas."""
+    places = frozenset(filter(None, place.split(", ")))
+    if not places <= set(TERM_PLACES):
+        raise ValueError(f"{place}: words of {', '.join(TERM_PLACES)}")
+    return lambda function: Mechanism(kernel("dynamics")(function), source, draws, frozenset(true.split()), places)

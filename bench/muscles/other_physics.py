@@ -9,6 +9,7 @@ from numpy.random import Generator
 
 from bench.muscles.mechanism import Mechanism
 from bench.muscles.physics import FURTHER, PHYSICS
+from bench.muscles.physics_new import NEW
 from bench.muscles.physics_places import PLACES
 from stimrig.hardware_sim.hidden.base import Base, draw_base, recruit
 from stimrig.hardware_sim.hidden.chain import Chain
@@ -20,6 +21,7 @@ SETS: dict[str, dict[str, Mechanism]] = {
     "physics": PHYSICS,
     "further": FURTHER,
     "places": PLACES,
+    "new": NEW,
     "plain": {},
 }
 """Kinds of muscles, which seeds take in turn; those of `plain` are of the library's own structure, and lack nothing."""

@@ -42,8 +42,7 @@ def calcium_of(p: Any, s: Any, c: Any) -> float:
 @mechanism(
     "Ding, Wexler and Binder-Macleod 2003; recruitment 2007",
     "catch_like asymmetric_relaxation activation_dependent_speed",
-    "drive, rate of rise, rate of fall",
-    "activation, time since",
+    "strength, rate of the second lag",
     **_ding,
 )
 def ding(x, p, s, c):
@@ -59,8 +58,7 @@ def ding(x, p, s, c):
 @mechanism(
     "Ding, Wexler and Binder-Macleod 2003, with fatigue of A, τ1 and Km",
     "catch_like asymmetric_relaxation activation_dependent_speed fatigue",
-    "drive, rate of rise, rate of fall",
-    "activation, time since, sum of the past",
+    "strength, rate of the second lag",
     **_ding,
     loss=(0.25, 0.7),
     slowing=(0.1, 0.8),
@@ -95,8 +93,7 @@ def lengthening(tension: float, active: float, fastest: float, curved: float) ->
 @mechanism(
     "Hill 1938 with a series spring that stiffens; activation as in Winters and Thelen",
     "asymmetric_relaxation series_compliance activation_dependent_speed",
-    "rate of rise, rate of fall",
-    "activation, torque",
+    "rate of the first lag, rate of the second lag",
     rise_s=(0.02, 0.08),
     fall_s=(0.05, 0.2),
     fastest_per_s=(1.0, 4.0),
@@ -119,8 +116,7 @@ def hill_series(x, p, s, c):
 @mechanism(
     "fast fibres that tire beside slow ones that hardly do, each with thresholds of its own; Burke 1973",
     "mixed_fibres fatigue",
-    "drive, rate of rise, rate of fall",
-    "width, activation, sum of the past",
+    "",
     share=(0.35, 0.65),
     fast_s=(0.04, 0.09),
     slow_s=(0.15, 0.35),
@@ -154,8 +150,7 @@ def two_populations(x, p, s, c):
 @mechanism(
     "Huxley 1957, bridges over their strain, against a series spring; activation by two lags",
     "asymmetric_relaxation series_compliance activation_dependent_speed",
-    "rate of rise, rate of fall",
-    "activation, torque",
+    "rate of the second lag",
     activation_s=(0.02, 0.07),
     attach_per_s=(10.0, 40.0),
     detach_per_s=(6.0, 20.0),
@@ -198,8 +193,7 @@ def huxley(x, p, s, c):
 @mechanism(
     "a pool of 40 units, small ones slow: twitches that fuse by their own time, sag of the fast; Fuglevand 1993",
     "mixed_fibres catch_like asymmetric_relaxation",
-    "drive, rate of rise, rate of fall",
-    "width, activation, time since",
+    "",
     sizes=(5.0, 40.0),
     fastest_s=(0.03, 0.06),
     slower_by=(2.0, 4.0),
@@ -238,8 +232,7 @@ def unit_pool(x, p, s, c):
 @mechanism(
     "a viscoelastic tendon that is slack at rest, behind a second-order muscle; Zajac 1989",
     "series_compliance electromechanical_delay asymmetric_relaxation",
-    "rate of rise, rate of fall, output",
-    "torque",
+    "rate of the second lag, torque at the cell",
     active_s=(0.04, 0.12),
     slack=(0.1, 0.6),
     stretch=(0.2, 0.8),
@@ -267,8 +260,7 @@ def slack_tendon(x, p, s, c):
 @mechanism(
     "calcium bound by troponin and, slowly, by parvalbumin, which fills in a train; Baylor and Hollingworth 1998",
     "asymmetric_relaxation potentiation catch_like",
-    "drive, rate of fall",
-    "time since, sum of the past",
+    "strength, rate of the first lag",
     pump_s=(0.008, 0.03),
     troponin_per_s=(60.0, 200.0),
     parvalbumin=(0.5, 3.0),
@@ -300,8 +292,7 @@ def two_buffers(x, p, s, c):
 @mechanism(
     "bridges that hold the filament open: attachment grows with force, detachment falls; Campbell 1997",
     "activation_dependent_speed asymmetric_relaxation",
-    "rate of rise, rate of fall",
-    "activation, torque",
+    "strength, rate of the second lag",
     activation_s=(0.02, 0.06),
     on_per_s=(3.0, 10.0),
     off_per_s=(8.0, 25.0),
@@ -322,8 +313,7 @@ def cooperative(x, p, s, c):
 @mechanism(
     "a chain of sarcomeres of unequal strength on their length-tension curve: Morgan 1990, Campbell 2009",
     "asymmetric_relaxation series_compliance potentiation",
-    "rate of rise, rate of fall",
-    "activation, torque, sum of the past",
+    "strength, rate of the second lag",
     activation_s=(0.03, 0.09),
     unequal=(0.05, 0.25),
     fastest_per_s=(0.5, 3.0),
@@ -359,8 +349,7 @@ def sarcomere_chain(x, p, s, c):
 @mechanism(
     "phosphate and potassium of a closed space, washed out by flow that force itself stops; Dutka and Lamb 2004",
     "fatigue asymmetric_relaxation activation_dependent_speed",
-    "drive, rate of rise, rate of fall",
-    "activation, torque, sum of the past",
+    "strength, rate of the second lag",
     rise_s=(0.03, 0.1),
     force_s=(0.06, 0.3),
     heaps_s=(3.0, 15.0),

@@ -33,8 +33,7 @@ def share_above(width_us, half_us, spread_us):
     "wide pulses reach sensory axons, whose motoneurons go on by plateau potentials that warm up: Dean, Yates and"
     " Collins 2007; Bennett and others 1998",
     "recruitment_hysteresis mixed_fibres potentiation asymmetric_relaxation",
-    "drive, rate of fall",
-    "width, sum of the past",
+    "strength",
     **_muscle,
     central=(0.25, 0.5),
     afferents_at_us_share=(0.3, 0.9),
@@ -65,8 +64,7 @@ def central_plateau(x, p, s, c):
 @mechanism(
     "the bulging muscle carries the nerve away from the electrode: position-dependent recruitment, Grill 2006",
     "asymmetric_relaxation catch_like",
-    "drive",
-    "torque",
+    "width that acts",
     **_muscle,
     half_at_us_share=(0.3, 0.8),
     spread_us=(15.0, 40.0),
@@ -87,8 +85,7 @@ def moving_electrode(x, p, s, c):
 @mechanism(
     "the forearm on a viscoelastic cushion, held back by a strap's dry friction: Zener's solid; Dahl 1968",
     "series_compliance",
-    "output, zero",
-    "torque, sum of the past",
+    "torque at the cell",
     **_muscle,
     lasting=(0.4, 0.8),
     creep_s=(0.5, 4.0),
@@ -116,8 +113,7 @@ def dry_cushion(x, p, s, c):
 @mechanism(
     "a reflex beside the direct way, worn by each pulse and held down by tension, late: Crone and Nielsen 1989 and Ib",
     "catch_like asymmetric_relaxation",
-    "drive",
-    "torque, time since",
+    "strength",
     first_s=(0.03, 0.08),
     second_s=(0.06, 0.2),
     reflex=(0.6, 2.0),
@@ -146,8 +142,7 @@ def worn_reflex(x, p, s, c):
 @mechanism(
     "axons whose own pump hyperpolarises them the more they fire: Vagg and others 1998, Kiernan and others 2004",
     "fatigue threshold_drift",
-    "drive",
-    "width, sum of the past",
+    "width that acts",
     **_muscle,
     half_at_us_share=(0.3, 0.8),
     spread_us=(12.0, 35.0),
@@ -173,8 +168,7 @@ def axon_pump(x, p, s, c):
 @mechanism(
     "forearm and splint swing on pads that are soft until they are pressed, between joints that slip: Iwan 1966",
     "series_compliance",
-    "rate of rise, rate of fall, output",
-    "torque",
+    "rate of the second lag, torque at the cell",
     first_s=(0.02, 0.06),
     second_s=(0.04, 0.12),
     swings_hz=(2.5, 6.0),

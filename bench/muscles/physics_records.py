@@ -55,8 +55,8 @@ def record_of_physics(
     dict
         `time_s`, `pulse_width_us`, `torque_nm`, `segment`, shape (n,), at 400 Hz; `unseen`, the same columns of the
         second record, whose torque has neither noise nor zero; `truth`: `kind`, `numbers`, `true` (names that are no
-        mistake), `enters` and `driven_by` (right answers to where the muscle departs from the plain structure, and by
-        what; none of `plain`), `disturbed`, `noise_sd_nm`.
+        mistake), `place` (right answers to where the muscle departs from the plain structure, of `TERM_PLACES`; none
+        of `plain`), `disturbed`, `noise_sd_nm`.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def further_record(kinds: str, seed: int, over: tuple[str, ...], width_us: Float
 def _truth(kinds: str, muscle: PhysicsMuscle) -> dict[str, Any]:
     """Return the right answers about the muscle alone."""
     kind = SETS[kinds].get(muscle.kind)
-    right = {key: sorted(getattr(kind, key)) if kind else [] for key in ("true", "enters", "driven_by")}
+    right = {key: sorted(getattr(kind, key)) if kind else [] for key in ("true", "place")}
     return {"kind": muscle.kind, "numbers": muscle.numbers} | right
 
 
