@@ -1,6 +1,6 @@
 """Score what `improve` learns of muscles that are not in the library, on a record that was not fitted.
 
-    python -m bench.strange --set SET --seeds 1000:1004 [--protocol full|paper|short]
+    python -m bench.strange --set SET --seeds 1000:1004 [--protocol NAME]
 
 Seeds 0 to 99 were developed on; report on seeds from 1000. Errors are over the noise's standard
 deviation, on a second record of the muscle that no fit was given, tared on its first rest.

@@ -11,6 +11,7 @@ from bench.muscles.mechanism import Mechanism
 from bench.muscles.physics import FURTHER, PHYSICS
 from bench.muscles.physics_new import NEW
 from bench.muscles.physics_places import PLACES
+from bench.muscles.physics_report import REPORT
 from stimrig.hardware_sim.hidden.base import Base, draw_base, recruit
 from stimrig.hardware_sim.hidden.chain import Chain
 from stimrig.hardware_sim.hidden.design import PULSES_PER_S
@@ -22,6 +23,7 @@ SETS: dict[str, dict[str, Mechanism]] = {
     "further": FURTHER,
     "places": PLACES,
     "new": NEW,
+    "report": REPORT,
     "plain": {},
 }
 """Kinds of muscles, which seeds take in turn; those of `plain` are of the library's own structure, and lack nothing."""

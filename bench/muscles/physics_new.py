@@ -1,6 +1,6 @@
 """Muscles of other physics to develop on: one of contraction, nerve, electrode, cuff and sensor each.
 
-As `physics`.
+As `physics`; `physics_report` has as many to report on.
 """
 
 from __future__ import annotations
