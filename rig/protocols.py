@@ -72,12 +72,12 @@ def short(max_pulse_width_us: float) -> list[SegmentPlan]:
     ]
 
 
-DEFAULT = "paper"
+DEFAULT = "mixed"
 LIBRARY: dict[str, Callable[[float], list[SegmentPlan]]] = {
+    "mixed": mixed,
     "paper": paper,
     "short": short,
     "levels": levels,
-    "mixed": mixed,
 }
 """By their ids, the default first."""
 

@@ -23,7 +23,7 @@ SETTLED_S = 0.5
 NEXT_PULSES = 1.5
 """Periods after the newest pulse for which the muscle is taken to be stimulated."""
 WIDTHS_FROM = {"profile", "protocol", "pulse_rate_hz", "max_pulse_width_us", "max_torque_nm"}
-"""Fields of a plan on which the widths of the paper's test depend."""
+"""Fields of a plan on which the widths of the default test depend."""
 TELL_S = 0.2
 """Pages hear this often how much was seen."""
 
@@ -43,8 +43,8 @@ class JointTests(Watched):
     names, part, fitted, status_type = KINDS, "joint", False, JointStatus
     left_alone = "What is seen is not counted any more. The test goes on to its longest time"
 
-    _paper: tuple[str, list[float]] | None = None
-    """The `WIDTHS_FROM` of the last plan whose paper's test the rig previewed, and its widths, µs."""
+    _default: tuple[str, list[float]] | None = None
+    """The `WIDTHS_FROM` of the last plan whose default test the rig previewed, and its widths, µs."""
 
     # ---- before ----------------------------------------------------------------------------------------------
 
@@ -79,32 +79,32 @@ class JointTests(Watched):
         return Planned(plan, {"joint": document})
 
     async def _layout(self, plan: messages.TestPlan, longest_s: float | None, preview_s: float) -> Layout:
-        """Lay out the three tests within the paper's torque-time; `plan`: any of the participant, with its limits."""
-        paper_us = await self._paper_widths(plan, preview_s)
+        """Lay out the three tests within the default test's torque-time; `plan`: any of the participant's."""
+        default_us = await self._default_widths(plan, preview_s)
         table = await asyncio.to_thread(self.versions.recruitment, plan.participant)
         curve = joint_plan.curve_of(table, plan.largest_us, plan.profile.motor_pulse_width_us)
         moving_s = (longest_s or joint_plan.LONGEST_S[MOVING]) - messages.SAFE_END_S
         range_rad, rate_hz = plan.profile.angle_range_rad, plan.pulse_rate_hz
         assert range_rad is not None
-        return joint_plan.layout(range_rad, curve, plan.largest_us, paper_us, rate_hz, moving_s)
+        return joint_plan.layout(range_rad, curve, plan.largest_us, default_us, rate_hz, moving_s)
 
-    async def _paper_widths(self, plan: messages.TestPlan, preview_s: float) -> list[float]:
-        """Return every width of the paper's test with the limits of `plan`, µs.
+    async def _default_widths(self, plan: messages.TestPlan, preview_s: float) -> list[float]:
+        """Return every width of the default test with the limits of `plan`, µs.
 
         The rig previews nothing while a test plays: then the last answer for the same limits is returned.
 
         Raises ApiError: 409 rig-busy there is none; what the rig refuses.
         """
         limits = plan.model_dump_json(include=WIDTHS_FROM)
-        paper = plan.model_copy(update={"kind": "pre-session", "segments": None})
+        default = plan.model_copy(update={"kind": "pre-session", "segments": None})
         try:
-            preview = await self.rig.ask(requests.PreviewRequest(plan=paper, recruitment=None), timeout_s=preview_s)
+            preview = await self.rig.ask(requests.PreviewRequest(plan=default, recruitment=None), timeout_s=preview_s)
         except ApiError as error:
-            if error.code != "rig-busy" or self._paper is None or self._paper[0] != limits:
+            if error.code != "rig-busy" or self._default is None or self._default[0] != limits:
                 raise
         else:
-            self._paper = limits, preview["pulse_width_us"]
-        return self._paper[1]
+            self._default = limits, preview["pulse_width_us"]
+        return self._default[1]
 
     def _target(self, plan: messages.TestPlan, angle_in: AngleIn, shared: Layout) -> float:
         """Return the angle to hold: the requested one, or the next that is open."""
@@ -164,7 +164,7 @@ class JointTests(Watched):
         return self.versions.store.all(Test, *conditions, order=Test.requested_utc.desc())
 
     async def overview(self, plan: messages.TestPlan, preview_s: float) -> dict[str, Any]:
-        """Return today's open guided tests, and their dose relative to the paper's test.
+        """Return today's open guided tests, and their dose relative to the default test.
 
         `plan`: any plan of the participant, with its limits.
         """

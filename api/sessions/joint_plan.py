@@ -1,6 +1,6 @@
 """The three guided tests of a joint that moves: which angles, which widths, for how long, at what torque-time. Pure.
 
-Together they cost at most what the paper's test costs: a part of what that one is expected to take is shared out, and
+Together they cost at most what the default test costs: a part of what that one is expected to take is shared out, and
 each staircase and each steady level is as long as its share allows. All is counted with the same recruitment curve at
 the angle of the isometric test; how the torque changes with angle and velocity is what these tests are to find out, and
 the part that is not planned is there for a muscle that is stronger elsewhere.
@@ -29,7 +29,7 @@ RANGES_RAD = (math.radians(60), math.radians(90))
 """From the first on there are four angles to hold, from the second on five."""
 
 PLANNED_SHARE = 0.85
-"""Share of the paper's torque-time: the worst of 60 simulated arms took 1.15 times the planned dose."""
+"""Share of the default test's torque-time: the worst of 60 simulated arms took 1.15 times the planned dose."""
 HELD_SHARE = 0.45
 """Share of the planned dose for all held tests together; the moving test has the rest."""
 STAIRS = (0.25, 0.5, 0.75)
@@ -163,35 +163,35 @@ class Layout:
     held: list[Segment]  # of one held test
     moving: list[Segment]
     doses: dict[str, float]
-    """Expected torque-time: of the paper's test, one held test, all of them, the moving one, and all together; N·m·s,
+    """Expected torque-time: of the default test, one held test, all of them, the moving one, and all together; N·m·s,
     with a stand-in curve only good for being compared."""
     known: bool  # whether the doses are N·m·s
 
     @property
     def share(self) -> float:
-        """Share of the paper's torque-time."""
+        """Share of the default test's torque-time."""
         return self.doses["total"] / self.doses["paper"] if self.doses["paper"] > 0 else 0.0
 
 
 def layout(
-    range_rad: Sequence[float], curve: Curve, largest_us: float, paper_us: Sequence[float], rate_hz: float,
+    range_rad: Sequence[float], curve: Curve, largest_us: float, default_us: Sequence[float], rate_hz: float,
     moving_s: float = LONGEST_S[MOVING],
 ) -> Layout:  # fmt: skip
-    """Share out `PLANNED_SHARE` of the paper's torque-time among the held tests and the moving one.
+    """Share out `PLANNED_SHARE` of the default test's torque-time among the held tests and the moving one.
 
-    `range_rad`: the participant's lowest and highest angle, rad; `paper_us`: every width of the paper's test with these
-    limits, µs; `moving_s`: the longest moving test without its safe end, s.
+    `range_rad`: the participant's lowest and highest angle, rad; `default_us`: every width of the default test with
+    these limits, µs; `moving_s`: the longest moving test without its safe end, s.
     """
     angles = targets(range_rad)
-    paper = float(np.sum(curve.torque(paper_us))) / rate_hz
+    default_nms = float(np.sum(curve.torque(default_us))) / rate_hz
     full = curve.torque_time(held(curve, largest_us, LONGEST_STAIR_S, rate_hz), rate_hz)
-    fits = HELD_SHARE * PLANNED_SHARE * paper / (full * len(angles)) if angles and full > 0 else 0.0
+    fits = HELD_SHARE * PLANNED_SHARE * default_nms / (full * len(angles)) if angles and full > 0 else 0.0
     stairs = held(curve, largest_us, LONGEST_STAIR_S * min(1.0, fits), rate_hz)
     each = curve.torque_time(stairs, rate_hz)
-    left = max(PLANNED_SHARE * paper - each * len(angles), 0.0)
+    left = max(PLANNED_SHARE * default_nms - each * len(angles), 0.0)
     levels = moving(curve, largest_us, left, moving_s, rate_hz)
     doses = {
-        "paper": paper,
+        "paper": default_nms,
         "held_each": each,
         "held": each * len(angles),
         "moving": curve.torque_time(levels, rate_hz),

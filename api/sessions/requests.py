@@ -189,7 +189,7 @@ class TestIn(Labels, Body):
         gt=0,
         le=10_000,
         description="kinds `adaptive` and `moving`: the largest torque-time, N·m·s; None: 12 s at the torque that "
-        "stops a test, of `moving` what the paper's test is expected to take, where a model is approved",
+        "stops a test, of `moving` what the default test is expected to take, where a model is approved",
     )
     anyway: StrictBool = Field(
         default=False, description="kind `adaptive`: play it although the target is out of reach"

@@ -242,7 +242,7 @@ def test_a_moving_test_counts_under_stimulation_only(service: Service, client: h
     assert told["ended"] in ("covered", "torque-time")
 
 
-def test_the_three_cost_at_most_the_papers_test(client: httpx.Client, ready: str) -> None:
+def test_the_three_cost_at_most_the_default_test(client: httpx.Client, ready: str) -> None:
     listed = client.get(f"/v1/participants/{ready}/joint").json()
     doses = listed["doses"]
     assert not listed["known"], "no model is approved: nothing but the share is told"
@@ -340,7 +340,7 @@ def test_recordings_without_an_angle_of_others_and_twice_are_refused(
     assert client.post(at, json={"recordings": recordings, "effects": ["none_such"]}).status_code == 422
 
 
-# ---- The plans: angles within the range, and never more torque-time than the paper's test
+# ---- The plans: angles within the range, and never more torque-time than the default test
 
 
 RATE_HZ = 40.0

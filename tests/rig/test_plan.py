@@ -38,7 +38,7 @@ def test_preview():
     assert shown.charge_uc == test.charge_uc == pytest.approx(test.pulse_width_us.sum() * 0.02)
     assert shown.torque_time_nms == pytest.approx(np.sum(test.pulse_width_us) * 0.02 / 40)
     assert plan.preview(test).torque_time_nms is None
-    assert shown.segments[1] == {"name": "prbs", "start_s": 2.0, "end_s": pytest.approx(14.7)}
+    assert shown.segments[1] == {"name": "prbs", "start_s": 2.0, "end_s": pytest.approx(8.3)}
     with pytest.raises(PlanError, match="recruitment"):
         plan.preview(test, RecruitmentTable(pulse_width_us=[0, 0], torque_nm=[0, 6]))
 
@@ -169,7 +169,7 @@ def test_every_protocol_fits_every_comfort_maximum(protocol: str, comfort_us: fl
     assert np.all(test.pulse_width_us[-40:] == 0)
 
 
-def test_what_is_told_is_what_is_played_and_the_default_is_the_papers():
+def test_what_is_told_is_what_is_played():
     told = plan.library()
     durations_s = {one.id: round(one.duration_s, 6) for one in told.protocols}
     assert durations_s == {"paper": 38.7, "short": 26.2, "levels": 38.7, "mixed": 38.7}
@@ -178,7 +178,7 @@ def test_what_is_told_is_what_is_played_and_the_default_is_the_papers():
         assert test.duration_s == pytest.approx(one.duration_s)
         assert [segment.name for segment in test.segments] == one.segments
     assert [segment.name for segment in told.default] == told.protocols[0].segments
-    assert told.protocols[0].segments == ["rest", "prbs", "rest", "ramp", "rest", "validate", "rest"]
+    assert told.protocols[0].segments == ["rest", "prbs", "levels", "rest", "ramp", "rest", "validate", "rest"]
     assert built().plan.protocol == protocols.DEFAULT == told.protocols[0].id
 
 
@@ -202,7 +202,7 @@ def test_levels_are_random_a_quarter_without_pulses_and_of_no_higher_dose(protoc
 
 def test_an_unknown_protocol_is_refused_with_those_there_are():
     for protocol in ("", "../paper"):
-        with pytest.raises(PlanError, match="is unknown; use one of paper, short, levels, mixed"):
+        with pytest.raises(PlanError, match="is unknown; use one of mixed, paper, short, levels"):
             built_of(protocol)
 
 

@@ -45,7 +45,8 @@ def test(
     url: Annotated[str, typer.Option(help="a running service; default: one is started", envvar="STIMRIG_URL")] = "",
     data: DataDir = None,
     protocol: Annotated[
-        str | None, typer.Option(help="which fixed test: paper (default), short", show_default=False)
+        str | None,
+        typer.Option(help="another fixed test: paper, short, levels", show_default=False),
     ] = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="write the recording (HDF5) here")] = None,
     emulate: Emulate = "",

@@ -248,7 +248,7 @@ class CoverageOut(Document):
 class DosesOut(Document):
     """Expected torque-time, N·m·s; without an approved model only good for being compared."""
 
-    paper: float = Field(description="of the paper's test with the same limits")
+    paper: float = Field(description="of the default test with the same limits")
     held_each: float = Field(description="of one held test")
     held: float = Field(description="of all held tests")
     moving: float
@@ -296,4 +296,4 @@ class JointOverviewOut(Document):
     tests: dict[Literal["passive", "moving"], str | None] = Field(description="today's newest that ended well")
     doses: DosesOut | None = Field(description="null without a sensor or a range")
     known: bool = Field(description="whether `doses` are N·m·s: a model is approved")
-    share_of_paper: float | None = Field(description="of the paper's torque-time that all of them take, 0 to 1")
+    share_of_paper: float | None = Field(description="of the default test's torque-time that all of them take, 0 to 1")
