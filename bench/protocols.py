@@ -18,27 +18,17 @@ import numpy as np
 
 from bench.common import bench_parser, table
 from bench.muscles.hidden_records import sampled
+from bench.muscles.physics_records import protocol_design
 from stimrig import identify
 from stimrig.hardware_sim.hidden.design import Design, make_design
 from stimrig.hardware_sim.hidden.library import STILL
 from stimrig.hardware_sim.hidden.scenario import Scenario, draw_scenario, rng_of
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.estimation.fit_statistics import best_fit_percent
-from stimrig.rig import limits, plan, protocols
-from stimrig.rig.messages import Profile, TestPlan
+from stimrig.rig import protocols
 from tests.harness.carried_sessions import as_record
 
 RATE_HZ, NOISE_SD_NM, UNSEEN_S = 400.0, 0.05, 30.0
-
-
-def design_of(protocol: str, largest_us: float) -> Design:
-    """Return a protocol's pulses, as the rig builds them."""
-    request = TestPlan(
-        test_id="bench", participant="P", profile=Profile(max_pulse_width_us=largest_us), protocol=protocol
-    )
-    test = plan.build(request, limits.for_plan(limits.HARD_LIMITS, request))
-    names = np.concatenate([np.full(s.end - s.start, s.name, dtype="<U20") for s in test.segments])
-    return Design(np.floor(test.pulse_width_us), names)
 
 
 def record_of(scenario: Scenario, design: Design, noise: np.random.Generator | None) -> identify.Record:
@@ -59,7 +49,7 @@ def accuracy_lines(seeds: range, steep: bool) -> list[str]:
         unseen = make_design("full", rng_of(seed, "unseen"), largest_us, validate_s=UNSEEN_S)
         truth = record_of(scenario, Design(unseen.width_us[unseen.held_out], unseen.segment[unseen.held_out]), None)
         for name in protocols.LIBRARY:
-            design = design_of(name, largest_us)
+            design = protocol_design(name, largest_us)
             durations_s[name] = design.duration_s
             doses[name].append(float(np.sum(np.abs(record_of(scenario, design, None).torque_nm))))
             model = identify.fit(record_of(scenario, design, rng_of(seed, "noise", name)))
@@ -82,7 +72,7 @@ def hidden_lines(seeds: range, strengths: list[str]) -> list[str]:
         strength = strengths[number // len(STILL) % len(strengths)]
         scenario = draw_scenario((effect,) if effect else (), strength, seed, noise_sd_nm=NOISE_SD_NM)
         for name in protocols.LIBRARY:
-            design = design_of(name, float(np.floor(scenario.base.largest_width_us)))
+            design = protocol_design(name, float(np.floor(scenario.base.largest_width_us)))
             diagnosis = identify.diagnose(record_of(scenario, design, rng_of(seed, "noise", name)))
             diagnoses_of[name].append((effect, diagnosis))
             first = [entry["effect"] for entry in diagnosis.missing]
