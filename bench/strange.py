@@ -72,14 +72,14 @@ def identify_record(job: tuple[str, int, str, bool]) -> dict[str, Any]:
 
 def first_term(model: identify.Model) -> dict[str, Any] | None:
     """Return the first term of the model's free effect: its `place` and `driver`; None without one."""
-    return next((effect["term"] for effect in model.effects if "term" in effect), None)
+    return next((effect["shape"] for effect in model.effects if "shape" in effect), None)
 
 
 def place_line(rows: list[dict[str, Any]]) -> str:
     """Count the first terms that stand at the right place, over the muscles that have one."""
     placed = [row for row in rows if row["place"]]
     terms = [row for row in placed if row["term"]]
-    right = sum(row["term"]["place"] in row["place"] for row in terms)
+    right = sum(row["term"]["place"].removeprefix("factor of the ") in row["place"] for row in terms)
     return f"first term at the true place: {right} of {len(placed)} with a true place, {len(terms)} of them with a term"
 
 

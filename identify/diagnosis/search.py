@@ -44,7 +44,7 @@ LEAST_S = 3.0
 width, and its curve and dynamics explain whatever happens in it."""
 MAX_EFFECTS = 3
 """Effects at most."""
-DYNAMIC = {"speed", "lags", "branch", "delay", "filter"}
+DYNAMIC = {"speed", "term", "branch", "delay", "filter"}
 """Stages that change how quickly the torque follows."""
 FORMS = 3
 """Forms of an effect that are tried beside another effect."""

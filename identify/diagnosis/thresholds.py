@@ -23,6 +23,10 @@ BETTER_THAN_ALIKE = 3.0
 inexact form looks like two."""
 FREE_FALL = 0.2
 """Logarithm by which that error must fall with a free effect, too: it is chosen among many."""
+TERM_MARGIN = 3.0
+"""Log evidence that a further term must gain."""
+NEAR = 0.03
+"""Logarithm of the left-out error by which a chain of fewer terms may predict worse than the best one."""
 UNSURE = 0.85
 """Weight of the evidence for efforts: where a law explains as much, the law is preferred, since it can be tested. It is
 also the largest probability of an effect that may only repair the inexact form of an earlier one, and of efforts that

@@ -11,11 +11,10 @@ import numpy as np
 from numba import njit
 from numpy.polynomial.chebyshev import chebvander
 
-from stimrig.identify.dynamics.free_lags import FreeLaw, filled
 
 IDLE_SHARE = 0.1
 """Pulses of this share of the largest width are as good as none: some stimulators never send 0."""
-STAGES = ("pulse_width", "gain", "speed", "lags", "branch", "delay", "filter", "output", "additive", "sensor")
+STAGES = ("pulse_width", "gain", "speed", "term", "branch", "delay", "filter", "output", "additive", "sensor")
 """The stages at which a form can act, in the order in which the signal passes them: see `Form`."""
 
 JOINT_COLUMNS = frozenset({"angle_rad", "velocity_rad_s"})
@@ -175,7 +174,7 @@ class Form:
 
     - "pulse_width": x is the pulse width, µs; returns the pulse width that acts.
     - "gain": x is the drive f(u), N·m; returns the drive.
-    - "speed", "lags": no `apply`; `law` says what sets the time constant, or both lags.
+    - "speed", "term": no `apply`; `law` says what sets the time constant, or what the term changes and what drives it.
     - "branch": x is the drive; returns a list of (drive, factor on the time constant), whose responses are added.
     - "delay": x is None; returns a delay, s.
     - "filter": x is (torque, rate) at the ends of the pulse intervals, shape (K + 1,); returns the same.
@@ -194,7 +193,7 @@ class Form:
     """True if `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row."""
     law: Mapping[Any, str | float] = field(default_factory=dict)
     """What sets each column of the compiled table: a parameter, or a number. Columns are (`Lag`, `SpeedLaw`) for
-    "speed", set by the logarithm of what is varied on that scale; `FreeLaw` for "lags"."""
+    "speed", set by the logarithm of what is varied on that scale; `place`, `driver` and `lag` for "term"."""
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None
     """`propose(residual_nm, scene, previous)` returns starting values found in the data, as a list of dicts; empty if
     there are none. `previous` holds the parameters of the form before it in a chain."""
@@ -241,8 +240,8 @@ class Form:
 class Shape:
     """Fitted behaviour of a free effect, as a sentence and curves."""
 
-    enters: str  # "drive", "rate of rise", "rate of fall", "output" or "zero"
-    driven_by: str  # "width", "activation", "torque", "time since" or "sum of the past"
+    place: str  # where it enters
+    driven_by: str  # by what
     words: str  # the same in one sentence with its size
     driver: str  # name and unit of the horizontal axis
     at: np.ndarray  # shape (n,); places there
@@ -422,6 +421,16 @@ def slow_gain(
 
 
 @njit(cache=True, nogil=True)
+def _filled(state, up, down, step_s):  # pragma: no cover
+    """A slow state after a step: s' = up (1 - s) - down s, exact for held rates, 1/s; as it was where both are 0."""
+    rate = up + down
+    if not rate > 0.0:
+        return state
+    goal = up / rate
+    return goal + (state - goal) * np.exp(-rate * step_s)
+
+
+@njit(cache=True, nogil=True)
 def adapt(
     drive: np.ndarray,
     onset_s: np.ndarray,
@@ -448,7 +457,7 @@ def adapt(
             a = min(max(drive[m, k], 0.0), 1.0)
             up = a / onset_s[m]
             down = 1.0 / recovery_s[m] if constant else (1.0 - a) / recovery_s[m]
-            end = filled(x, up, down, step_s)
+            end = _filled(x, up, down, step_s)
             out[m, k] = 0.5 * (x + end)
             x = end
         last[m] = x
@@ -456,15 +465,7 @@ def adapt(
 
 
 def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> str | None:
-    """The effect of a model that cannot stand beside these forms.
-
-    Free lags take the place of every speed law, and there is one slow state, one gate: two cannot share them.
-    """
-    against = {"lags": "speed", "speed": "lags"}
-    stages, alone = {against.get(form.stage, "") for form in forms}, set().union(*map(_alone, forms))
-    return next((name for name, form in present if form.stage in stages or alone & _alone(form)), None)
-
-
-def _alone(form: Form) -> set[int]:
-    """Columns of free lags that only one form may set: all but the rates, whose logarithms add up."""
-    return {column for column in form.law if form.stage == "lags" and column > FreeLaw.COUPLING}
+    """The effect of a model that cannot stand beside these forms: terms set the lags, so do speed laws and branches."""
+    against = {"term": ("speed", "branch"), "speed": ("term",), "branch": ("term",)}
+    stages = {stage for form in forms for stage in against.get(form.stage, ())}
+    return next((name for name, form in present if form.stage in stages), None)

@@ -16,7 +16,7 @@ from stimrig.identify.errors import IdentifyError
 FIX = "See docs/add-an-effect.md."
 SCALES = ("linear", "log")
 RELATIVE = ("", "torque", "width", "span", "level")
-OWN_STAGES = tuple(stage for stage in STAGES if stage not in ("speed", "lags"))
+OWN_STAGES = tuple(stage for stage in STAGES if stage not in ("speed", "term"))
 """The laws of the two others are compiled, and those of the library alone."""
 ID = r"[a-z][a-z0-9_]{0,63}"
 ROWS = 80

@@ -153,7 +153,7 @@ def _gate(passed: bool, severity: str, message: str) -> dict[str, Any]:
 def _stable(model: Model) -> dict[str, Any]:
     linear = model.linear
     stable = linear.stable if isinstance(linear, Discrete) else linear.time_constant_s > 0 and linear.damping > 0
-    if stable and any(JointEffect.of(entry).form.stage == "lags" for entry in model.effects):
+    if stable and any(JointEffect.of(entry).form.stage == "term" for entry in model.effects):
         stable = _tame(model)
     return _gate(stable, "refuse", "the dynamics are unstable")
 

@@ -20,7 +20,7 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
     """Compute the curves of one effect of a fit; None for an effect that is not free.
 
     `index`: of the effect in `fitted.problem.chosen`. `matrix`: covariance of all parameters in their units. Returns
-    `enters`, `driven_by`, `words`, `driver`, `at`, `effect`, and `lines`: by name `value`, `lower` and `upper` (95 % of
+    `place`, `driven_by`, `words`, `driver`, `at`, `effect`, and `lines`: by name `value`, `lower` and `upper` (95 % of
     draws of the effect's parameters), each of shape (n,).
     """
     chosen = fitted.problem.chosen[index]
@@ -39,7 +39,7 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
     for name, line in fitted_shape.lines.items():
         lower, upper = np.percentile([drawn_lines[name] for drawn_lines in every], PERCENTILES, axis=0)
         lines[name] = {"value": line.tolist(), "lower": lower.tolist(), "upper": upper.tolist()}
-    description = {key: getattr(fitted_shape, key) for key in ("enters", "driven_by", "words", "driver", "effect")}
+    description = {key: getattr(fitted_shape, key) for key in ("place", "driven_by", "words", "driver", "effect")}
     return description | {"at": fitted_shape.at.tolist(), "lines": lines}
 
 

@@ -336,7 +336,8 @@ def newton_step(at: Point, damping: float) -> tuple[np.ndarray, float]:
 def solve_scaled(matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Solve a symmetric system, scaled to a unit diagonal; a very small ridge holds what nothing shows."""
     scale = 1.0 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    return scale * np.linalg.solve(matrix * scale[:, None] * scale + 1e-12 * np.eye(scale.size), scale * right)
+    scaled = matrix * scale[:, None] * scale + 1e-12 * np.eye(scale.size)
+    return (np.linalg.solve(scaled, (right.T * scale).T).T * scale).T
 
 
 def start_from(problem: Problem, base: Fitted, values: dict[int, dict[str, float]]) -> np.ndarray:

@@ -13,13 +13,16 @@ from functools import cached_property
 
 import numpy as np
 
-from stimrig.identify.dynamics.free_lags import FreeLaw, run_free
 from stimrig.identify.dynamics.linear import DAMPING_BOUNDS, TIME_CONSTANT_BOUNDS_S
 from stimrig.identify.dynamics.second_order import Core, read_means
+from stimrig.identify.dynamics.terms import lags_of, run_terms
 from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw, run_core
 from stimrig.identify.effects.base import Form, Parameter, Values
-from stimrig.identify.problem.setup import Setup
-from stimrig.identify.recruitment import Basis
+from stimrig.identify.problem.setup import Setup, extended
+
+
+TERM_SD = 1.0
+"""Prior standard deviation of a term's size."""
 
 
 @dataclass(frozen=True)
@@ -35,17 +38,6 @@ class Chosen:
     def places(self) -> range:
         """Indices of its parameters."""
         return range(self.first, self.first + len(self.parameters))
-
-
-def extended(basis: Basis, width_us: np.ndarray) -> np.ndarray:
-    """Basis functions at widths that a drift may have moved beyond the largest; continued linearly; shape (K, n)."""
-    top = basis.largest_us
-    design = basis.design(width_us)
-    over = np.clip(width_us - top, 0.0, 0.35 * top)
-    if np.any(over > 0.0):
-        end = np.array([top])
-        design = design + over[:, None] * basis.design(end, 1)
-    return design
 
 
 class Problem:
@@ -115,6 +107,7 @@ class Problem:
         sd = np.ones(self.size)
         sd[inside] = np.maximum((self.upper[inside] - self.lower[inside]) / 3.0, 1e-9)
         mean[:2], sd[:2] = [np.log(0.2), 0.0], [1.2, 0.8]
+        sd[[chosen.first for chosen in self.chosen if chosen.form.stage == "term"]] = TERM_SD
         sd[2] = max((self.upper[2] - self.lower[2]) / 2.0, 1e-5)
         scale = self.setup.scale_nm
         at = slice(self.baselines.start, self.baselines.stop)
@@ -259,6 +252,7 @@ class _StagePass:
         coefficients = self.value[problem.coefficients]
         for chosen, p in self.joined("pulse_width"):
             width = np.asarray(chosen.form.call(self.grown(width), p, setup.scene))
+        self.width = np.array(width[0], float)
         if not self.forms("pulse_width"):
             design = setup.design
             drive = (coefficients @ design)[None, :]
@@ -275,9 +269,12 @@ class _StagePass:
 
     def dynamics(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         core, initial = self.join(range(2)), self.join(self.problem.initials)
-        speeds, lags = (
-            [(chosen, self.join(chosen.places)) for chosen in self.forms(stage)] for stage in ("speed", "lags")
+        speeds, terms = (
+            [(chosen, self.join(chosen.places)) for chosen in self.forms(stage)] for stage in ("speed", "term")
         )
+        if terms and (self.derivatives or any(values[0, 0] for _, values in terms)):
+            self.cores = self.grown(core)
+            return self.by_terms(drive, terms, initial[0])
         branches = [(drive, np.ones((len(drive), 1)))]
         for chosen, p in self.joined("branch"):
             branches = [
@@ -287,33 +284,77 @@ class _StagePass:
             ]
         branches = [(self.grown(part), self.grown(slower)) for part, slower in branches]
         self.cores, initial = self.grown(core), self.grown(initial)
-        free = bool(lags) and bool(np.any(np.concatenate([values for _, values in lags], axis=None)))
-        law = np.zeros((len(initial), len(FreeLaw)) if free else (len(initial), len(Lag), len(SpeedLaw)))
-        for chosen, values in lags if free else speeds:
+        law = np.zeros((len(initial), len(Lag), len(SpeedLaw)))
+        for chosen, values in speeds:
             p = self.named(chosen, self.grown(values))
-            logs = set() if free else {parameter.name for parameter in chosen.parameters if parameter.scale == "log"}
+            logs = {parameter.name for parameter in chosen.parameters if parameter.scale == "log"}
             for column, name in chosen.form.law.items():
                 value = p[name][:, 0] if isinstance(name, str) else name
                 law[:, *np.atleast_1d(column)] += np.log(value) if name in logs else value
-        return self.respond(branches, law, initial, free)
+        return self.respond(branches, law, initial)
 
-    def respond(
-        self, branches: list, law: np.ndarray, initial: np.ndarray, free: bool
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Sum of the responses of all branches, each from its share of the initial state; `free`: of free lags."""
+    def respond(self, branches: list, law: np.ndarray, initial: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sum of the responses of all branches, each from its share of the initial state."""
         setup, responses = self.setup, []
         begin = initial.reshape(initial.shape[0], -1, 2) / len(branches)
         shared = law, setup.grid.starts, begin, setup.scale_nm, setup.grid.step_s
         for part, slower in branches:
             drive, core = np.ascontiguousarray(part), self.cores * np.c_[slower, np.ones_like(slower)]
-            if free:
-                responses.append(run_free(drive, setup.present, setup.scene.rest_s, core, *shared))
-            else:
-                time_constant_s, damping = np.ascontiguousarray(core.T)
-                responses.append(run_core(drive, time_constant_s, damping, *shared))
+            time_constant_s, damping = np.ascontiguousarray(core.T)
+            responses.append(run_core(drive, time_constant_s, damping, *shared))
         if len(responses) == 1:
             return responses[0]
         return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore
+
+    def by_terms(
+        self, drive: np.ndarray, terms: list[tuple[Chosen, np.ndarray]], initial: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Response where terms act on the lags: each further row is row 0 and a step along its exact derivative."""
+        setup, problem = self.setup, self.problem
+        at = {place: number for number, (place, _) in enumerate(self.owners)}
+        steps = np.array([step for _, step in self.owners])
+        drives = np.zeros((steps.size, drive.shape[1]))
+        drives[: len(drive) - 1] = (drive[1:] - drive[0]) / steps[: len(drive) - 1, None]
+        lags, by_lag = lags_of(*self.value[:2])
+        lag_slopes = np.zeros((steps.size, 3))
+        initials = np.zeros((steps.size, initial.size))
+        for place in range(2):
+            if place in at:
+                lag_slopes[at[place]] = by_lag[place]
+        for number, place in enumerate(problem.initials):
+            if place in at:
+                initials[at[place], number] = 1.0
+        known = [i for i in range(problem.coefficients.start, problem.coefficients.stop) if i in at]
+        design = setup.table
+        forms = [chosen.form for chosen, _ in terms]
+        numbers = np.array([[values[0, 0], (*values[0], chosen.form.law["lag"])[1]] for chosen, values in terms])
+        own = [[at.get(p, -1) for p in (*chosen.places, -1)[:2]] for chosen, _ in terms]
+        torque, rate, torques, rates = run_terms(
+            np.ascontiguousarray(drive[0]),
+            drives,
+            self.width / setup.basis.largest_us,
+            setup.present,
+            setup.scene.rest_s,
+            self.value[problem.coefficients] @ design,
+            design,
+            np.array([at[i] for i in known], np.int64),
+            lags,
+            lag_slopes,
+            np.array([form.law["place"] for form in forms]),
+            np.array([form.law["driver"] for form in forms]),
+            np.ascontiguousarray(numbers[:, 0]),
+            np.ascontiguousarray(numbers[:, 1]),
+            np.array(own),
+            setup.grid.starts,
+            initial.reshape(-1, 2),
+            initials.reshape(steps.size, initial.size // 2, 2),
+            setup.scale_nm,
+            setup.grid.step_s,
+        )
+        return tuple(
+            np.concatenate([row[None, :], row + steps[:, None] * slopes])
+            for row, slopes in ((torque, torques), (rate, rates))
+        )  # type: ignore
 
     def shaped(self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A static output stage at the boundary states."""

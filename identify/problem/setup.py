@@ -10,13 +10,27 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of
+from stimrig.identify.dynamics.terms import REACH
 from stimrig.identify.effects.base import Scene
 from stimrig.identify.noise import NoiseLevel, whitened
 from stimrig.identify.records.joint_motion import MOTION, JointMotion
 from stimrig.identify.recruitment import Basis
 
+TABLE = 271
+"""Widths at which the curve is tabled for what changes them."""
 WITHIN = 5
 """A joint that turns round within a pulse interval has dry friction on both sides: the middle knows one of them."""
+
+
+def extended(basis: Basis, width_us: np.ndarray) -> np.ndarray:
+    """Basis functions at widths that a drift may have moved beyond the largest; continued linearly; shape (K, n)."""
+    top = basis.largest_us
+    design = basis.design(width_us)
+    over = np.clip(width_us - top, 0.0, (REACH - 1.0) * top)
+    if np.any(over > 0.0):
+        end = np.array([top])
+        design = design + over[:, None] * basis.design(end, 1)
+    return design
 
 
 @dataclass(frozen=True)
@@ -148,6 +162,11 @@ class Setup:
         return np.ascontiguousarray(self.basis.design(widths_us)[place].T)
 
     @cached_property
+    def table(self) -> np.ndarray:
+        """Spline basis at `TABLE` even widths up to `REACH` times the largest, shape (n, TABLE)."""
+        return np.ascontiguousarray(extended(self.basis, np.linspace(0.0, REACH, TABLE) * self.basis.largest_us).T)
+
+    @cached_property
     def penalty(self) -> np.ndarray:
         """Prior precision of the coefficients, shape (n, n)."""
         # A coefficient of a spline is a torque of plausible size; powers of the width cancel each other and may be
@@ -176,5 +195,10 @@ class Setup:
         return self.with_(basis=basis, roughness=np.zeros((basis.size, basis.size)))
 
 
-_STALE = {"roughness": {"penalty"}, "curve_nm": set(), "basis": {"penalty", "design"}, "fitted": {"stretches", "scene"}}
+_STALE = {
+    "roughness": {"penalty"},
+    "curve_nm": set(),
+    "basis": {"penalty", "design", "table"},
+    "fitted": {"stretches", "scene"},
+}
 """Derived arrays of a `Setup` that depend on a field; on fields that are not listed they may all depend."""

@@ -1,0 +1,266 @@
+"""Two lags in a row, parts of which change in proportion to what happened; with exact derivatives; compiled.
+
+a' = k1 (w - a + κ (a - y)), y' = k2 (a - y): a follows the drive w, the torque y follows a. With constant rates this is
+T² y'' + 2 ζ T y' + y = w, where T² = 1/(k1 k2) and 2 ζ T = 1/k1 + (1 - κ)/k2. A term *place <- driver, late by τ* adds
+size·x to the exponent z of its place: x' = (driver - x)/τ. The states are found by the trapezoidal rule in `PARTS`
+steps of a pulse interval, during which places and drivers' lags hold what they were at the step's start.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+import numpy as np
+from numba import njit
+
+PARTS = 3
+"""Steps within a pulse interval."""
+QUICK_S = 0.1
+"""A rate of the torque counts as the change in this time, as a share of y_max."""
+EDGE = 0.02
+"""Change in `QUICK_S` over which a rise turns into a fall."""
+LARGEST = 3.0
+"""Bound of an exponent: tanh bends it there."""
+LEAST_ROOT = 0.01
+"""Root of ζ² - 1 below which the two lags are no longer told apart in a derivative."""
+REACH = 1.35
+"""The curve's table goes up to so many times the largest width."""
+
+
+class Place(IntEnum):
+    """What a term changes."""
+
+    WIDTH = 0  # the width that acts: u exp(z)
+    STRENGTH = 1  # the drive before the lags: f exp(z)
+    FIRST_RATE = 2  # k1 exp(z), that of the quicker lag
+    SECOND_RATE = 3  # k2 exp(z)
+    TORQUE = 4  # torque at the cell: y + y_max z
+    FACTOR = 5  # y exp(z)
+
+
+class Driver(IntEnum):
+    """What drives a term, as a share; with a lag τ, but for those behind `SQUARE`, which have a reach or nothing."""
+
+    DRIVE = 0  # the drive f(u) over y_max
+    TORQUE = 1  # y over y_max
+    RISE = 2  # the torque's rise
+    FALL = 3  # its fall
+    PULSES = 4  # 1 under pulses
+    SQUARE = 5  # (y/y_max)², at once
+    TORQUE_PLAY = 6  # y/y_max behind play of a reach: a Prandtl-Ishlinskii operator
+    WIDTH_PLAY = 7  # the width over the largest, behind play
+
+
+def lags_of(time_constant_s: float, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return k1, k2, 1/s, and κ, shape (3,), and ln k1, ln k2 and κ by ln T and ln ζ, shape (2, 3)."""
+    root = np.sqrt(max(damping * damping - 1.0, 0.0))
+    both = max(damping, 1.0)
+    lags = np.array([1.0 / (both - root), 1.0 / (both + root), 2.0 * max(1.0 - damping, 0.0) * time_constant_s])
+    apart = damping / max(root, LEAST_ROOT) if damping > 1.0 else 0.0
+    return lags / time_constant_s, np.array([[-1.0, -1.0, 0.0], [apart, -apart, -2.0 * damping * (damping < 1.0)]])
+
+
+@njit(cache=True, nogil=True)
+def _cell(table, place):  # pragma: no cover
+    """Value of a table at a place between its rows, and its slope."""
+    low = min(int(place), table.size - 2)
+    return table[low] + (place - low) * (table[low + 1] - table[low]), table[low + 1] - table[low]
+
+
+@njit(cache=True, nogil=True, fastmath=True)
+def run_terms(
+    drive, drives, width, present, rest_s, curve, curves, owner, lags, lag_slopes, places, drivers, sizes, lag, own,
+    begins, initial, initials, scale_nm, step_s,
+):  # pragma: no cover  # fmt: skip
+    """Torque, N·m, and its rate at the boundaries, (K + 1,), and their derivatives by P parameters, (P, K + 1).
+
+    Parameters
+    ----------
+    drive, drives
+        The mean drive of each interval, (K,), and its derivatives, (P, K).
+    width, present, rest_s
+        Width over the largest, share of the interval in which a pulse acts, further rest before it, s, (K,).
+    curve, curves, owner
+        The recruitment curve at G even widths up to `REACH`, (G,); its derivatives by its coefficients, (C, G), and
+        which of the parameters these are, (C,).
+    lags, lag_slopes
+        k1, k2, 1/s, and κ, (3,); derivatives of ln k1, ln k2 and κ, (P, 3).
+    places, drivers, sizes, lag, own
+        Of each term, (J,): a `Place`, a `Driver`, its size, its lag, s, or its reach; and the parameters that are its
+        size and the logarithm of its lag, (J, 2), -1 for none. The sizes of active terms come first.
+    begins, initial, initials
+        Intervals at which the torque and its rate are those of `initial`, (B,) and (B, 2); derivatives, (P, B, 2).
+    """
+    count, size, terms = len(drives), drive.size, places.size
+    torque, rate = np.zeros(size + 1), np.zeros(size + 1)
+    torques, rates = np.zeros((count, size + 1)), np.zeros((count, size + 1))
+    active = 0
+    for j in range(terms):
+        if sizes[j] != 0.0:
+            active = j + 1
+    x, dx = np.zeros(terms), np.zeros((active, count))
+    z, zt, dz = np.zeros(6), np.zeros(6), np.zeros((6, count))
+    y, a, dy, da = 0.0, 0.0, np.zeros(count), np.zeros(count)
+    dw, values, slopes = np.zeros(count), np.zeros(8), np.zeros((8, count))
+    h = step_s / PARTS
+    decay = np.exp(-h / lag)
+    used, moved = np.zeros(6, np.bool_), np.zeros(8, np.bool_)
+    for j in range(terms):
+        used[places[j]] = True
+        if j < active:
+            moved[drivers[j]] = True
+    grain = (curve.size - 1) / REACH
+    part = 0
+    for k in range(size):
+        if rest_s[k] > 0.0:
+            for j in range(terms):
+                if drivers[j] < Driver.SQUARE:
+                    x[j] *= np.exp(-rest_s[k] / lag[j])
+                    if j < active:
+                        dx[j] *= np.exp(-rest_s[k] / lag[j])
+        if part < begins.size and k == begins[part]:
+            y = initial[part, 0]
+            a = y + initial[part, 1] / lags[1]
+            for p in range(count):
+                dy[p] = initials[p, part, 0]
+                da[p] = dy[p] + initials[p, part, 1] / lags[1] - initial[part, 1] / lags[1] * lag_slopes[p, 1]
+            torque[k], rate[k] = y, initial[part, 1]
+            torques[:, k], rates[:, k] = dy, initials[:, part, 1]
+            part += 1
+        for sub in range(PARTS):
+            # ---- exponents of the places
+            for q in range(6):
+                z[q] = 0.0
+                if used[q]:
+                    dz[q] = 0.0
+            for j in range(terms):
+                z[places[j]] += sizes[j] * x[j]
+                if j < active and sizes[j] != 0.0:
+                    for p in range(count):
+                        dz[places[j], p] += sizes[j] * dx[j, p]
+                if own[j, 0] >= 0:
+                    dz[places[j], own[j, 0]] += x[j]
+            for q in range(4):
+                zt[q] = LARGEST * np.tanh(z[q] / LARGEST)
+                if used[q] and z[q] != 0.0:
+                    dz[q] *= 1.0 - (zt[q] / LARGEST) ** 2
+            # ---- what drives the lags
+            w = drive[k]
+            for p in range(count):
+                dw[p] = drives[p, k]
+            if used[Place.WIDTH] and width[k] > 0.0:
+                place = width[k] * np.exp(zt[Place.WIDTH]) * grain
+                there, steep = _cell(curve, min(place, curve.size - 1.0))
+                here = _cell(curve, width[k] * grain)[0]
+                gain = w / here if abs(here) > 0.02 * scale_nm else present[k]
+                w += gain * (there - here)
+                inside = steep * place if place < curve.size - 1.0 else 0.0
+                ratio = there / here if abs(here) > 0.02 * scale_nm else 1.0
+                for p in range(count):
+                    dw[p] = dw[p] * ratio + gain * inside * dz[Place.WIDTH, p]
+                for c in range(owner.size):  # exact for the curve's coefficients
+                    p = owner[c]
+                    own_there = _cell(curves[c], min(place, curve.size - 1.0))[0]
+                    own_here = _cell(curves[c], width[k] * grain)[0]
+                    dw[p] += gain * (own_there - own_here * ratio)
+                    if abs(here) <= 0.02 * scale_nm:
+                        dw[p] += gain * own_here * (ratio - 1.0)
+            if used[Place.STRENGTH]:
+                factor = np.exp(zt[Place.STRENGTH])
+                w *= factor
+                for p in range(count):
+                    dw[p] = factor * dw[p] + w * dz[Place.STRENGTH, p]
+            k1, k2 = lags[0] * np.exp(zt[Place.FIRST_RATE]), lags[1] * np.exp(zt[Place.SECOND_RATE])
+            # ---- a trapezoidal step of y' = k2 (a - y), a' = k1 (w - (1 - κ) a - κ y)
+            i, g, m, n = 0.5 * h * k2, 0.5 * h * k1, 1.0 - lags[2], lags[2]
+            ry = (1.0 - i) * y + i * a
+            ra = -g * n * y + (1.0 - g * m) * a + 2.0 * g * w
+            inverse = 1.0 / ((1.0 + i) * (1.0 + g * m) + i * g * n)
+            new_y = inverse * ((1.0 + g * m) * ry + i * ra)
+            new_a = inverse * ((1.0 + i) * ra - g * n * ry)
+            mid_y, mid_a = 0.5 * (y + new_y), 0.5 * (a + new_a)
+            pull_y, pull_a = 2.0 * i * (mid_a - mid_y), 2.0 * g * (w - m * mid_a - n * mid_y)
+            pull_k = 2.0 * g * (mid_a - mid_y)
+            first, second = used[Place.FIRST_RATE], used[Place.SECOND_RATE]
+            for p in range(count):
+                one, two = lag_slopes[p, 0], lag_slopes[p, 1]
+                if first:
+                    one += dz[Place.FIRST_RATE, p]
+                if second:
+                    two += dz[Place.SECOND_RATE, p]
+                sy = (1.0 - i) * dy[p] + i * da[p] + pull_y * two
+                sa = -g * n * dy[p] + (1.0 - g * m) * da[p] + 2.0 * g * dw[p] + pull_a * one + pull_k * lag_slopes[p, 2]
+                next_y = inverse * ((1.0 + g * m) * sy + i * sa)
+                da[p] = inverse * ((1.0 + i) * sa - g * n * sy)
+                slopes[Driver.TORQUE, p] = 0.5 * (dy[p] + next_y) / scale_nm
+                slopes[Driver.RISE, p] = (next_y - dy[p]) * QUICK_S / (h * scale_nm)
+                dy[p] = next_y
+            # ---- the drivers
+            change = (new_y - y) * QUICK_S / (h * scale_nm)
+            root = np.sqrt(change * change + EDGE * EDGE)
+            values[Driver.DRIVE], values[Driver.PULSES] = drive[k] / scale_nm, present[k]
+            values[Driver.TORQUE] = mid_y / scale_nm
+            values[Driver.RISE], values[Driver.FALL] = (
+                0.5 * (root + change) - 0.5 * EDGE,
+                0.5 * (root - change) - 0.5 * EDGE,
+            )
+            up = 0.5 * (1.0 + change / root)
+            for p in range(count):
+                slopes[Driver.FALL, p] = (up - 1.0) * slopes[Driver.RISE, p]
+                slopes[Driver.RISE, p] *= up
+            if moved[Driver.DRIVE]:
+                for p in range(count):
+                    slopes[Driver.DRIVE, p] = drives[p, k] / scale_nm
+            y, a = new_y, new_a
+            for j in range(terms):
+                d, mine = drivers[j], own[j, 1]
+                if d < Driver.SQUARE:
+                    away = x[j] - values[d]
+                    x[j] = values[d] + away * decay[j]
+                    if j < active:
+                        for p in range(count):
+                            dx[j, p] = slopes[d, p] + (dx[j, p] - slopes[d, p]) * decay[j]
+                        if mine >= 0:
+                            dx[j, mine] += away * decay[j] * h / lag[j]
+                elif d == Driver.SQUARE:
+                    x[j] = (y / scale_nm) ** 2
+                    if j < active:
+                        for p in range(count):
+                            dx[j, p] = 2.0 * y * dy[p] / (scale_nm * scale_nm)
+                else:
+                    by_torque = d == Driver.TORQUE_PLAY
+                    now = y / scale_nm if by_torque else width[k]
+                    away = now - x[j]
+                    if abs(away) > lag[j]:
+                        side = 1.0 if away > 0.0 else -1.0
+                        x[j] = now - side * lag[j]
+                        if j < active:
+                            for p in range(count):
+                                dx[j, p] = dy[p] / scale_nm if by_torque else 0.0
+                            if mine >= 0:
+                                dx[j, mine] -= side * lag[j]
+        pull = k2 * (a - y)
+        torque[k + 1], rate[k + 1] = y, pull
+        for p in range(count):
+            two = lag_slopes[p, 1] + (dz[Place.SECOND_RATE, p] if used[Place.SECOND_RATE] else 0.0)
+            torques[p, k + 1], rates[p, k + 1] = dy[p], k2 * (da[p] - dy[p]) + pull * two
+        if used[Place.TORQUE] or used[Place.FACTOR]:
+            z[Place.TORQUE], z[Place.FACTOR] = 0.0, 0.0
+            dz[Place.TORQUE], dz[Place.FACTOR] = 0.0, 0.0
+            for j in range(terms):
+                q = places[j]
+                if q >= Place.TORQUE:
+                    z[q] += sizes[j] * x[j]
+                    if j < active and sizes[j] != 0.0:
+                        for p in range(count):
+                            dz[q, p] += sizes[j] * dx[j, p]
+                    if own[j, 0] >= 0:
+                        dz[q, own[j, 0]] += x[j]
+            bend = LARGEST * np.tanh(z[Place.FACTOR] / LARGEST)
+            factor, less = np.exp(bend), 1.0 - (bend / LARGEST) ** 2
+            torque[k + 1] = factor * y + scale_nm * z[Place.TORQUE]
+            rate[k + 1] *= factor
+            for p in range(count):
+                torques[p, k + 1] = factor * (dy[p] + y * less * dz[Place.FACTOR, p]) + scale_nm * dz[Place.TORQUE, p]
+                rates[p, k + 1] *= factor
+    return torque, rate, torques, rates
