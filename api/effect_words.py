@@ -46,8 +46,8 @@ def _short_names() -> dict[str, str]:
 
 
 def effect_words(effect: str) -> str:
-    """Return an effect's title; the id of a person's own effect as words."""
-    return fact_of(effect, "name", "") or effect.replace("_", " ").capitalize()
+    """Return an effect's title; the id of a term or of a person's own effect as words."""
+    return fact_of(effect, "name", "") or effect.removeprefix("free_").replace("_", " ").capitalize()
 
 
 def within(effect: str) -> str:

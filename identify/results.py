@@ -110,7 +110,7 @@ class Diagnosis(Result):
     `plain`."""
     free: tuple[Row, ...]
     """Free effects, which describe what no effect of the library explains: `effect`, `name`, `form`, `equation`,
-    `parameters`, `enters`, `driven_by`, `words`, `left_out`, and the picture: `driver`, `at`, `axis`, `lines`, each
+    `parameters`, `place`, `driven_by`, `words`, `left_out`, and the picture: `driver`, `at`, `axis`, `lines`, each
     with `value`, `lower` and `upper`."""
     add: tuple[str, ...]  # what `improve` adds, in its order: effects of the library, then free ones
     deciding_experiment: Row | None

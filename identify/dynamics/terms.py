@@ -100,7 +100,7 @@ def run_terms(
             active = j + 1
     x, dx = np.zeros(terms), np.zeros((active, count))
     z, zt, dz = np.zeros(6), np.zeros(6), np.zeros((6, count))
-    y, a, dy, da = 0.0, 0.0, np.zeros(count), np.zeros(count)
+    y, a, dy, da, k2 = 0.0, 0.0, np.zeros(count), np.zeros(count), lags[1]
     dw, values, slopes = np.zeros(count), np.zeros(8), np.zeros((8, count))
     h = step_s / PARTS
     decay = np.exp(-h / lag)
@@ -127,7 +127,7 @@ def run_terms(
             torque[k], rate[k] = y, initial[part, 1]
             torques[:, k], rates[:, k] = dy, initials[:, part, 1]
             part += 1
-        for sub in range(PARTS):
+        for _ in range(PARTS):
             # ---- exponents of the places
             for q in range(6):
                 z[q] = 0.0
@@ -262,5 +262,5 @@ def run_terms(
             rate[k + 1] *= factor
             for p in range(count):
                 torques[p, k + 1] = factor * (dy[p] + y * less * dz[Place.FACTOR, p]) + scale_nm * dz[Place.TORQUE, p]
-                rates[p, k + 1] *= factor
+                rates[p, k + 1] = factor * rates[p, k + 1] + rate[k + 1] * less * dz[Place.FACTOR, p]
     return torque, rate, torques, rates

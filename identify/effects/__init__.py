@@ -1,6 +1,6 @@
 """The library of physical effects, found in this package, in entry points and in a user's folder.
 
-Each has its own file; the free ones share `free_effects.py`, which lists them as `EFFECTS`.
+Each has its own file; the free ones share `terms.py`, which lists them as `EFFECTS`.
 
 A user's own effect is a file with `EFFECT = Effect(...)`, found in the folder named by the environment variable
 STIMRIG_EFFECTS_DIR, or through an entry point of the group `stimrig.effects`. See `docs/add-an-effect.md`.
@@ -83,6 +83,8 @@ def find_effect(effect_id: str) -> Effect:
     if effect_id not in effects:
         known = ", ".join(sorted(effects))
         fix = f"If it is one of your own, set {FOLDER_VARIABLE} to the folder with its file. Known: {known}."
+        if effect_id.startswith("free_"):
+            fix = "Its free effects are terms now. Fit the record again."
         raise BadRequest(f"unknown effect {effect_id!r}", fix=fix)
     return effects[effect_id]
 

@@ -11,7 +11,6 @@ import numpy as np
 from numba import njit
 from numpy.polynomial.chebyshev import chebvander
 
-
 IDLE_SHARE = 0.1
 """Pulses of this share of the largest width are as good as none: some stimulators never send 0."""
 STAGES = ("pulse_width", "gain", "speed", "term", "branch", "delay", "filter", "output", "additive", "sensor")
@@ -191,7 +190,7 @@ class Form:
     apply: Apply | None = None  # the law, as above; None for the stages that `law` describes
     batched: bool = False
     """True if `apply` takes x of shape (M, K) and parameters of shape (M, 1). If not, it is called row by row."""
-    law: Mapping[Any, str | float] = field(default_factory=dict)
+    law: dict[Any, Any] = field(default_factory=dict)
     """What sets each column of the compiled table: a parameter, or a number. Columns are (`Lag`, `SpeedLaw`) for
     "speed", set by the logarithm of what is varied on that scale; `place`, `driver` and `lag` for "term"."""
     propose: Callable[[np.ndarray, Scene, dict[str, float]], list[dict[str, float]]] | None = None

@@ -97,7 +97,7 @@ def _term(place: Place, driver: Driver) -> Effect:
         equation = f"{acts}; z = change·x, x follows {is_} behind a play of ±reach"
     return Effect(
         id=f"free_{place.name.lower()}_by_{driver.name.lower()}",
-        name=f"{where.capitalize()} that follows the {what}",
+        name=f"{place.name} by {driver.name}".replace("_", " ").capitalize(),
         forms=(Form("term", "term", equation, tuple(parameters), law=law),),
         signature=f"The error follows the {what}, as if the {where} changed with it.",
         resembles=(),

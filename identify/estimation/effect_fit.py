@@ -175,7 +175,7 @@ def add_effect(base: Fitted, effect: Effect, form: str, raw: Raw) -> Fitted:
             raise NotIdentifiable(f"{effect.id} needs the column {need}", place=need, fix="Record this column.")
     forms = [_form(effect, form)] if form else list(effect.forms)
     if (other := replaced_by(base.effects, forms)) is not None:
-        message = f"{effect.id} and {other} both set the speed of the lags, or their slow state: one would be ignored"
+        message = f"{effect.id} and {other} both set the lags: one would be ignored"
         raise BadRequest(message, place="effects", fix="Leave one of them out.")
     for identifier, detected_form, values in detected_effects(raw):
         if identifier == effect.id:

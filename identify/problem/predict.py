@@ -185,9 +185,7 @@ def _refuse_ignored(acting: Sequence[tuple[str, Form]]) -> None:
     for number, (name, form) in enumerate(acting):
         other = name if name in dict(acting[:number]) else replaced_by(acting[:number], [form])
         if other is not None:
-            message = (
-                "it stands twice" if other == name else f"{other} already sets the speed of the lags, or their state"
-            )
+            message = "it stands twice" if other == name else f"{other} already sets the lags"
             raise BadModel(message, place=f"effects, {name}", fix="Leave one of them out, and fit again.")
 
 

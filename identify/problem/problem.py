@@ -20,7 +20,6 @@ from stimrig.identify.dynamics.variable_speed import Lag, SpeedLaw, run_core
 from stimrig.identify.effects.base import Form, Parameter, Values
 from stimrig.identify.problem.setup import Setup, extended
 
-
 TERM_SD = 1.0
 """Prior standard deviation of a term's size."""
 
@@ -351,10 +350,8 @@ class _StagePass:
             setup.scale_nm,
             setup.grid.step_s,
         )
-        return tuple(
-            np.concatenate([row[None, :], row + steps[:, None] * slopes])
-            for row, slopes in ((torque, torques), (rate, rates))
-        )  # type: ignore
+        steps = steps[:, None]
+        return np.vstack([torque, torque + steps * torques]), np.vstack([rate, rate + steps * rates])
 
     def shaped(self, chosen: Chosen, torque: np.ndarray, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """A static output stage at the boundary states."""

@@ -154,9 +154,15 @@ def test_version_with_effects_is_criticised_with_them(client: httpx.Client, page
 
 def test_reasons_against_an_effect() -> None:
     fatigue, against = {"effect": "fatigue", "confused_with": ["drift"]}, "The evidence is against it."
-    free = [{"effect": "free_level"}]
+    free = [{"effect": "free_width_by_rise"}]
     found = {"missing": [fatigue], "free": free, "refused": [{"effect": "tremor", "reason": against}]}
-    asked = ["fatigue", "drift", "free_level", "tremor", "torque_angle"]  # drift cannot be told apart from fatigue
+    asked = [
+        "fatigue",
+        "drift",
+        "free_width_by_rise",
+        "tremor",
+        "torque_angle",
+    ]  # drift cannot be told apart from fatigue
     assert explanation.refusals(found, asked) == {"tremor": against, "torque_angle": explanation.NOT_TESTED}
     objected = {**FATIGUE, "objection": "On held-out pulses the error would rise."}
     assert explanation.refusals({"missing": [objected]}, ["fatigue"]) == {"fatigue": objected["objection"]}
@@ -220,7 +226,7 @@ FATIGUE = {"effect": "fatigue", "name": "Fatigue", "probability": 0.97, "rms_bef
 NOTHING = {"verdict": "nothing_missing", "missing": [], "noise_sd_nm": 0.04, "where": [PLACE]}
 MISSING = {"verdict": "effect_missing", "missing": [FATIGUE], "noise_sd_nm": 0.04}
 PART = {"verdict": "unexplained_structure", "missing": [{**FATIGUE, "probability": 0.45}], "noise_sd_nm": 0.04}
-FREE = {"effect": "free_level", "name": "Free level", "words": "", "parameters": {}}
+FREE = {"effect": "free_width_by_rise", "name": "Free level", "words": "", "parameters": {}}
 PLAN = {"deciding_experiment": {"text": "x"}}
 
 
@@ -244,7 +250,7 @@ def test_what_may_be_more_than_noise_is_not_called_noise(more: dict[str, Any], k
     [
         (PART | {"add": ["fatigue"]}, "explain a part of the error only", "Add “Fatigue”: it explains a part.",
          "More can be learnt from this record."),
-        (PART | {"add": ["fatigue", "free_level"], "free": [FREE]} | PLAN, "a part of the error only",
+        (PART | {"add": ["fatigue", "free_width_by_rise"], "free": [FREE]} | PLAN, "a part of the error only",
          "Add “Fatigue”: it explains a part. Add “Free level”: it describes what is left, and names no cause. "
          "The next experiment teaches most about it.", "More"),
         (PART | {"add": ["fatigue"]} | PLAN, "a part of the error only",
@@ -304,7 +310,7 @@ def test_it_is_not_searched_anew_and_a_free_effect_has_the_form_that_was_found(
 
 
 def test_a_free_effect_that_is_left_to_add_is_no_nothing() -> None:
-    found = MISSING | {"free": [FREE], "add": ["fatigue", "free_level"], "base": {"held_out_rms_nm": 0.2}}
+    found = MISSING | {"free": [FREE], "add": ["fatigue", "free_width_by_rise"], "base": {"held_out_rms_nm": 0.2}}
     left = explanation.remaining(found, ["fatigue"], {"held_out_rms_nm": 0.08})
     assert left["conclusion"]["kind"] == "unexplained" and "Free level" in left["conclusion"]["advice"]
 

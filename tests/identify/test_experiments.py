@@ -26,7 +26,7 @@ def made():
 
 @pytest.fixture(scope="module")
 def diagnosis(made):
-    with few_effects.only("fatigue", "free_gate"):
+    with few_effects.only("fatigue", "free_strength_by_pulses"):
         return identify.diagnose(as_record(made))
 
 
@@ -73,7 +73,7 @@ def test_both_records_together_foretell_a_further_one_better_than_the_first_alon
     both = join([first, further], [0.0, 1200.0])
     error_nm = []
     for record in (first, both):
-        model = identify.fit(record, effects=["free_gate"])
+        model = identify.fit(record, effects=["free_strength_by_pulses"])
         off = identify.predict(model, as_record(made["unseen"])) - made["unseen"]["torque_nm"]
         error_nm.append(np.std(off))
     assert error_nm[1] < error_nm[0]
