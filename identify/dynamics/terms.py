@@ -119,6 +119,11 @@ def run_terms(
                     if j < active:
                         dx[j] *= np.exp(-rest_s[k] / lag[j])
         if part < begins.size and k == begins[part]:
+            for j in range(terms):  # a play starts anew, as in a record that is predicted; a kept one passes for a zero
+                if drivers[j] > Driver.SQUARE:
+                    x[j] = 0.0
+                    if j < active:
+                        dx[j] = 0.0
             y = initial[part, 0]
             a = y + initial[part, 1] / lags[1]
             for p in range(count):

@@ -45,7 +45,13 @@ PARALLEL = {
 }
 
 
-def run(width: np.ndarray, *terms: tuple[Place, Driver, float, float], damping: float = 1.0, rest_s: float = 0.0):
+def run(
+    width: np.ndarray,
+    *terms: tuple[Place, Driver, float, float],
+    damping: float = 1.0,
+    rest_s: float = 0.0,
+    begins: tuple[int, ...] = (0,),
+):
     """Torque and rate of a muscle whose curve is straight, with terms of (place, driver, size, lag); rests halfway."""
     places, drivers = (np.array([term[i] for term in terms], np.int64) for i in range(2))
     sizes, lag = (np.array([term[i] for term in terms], float) for i in (2, 3))
@@ -54,7 +60,7 @@ def run(width: np.ndarray, *terms: tuple[Place, Driver, float, float], damping: 
     return run_terms(
         FULL_NM * width, np.zeros((0, width.size)), width, (width > 0).astype(float), rests_s, curve,
         np.zeros((0, 271)), np.zeros(0, np.int64), lags_of(0.15, damping)[0], np.zeros((0, 3)), places, drivers, sizes,
-        lag, own, np.zeros(1, np.int64), np.zeros((1, 2)), np.zeros((0, 1, 2)), FULL_NM, STEP_S,
+        lag, own, np.array(begins), np.zeros((len(begins), 2)), np.zeros((0, len(begins), 2)), FULL_NM, STEP_S,
     )[:2]  # fmt: skip
 
 
@@ -82,6 +88,13 @@ def test_a_rest_without_samples_lets_a_term_decay_as_recorded_rest_does(driver: 
     rested = run(np.insert(width, SIZE // 2, np.zeros(120)), term)[0][-200:]
     np.testing.assert_allclose(run(width, term, rest_s=120 * STEP_S)[0][-200:], rested, atol=1e-6)
     assert np.max(np.abs(run(width, term)[0][-200:] - rested)) > 1e-3
+
+
+@pytest.mark.parametrize("driver", [Driver.TORQUE_PLAY, Driver.WIDTH_PLAY])
+def test_a_play_begins_anew_with_each_part_as_in_an_unseen_record(driver: Driver):
+    half, term = np.r_[np.ones(SIZE // 4), np.zeros(SIZE // 4)], (Place.TORQUE, driver, 0.3, 0.2)
+    first, second = np.split(run(np.r_[half, half], term, begins=(0, half.size))[0][1:], 2)
+    np.testing.assert_array_equal(second[:-1], first[:-1])
 
 
 @pytest.fixture(scope="module")
