@@ -23,13 +23,15 @@ from stimrig.identify.diagnosis.search import (
     helpful,
     search_effects,
     silent,
+    without_effect,
 )
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free
 from stimrig.identify.dynamics.grid import Grid
-from stimrig.identify.effects import find_effect, registry
+from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Effect, replaced_by
 from stimrig.identify.effects.terms import tried_at
+from stimrig.identify.estimation.effect_fit import try_effect
 from stimrig.identify.estimation.left_out import Difference, difference
 from stimrig.identify.estimation.samples import Raw, fitted_rows
 from stimrig.identify.estimation.solve import Fitted, solve, solve_scaled, start_from
@@ -38,6 +40,9 @@ from stimrig.identify.problem.problem import Problem
 
 MAX_TERMS, FITTED_TERMS = 6, 5
 """Terms at most; and so many, of those that promise most, are fitted in each round."""
+DRIFT = "baseline_drift"
+STEPS = 5
+"""Steps of the search by which the terms of a round are compared; the likeliest one is then fitted to its end."""
 Chain = tuple[Step, ...]
 """Steps of a search from its base on, the last ones with terms."""
 Start = tuple[Effect, dict[str, float]]
@@ -66,79 +71,99 @@ def searched(
     verdict = judge(search)
     if max_effects == 0 or verdict.kind == "nothing_missing":
         return search, verdict
-    supported = [str(step.added) for step in helpful(search)[0] if step.origin == "library"]
-    named = verdict.kind == "effect_missing" and bool(supported or not search.found)
-    error = verdict.held_out_error
-    doubted = search.residual.significant or (error is not None and error.ratio > thresholds.NAMED_BUT)
+    supported = helpful(search)[0]
+    named = verdict.kind == "effect_missing" and bool(supported[-1].origin == "library" or not search.found)
+    error, noise_nm = verdict.held_out_error, grid.mean_noise_nm(search.last.problem.setup.fitted)
+    doubted = search.residual.significant or search.last.rms_nm > thresholds.NAMED_BUT * noise_nm
+    doubted = doubted or (error is not None and error.ratio > thresholds.NAMED_BUT)
     if named and not doubted:
         return search, verdict
-    freely = explain_freely(search, supported, named, lambda done, text: report(0.7 + 0.25 * done, text))
-    return freely, judge_free(freely, verdict, named) if freely.names("free") else verdict
+    freely = explain_freely(search, supported if named else (), lambda done, text: report(0.7 + 0.25 * done, text))
+    if not freely.names("free"):
+        return search, verdict
+    return freely, judge_free(freely, verdict, named and freely.steps[: len(supported)] == [*supported])
 
 
-def explain_freely(search: EffectSearch, names: Sequence[str], named: bool, progress: Progress) -> EffectSearch:
-    """The search with terms, where they predict left-out blocks better than what it found; else as it was.
+def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progress) -> EffectSearch:
+    """The search with terms, where they describe the record better than what it found; else as it was.
 
-    `names`: of its effects the first ones, against which held-out pulses do not speak. `named`: whether they are named;
-    then they stay beside terms. Where nothing is named, only what was seen in the samples and a moving zero stay.
+    `named`: its steps with effects that are named, empty where none is. Terms are looked for beside them, and on the
+    model with what the samples show alone. A model without the names takes their place only where it is likelier and
+    predicts left-out blocks better.
     """
-    kept = [name for name in names if named or _follows_no_pulse(find_effect(name))]
-    base = _with_only(search, kept)
-    chain = _extended(base, progress)
-    required = thresholds.BETTER_THAN_ALIKE if named else thresholds.BETTER_IF_DOUBTFUL
-    if len(chain) == len(base) or not _predicts_better(search.steps[-1:], chain, required):
-        return search
-    if vetoed(search.last, chain[-1].searched):
-        return search
-    return replace(
-        search, steps=list(chain), refused=search.refused if len(kept) == len(search.found) else search.rounds[0]
-    )
+    before, best = _in_white_noise(search.steps), search
+    alone = [step for step in search.steps if step.origin != "library"]
+    for base in [named, alone] if len(named) > len(alone) else [alone]:
+        if base[-1].searched.noise.band:  # a wave that terms, in white noise, would have to describe
+            continue
+        chain = _extended(tuple(base), progress)
+        own, other = _better(base, chain), _better(before, chain)
+        if len(chain) == len(base) or own.gain < thresholds.FREE_FALL:
+            continue
+        if base is alone and own.errors >= thresholds.BETTER_IF_DOUBTFUL:
+            likelier = chain[-1].searched.log_evidence > before[-1].searched.log_evidence + thresholds.NEXT_MARGIN
+            replaces = not named or (other.errors >= thresholds.BETTER and likelier)
+        else:
+            replaces = base is named and own.errors >= thresholds.BETTER_THAN_ALIKE
+        if replaces:
+            whole = len(base) == len(search.steps)
+            best = replace(search, steps=list(chain), refused=search.refused if whole else search.rounds[0])
+            before = _in_white_noise(chain)
+    return best
 
 
-def _follows_no_pulse(effect: Effect) -> bool:
-    return not effect.predictable and not effect.sporadic
+def _in_white_noise(chain: Sequence[Step]) -> Chain:
+    """The chain, the last model of which was searched again with white noise."""
+    last = chain[-1].searched
+    return (*chain[:-1], replace(chain[-1], searched=solve(last.problem, last.theta, WHITE), known=None))
 
 
-def _with_only(search: EffectSearch, retained: Sequence[str]) -> Chain:
-    """The steps with only some of the library's effects that were added, each fitted from the one before."""
-    given = [step for step in search.steps if step.origin != "library"]
-    for _, step in search.found:
-        if step.added in retained:
-            if dict(step.searched.effects).keys() != {*dict(given[-1].searched.effects), str(step.added)}:
-                form = dict(step.searched.effects)[str(step.added)]
-                before = given[-1].searched
-                problem = Problem(before.problem.setup, [*before.effects, (str(step.added), form)])
-                values = {len(before.effects): step.searched.parameters_of(str(step.added))}
-                step = replace(step, searched=solve(problem, start_from(problem, before, values), before.noise))
-            given.append(step)
-    return tuple(given)
+def _without_drift(chain: Chain) -> Chain:
+    """The chain without a moving zero that was added, where left-out blocks do not ask for it."""
+    added = [number for number, step in enumerate(chain) if step.added == DRIFT and step.origin == "free"]
+    if not added:
+        return chain
+    later = [replace(step, searched=without_effect(step.searched, DRIFT)) for step in chain[added[0] + 1 :]]
+    shorter = (*chain[: added[0]], *later)
+    return shorter if later and _better(chain, shorter).errors > -thresholds.BETTER else chain
 
 
 def _extended(base: Chain, progress: Progress) -> Chain:
-    """The base with the terms that left-out blocks ask for; of chains that predict them about equally the shortest."""
-    first = base[-1]
-    last = solve(first.searched.problem, first.searched.theta, WHITE)
-    chains = [(*base[:-1], replace(first, searched=last, known=None))]
+    """The base with the terms that left-out blocks ask for; of chains that predict them about equally the shortest.
+
+    A zero that moves competes with them: in white noise a slow term would take its place.
+    """
+    chains = [_in_white_noise(base)]
+    last = chains[0][-1].searched
     for number in range(MAX_TERMS):
         starts = _promising(last)
 
         def fit(at: int, before: Fitted = last, listed: Sequence[Start] = starts) -> Fitted:
             """Without the problem: it holds functions, which cannot be sent between processes."""
-            return replace(_with_term(before, *listed[at]), problem=None)  # type: ignore
+            return replace(_with_term(before, *listed[at], STEPS), problem=None)  # type: ignore
 
         fits: list[Fitted] = []
         for at, fitted in side_by_side(fit, len(starts)):
             progress((number + len(fits) / len(starts)) / MAX_TERMS, f"tried {starts[at][0].name.lower()}")
             fits.append(replace(fitted, problem=_problem(last, [starts[at][0]])))
         best = max(fits, key=lambda fitted: fitted.log_evidence, default=last)
+        drift = registry().get(DRIFT) if starts and DRIFT not in dict(last.effects) else None
+        zero = None if drift is None else try_effect(drift, last)
+        if zero is not None and zero.fitted.log_evidence > best.log_evidence:
+            best = zero.fitted
+        best = solve(best.problem, best.theta, best.noise)
         if best.log_evidence < last.log_evidence + thresholds.TERM_MARGIN:
             break
         last = best
         step = Step(best.effects[-1][0], best, "free", renews=base[0].renews)
         chains.append((*chains[-1], step))
-    gains = [_better(chains[0], chain).gain for chain in chains]
-    near = next(chain for chain, gain in zip(chains, gains, strict=True) if gain >= max(gains) - thresholds.NEAR)
-    return (*base, *near[len(base) :])
+    allowed: list[Chain] = []  # held-out pulses speak against none of them, compared with each shorter one
+    for chain in chains:
+        if not any(vetoed(shorter[-1].searched, chain[-1].searched) for shorter in allowed):
+            allowed.append(chain)
+    gains = [_better(chains[0], chain).gain for chain in allowed]
+    near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= max(gains) - thresholds.NEAR)
+    return (*base, *_without_drift(near)[len(base) :])
 
 
 def _promising(base: Fitted) -> list[Start]:
@@ -146,7 +171,7 @@ def _promising(base: Fitted) -> list[Start]:
     terms = [effect for effect in registry().values() if effect.shape and effect.id not in dict(base.effects)]
     if not terms or replaced_by(base.effects, terms[0].forms):
         return []
-    tried = [(effect, value) for effect in terms for value in tried_at(effect.forms[0].law["driver"])]
+    tried = [(effect, value) for effect in terms for value in tried_at(effect.forms[0])]
     forms = [
         (
             f"{effect.id} {value}",
@@ -178,17 +203,12 @@ def _problem(base: Fitted, terms: Sequence[Effect]) -> Problem:
     return Problem(base.problem.setup, [*base.effects, *((effect.id, effect.forms[0]) for effect in terms)])
 
 
-def _with_term(base: Fitted, effect: Effect, values: dict[str, float]) -> Fitted:
+def _with_term(base: Fitted, effect: Effect, values: dict[str, float], max_steps: int) -> Fitted:
     problem = _problem(base, [effect])
-    return solve(problem, start_from(problem, base, {len(base.effects): values}), base.noise)
+    start = start_from(problem, base, {len(base.effects): values})
+    return solve(problem, start, base.noise, max_steps=max_steps)
 
 
 def _better(before: Sequence[Step], after: Sequence[Step]) -> Difference:
     """Compare the left-out errors of the last models of two chains."""
     return difference(before[-1].left_out, after[-1].left_out)
-
-
-def _predicts_better(before: Sequence[Step], after: Sequence[Step], required: float) -> bool:
-    """Return True if the left-out error falls by so many standard errors, and by what is worth a free effect."""
-    comparison = _better(before, after)
-    return comparison.errors >= required and comparison.gain >= thresholds.FREE_FALL

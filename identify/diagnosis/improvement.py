@@ -170,7 +170,10 @@ def _reason(search: EffectSearch, before: Step, step: Step, model: Model) -> str
         return "The samples show it directly, before any fit."
     comparison = difference(before.left_out, step.left_out)
     if step.origin == "free":
-        description = next(effect["shape"]["words"] for effect in model.effects if effect["id"] == step.added)
+        described = next(
+            (entry["shape"] for entry in model.effects if entry["id"] == step.added and "shape" in entry), {}
+        )
+        description = described.get("words", f"{find_effect(step.added).name}.")
         return " ".join([description, comparison.words_of_choice, FREE])
     gain = next(candidate.gain for candidate in step.tried if candidate.effect.id == step.added)
     margin = search.margin(search.names("library").index(step.added))

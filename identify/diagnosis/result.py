@@ -81,9 +81,7 @@ def _effects(search: EffectSearch, verdict: Verdict) -> tuple[list[dict[str, Any
             "equation": form.equation,
             "parameters": dict(list(describe_parameters(fitted, index, covariance).items())[:MAX_PARAMETERS]),
         }
-        if step.origin == "free":
-            shape = shape_of(fitted, index, covariance)
-            assert shape is not None
+        if (shape := shape_of(fitted, index, covariance)) is not None:
             axes = {"axis" if key == "effect" else key: value for key, value in shape.items()}
             free.append(row | {"left_out": difference(before.left_out, step.left_out).words_of_choice} | axes)
         else:
@@ -184,7 +182,7 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
 
 def _plain(search: EffectSearch, diagnosis: dict[str, Any]) -> list[str]:
     base, missing = diagnosis["base"], diagnosis["missing"]
-    named = search.steps[-1 - len(diagnosis["free"])].statistics
+    named = [step for step in search.steps if step.origin != "free"][-1].statistics
     base_names = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
     conclusion = conclude(diagnosis)
     lines = [

@@ -394,12 +394,15 @@ def without_effect(fitted: Fitted, effect: str) -> Fitted:
 
 
 def helpful(search: EffectSearch) -> tuple[list[Step], list[dict[str, Any]]]:
-    """The steps up to the first that raises the error on held-out pulses, and the effects refused for that reason."""
+    """The steps up to the first that raises the error on held-out pulses, and the effects refused for that reason.
+
+    Terms are judged together: the first ones may help only beside the later ones.
+    """
     steps = search.steps
-    for number in range(1, len(steps)):
-        objection = (
-            None if steps[number].origin == "detected" else vetoed(steps[number - 1].fitted, steps[number].fitted)
-        )
+    chain = next((number for number, step in enumerate(steps) if step.origin == "free"), len(steps))
+    for number in range(1, min(chain + 1, len(steps))):
+        last = steps[-1] if number == chain else steps[number]
+        objection = None if last.origin == "detected" else vetoed(steps[number - 1].fitted, last.fitted)
         if objection is None:
             continue
         first = find_effect(str(steps[number].added)).name

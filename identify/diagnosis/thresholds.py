@@ -25,7 +25,7 @@ FREE_FALL = 0.2
 """Logarithm by which that error must fall with a free effect, too: it is chosen among many."""
 TERM_MARGIN = 3.0
 """Log evidence that a further term must gain."""
-NEAR = 0.03
+NEAR = 0.1
 """Logarithm of the left-out error by which a chain of fewer terms may predict worse than the best one."""
 UNSURE = 0.85
 """Weight of the evidence for efforts: where a law explains as much, the law is preferred, since it can be tested. It is

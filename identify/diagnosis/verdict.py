@@ -101,12 +101,13 @@ def _notes(search: EffectSearch) -> list[str]:
 
 def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
     """The verdict with free effects. They name nothing: what was `named` of the library's effects stays."""
-    notes, there = _notes(search), search.names("detected", "library")
+    notes = _notes(search)
     error = _held_out(search, notes)[0]
+    there = [str(step.added) for step in search.steps[1:] if not find_effect(str(step.added)).shape]
     return replace(
         before,
         kind=before.kind if named else "unexplained_structure",
-        probabilities={effect: p for effect, p in before.probabilities.items() if effect in there},
+        probabilities={effect: before.probabilities.get(effect, thresholds.DOUBTED) for effect in there},
         explained=_explained(search),
         structure=search.residual.ratio,
         held_out_error=error,

@@ -93,7 +93,7 @@ def run_terms(
     """
     count, size, terms = len(drives), drive.size, places.size
     torque, rate = np.zeros(size + 1), np.zeros(size + 1)
-    torques, rates = np.zeros((count, size + 1)), np.zeros((count, size + 1))
+    torques, rates = np.zeros((size + 1, count)), np.zeros((size + 1, count))
     active = 0
     for j in range(terms):
         if sizes[j] != 0.0:
@@ -102,13 +102,16 @@ def run_terms(
     z, zt, dz = np.zeros(6), np.zeros(6), np.zeros((6, count))
     y, a, dy, da, k2 = 0.0, 0.0, np.zeros(count), np.zeros(count), lags[1]
     dw, values, slopes = np.zeros(count), np.zeros(8), np.zeros((8, count))
+    by_drive, by_torque, by_rise = slopes[Driver.DRIVE], slopes[Driver.TORQUE], slopes[Driver.RISE]
+    by_fall, by_first, by_second = slopes[Driver.FALL], dz[Place.FIRST_RATE], dz[Place.SECOND_RATE]
+    lag_first, lag_second, lag_kappa = lag_slopes[:, 0].copy(), lag_slopes[:, 1].copy(), lag_slopes[:, 2].copy()
+    driven = np.zeros(count)
+    small = 1.0 / scale_nm
     h = step_s / PARTS
     decay = np.exp(-h / lag)
-    used, moved = np.zeros(6, np.bool_), np.zeros(8, np.bool_)
+    used = np.zeros(6, np.bool_)
     for j in range(terms):
         used[places[j]] = True
-        if j < active:
-            moved[drivers[j]] = True
     grain = (curve.size - 1) / REACH
     part = 0
     for k in range(size):
@@ -130,8 +133,10 @@ def run_terms(
                 dy[p] = initials[p, part, 0]
                 da[p] = dy[p] + initials[p, part, 1] / lags[1] - initial[part, 1] / lags[1] * lag_slopes[p, 1]
             torque[k], rate[k] = y, initial[part, 1]
-            torques[:, k], rates[:, k] = dy, initials[:, part, 1]
+            torques[k], rates[k] = dy, initials[:, part, 1]
             part += 1
+        for p in range(count):
+            driven[p] = drives[p, k]
         for _ in range(PARTS):
             # ---- exponents of the places
             for q in range(6):
@@ -141,8 +146,9 @@ def run_terms(
             for j in range(terms):
                 z[places[j]] += sizes[j] * x[j]
                 if j < active and sizes[j] != 0.0:
+                    row, moving, much = dz[places[j]], dx[j], sizes[j]
                     for p in range(count):
-                        dz[places[j], p] += sizes[j] * dx[j, p]
+                        row[p] += much * moving[p]
                 if own[j, 0] >= 0:
                     dz[places[j], own[j, 0]] += x[j]
             for q in range(4):
@@ -152,7 +158,7 @@ def run_terms(
             # ---- what drives the lags
             w = drive[k]
             for p in range(count):
-                dw[p] = drives[p, k]
+                dw[p] = driven[p]
             if used[Place.WIDTH] and width[k] > 0.0:
                 place = width[k] * np.exp(zt[Place.WIDTH]) * grain
                 there, steep = _cell(curve, min(place, curve.size - 1.0))
@@ -161,8 +167,9 @@ def run_terms(
                 w += gain * (there - here)
                 inside = steep * place if place < curve.size - 1.0 else 0.0
                 ratio = there / here if abs(here) > 0.02 * scale_nm else 1.0
+                row = dz[Place.WIDTH]
                 for p in range(count):
-                    dw[p] = dw[p] * ratio + gain * inside * dz[Place.WIDTH, p]
+                    dw[p] = dw[p] * ratio + gain * inside * row[p]
                 for c in range(owner.size):  # exact for the curve's coefficients
                     p = owner[c]
                     own_there = _cell(curves[c], min(place, curve.size - 1.0))[0]
@@ -173,8 +180,9 @@ def run_terms(
             if used[Place.STRENGTH]:
                 factor = np.exp(zt[Place.STRENGTH])
                 w *= factor
+                row = dz[Place.STRENGTH]
                 for p in range(count):
-                    dw[p] = factor * dw[p] + w * dz[Place.STRENGTH, p]
+                    dw[p] = factor * dw[p] + w * row[p]
             k1, k2 = lags[0] * np.exp(zt[Place.FIRST_RATE]), lags[1] * np.exp(zt[Place.SECOND_RATE])
             # ---- a trapezoidal step of y' = k2 (a - y), a' = k1 (w - (1 - κ) a - κ y)
             i, g, m, n = 0.5 * h * k2, 0.5 * h * k1, 1.0 - lags[2], lags[2]
@@ -186,19 +194,17 @@ def run_terms(
             mid_y, mid_a = 0.5 * (y + new_y), 0.5 * (a + new_a)
             pull_y, pull_a = 2.0 * i * (mid_a - mid_y), 2.0 * g * (w - m * mid_a - n * mid_y)
             pull_k = 2.0 * g * (mid_a - mid_y)
-            first, second = used[Place.FIRST_RATE], used[Place.SECOND_RATE]
+            c1, c2, c3, c4, quick = (1.0 - i), -g * n, (1.0 - g * m), 2.0 * g, QUICK_S * small / h
+            d1, d2, d3, d4 = inverse * (1.0 + g * m), inverse * i, inverse * (1.0 + i), -inverse * g * n
             for p in range(count):
-                one, two = lag_slopes[p, 0], lag_slopes[p, 1]
-                if first:
-                    one += dz[Place.FIRST_RATE, p]
-                if second:
-                    two += dz[Place.SECOND_RATE, p]
-                sy = (1.0 - i) * dy[p] + i * da[p] + pull_y * two
-                sa = -g * n * dy[p] + (1.0 - g * m) * da[p] + 2.0 * g * dw[p] + pull_a * one + pull_k * lag_slopes[p, 2]
-                next_y = inverse * ((1.0 + g * m) * sy + i * sa)
-                da[p] = inverse * ((1.0 + i) * sa - g * n * sy)
-                slopes[Driver.TORQUE, p] = 0.5 * (dy[p] + next_y) / scale_nm
-                slopes[Driver.RISE, p] = (next_y - dy[p]) * QUICK_S / (h * scale_nm)
+                sy = c1 * dy[p] + i * da[p] + pull_y * (lag_second[p] + by_second[p])
+                sa = (
+                    c2 * dy[p] + c3 * da[p] + c4 * dw[p] + pull_a * (lag_first[p] + by_first[p]) + pull_k * lag_kappa[p]
+                )
+                next_y = d1 * sy + d2 * sa
+                da[p] = d3 * sa + d4 * sy
+                by_torque[p] = 0.5 * small * (dy[p] + next_y)
+                by_rise[p] = quick * (next_y - dy[p])
                 dy[p] = next_y
             # ---- the drivers
             change = (new_y - y) * QUICK_S / (h * scale_nm)
@@ -211,11 +217,9 @@ def run_terms(
             )
             up = 0.5 * (1.0 + change / root)
             for p in range(count):
-                slopes[Driver.FALL, p] = (up - 1.0) * slopes[Driver.RISE, p]
-                slopes[Driver.RISE, p] *= up
-            if moved[Driver.DRIVE]:
-                for p in range(count):
-                    slopes[Driver.DRIVE, p] = drives[p, k] / scale_nm
+                by_fall[p] = (up - 1.0) * by_rise[p]
+                by_rise[p] *= up
+                by_drive[p] = driven[p] * small
             y, a = new_y, new_a
             for j in range(terms):
                 d, mine = drivers[j], own[j, 1]
@@ -223,8 +227,9 @@ def run_terms(
                     away = x[j] - values[d]
                     x[j] = values[d] + away * decay[j]
                     if j < active:
+                        row, moving, less = slopes[d], dx[j], decay[j]
                         for p in range(count):
-                            dx[j, p] = slopes[d, p] + (dx[j, p] - slopes[d, p]) * decay[j]
+                            moving[p] = row[p] + (moving[p] - row[p]) * less
                         if mine >= 0:
                             dx[j, mine] += away * decay[j] * h / lag[j]
                 elif d == Driver.SQUARE:
@@ -233,22 +238,23 @@ def run_terms(
                         for p in range(count):
                             dx[j, p] = 2.0 * y * dy[p] / (scale_nm * scale_nm)
                 else:
-                    by_torque = d == Driver.TORQUE_PLAY
-                    now = y / scale_nm if by_torque else width[k]
+                    of_torque = d == Driver.TORQUE_PLAY
+                    now = y / scale_nm if of_torque else width[k]
                     away = now - x[j]
                     if abs(away) > lag[j]:
                         side = 1.0 if away > 0.0 else -1.0
                         x[j] = now - side * lag[j]
                         if j < active:
                             for p in range(count):
-                                dx[j, p] = dy[p] / scale_nm if by_torque else 0.0
+                                dx[j, p] = dy[p] * small if of_torque else 0.0
                             if mine >= 0:
                                 dx[j, mine] -= side * lag[j]
         pull = k2 * (a - y)
         torque[k + 1], rate[k + 1] = y, pull
+        torque_row, rate_row = torques[k + 1], rates[k + 1]
         for p in range(count):
-            two = lag_slopes[p, 1] + (dz[Place.SECOND_RATE, p] if used[Place.SECOND_RATE] else 0.0)
-            torques[p, k + 1], rates[p, k + 1] = dy[p], k2 * (da[p] - dy[p]) + pull * two
+            torque_row[p] = dy[p]
+            rate_row[p] = k2 * (da[p] - dy[p]) + pull * (lag_second[p] + by_second[p])
         if used[Place.TORQUE] or used[Place.FACTOR]:
             z[Place.TORQUE], z[Place.FACTOR] = 0.0, 0.0
             dz[Place.TORQUE], dz[Place.FACTOR] = 0.0, 0.0
@@ -257,15 +263,17 @@ def run_terms(
                 if q >= Place.TORQUE:
                     z[q] += sizes[j] * x[j]
                     if j < active and sizes[j] != 0.0:
+                        row, moving, much = dz[q], dx[j], sizes[j]
                         for p in range(count):
-                            dz[q, p] += sizes[j] * dx[j, p]
+                            row[p] += much * moving[p]
                     if own[j, 0] >= 0:
                         dz[q, own[j, 0]] += x[j]
             bend = LARGEST * np.tanh(z[Place.FACTOR] / LARGEST)
             factor, less = np.exp(bend), 1.0 - (bend / LARGEST) ** 2
             torque[k + 1] = factor * y + scale_nm * z[Place.TORQUE]
             rate[k + 1] *= factor
+            bent, added = dz[Place.FACTOR], dz[Place.TORQUE]
             for p in range(count):
-                torques[p, k + 1] = factor * (dy[p] + y * less * dz[Place.FACTOR, p]) + scale_nm * dz[Place.TORQUE, p]
-                rates[p, k + 1] = factor * rates[p, k + 1] + rate[k + 1] * less * dz[Place.FACTOR, p]
-    return torque, rate, torques, rates
+                torque_row[p] = factor * (dy[p] + y * less * bent[p]) + scale_nm * added[p]
+                rate_row[p] = factor * rate_row[p] + rate[k + 1] * less * bent[p]
+    return torque, rate, torques.T, rates.T

@@ -36,14 +36,25 @@ SLOW_S = 5.0
 LEVEL = np.linspace(0.0, 1.0, 41)
 
 
+def longest_s(place: Place) -> float:
+    """Largest lag of a term: an added torque that is slower cannot be told from a zero that moves."""
+    return 10.0 if place == Place.TORQUE else 30.0
+
+
 def later(driver: Driver) -> bool:
     """Return True if a driver acts through a lag."""
     return driver < Driver.SQUARE
 
 
-def tried_at(driver: Driver) -> tuple[float, ...]:
-    """Lags or reaches at which a term of a driver is looked for; one number that says nothing where it has neither."""
-    return LAGS_S if later(driver) else (1.0,) if driver == Driver.SQUARE else REACHES
+def tried_at(form: Form) -> tuple[float, ...]:
+    """Lags or reaches at which a term is looked for; one number that says nothing where it has neither."""
+    if not form.parameters[1:]:
+        return (1.0,)
+    return tuple(
+        value
+        for value in (LAGS_S if form.parameters[1].name == "lag_s" else REACHES)
+        if value <= form.parameters[1].upper
+    )
 
 
 def percent(place: Place, exponent: float) -> str:
@@ -88,7 +99,7 @@ def _term(place: Place, driver: Driver) -> Effect:
     parameters = [Parameter("change", "1", -3.0, 3.0, about="exponent z at the full driver, held")]
     law = {"place": place, "driver": driver, "lag": 1.0}
     if later(driver):
-        parameters.append(Parameter("lag_s", "s", 0.02, 60.0, 0.0, (0.25,), "log", about="time constant"))
+        parameters.append(Parameter("lag_s", "s", 0.02, longest_s(place), 0.0, (0.25,), "log", about="time constant"))
         equation = f"{acts}; z = change·x, x' = (d - x)/lag_s; d = {is_}"
     elif driver == Driver.SQUARE:
         equation = f"{acts}; z = change·{is_}"
