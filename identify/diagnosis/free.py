@@ -34,7 +34,7 @@ from stimrig.identify.effects.terms import tried_at
 from stimrig.identify.estimation.effect_fit import try_effect
 from stimrig.identify.estimation.left_out import Difference, difference
 from stimrig.identify.estimation.samples import Raw, fitted_rows
-from stimrig.identify.estimation.solve import Fitted, solve, solve_scaled, start_from
+from stimrig.identify.estimation.solve import LARGEST_SLOPE, Fitted, solve, solve_scaled, start_from
 from stimrig.identify.noise import WHITE
 from stimrig.identify.problem.problem import Problem
 
@@ -195,7 +195,9 @@ def _promising(base: Fitted) -> list[Start]:
     for place in np.argsort(-gain):
         effect, value = tried[place]
         names = [p.name for p in effect.forms[0].parameters]
-        best.setdefault(effect.id, (effect, dict(zip(names, (float(size[place]), value), strict=False))))
+        best.setdefault(
+            effect.id, (effect, dict(zip(names, (float(np.clip(size[place], -1.0, 1.0)), value), strict=False)))
+        )
     return [*best.values()][:FITTED_TERMS]
 
 
@@ -206,6 +208,8 @@ def _problem(base: Fitted, terms: Sequence[Effect]) -> Problem:
 def _with_term(base: Fitted, effect: Effect, values: dict[str, float], max_steps: int) -> Fitted:
     problem = _problem(base, [effect])
     start = start_from(problem, base, {len(base.effects): values})
+    while not np.max(np.abs(problem.run(start, derivatives=True)[1])) < LARGEST_SLOPE:  # type: ignore
+        start[problem.chosen[-1].first] *= 0.3  # the torque ran away
     return solve(problem, start, base.noise, max_steps=max_steps)
 
 

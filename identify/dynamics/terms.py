@@ -67,7 +67,7 @@ def _cell(table, place):  # pragma: no cover
     return table[low] + (place - low) * (table[low + 1] - table[low]), table[low + 1] - table[low]
 
 
-@njit(cache=True, nogil=True, fastmath=True)
+@njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def run_terms(
     drive, drives, width, present, rest_s, curve, curves, owner, lags, lag_slopes, places, drivers, sizes, lag, own,
     begins, initial, initials, scale_nm, step_s,

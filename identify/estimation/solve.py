@@ -43,6 +43,8 @@ HEAVY_TAILS = 10.0
 a sixth of the squares."""
 NEGLIGIBLE = 0.5
 """Gain of log posterior by the linear parameters below which the slopes by the others are as good as at the optimum."""
+LARGEST_SLOPE = 1e100
+"""A larger derivative is that of a model that runs away, and its square is none."""
 OPTIMISM = 3.0
 """A run is stopped only if it stays below the floor even with this many times the gain that a parabola predicts."""
 
@@ -273,7 +275,7 @@ def _at(
     """The point with these parameters. Without effects the linear ones are solved for, given all others."""
     for attempt in (1, 2):
         mean, slopes = problem.run(theta, derivatives=True)
-        if slopes is None or not np.all(np.isfinite(mean)):
+        if slopes is None or not (np.all(np.isfinite(mean)) and np.max(np.abs(slopes)) < LARGEST_SLOPE):
             return None
         residual = problem.setup.target_nm - mean
         if problem.chosen:
