@@ -110,8 +110,9 @@ class Diagnosis(Result):
     `plain`."""
     free: tuple[Row, ...]
     """Free effects, which describe what no effect of the library explains: `effect`, `name`, `form`, `equation`,
-    `parameters`, `place`, `driven_by`, `words`, `left_out`, and the picture: `driver`, `at`, `axis`, `lines`, each
-    with `value`, `lower` and `upper`."""
+    `parameters`, `place`, `driven_by`, `words`, `behaves_as` (effects of the library that act as it does), `left_out`,
+    its law: `driver`, `at`, `axis`, `lines`, each with `value`, `lower` and `upper`, and its `course` over the record:
+    `time_s`, `driver` and `value`."""
     add: tuple[str, ...]  # what `improve` adds, in its order: effects of the library, then free ones
     deciding_experiment: Row | None
     """Where structure is left, the test that teaches most about it: as `next_experiment_plan`, with `expected_fall`,
@@ -214,6 +215,7 @@ class Explanation(Result):
         if self.diagnosis.conclusion.kind != "nothing" or stands_out(before):
             places = healed_places(before, self.after.to_dict())
             rows += [("failed in", f"{place['text']}: {place_words(place)}") for place in places]
+        rows += _listed("free effects", [str(row["words"]) for row in self.diagnosis.free])
         improved = self.improvement._sheet()
         rows += [*improved.rows, ("ended", why_ended(vars(self.left)))]
         return Sheet(f"Explanation: {improved.title.partition(': ')[2]}", tuple(rows))

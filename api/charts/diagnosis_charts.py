@@ -102,7 +102,7 @@ def story_figures(story: dict[str, Any], before: dict[str, Any], after: dict[str
         figures["story-place"] = side_by_side(before, after, places[:1], close=True)
     if len(rows) > 1:
         figures["falling"] = falling(rows)
-    return figures
+    return figures | free_effects(story["why"]["free"] if story["why"] else [])
 
 
 def side_by_side(before: dict[str, Any], after: dict[str, Any], places: Places, close: bool = False) -> Figure:

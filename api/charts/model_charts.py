@@ -82,7 +82,7 @@ def broken_at_pauses(curves: dict[str, Any]) -> dict[str, Any]:
         return curves
     broken = dict(curves)
     broken["time_s"] = np.insert(time_s, pauses, (time_s[pauses - 1] + time_s[pauses]) / 2).tolist()
-    for name in ("torque_nm", "predicted_torque_nm", "pulse_width_us", "residual_nm"):
+    for name in ("torque_nm", "predicted_torque_nm", "pulse_width_us", "residual_nm", "value", "driver"):
         if name in curves:
             parts = np.split(np.asarray(curves[name], dtype=object), pauses)
             broken[name] = [value for part in parts for value in (*part, None)][:-1]
@@ -155,8 +155,9 @@ def _band_of(document: dict[str, Any], curve: str, along: str) -> list[Band]:
 
 
 def free_effects(entries: Sequence[Mapping[str, Any]]) -> dict[str, Figure]:
-    """Return a figure of each free effect by name."""
-    return {f"free-{entry['id']}": free_effect(entry) for entry in entries}
+    """Return two figures of each free effect by name: its law, and its course over the record."""
+    laws = {f"free-{entry['id']}": free_effect(entry) for entry in entries}
+    return laws | {f"course-{entry['id']}": free_course(entry) for entry in entries if "course" in entry}
 
 
 def free_effect(entry: Mapping[str, Any]) -> Figure:
@@ -167,3 +168,13 @@ def free_effect(entry: Mapping[str, Any]) -> Figure:
         colour = "series-band" if number else "model-band"
         bands.append(Band(entry["at"], known["lower"], known["upper"], colour=colour, listed=not number))
     return Figure(Axis(entry["driver"]), [Axis(entry["axis"])], [*bands, *lines], 270)
+
+
+def free_course(entry: Mapping[str, Any]) -> Figure:
+    """Return what a free effect does over the record, and below it what drives it."""
+    course = broken_at_pauses(entry["course"])
+    time_s = course["time_s"]
+    effect = Line(time_s, course["value"], "what it does", "model", 1.6)
+    driver = Line(time_s, course["driver"], "what drives it", "measured", 1.2, panel=1)
+    panels = [Axis(entry["axis"]), Axis(f"{entry['driven_by'].capitalize()} (share)")]
+    return Figure(time_axis(time_s[0], time_s[-1]), panels, [effect, driver], 360, (0.55, 0.4))

@@ -164,7 +164,7 @@ def held_free(document: Mapping[str, Any]) -> list[dict[str, Any]]:
     for effect in document.get("effects") or []:
         if shape := effect.get("shape"):
             naming = {"effect": effect["id"], "name": effect_words(effect["id"]), "axis": shape["effect"]}
-            entry = {**shape, **naming, **{key: effect[key] for key in ("equation", "parameters") if key in effect}}
+            entry = {**{key: effect[key] for key in ("equation", "parameters") if key in effect}, **shape, **naming}
             cards.append(free_card(entry, {}, f"In this model: {naming['name']}"))
     return cards
 

@@ -194,7 +194,7 @@ def _plain(search: EffectSearch, diagnosis: dict[str, Any]) -> list[str]:
             for place in diagnosis["where"][:1]
             if conclusion.kind == "unexplained"
         ],
-        *[f"{row['words']} {row['left_out']}" for row in diagnosis["free"]],
+        *[f"{row['words']} {row['equation']}. {row['left_out']}" for row in diagnosis["free"]],
     ]
     for entry in missing:
         chance = entry["probability"]

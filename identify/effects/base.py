@@ -245,7 +245,9 @@ class Shape:
     driver: str  # name and unit of the horizontal axis
     at: np.ndarray  # shape (n,); places there
     effect: str  # name and unit of the vertical axis
-    lines: Mapping[str, np.ndarray]  # shape (n,); the curves, by name
+    lines: Mapping[str, np.ndarray]  # shape (M, n); the curves of all draws, by name
+    equation: str  # with its numbers
+    behaves_as: tuple[str, ...]  # ids of the library's effects that act like it
 
 
 @dataclass(frozen=True)
@@ -281,9 +283,9 @@ class Effect:
     main: dict[str, str] = field(default_factory=dict)
     """The parameters that stand for it in the trend, first choice first, and their names for people, without units; the
     form's first one where none of them is its own. The service reads this, `muscle` and `name` without an import."""
-    shape: Callable[[Form, Mapping[str, float]], Shape] | None = None
-    """For a free effect only: `shape(form, values)` returns the fitted curves and a sentence. A free effect describes
-    an error that no other effect explains. It is tried last, and its name claims no physics."""
+    shape: Callable[[Form, Mapping[str, np.ndarray]], Shape] | None = None
+    """For a free effect only: `shape(form, values)` returns curves and words; values, shape (M, 1), are fitted, then
+    draws. It describes an error that no other effect explains, is tried last, and its name claims no physics."""
 
     @property
     def stage(self) -> str:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,21 +20,35 @@ PLACES = {
 }
 """Of each place its name, and how an exponent z acts there."""
 DRIVERS = {
-    Driver.DRIVE: ("drive", "f(u)/y_max"),
-    Driver.TORQUE: ("torque", "y/y_max"),
-    Driver.RISE: ("rise of the torque", "max(y', 0)·0.1 s/y_max"),
-    Driver.FALL: ("fall of the torque", "max(-y', 0)·0.1 s/y_max"),
-    Driver.PULSES: ("presence of pulses", "1 under pulses"),
-    Driver.SQUARE: ("square of the torque", "(y/y_max)²"),
-    Driver.TORQUE_PLAY: ("torque with play", "y/y_max"),
-    Driver.WIDTH_PLAY: ("width with play", "u/u_max"),
+    Driver.DRIVE: ("drive", "f(u)/y_max", "at full drive"),
+    Driver.TORQUE: ("torque", "y/y_max", "at full torque"),
+    Driver.RISE: ("rise of the torque", "max(y', 0)·0.1 s/y_max", "at a rise by the largest torque in 0.1 s"),
+    Driver.FALL: ("fall of the torque", "max(-y', 0)·0.1 s/y_max", "at a fall by the largest torque in 0.1 s"),
+    Driver.PULSES: ("presence of pulses", "(1 under pulses)", "under pulses"),
+    Driver.SQUARE: ("square of the torque", "(y/y_max)²", "at full torque"),
+    Driver.TORQUE_PLAY: ("torque with play", "y/y_max", "at full torque"),
+    Driver.WIDTH_PLAY: ("width with play", "u/u_max", "at the largest width"),
 }
-"""Of each driver its name, and what it is."""
+"""Of each driver its name, what it is as a share, and where it is 1."""
 LAGS_S, REACHES = (0.08, 0.25, 0.8, 2.5, 8.0, 25.0), (0.05, 0.12, 0.3)
 """Lags, and reaches of a play, at which a term is looked for; then they are refined."""
-SLOW_S = 5.0
-"""Lag from which a term is one of use, not of the answer to single pulses."""
+USE, RATES = (Driver.DRIVE, Driver.TORQUE, Driver.PULSES), (Place.FIRST_RATE, Place.SECOND_RATE)
+AFTER_LAGS = (Place.TORQUE, Place.FACTOR)
+BEHAVIOURS: tuple[tuple[str, Sequence[Place], Sequence[Driver], float, float, int], ...] = (
+    ("fatigue", (Place.STRENGTH, Place.FACTOR), USE, 5.0, 60.0, -1),
+    ("potentiation", (Place.STRENGTH, Place.FACTOR), USE, 2.5, 60.0, 1),
+    ("threshold_drift", (Place.WIDTH,), USE, 5.0, 60.0, 0),
+    ("catch_like", (Place.STRENGTH,), (Driver.PULSES,), 0.05, 1.2, -1),
+    ("asymmetric_relaxation", RATES, (Driver.RISE, Driver.FALL), 0.0, 1.0, 0),
+    ("activation_dependent_speed", RATES, (Driver.DRIVE, Driver.TORQUE), 0.0, 1.0, 0),
+    ("mixed_fibres", (Place.TORQUE,), (Driver.DRIVE,), 0.05, 1.2, 1),
+    ("output_saturation", AFTER_LAGS, (Driver.SQUARE,), 0.0, 0.0, -1),
+    ("recruitment_hysteresis", AFTER_LAGS, (Driver.WIDTH_PLAY,), 0.0, 0.0, 0),
+)
+"""Effects of the library that act as a term does: its places, drivers, lags from and to, s, and sign (0: either)."""
 LEVEL = np.linspace(0.0, 1.0, 41)
+PERCENTILES = 2.5, 97.5
+"""Those of draws between which 95 % lie."""
 
 
 def longest_s(place: Place) -> float:
@@ -50,66 +65,99 @@ def tried_at(form: Form) -> tuple[float, ...]:
     """Lags or reaches at which a term is looked for; one number that says nothing where it has neither."""
     if not form.parameters[1:]:
         return (1.0,)
+    values = LAGS_S if form.parameters[1].name == "lag_s" else REACHES
+    return tuple(value for value in values if value <= form.parameters[1].upper)
+
+
+def acting(place: Place, exponent: np.ndarray) -> np.ndarray:
+    """Factor by which an exponent z changes its place; what it adds to the torque, as a share of the largest."""
+    return exponent if place == Place.TORQUE else np.exp(LARGEST * np.tanh(exponent / LARGEST))
+
+
+def behaves_as(place: Place, driver: Driver, size: np.ndarray, lag_s: float) -> tuple[str, ...]:
+    """Ids of the library's effects that act as a term does; none where its sign is open. `size`: its draws."""
+    sign = np.sign(np.percentile(size, PERCENTILES))
     return tuple(
-        value
-        for value in (LAGS_S if form.parameters[1].name == "lag_s" else REACHES)
-        if value <= form.parameters[1].upper
+        effect
+        for effect, places, drivers, low_s, high_s, wanted in BEHAVIOURS
+        if place in places and driver in drivers and low_s <= lag_s <= high_s
+        if sign[0] == sign[1] and wanted in (0, sign[0])
     )
 
 
-def percent(place: Place, exponent: float) -> str:
-    """How an exponent changes its place, in percent; of an added torque, of the largest torque."""
-    change = exponent if place == Place.TORQUE else np.expm1(LARGEST * np.tanh(exponent / LARGEST))
-    return f"{100.0 * change:+.2g} %"
+def _number(value: float, sign: str = "") -> str:
+    """Two digits that count, never with an exponent."""
+    return f"{value:{sign}.{max(1 - math.floor(math.log10(abs(value) or 1.0)), 0)}f}"
 
 
-def _seconds(value_s: float) -> str:
-    return f"{value_s:.2g} s" if value_s < 100.0 else f"{value_s / 60.0:.2g} min"
+def _stated(draws: np.ndarray, sign: str = "") -> tuple[str, str]:
+    """The fitted value, that of the first draw, and the 95 % interval of the others."""
+    low, high = np.percentile(draws[1:], PERCENTILES)
+    return _number(float(draws[0, 0]), sign), f"{_number(low, sign)} to {_number(high, sign)}"
 
 
-def _shape(form: Form, values: Mapping[str, float]) -> Shape:
+def _sized(place: Place, driver: Driver, exponent: np.ndarray) -> str:
+    """How a term changes its place where its driver is 1: a change in percent, or a factor where it may double."""
+    effect, whole = acting(place, exponent), DRIVERS[driver][2]
+    if place != Place.TORQUE and np.percentile(effect[1:], PERCENTILES[1]) > 2.0:
+        value, interval = _stated(effect)
+        return f"× {value} {whole} ({interval})"
+    value, interval = _stated(100.0 * (effect - (place != Place.TORQUE)), "+")
+    return f"{value} %{' of the largest' if place == Place.TORQUE else ''} {whole} ({interval} %)"
+
+
+def _equation(place: Place, driver: Driver, size: str, other: str) -> str:
+    """Equation of a term; `size` and `other` (lag or reach): numbers or names."""
+    acts, share = PLACES[place][1], DRIVERS[driver][1]
+    if driver == Driver.SQUARE:
+        return f"{acts}; z = {size}·{share}"
+    state = f"x' = ({share} - x)/{other}" if later(driver) else f"x follows {share} behind a play of ±{other}"
+    return f"{acts}; z = {size}·x, {state}"
+
+
+def _shape(form: Form, values: Mapping[str, np.ndarray]) -> Shape:
     place, driver = Place(int(form.law["place"])), Driver(int(form.law["driver"]))
-    size, where, what = values["change"], PLACES[place][0], DRIVERS[driver][0]
-    whole = "a rise by the largest torque in 0.1 s" if driver in (Driver.RISE, Driver.FALL) else f"full {what}"
-    words = f"{where.capitalize()} <- {what}: {percent(place, size)} at {whole}"
-    axis = "torque added (share of the largest)" if place == Place.TORQUE else f"{where} (factor)"
+    (size, other), (where, what) = (*values.values(), np.zeros((1, 1)))[:2], (PLACES[place][0], DRIVERS[driver][0])
+    words, full, lag_s = f"{where.capitalize()} <- {what}", size, float(other[0, 0])
     if later(driver):
-        lag_s = values["lag_s"]
-        at, rising = 4.0 * lag_s * LEVEL, LEVEL < 0.5
-        state = np.where(rising, -np.expm1(-at / lag_s), -np.expm1(-2.0) * np.exp(2.0 - at / lag_s))
-        words, lines = f"{words}, {_seconds(lag_s)} late", {"change": state}
-        along = f"time, full {what} for {_seconds(2.0 * lag_s)}, then none (s)"
+        value, interval = _stated(other)
+        words += f", {value} s late ({interval} s)"
+        at, along = 4.0 * lag_s * LEVEL, f"Time, {what} {_number(2.0 * lag_s)} s long, then none (s)"
+        held = np.minimum(at, 2.0 * lag_s)
+        lines, second = {"change": -np.expm1(-held / other) * np.exp((held - at) / other)}, f"{value} s"
     elif driver == Driver.SQUARE:
-        at, lines, along = LEVEL, {"change": LEVEL**2}, "torque (share of the largest)"
+        at, lines, along, second = LEVEL, {"change": LEVEL**2}, "Torque (share of the largest)", ""
     else:
-        reach = values["reach"]
-        words += f", behind a play of {100.0 * reach:.2g} %"
-        lines = {"rising": np.maximum(LEVEL - reach, 0.0), "falling": np.minimum(LEVEL + reach, 1.0 - reach)}
-        at, along = LEVEL, f"{what.removesuffix(' with play')} (share of the largest)"
-    drawn = {
-        name: size * x if place == Place.TORQUE else np.exp(LARGEST * np.tanh(size * x / LARGEST))
-        for name, x in lines.items()
-    }
-    return Shape(where, what, f"{words}.", along, at, axis, drawn)
+        second, interval = _stated(100.0 * other)
+        words, full, second = f"{words} of ±{second} % ({interval} %)", size * (1.0 - other), _number(lag_s)
+        lines = {"rising": np.maximum(LEVEL - other, 0.0), "falling": np.minimum(LEVEL + other, 1.0 - other)}
+        at, along = LEVEL, f"{what.removesuffix(' with play').capitalize()} (share of the largest)"
+    name = where.removeprefix("factor of the ")
+    return Shape(
+        place=where,
+        driven_by=what,
+        words=f"{words}: {_sized(place, driver, full)}.",
+        driver=along,
+        at=at,
+        effect="Torque added (share of the largest)" if place == Place.TORQUE else f"{name.capitalize()} (factor)",
+        lines={line: acting(place, size * x) for line, x in lines.items()},
+        equation=_equation(place, driver, _number(float(size[0, 0])), second),
+        behaves_as=behaves_as(place, driver, size[1:], lag_s if later(driver) else 0.0),
+    )
 
 
 def _term(place: Place, driver: Driver) -> Effect:
-    where, acts = PLACES[place]
-    what, is_ = DRIVERS[driver]
+    where, what = PLACES[place][0], DRIVERS[driver][0]
     parameters = [Parameter("change", "1", -3.0, 3.0, about="exponent z at the full driver, held")]
-    law = {"place": place, "driver": driver, "lag": 1.0}
     if later(driver):
         parameters.append(Parameter("lag_s", "s", 0.02, longest_s(place), 0.0, (0.25,), "log", about="time constant"))
-        equation = f"{acts}; z = change·x, x' = (d - x)/lag_s; d = {is_}"
-    elif driver == Driver.SQUARE:
-        equation = f"{acts}; z = change·{is_}"
-    else:
+    elif driver > Driver.SQUARE:
         parameters.append(Parameter("reach", "1", 0.01, 0.6, 0.0, (0.12,), "log", about="half of the play, a share"))
-        equation = f"{acts}; z = change·x, x follows {is_} behind a play of ±reach"
+    equation = _equation(place, driver, "change", parameters[-1].name)
     return Effect(
         id=f"free_{place.name.lower()}_by_{driver.name.lower()}",
         name=f"{place.name} by {driver.name}".replace("_", " ").capitalize(),
-        forms=(Form("term", "term", equation, tuple(parameters), law=law),),
+        forms=(Form("term", "term", equation, tuple(parameters), law={"place": place, "driver": driver, "lag": 1.0}),),
         signature=f"The error follows the {what}, as if the {where} changed with it.",
         resembles=(),
         separated_by="Levels held for times about the lag, and rests as long.",

@@ -161,6 +161,12 @@ class Problem:
         _StagePass(self, theta, False).gained(slow_states)
         return slow_states
 
+    def inner_signals(self, theta: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Width, µs, and drive, N·m, before all terms, shape (K,), and torque behind the lags, N·m, shape (K + 1,)."""
+        stages = _StagePass(self, theta, False)
+        drive = stages.gained()
+        return stages.width, drive[0], stages.dynamics(drive)[0][0]
+
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
         """Torque at the record's samples, with its sign and zero, N·m; what effects in `skip` add is left out."""
         stages = _StagePass(self, theta, False)

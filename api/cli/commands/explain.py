@@ -11,7 +11,7 @@ from stimrig import identify
 from stimrig.api.cli.commands.diagnose import next_commands
 from stimrig.api.cli.files import html_report, load_structure, short, story_of, write
 from stimrig.api.cli.options import ColumnMap, HeldModel, Json, LastModel, SeveralData
-from stimrig.api.cli.terminal import report
+from stimrig.api.cli.terminal import print_aside, report
 from stimrig.api.progress_bar import progress_bar
 
 
@@ -20,6 +20,7 @@ def explain(
     model_json: HeldModel = None,
     html: Annotated[Path | None, typer.Option(help="write the story with its figures here, one file")] = None,
     figures: Annotated[Path | None, typer.Option(help="write each figure as SVG, PDF and PNG into this folder")] = None,
+    own: Annotated[Path | None, typer.Option(help="write the strongest term as an own effect here, a .py file")] = None,
     output: LastModel = None,
     columns: ColumnMap = None,
     as_json: Json = False,
@@ -45,3 +46,8 @@ def explain(
                 write(figures / f"{name}.{kind}", figure.file(kind))
     document = {"structure": structure, **explained.to_dict()}
     report(document, as_json, explained, *next_commands(explained.left), files=[output, html, figures])
+    if own is not None:  # last: without a term there is nothing to write
+        from stimrig.api.export.own_effect import own_effect
+
+        write(own, own_effect(explained.improvement.models[-1]))
+        print_aside(f"own effect written to {own}")

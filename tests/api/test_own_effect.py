@@ -1,0 +1,56 @@
+"""A term written as an own effect: the file is loaded and predicts as the term does; a rate is refused in one line."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from stimrig import identify
+from stimrig.api.charts.model_charts import model_figures
+from stimrig.api.export.own_effect import own_effect
+from stimrig.identify.effects import find_effect, registry
+from tests.identify import hidden_muscles
+
+TERM = "free_width_by_torque"
+
+
+def model_with(effect: str, model: identify.Model) -> identify.Model:
+    """With a free effect at a lag of 0.25 s."""
+    values = {p.name: {"value": p.start[0] or -0.5, "sd": 0.1} for p in find_effect(effect).forms[0].parameters}
+    shape = {"words": "A term.", "behaves_as": []}
+    entry = {"id": effect, "form": "term", "equation": "u exp(z)", "parameters": values, "shape": shape}
+    return model.with_(effects=({**entry, "settings": {"scale_nm": 6.0}},))
+
+
+@pytest.fixture(scope="module")
+def plain() -> identify.Model:
+    return identify.fit(hidden_muscles.record(rate_hz=100))
+
+
+def test_an_own_effect_reaches_the_error_of_the_term(plain, tmp_path, monkeypatch):
+    record = hidden_muscles.record(rate_hz=100)
+    noise_nm = np.random.default_rng(0).normal(0.0, 0.05, record.torque_nm.size)
+    record = record.with_torque(model_with(TERM, plain).predict(record) + noise_nm)
+    term = identify.fit(record, effects=[TERM])
+    assert {f"free-{TERM}", f"course-{TERM}"} <= model_figures(term.to_dict(), None).keys()
+    text = own_effect(term)
+    assert len(text.splitlines()) < 40 and term.effects[0]["shape"]["words"] in text
+    (tmp_path / "own.py").write_text(text)
+    monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
+    own = identify.fit(record, effects=["own_width_by_torque"])
+    assert own.fit["rms_nm"] < 1.05 * term.fit["rms_nm"] < 0.5 * identify.fit(record).fit["rms_nm"]
+
+
+def test_every_term_that_a_stage_can_express_is_written_and_loaded(plain, tmp_path, monkeypatch):
+    free = [effect.id for effect in registry().values() if effect.shape and "_rate_" not in effect.id]
+    for effect in free:
+        (tmp_path / f"{effect}.py").write_text(own_effect(model_with(effect, plain)))
+    monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
+    assert len(registry().keys() & {effect.replace("free_", "own_", 1) for effect in free}) == len(free)
+
+
+def test_without_a_term_or_with_a_rate_nothing_is_written(plain):
+    with pytest.raises(identify.IdentifyError, match="no free effect was found"):
+        own_effect(plain)
+    with pytest.raises(identify.IdentifyError, match="changes a rate"):
+        own_effect(model_with("free_first_rate_by_rise", plain))

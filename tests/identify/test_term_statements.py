@@ -1,0 +1,81 @@
+"""What a term says of itself: words with intervals, effects of the library that act like it, its course."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from stimrig import identify
+from stimrig.identify.dynamics.grid import make_grid
+from stimrig.identify.dynamics.terms import Driver, Place
+from stimrig.identify.effects import find_effect, registry
+from stimrig.identify.effects.terms import BEHAVIOURS, behaves_as
+from stimrig.identify.estimation.shapes import _course
+from stimrig.identify.problem.predict import problem_of
+from tests.identify import hidden_muscles
+
+DRAWS = np.r_[0.0, np.linspace(-1.0, 1.0, 401)][:, None]
+
+
+@pytest.mark.parametrize(
+    ("effect", "values", "words", "equation"),
+    [
+        (
+            "free_width_by_torque",
+            {"change": -0.53 + 0.07 * DRAWS, "lag_s": 0.25 + 0.06 * DRAWS},
+            "Width that acts <- torque, 0.25 s late (0.19 to 0.31 s): -41 % at full torque (-44 to -37 %).",
+            "u exp(z); z = -0.53·x, x' = (y/y_max - x)/0.25 s",
+        ),
+        (
+            "free_factor_by_square",
+            {"change": 0.9 + 0.2 * DRAWS},
+            "Factor of the torque at the cell <- square of the torque: × 2.4 at full torque (2.0 to 2.8).",
+            "y exp(z); z = 0.90·(y/y_max)²",
+        ),
+        (
+            "free_torque_by_width_play",
+            {"change": 0.2 + 0.02 * DRAWS, "reach": 0.1 + 0.01 * DRAWS},
+            "Torque at the cell <- width with play of ±10 % (9.1 to 11 %): +18 % of the largest at the largest width "
+            "(+16 to +20 %).",
+            "y + y_max z; z = 0.20·x, x follows u/u_max behind a play of ±0.10",
+        ),
+    ],
+)
+def test_words_give_place_driver_lag_and_size_with_intervals(effect, values, words, equation):
+    described = find_effect(effect)
+    shape = described.shape(described.forms[0], values)
+    assert (shape.words, shape.equation) == (words, equation)
+    assert all(np.isfinite(line).all() and line.shape == (402, shape.at.size) for line in shape.lines.values())
+
+
+@pytest.mark.parametrize(
+    ("place", "driver", "size", "lag_s", "effects"),
+    [
+        (Place.STRENGTH, Driver.DRIVE, -0.5, 20.0, ("fatigue",)),
+        (Place.STRENGTH, Driver.DRIVE, 0.5, 20.0, ("potentiation",)),
+        (Place.STRENGTH, Driver.DRIVE, 0.0, 20.0, ()),
+        (Place.SECOND_RATE, Driver.FALL, 0.5, 0.1, ("asymmetric_relaxation",)),
+        (Place.TORQUE, Driver.TORQUE_PLAY, 0.5, 0.0, ()),
+    ],
+)
+def test_a_term_behaves_as_an_effect_of_the_library_or_as_none(place, driver, size, lag_s, effects):
+    assert behaves_as(place, driver, size + 0.1 * DRAWS, lag_s) == effects
+    assert {row[0] for row in BEHAVIOURS} <= registry().keys()
+
+
+def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque():
+    record = hidden_muscles.record(rate_hz=100)
+    parameters = {"change": {"value": -0.5, "sd": 0.0}, "lag_s": {"value": 0.5, "sd": 0.0}}
+    term = {"id": "free_factor_by_torque", "form": "term", "parameters": parameters, "settings": {"scale_nm": 6.0}}
+    model = identify.fit(record).with_(effects=(term,))
+    problem, theta = problem_of(model, make_grid(record))
+    fitted = SimpleNamespace(problem=problem, theta=theta, physical=problem.physical(theta))
+    course, without = _course(fitted, problem.chosen[0]), theta.copy()
+    without[problem.chosen[0].first] = 0.0
+    changed, torque = (problem.run(at)[0] - problem.physical(theta)[problem.baselines.start] for at in (theta, without))
+    times_s, working = problem.setup.scene.time_s, torque > 1.0
+    expected = np.interp(times_s[working], course["time_s"], course["value"])
+    np.testing.assert_allclose(changed[working] / torque[working], expected, atol=0.015)
+    assert np.min(expected) < 0.7
