@@ -5,7 +5,8 @@
 Seeds 0 to 99 were developed on; report on seeds from 1000. Errors are over the noise's standard
 deviation, on a second record of the muscle that no fit was given, tared on its first rest.
 
-`--no-names` leaves out `diagnose`, half of the time; then no name counts as untrue.
+`--no-names` leaves out `diagnose`, half of the time; then no name counts as untrue. `--again` joins a second test of
+the rested muscle: the one that the product asks for, or the same one again. The plain model stays that of the first.
 """
 
 from __future__ import annotations
@@ -17,15 +18,19 @@ from typing import Any
 import numpy as np
 
 from bench.common import bench_parser, in_processes, line, table, write_json
-from bench.muscles.physics_records import DISTURBED, FULL, SETS, TESTS, record_of_physics
+from bench.muscles.physics_records import DISTURBED, FULL, SETS, TESTS, further_record, record_of_physics
 from stimrig import identify
 from stimrig.identify.diagnosis import side_by_side as workers
+from stimrig.identify.records.join import join
+from stimrig.rig.sequences import build
 from tests.harness.carried_sessions import as_record
 
 SURE_PROBABILITY = 0.9
 """Probability from which an effect counts as named for sure."""
 WORSE, CLOSE = 1.02, 1.3
 REST_S = 1.9
+BETWEEN_S = 1200.0
+"""From the start of the first test to that of a second one."""
 HEADS = ("record", "plain", "improved", "added", "names and probabilities", "verdict", "seconds")
 
 
@@ -41,14 +46,29 @@ def score(generated: dict[str, Any], model: identify.Model) -> float:
     return rms(off - np.mean(off[unseen["time_s"] < REST_S])) / generated["truth"]["noise_sd_nm"]
 
 
-def identify_record(job: tuple[str, int, str, bool]) -> dict[str, Any]:
+def with_second(kinds: str, generated: dict[str, Any], again: str) -> identify.Record:
+    """Return the first record joined with a second: `chosen` by the product, if it asks for one, or the `same`."""
+    first, truth = as_record(generated), generated["truth"]
+    width_us = first.pulse_width_us[:: round(first.sample_rate_hz / first.pulse_rate_hz)]
+    if again == "chosen":
+        experiment = identify.next_experiment(first)
+        if experiment is None:
+            return first
+        widths_us = [build(one["sequence"], dict(one["settings"]), first.pulse_rate_hz) for one in experiment.segments]
+        width_us = np.concatenate(widths_us)
+    second = further_record(kinds, truth["seed"], tuple(truth["disturbed"]), width_us)
+    return join([first, as_record(second)], [0.0, BETWEEN_S])
+
+
+def identify_record(job: tuple[str, int, str, bool, str]) -> dict[str, Any]:
     """Score one record of a set and a seed: its plain fit, `improve` and, where wanted, the names of `diagnose`."""
-    kind, seed, protocol, with_names = job
+    kind, seed, protocol, with_names, again = job
     generated = record_of_physics(kind, seed, protocol=protocol)
     workers.WORKERS = 1
     record = as_record(generated)
     began = time.perf_counter()
     plain = identify.fit(record)
+    record = with_second(kind, generated, again) if again else record
     improved = identify.improve(record)
     seconds = time.perf_counter() - began
     missing = identify.diagnose(record).missing if with_names else ()
@@ -120,16 +140,20 @@ def main() -> None:
     parser.add_argument("--set", choices=SETS, required=True)
     parser.add_argument("--protocol", choices=TESTS, default=FULL, help="test of the first record")
     parser.add_argument("--no-names", action="store_true", help="without `diagnose`: half the time")
+    parser.add_argument("--again", choices=("chosen", "same"), default="", help="join a second test")
     parser.add_argument("--jobs", type=int, default=1, help="processes")
     options = parser.parse_args()
-    jobs = [(options.set, seed, options.protocol, not options.no_names) for seed in options.seeds]
+    jobs = [(options.set, seed, options.protocol, not options.no_names, options.again) for seed in options.seeds]
     results = in_processes(identify_record, jobs, options.jobs) if options.jobs > 1 else map(identify_record, jobs)
     rows = []
     print(*table(HEADS, []), sep="\n", flush=True)
     for row in results:
         rows.append(row)
         print(line(cells(row)), flush=True)
-    title = f"\n{options.set}, protocol {options.protocol}, seeds {options.seeds.start} to {options.seeds.stop - 1}"
+    second = f" and {options.again} again" if options.again else ""
+    title = (
+        f"\n{options.set}, protocol {options.protocol}{second}, seeds {options.seeds.start} to {options.seeds.stop - 1}"
+    )
     print(title, *summary_lines(options.set, rows), sep="\n")
     write_json(options.json, rows)
 

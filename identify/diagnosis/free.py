@@ -43,6 +43,8 @@ MAX_TERMS, FITTED_TERMS = 6, 5
 DRIFT = "baseline_drift"
 STEPS = 5
 """Steps of the search by which the terms of a round are compared; the likeliest one is then fitted to its end."""
+RIVALS = 2
+"""Terms kept beside the chosen one of a round: its likeliest rivals."""
 Chain = tuple[Step, ...]
 """Steps of a search from its base on, the last ones with terms."""
 Start = tuple[Effect, dict[str, float]]
@@ -155,7 +157,10 @@ def _extended(base: Chain, progress: Progress) -> Chain:
         if best.log_evidence < last.log_evidence + thresholds.TERM_MARGIN:
             break
         last = best
-        step = Step(best.effects[-1][0], best, "free", renews=base[0].renews)
+        name = best.effects[-1][0]
+        others = [fitted for fitted in fits if fitted.effects[-1][0] != name]
+        others.sort(key=lambda fitted: -fitted.log_evidence)
+        step = Step(name, best, "free", renews=base[0].renews, others=tuple(others[:RIVALS]))
         chains.append((*chains[-1], step))
     allowed: list[Chain] = []  # held-out pulses speak against none of them, compared with each shorter one
     for chain in chains:

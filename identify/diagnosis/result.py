@@ -135,7 +135,7 @@ def _plan(experiment: Experiment) -> dict[str, Any]:
 def _deciding(search: EffectSearch, verdict: Verdict, diagnosis: dict[str, Any]) -> dict[str, Any] | None:
     """The test for what is left, or for an effect that the record neither names nor excludes."""
     if _undecided(search, verdict):
-        return _plan(plan_further(search.record, search.last))
+        return _plan(plan_further(search.record, search.last, search.steps[-1].rivals))
     best = search.rounds[0][0] if only_open(diagnosis) else None
     if best is None or best.effect.band or best.effect.sporadic:
         return None

@@ -66,12 +66,22 @@ class Step:
     origin: Literal["base", "detected", "library", "free"]  # "detected": seen in the samples before any fit
     tried: tuple[Candidate, ...] = ()  # all effects of the library tried in its round, best first
     renews: bool = False  # whether the curve is chosen again with all rows once effects of the joint are there
+    others: tuple[Fitted, ...] = ()  # of a term: the model with another term in its place, likeliest first
     known: LeftOut | None = None  # its errors on left-out blocks, where another process computed them
 
     @property
     def left_out(self) -> LeftOut:
         """Its errors on left-out blocks."""
         return leave_out(self.searched) if self.known is None else self.known
+
+    @property
+    def rivals(self) -> list[Fitted]:
+        """The models with another term that predict left-out blocks about as well."""
+        return [
+            fitted
+            for fitted in self.others
+            if difference(self.left_out, leave_out(fitted)).errors >= -thresholds.BETTER
+        ]
 
     @cached_property
     def fitted(self) -> Fitted:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import permutations
 from typing import Any
@@ -85,11 +85,12 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     return Experiment(names, *played, gain, decides, text)
 
 
-def plan_further(record: Record, fitted: Fitted) -> Experiment:
-    """The test that teaches a model most, where structure is left and no two effects stand against one another.
+def plan_further(record: Record, fitted: Fitted, rivals: Sequence[Fitted] = ()) -> Experiment:
+    """The test that teaches a model most, where structure is left that no effect of the library explains.
 
-    Held random levels, in the design after which the model's own standard error on other such levels is smallest: jumps
-    of level while stimulated are what the paper's test lacks. A further ramp taught muscles of other physics nothing.
+    Held random levels, in the design that separates the model best from its rivals; without rivals, in that after which
+    the model's own standard error on other such levels is smallest. Jumps of level while stimulated are what the
+    paper's test lacks. A further ramp alone taught muscles of other physics nothing.
 
     Parameters
     ----------
@@ -97,6 +98,8 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
         In which structure is left.
     fitted : Fitted
         The last model.
+    rivals : Sequence[Fitted]
+        Models with another last term that predict left-out parts as well.
     """
     rate_hz = record.pulse_rate_hz
     # the smallest width with a tenth of the largest torque
@@ -121,13 +124,17 @@ def plan_further(record: Record, fitted: Fitted) -> Experiment:
     for _, width in tests:
         white = _whitened(_simulate(fitted, _blank(record, width))[1], fitted)
         after.append(error_nm(white @ white.T))
-    best = int(np.argmin(after))
+    fits = {model.effects[-1][0]: model for model in (fitted, *rivals)} if rivals else {}
+    gains = [expected_log_evidence(width, record, fits) for _, width in tests] if rivals else [0.0] * len(tests)
+    best = min(range(len(tests)), key=lambda n: (-gains[n], after[n]))
     fall, played = 1.0 - after[best] / error_nm(0.0), _played(*tests[best], record, fitted)
+    those = " from ".join(find_effect(name).name.lower() for name in [*fits][:2])
+    teaches = f"should best separate {those} and" if rivals else "would"
     text = (
-        f"{tests[best][0].words} ({played[1]:.0f} s) would teach most about what is left: the model's own standard "
+        f"{tests[best][0].words} ({played[1]:.0f} s) {teaches} teach most about what is left: the model's own standard "
         f"error on levels is expected to fall by {100.0 * fall:.0f} %."
     )
-    return Experiment((), *played, 0.0, False, text, fall)
+    return Experiment((), *played, gains[best], gains[best] >= ENOUGH, text, fall)
 
 
 def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[str, Fitted]) -> float:

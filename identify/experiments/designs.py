@@ -128,18 +128,20 @@ OFTEN_S = 5.0
 def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, seed: int) -> list[Design]:
     """Random levels, each held for a while, as no ramp and no PRBS has them: jumps of level while stimulated.
 
-    In one design they are even between the threshold and the largest width, in the other half of them lie near the
-    threshold, where a slow ramp spends little time and a PRBS none.
+    In one design they are even between the threshold and the largest width, in the second half of them lie near the
+    threshold, where a slow ramp spends little time and a PRBS none; in the third ramps of two speeds follow.
     """
     pause, tests = Segment("rest", "rest", {"duration_s": 2.0}), []
-    for words, near in (
-        ("Random levels, each held for a moment", 0.0),
-        ("Random levels, many near the threshold", 0.5),
+    ramps_us = [_ramp({"up_s": s, "down_s": s, "max_pulse_width_us": largest_us}, pulse_rate_hz) for s in (1.2, 4.0)]
+    for words, near, ramps in (
+        ("Random levels, each held for a moment", 0.0, False),
+        ("Random levels, many near the threshold", 0.5, False),
+        ("Random levels, a fast ramp and a slow one", 0.0, True),
     ):
         rng = np.random.default_rng(seed)
         levels: list[tuple[float, float]] = []
         rested_s = 0.0
-        while sum(seconds for _, seconds in levels) < LEVELS_S:
+        while sum(seconds for _, seconds in levels) < (0.6 if ramps else 1.0) * LEVELS_S:
             top_us = min(1.5 * threshold_us, largest_us) if rng.random() < near else largest_us
             levels.append((rng.uniform(0.9 * threshold_us, top_us), rng.uniform(SHORTEST_S, LONGEST_S)))
             rested_s += levels[-1][1]
@@ -147,6 +149,8 @@ def held_levels(largest_us: float, threshold_us: float, pulse_rate_hz: float, se
                 levels.append((0.0, 1.0))
                 rested_s = 0.0
         widths_us = [np.full(round(seconds * pulse_rate_hz), us) for us, seconds in levels]
+        if ramps:
+            widths_us += [np.r_[np.zeros(round(pulse_rate_hz)), ramp_us] for ramp_us in ramps_us]
         tests.append(Design(words, (pause, played_widths("levels", np.concatenate(widths_us)), pause)))
     return tests
 

@@ -7,6 +7,7 @@ import pytest
 
 from bench.muscles.physics_records import further_record, record_of_physics
 from stimrig import identify
+from stimrig.identify.diagnosis.search import Step
 from stimrig.identify.estimation.effect_fit import fitted_with
 from stimrig.identify.experiments import expected_log_evidence, plan, plan_further
 from stimrig.identify.experiments.designs import SHAPES, designs, held_levels, pieces
@@ -48,6 +49,25 @@ def test_the_muscle_decides_which_design_is_chosen():
     records = [as_record(record_of_physics("physics", seed, ())) for seed in (0, 3)]
     chosen = {plan_further(record, fitted_with(record, [])).text.partition(" (")[0] for record in records}
     assert len(chosen) == 2
+
+
+@pytest.fixture(scope="module")
+def rivals(made):
+    return {name: fitted_with(as_record(made), [name]) for name in ("free_torque_by_torque", "free_width_by_torque")}
+
+
+def test_terms_that_predict_left_out_parts_as_well_are_rivals_and_others_are_none(made, rivals):
+    first, second = rivals.values()
+    worse = fitted_with(as_record(made), ["free_strength_by_pulses"])
+    assert Step(None, first, "free", others=(worse, second)).rivals == [second]
+
+
+def test_the_test_separates_terms_better_than_the_same_test_again(made, rivals):
+    record, (first, second) = as_record(made), rivals.values()
+    found = plan_further(record, first, [second])
+    again_us = made["pulse_width_us"][:: round(record.sample_rate_hz / record.pulse_rate_hz)]
+    assert found.decides and "separate" in found.text
+    assert found.expected_log_evidence > expected_log_evidence(again_us, record, rivals)
 
 
 def test_a_tremor_is_no_reason_to_choose_none():
