@@ -27,6 +27,8 @@ TERM_MARGIN = 3.0
 """Log evidence that a further term must gain."""
 NEAR = 0.1
 """Logarithm of the left-out error by which a chain of fewer terms may predict worse than the best one."""
+NAMES_SHARE = 0.5
+"""Share of the log evidence gained by terms alone that names must gain where something is left beside them."""
 UNSURE = 0.85
 """Weight of the evidence for efforts: where a law explains as much, the law is preferred, since it can be tested. It is
 also the largest probability of an effect that may only repair the inexact form of an earlier one, and of efforts that

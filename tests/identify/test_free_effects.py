@@ -128,7 +128,8 @@ def test_every_derivative_is_that_of_central_differences(setup: Setup, effect):
 def test_a_picture_is_finite_and_says_where_it_enters(effect):
     (form,) = effect.forms
     shape = effect.shape(form, {p.name: np.full((2, 1), p.start[0] or 0.2) for p in form.parameters})
-    assert shape.place in {row[0] for row in PLACES.values()} and shape.driven_by in {row[0] for row in DRIVERS.values()}
+    assert shape.place in {row[0] for row in PLACES.values()}
+    assert shape.driven_by in {row[0] for row in DRIVERS.values()}
     assert shape.words.endswith(".") and shape.driver and shape.effect
     assert all(line.shape == (2, shape.at.size) and np.isfinite(line).all() for line in shape.lines.values())
 
