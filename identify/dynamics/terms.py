@@ -69,8 +69,8 @@ def _cell(table, place):  # pragma: no cover
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def run_terms(
-    drive, drives, width, present, rest_s, curve, curves, owner, lags, lag_slopes, places, drivers, sizes, lag, own,
-    begins, initial, initials, scale_nm, step_s,
+    drive, drives, width, widths, present, rest_s, curve, curves, owner, lags, lag_slopes, places, drivers, sizes, lag,
+    own, begins, initial, initials, scale_nm, step_s,
 ):  # pragma: no cover  # fmt: skip
     """Torque, N·m, and its rate at the boundaries, (K + 1,), and their derivatives by P parameters, (P, K + 1).
 
@@ -78,8 +78,9 @@ def run_terms(
     ----------
     drive, drives
         The mean drive of each interval, (K,), and its derivatives, (P, K).
-    width, present, rest_s
-        Width over the largest, share of the interval in which a pulse acts, further rest before it, s, (K,).
+    width, widths, present, rest_s
+        Width over the largest, (K,), and its derivatives by the first W parameters, (W, K); share of the interval in
+        which a pulse acts, and further rest before it, s, (K,).
     curve, curves, owner
         The recruitment curve at G even widths up to `REACH`, (G,); its derivatives by its coefficients, (C, G), and
         which of the parameters these are, (C,).
@@ -162,7 +163,7 @@ def run_terms(
             if used[Place.WIDTH] and width[k] > 0.0:
                 place = width[k] * np.exp(zt[Place.WIDTH]) * grain
                 there, steep = _cell(curve, min(place, curve.size - 1.0))
-                here = _cell(curve, width[k] * grain)[0]
+                here, steep_here = _cell(curve, width[k] * grain)
                 gain = w / here if abs(here) > 0.02 * scale_nm else present[k]
                 w += gain * (there - here)
                 inside = steep * place if place < curve.size - 1.0 else 0.0
@@ -170,13 +171,13 @@ def run_terms(
                 row = dz[Place.WIDTH]
                 for p in range(count):
                     dw[p] = dw[p] * ratio + gain * inside * row[p]
+                for p in range(len(widths)):
+                    dw[p] += gain * (inside / width[k] - steep_here * grain * ratio) * widths[p, k]
                 for c in range(owner.size):  # exact for the curve's coefficients
                     p = owner[c]
                     own_there = _cell(curves[c], min(place, curve.size - 1.0))[0]
                     own_here = _cell(curves[c], width[k] * grain)[0]
                     dw[p] += gain * (own_there - own_here * ratio)
-                    if abs(here) <= 0.02 * scale_nm:
-                        dw[p] += gain * own_here * (ratio - 1.0)
             if used[Place.STRENGTH]:
                 factor = np.exp(zt[Place.STRENGTH])
                 w *= factor

@@ -257,7 +257,7 @@ class _StagePass:
         coefficients = self.value[problem.coefficients]
         for chosen, p in self.joined("pulse_width"):
             width = np.asarray(chosen.form.call(self.grown(width), p, setup.scene))
-        self.width = np.array(width[0], float)
+        self.width = np.array(width, float)
         if not self.forms("pulse_width"):
             design = setup.design
             drive = (coefficients @ design)[None, :]
@@ -337,7 +337,8 @@ class _StagePass:
         torque, rate, torques, rates = run_terms(
             np.ascontiguousarray(drive[0]),
             drives,
-            self.width / setup.basis.largest_us,
+            self.width[0] / setup.basis.largest_us,
+            (self.width[1:] - self.width[0]) / (steps[: len(self.width) - 1, None] * setup.basis.largest_us),
             setup.present,
             setup.scene.rest_s,
             self.value[problem.coefficients] @ design,
