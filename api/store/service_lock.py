@@ -124,8 +124,10 @@ class DatabaseLock:
             raise HeldError(f"{self._safe_url}: another service runs on it; {ANOTHER}")
 
     def release(self) -> None:
-        """End the connection, which releases the lock."""
+        """Release the lock and end the connection; the server would release it a moment after the end."""
         if self._connection is not None:
+            with contextlib.suppress(SQLAlchemyError):
+                self._connection.exec_driver_sql(f"SELECT pg_advisory_unlock({SERVICE_KEY})")
             self._connection.invalidate()
             self._connection.close()
             self._connection = None
