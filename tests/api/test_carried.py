@@ -139,7 +139,8 @@ def until_carrying(client: httpx.Client, test_id: str) -> dict[str, Any]:
     def carrying() -> dict[str, Any] | None:
         test = client.get(f"/v1/tests/{test_id}").json()
         work = test["identification"] or {}
-        return test if work.get("verb") == "carry" and work["progress"] > 0 else None
+        begun = work.get("verb") == "carry" and work["progress"] > 0
+        return test if begun and test["model_url"] else None  # the row is read before the job that names a verb
 
     return soon(carrying)
 
