@@ -61,7 +61,8 @@ class ThreadWorker(processes.Worker):
         stub_worker.state.pause, stub_worker.state.die = pause, die
         while (call := calls.get()) is not None:
             job, future = call
-            future.set_running_or_notify_cancel()
+            if not future.set_running_or_notify_cancel():
+                continue
 
             def progress(fraction: float, text: str = "", job: Job = job) -> None:
                 pause(0.0)
