@@ -165,7 +165,7 @@ class Problem:
         """Width, µs, and drive, N·m, before all terms, shape (K,), and torque behind the lags, N·m, shape (K + 1,)."""
         stages = _StagePass(self, theta, False)
         drive = stages.gained()
-        return stages.width, drive[0], stages.dynamics(drive)[0][0]
+        return stages.width[0], drive[0], stages.dynamics(drive)[0][0]
 
     def at_samples(self, theta: np.ndarray, skip: frozenset[str] = frozenset()) -> np.ndarray:
         """Torque at the record's samples, with its sign and zero, N·m; what effects in `skip` add is left out."""

@@ -65,10 +65,13 @@ def test_a_term_behaves_as_an_effect_of_the_library_or_as_none(place, driver, si
     assert {row[0] for row in BEHAVIOURS} <= registry().keys()
 
 
-def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque():
+@pytest.mark.parametrize("driver", Driver)
+def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque(driver):
     record = hidden_muscles.record(rate_hz=100)
-    parameters = {"change": {"value": -0.5, "sd": 0.0}, "lag_s": {"value": 0.5, "sd": 0.0}}
-    term = {"id": "free_factor_by_torque", "form": "term", "parameters": parameters, "settings": {"scale_nm": 6.0}}
+    effect, values = f"free_factor_by_{driver.name.lower()}", (-0.5, 0.1 if driver > Driver.SQUARE else 0.5)
+    names = [parameter.name for parameter in find_effect(effect).forms[0].parameters]
+    parameters = {name: {"value": value, "sd": 0.0} for name, value in zip(names, values, strict=False)}
+    term = {"id": effect, "form": "term", "parameters": parameters, "settings": {"scale_nm": 6.0}}
     model = identify.fit(record).with_(effects=(term,))
     problem, theta = problem_of(model, make_grid(record))
     fitted = SimpleNamespace(problem=problem, theta=theta, physical=problem.physical(theta))
@@ -77,5 +80,5 @@ def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque():
     changed, torque = (problem.run(at)[0] - problem.physical(theta)[problem.baselines.start] for at in (theta, without))
     times_s, working = problem.setup.scene.time_s, torque > 1.0
     expected = np.interp(times_s[working], course["time_s"], course["value"])
-    np.testing.assert_allclose(changed[working] / torque[working], expected, atol=0.015)
-    assert np.min(expected) < 0.7
+    off = np.abs(changed[working] / torque[working] - expected)  # a course of few points misses where a driver jumps
+    assert np.median(off) < 0.01 and np.mean(off) < 0.02 and np.min(expected) < 0.95
