@@ -25,7 +25,7 @@ CELLS = ("pause_s", "folded_s", "own_s", "begun_s", "pulse_rate_hz", "name", "re
 """Columns of which only a part's first row is filled; `begun_s` may be empty there."""
 LONGEST_TEXT = 300
 FIX = "Join the recordings again."
-PAUSE_S = 30.0
+PAUSE_S = 5.0
 """Longest pause kept in the time: every pulse interval of it is a row of the grid."""
 LEAST_SAMPLES = 2
 """Samples between two pulses from which recordings of different rates are joined."""
@@ -154,7 +154,7 @@ def join(records: Sequence[Record], begun_s: Sequence[float | None]) -> Record:
 
     Parts sampled faster than the slowest are brought down by block means, whole blocks to a pulse interval. Those
     that differ by less than 1 % stay as they are. The slots of the pulses fall on one grid. A pause is kept in whole
-    pulse intervals, up to 30 s of it in `time_s`; it is 0 where a begin is not known, or where by their clocks two
+    pulse intervals, up to 5 s of it in `time_s`; it is 0 where a begin is not known, or where by their clocks two
     parts overlap. An angle or velocity is dropped unless all parts have it; so are the pulses in the gaps, which are
     doubted then. In a part without `late_s` or `doubted` they are 0.
 
