@@ -107,6 +107,8 @@ def _advise_effects(diagnosis: Mapping[str, Any], missing: Sequence[Mapping[str,
         return " ".join(["Add nothing yet: held-out pulses speak against adding any.", *further])
     rival = next((row for row in missing if row.get("confused_with")), None)
     first = f"Add {', then '.join(join_names([row]) for row in rows)} to the model."
+    if rival is None and diagnosis.get("deciding_experiment"):
+        return f"{first} The next experiment teaches most about what is left beside it."
     return first if rival is None else f"{first} The next experiment tells it from its rivals."
 
 

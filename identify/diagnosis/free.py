@@ -26,13 +26,13 @@ from stimrig.identify.diagnosis.search import (
     without_effect,
 )
 from stimrig.identify.diagnosis.side_by_side import side_by_side
-from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free
+from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free, leaves_more
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Effect, replaced_by
 from stimrig.identify.effects.terms import tried_at
 from stimrig.identify.estimation.effect_fit import try_effect
-from stimrig.identify.estimation.left_out import Difference, difference
+from stimrig.identify.estimation.left_out import Difference, difference, leave_out
 from stimrig.identify.estimation.samples import Raw, fitted_rows
 from stimrig.identify.estimation.solve import LARGEST_SLOPE, Fitted, solve, solve_scaled, start_from
 from stimrig.identify.noise import WHITE
@@ -75,10 +75,7 @@ def searched(
         return search, verdict
     supported = helpful(search)[0]
     named = verdict.kind == "effect_missing" and bool(supported[-1].origin == "library" or not search.found)
-    error, noise_nm = verdict.held_out_error, grid.mean_noise_nm(search.last.problem.setup.fitted)
-    doubted = search.residual.significant or search.last.rms_nm > thresholds.NAMED_BUT * noise_nm
-    doubted = doubted or (error is not None and error.ratio > thresholds.NAMED_BUT)
-    if named and not doubted:
+    if named and not leaves_more(search, verdict):
         return search, verdict
     freely = explain_freely(search, supported if named else (), lambda done, text: report(0.7 + 0.25 * done, text))
     if not freely.names("free"):
@@ -152,7 +149,7 @@ def _extended(base: Chain, progress: Progress) -> Chain:
         best = max(fits, key=lambda fitted: fitted.log_evidence, default=last)
         drift = registry().get(DRIFT) if starts and DRIFT not in dict(last.effects) else None
         zero = None if drift is None else try_effect(drift, last)
-        if zero is not None and zero.fitted.log_evidence > best.log_evidence:
+        if zero is not None and zero.fitted.log_evidence > best.log_evidence and _shows_at_rest(zero.fitted):
             best = zero.fitted
         best = solve(best.problem, best.theta, best.noise)
         if best.log_evidence < last.log_evidence + thresholds.TERM_MARGIN:
@@ -170,6 +167,15 @@ def _extended(base: Chain, progress: Progress) -> Chain:
     gains = [_better(chains[0], chain).gain for chain in allowed]
     near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= max(gains) - thresholds.NEAR)
     return (*base, *_without_drift(near)[len(base) :])
+
+
+def _shows_at_rest(fitted: Fitted) -> bool:
+    """Return True if a zero that moves does so at rest, too: else it would take up what the muscle does at work."""
+    setup, theta = fitted.problem.setup, fitted.theta
+    added_nm = fitted.problem.run(theta)[0] - fitted.problem.run(theta, skip=frozenset([DRIFT]))[0]
+    parts = [added_nm[setup.fitted & (setup.grid.part == part)] for part in range(setup.grid.begins.size)]
+    spread_nm = np.std(np.concatenate([part - np.mean(part) for part in parts if part.size]))
+    return bool(spread_nm <= thresholds.OVER_REST * leave_out(fitted).wander_nm)
 
 
 def _promising(base: Fitted) -> list[Start]:

@@ -12,7 +12,7 @@ from stimrig.identify.conclusion import conclude, only_open
 from stimrig.identify.criticism import worst_places
 from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful
 from stimrig.identify.diagnosis.thresholds import CLOSE, UNKNOWN_FORM
-from stimrig.identify.diagnosis.verdict import Verdict
+from stimrig.identify.diagnosis.verdict import Verdict, leaves_more
 from stimrig.identify.effects import Effect, find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters, finish
@@ -93,7 +93,7 @@ def _effects(search: EffectSearch, verdict: Verdict) -> tuple[list[dict[str, Any
 def _named(search: EffectSearch, verdict: Verdict, before: Step, step: Step) -> dict[str, Any]:
     """What is said of an effect that is named, beside its form and its parameters."""
     described = find_effect(str(step.added))
-    rivals = verdict.rivals.get(described.id, {})
+    rivals = verdict.rivals.get(described.id, {}) if step.tried else {}  # a drift beside terms was compared with none
     tried = {candidate.effect.id: candidate for candidate in step.tried}
     confused = sorted(
         (name for name in rivals if name and name != described.id and _is_rival(tried, rivals, described, name)),
@@ -134,7 +134,7 @@ def _plan(experiment: Experiment) -> dict[str, Any]:
 
 def _deciding(search: EffectSearch, verdict: Verdict, diagnosis: dict[str, Any]) -> dict[str, Any] | None:
     """The test for what is left, or for an effect that the record neither names nor excludes."""
-    if _undecided(search, verdict):
+    if _undecided(search, verdict, any(row["next_experiment_plan"] for row in diagnosis["missing"])):
         return _plan(plan_further(search.record, search.last, search.steps[-1].rivals))
     best = search.rounds[0][0] if only_open(diagnosis) else None
     if best is None or best.effect.band or best.effect.sporadic:
@@ -142,13 +142,16 @@ def _deciding(search: EffectSearch, verdict: Verdict, diagnosis: dict[str, Any])
     return _plan(plan(search.record, {best.effect.id: best.fitted, NOTHING: search.last}))
 
 
-def _undecided(search: EffectSearch, verdict: Verdict) -> bool:
+def _undecided(search: EffectSearch, verdict: Verdict, planned: bool) -> bool:
     """Return True if a further test is planned for the structure that is left.
 
+    Beside effects that are named, where they leave more than noise, and no test is `planned` for their rivals.
     None is planned for a moving joint, which has tests of its own, nor where the curve is a guess or the muscle hardly
     answers: the dose would be a guess, too.
     """
-    if verdict.kind != "unexplained_structure":
+    named = verdict.kind == "effect_missing" and not planned and not search.last.noise.band
+    named = named and leaves_more(search, verdict)
+    if not named and verdict.kind != "unexplained_structure":
         return False
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)
     return still and finish("maximum-likelihood", search.last).quality["gates"]["torque"]["passed"]

@@ -27,6 +27,8 @@ TERM_MARGIN = 3.0
 """Log evidence that a further term must gain."""
 NEAR = 0.1
 """Logarithm of the left-out error by which a chain of fewer terms may predict worse than the best one."""
+OVER_REST = 2.0
+"""Largest spread of a zero that moves, beside terms, over that of the torque at rest."""
 NAMES_SHARE = 0.5
 """Share of the log evidence gained by terms alone that names must gain where something is left beside them."""
 UNSURE = 0.85

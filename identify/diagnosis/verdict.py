@@ -161,6 +161,14 @@ def judge(search: EffectSearch) -> Verdict:
     )
 
 
+def leaves_more(search: EffectSearch, verdict: Verdict) -> bool:
+    """Return True if the last model leaves more than noise: its effects may be true, and another one missing."""
+    error, setup = verdict.held_out_error, search.last.problem.setup
+    noise_nm = setup.grid.mean_noise_nm(setup.fitted)
+    unseen = error is not None and error.ratio > thresholds.NAMED_BUT
+    return unseen or search.residual.significant or search.last.rms_nm > thresholds.NAMED_BUT * noise_nm
+
+
 def _rivals(search: EffectSearch, step: Step) -> dict[str, float]:
     """Probabilities of the effects tried in the round of a step, without those of other rounds."""
     others = {*search.names("library")} - {step.added}
