@@ -170,12 +170,12 @@ def _extended(base: Chain, progress: Progress) -> Chain:
 
 
 def _shows_at_rest(fitted: Fitted) -> bool:
-    """Return True if a zero that moves does so at rest, too: else it would take up what the muscle does at work."""
-    setup, theta = fitted.problem.setup, fitted.theta
+    """Return True if a zero moves no more than rests show, or there are none: else it takes up what the muscle does."""
+    setup, theta, wander_nm = fitted.problem.setup, fitted.theta, leave_out(fitted).wander_nm
     added_nm = fitted.problem.run(theta)[0] - fitted.problem.run(theta, skip=frozenset([DRIFT]))[0]
     parts = [added_nm[setup.fitted & (setup.grid.part == part)] for part in range(setup.grid.begins.size)]
     spread_nm = np.std(np.concatenate([part - np.mean(part) for part in parts if part.size]))
-    return bool(spread_nm <= thresholds.OVER_REST * leave_out(fitted).wander_nm)
+    return wander_nm == 0.0 or bool(spread_nm <= thresholds.OVER_REST * wander_nm)
 
 
 def _promising(base: Fitted) -> list[Start]:

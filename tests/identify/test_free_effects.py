@@ -20,11 +20,14 @@ from stimrig.identify.dynamics.terms import LARGEST, REACH, Driver, Place, lags_
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.terms import DRIVERS, PLACES
 from stimrig.identify.errors import BadModel, BadRequest
+from stimrig.identify.estimation.left_out import leave_out
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.quality import _stable
 from stimrig.identify.estimation.samples import fitted_rows, prepare
+from stimrig.identify.estimation.solve import solve, start_from
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
+from stimrig.identify.noise import WHITE
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.problem.setup import Setup
 from stimrig.identify.records.join import join
@@ -274,7 +277,31 @@ def test_no_dose_is_planned_for_a_muscle_that_hardly_answers(monkeypatch: pytest
     for passed in (True, False):
         quality = {"gates": {"torque": {"passed": passed}}}
         monkeypatch.setattr(result, "finish", lambda *_, quality=quality: SimpleNamespace(quality=quality))
-        assert result._undecided(search, verdict) == passed
+        assert result._undecided(search, verdict, False) == passed
+
+
+@pytest.mark.parametrize(("noises", "planned", "wanted"), [(2.0, False, True), (1.1, False, False), (2.0, True, False)])
+def test_a_further_test_is_planned_beside_a_name_that_leaves_more_than_noise(
+    setup: Setup, monkeypatch: pytest.MonkeyPatch, noises: float, planned: bool, wanted: bool
+):
+    """Unless one is planned that tells the name from its rivals."""
+    quality = {"gates": {"torque": {"passed": True}}}
+    monkeypatch.setattr(result, "finish", lambda *_: SimpleNamespace(quality=quality))
+    last: Any = SimpleNamespace(
+        problem=SimpleNamespace(setup=setup), noise=WHITE, rms_nm=noises * setup.grid.mean_noise_nm(setup.fitted)
+    )
+    search: Any = SimpleNamespace(record=setup.grid.record, last=last, residual=SimpleNamespace(significant=False))
+    verdict: Any = SimpleNamespace(kind="effect_missing", held_out_error=None)
+    assert result._undecided(search, verdict, planned) is wanted
+
+
+@pytest.mark.parametrize(("rests", "shows"), [(1.0, True), (10.0, False)])
+def test_a_zero_that_moves_more_than_rests_show_is_not_one(rests: float, shows: bool):
+    grid, _ = prepare(hidden_muscles.record(seed=3, rate_hz=100))
+    plain, form = fit_plain(grid, grid.fitted), registry()[free.DRIFT].form("wander")
+    problem, knot_nm = Problem(plain.problem.setup, [(free.DRIFT, form)]), rests * leave_out(plain).wander_nm
+    start = start_from(problem, plain, {0: {p.name: knot_nm * (-1) ** n for n, p in enumerate(form.parameters)}})
+    assert free._shows_at_rest(solve(problem, start, WHITE, max_steps=0)) is shows
 
 
 @pytest.mark.parametrize(

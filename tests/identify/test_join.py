@@ -226,7 +226,7 @@ def test_parts_of_some_rows():
     assert [part.first for part in some.parts] == [0, a.time_s.size - 10]
     assert some.parts[0].own_s == pytest.approx(a.time_s[10])
     assert some.parts[1].pause_s == pytest.approx(104.0, abs=0.06)
-    assert some.parts[1].folded_s == pytest.approx(40.0, abs=0.06)
+    assert some.parts[1].folded_s == pytest.approx(2 * PAUSE_S, abs=0.06)
 
 
 @pytest.mark.parametrize("begun_s", [(1000.25, 8200.5), (None, None)])
