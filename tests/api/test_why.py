@@ -211,7 +211,7 @@ def test_worker_joins_by_begin_and_leaves_a_file_with_the_parts(tmp_path: Path) 
     joined = identify.read(out)
     assert [source.recording_id for source in joined.source.parts] == ["R-early", "R-late"]
     assert joined.sample_rate_hz == pytest.approx(400, abs=0.01)
-    assert joined.parts[1].pause_s == pytest.approx(594.0, abs=0.03) and joined.parts[1].folded_s == 30.0
+    assert joined.parts[1].pause_s == pytest.approx(594.0, abs=0.03) and joined.parts[1].folded_s == 5.0
     assert joined.parts[0].begun_s == pytest.approx(1767225600.25)
 
 
