@@ -14,6 +14,8 @@ MEAN_OF_SLOW = 0.27
 """Largest correlation of neighbouring innovations that the mean over an interval causes."""
 SLOWEST_S = 25.0 / 6.0
 """Memory of the slowest noise; anything slower is a drift, which has a cause."""
+LEAST_WHITE = 0.25
+"""Share of the variance that is white beside a slow part that is held."""
 Stretches = tuple[np.ndarray, np.ndarray]
 """Starts and ends of runs of intervals; noise is correlated only within a run."""
 LOWEST_HZ, HIGHEST_HZ = 2.8, 14.5
@@ -33,13 +35,13 @@ class NoiseLevel:
     shortest: float = 0.006  # 1 - ar1 of the slowest noise (`of_steps`); by default at 40 pulses/s
     slowest: float = 0.02  # smallest angle, rad
     fastest: float = 2.6  # largest angle, rad
-    white_only: bool = False
-    """White whatever the residual looks like, so that all error of a wrong structure counts."""
+    held: bool = False
+    """Held as it is, whatever the residual looks like; or white of any size, so that all error counts."""
 
     @property
     def at_bound(self) -> bool:
         """Return true for the slowest noise: anything slower is a drift, and levels cost the likelihood nothing."""
-        return min(self.share, 1.0) > 0.05 and self.ar1 >= 1.0 - 1.01 * self.shortest
+        return not self.held and min(self.share, 1.0) > 0.05 and self.ar1 >= 1.0 - 1.01 * self.shortest
 
     def of_steps(self, step_s: float) -> NoiseLevel:
         """The same on a grid of such steps, on which the slowest noise has a memory of `SLOWEST_S`."""
@@ -56,7 +58,7 @@ class NoiseLevel:
         return 0.0 if self.is_white else self.ar1
 
 
-WHITE = NoiseLevel(0.0, 0.0, 1.0, white_only=True)
+WHITE = NoiseLevel(0.0, 0.0, 1.0, held=True)
 """White noise of any size."""
 WHITE_AND_SLOW = NoiseLevel(0.5, 0.5, 1.0)
 """White and slow noise of any size."""
@@ -71,10 +73,13 @@ def profile(
     residual: np.ndarray, stretches: Stretches, near: NoiseLevel, wide: bool = True
 ) -> tuple[NoiseLevel, float]:
     """The most likely noise of the same kind as `near`, and its log-likelihood; searched over a `wide` range or not."""
-    if near.white_only:
-        fitted = np.concatenate([residual[start:stop] for start, stop in zip(*stretches, strict=True)])
-        sd = max(float(np.sqrt(np.mean(fitted**2))), 1e-9)
-        return replace(near, sd_nm=sd), -0.5 * fitted.size * (np.log(2 * np.pi * sd * sd) + 1.0)
+    if near.held:
+        if near.share == 0.0:
+            fitted = np.concatenate([residual[start:stop] for start, stop in zip(*stretches, strict=True)])
+            near = replace(near, sd_nm=max(float(np.sqrt(np.mean(fitted**2))), 1e-9))
+        white, log_det = _whiten(residual[None, :], *stretches, *_parts(near))
+        variance, size = near.sd_nm**2, white.size
+        return near, -0.5 * (np.sum(white**2) / variance + size * np.log(2.0 * np.pi * variance)) - log_det
     slow = np.log(1.0 - min(near.ar1, 1.0 - near.shortest))
     if near.band > 0.0:
         share = min(near.share / max(1.0 - near.band, 1e-9), 1.0)
@@ -90,6 +95,13 @@ def profile(
     x, sd, log_likelihood = _search(residual, *stretches, starts, bounds, step, SLOW_STEPS, 0.01 / step[0], 1e-9)
     ar1, share = float(1.0 - np.exp(x[0])), float(x[1])
     return replace(near, ar1=ar1, share=share, sd_nm=max(float(sd), 1e-9)), log_likelihood
+
+
+def beside_zero(wander_nm: float, error_nm: float, memory_s: float, step_s: float) -> NoiseLevel:
+    """A zero that wanders by some sd, N·m, with some memory, s, and white noise for the rest of an error, N·m."""
+    slow = wander_nm**2
+    variance = slow + max(error_nm**2 - slow, LEAST_WHITE * error_nm**2)
+    return NoiseLevel(float(np.exp(-step_s / memory_s)), slow / variance, float(np.sqrt(variance)), held=True)
 
 
 def correlation(residual: np.ndarray, stretches: Stretches, step_s: float) -> float:

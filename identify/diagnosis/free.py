@@ -2,8 +2,8 @@
 
 The library's effects ask "is it this?"; terms describe. They are tried only where structure is left. One derivative of
 the model by the sizes of all terms at zero tells what each would gain; the most promising are fitted, and the likeliest
-one stays. Left-out blocks then say how many terms stay. The noise is held white: slow noise would take up what a term
-is to describe, and ask for the increments alone.
+one stays. Left-out blocks then say how many terms stay. The noise is held as the rests show it: slow noise of any size would
+take up what a term is to describe, and ask for the increments alone.
 """
 
 from __future__ import annotations
@@ -33,14 +33,17 @@ from stimrig.identify.effects.base import Effect, replaced_by
 from stimrig.identify.effects.terms import tried_at
 from stimrig.identify.estimation.effect_fit import try_effect
 from stimrig.identify.estimation.left_out import Difference, difference, leave_out
+from stimrig.identify.estimation.rests import wander_nm
 from stimrig.identify.estimation.samples import Raw, fitted_rows
 from stimrig.identify.estimation.solve import LARGEST_SLOPE, Fitted, solve, solve_scaled, start_from
-from stimrig.identify.noise import WHITE
+from stimrig.identify.noise import WHITE, beside_zero
 from stimrig.identify.problem.problem import Problem
 
 MAX_TERMS, FITTED_TERMS = 6, 5
 """Terms at most; and so many, of those that promise most, are fitted in each round."""
 DRIFT = "baseline_drift"
+ZERO_MEMORY_S = 20.0
+"""Memory of a zero that wanders."""
 STEPS = 5
 """Steps of the search by which the terms of a round are compared; the likeliest one is then fitted to its end."""
 RIVALS = 2
@@ -90,7 +93,7 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
     model with what the samples show alone. A model without the names takes their place only where they explain less
     than half of what it explains, and where it predicts left-out blocks better.
     """
-    before, best = _in_white_noise(search.steps), search
+    before, best = _in_held_noise(tuple(search.steps)), search
     alone = [step for step in search.steps if step.origin != "library"]
     for base in [named, alone] if len(named) > len(alone) else [alone]:
         if base[-1].searched.noise.band:  # a wave that terms, in white noise, would have to describe
@@ -100,7 +103,7 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
         if len(chain) == len(base) or own.gain < thresholds.FREE_FALL:
             continue
         if base is alone and own.errors >= thresholds.BETTER_IF_DOUBTFUL:
-            start = _in_white_noise(base)[-1].searched.log_evidence
+            start = _in_held_noise(tuple(base))[-1].searched.log_evidence
             names, terms = (each[-1].searched.log_evidence - start for each in (before, chain))
             replaces = not named or (other.errors >= thresholds.BETTER and names < thresholds.NAMES_SHARE * terms)
         else:
@@ -108,14 +111,25 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
         if replaces:
             whole = len(base) == len(search.steps)
             best = replace(search, steps=list(chain), refused=search.refused if whole else search.rounds[0])
-            before = _in_white_noise(chain)
+            before = _in_held_noise(chain)
     return best
 
 
-def _in_white_noise(chain: Sequence[Step]) -> Chain:
-    """The chain, the last model of which was searched again with white noise."""
+def _in_held_noise(chain: Chain) -> Chain:
+    """The chain, the last model of which was searched again with white noise, beside what the rests show of the zero.
+
+    A zero that moves is no white noise: terms would take it up.
+    """
     last = chain[-1].searched
-    return (*chain[:-1], replace(chain[-1], searched=solve(last.problem, last.theta, WHITE), known=None))
+    setup = last.problem.setup
+    fitted = last if last.noise.held else solve(last.problem, last.theta, WHITE)
+    wander = wander_nm(setup.grid, setup.fitted, fitted.residual_nm)
+    noise = WHITE
+    if wander > thresholds.WANDERS * fitted.rms_nm:
+        noise = beside_zero(wander, fitted.rms_nm, ZERO_MEMORY_S, setup.grid.step_s)
+    if noise.share or fitted.noise.share:
+        fitted = solve(last.problem, fitted.theta, noise)
+    return (*chain[:-1], replace(chain[-1], searched=fitted, known=None))
 
 
 def _without_drift(chain: Chain) -> Chain:
@@ -131,11 +145,12 @@ def _without_drift(chain: Chain) -> Chain:
 def _extended(base: Chain, progress: Progress) -> Chain:
     """The base with the terms that left-out blocks ask for; of chains that predict them about equally the shortest.
 
-    A zero that moves competes with them: in white noise a slow term would take its place.
+    A zero that moves competes with them.
     """
-    chains = [_in_white_noise(base)]
-    last = chains[0][-1].searched
+    chains = [base]
     for number in range(MAX_TERMS):
+        chains[-1] = _in_held_noise(chains[-1])
+        last = chains[-1][-1].searched
         starts = _promising(last)
 
         def fit(at: int, before: Fitted = last, listed: Sequence[Start] = starts) -> Fitted:
@@ -154,7 +169,6 @@ def _extended(base: Chain, progress: Progress) -> Chain:
         best = solve(best.problem, best.theta, best.noise)
         if best.log_evidence < last.log_evidence + thresholds.TERM_MARGIN:
             break
-        last = best
         name = best.effects[-1][0]
         others = [fitted for fitted in fits if fitted.effects[-1][0] != name]
         others.sort(key=lambda fitted: -fitted.log_evidence)

@@ -298,8 +298,8 @@ def resembles_earlier(before: Fitted, effect: Effect, stage: str, detected: Iter
 
 
 def released(fitted: Fitted) -> Fitted:
-    """The model with its noise no longer held white, where its likelihood can then be trusted."""
-    if not fitted.noise.white_only:
+    """The model with its noise no longer held, where its likelihood can then be trusted."""
+    if not fitted.noise.held:
         return fitted
     free = solve(fitted.problem, fitted.theta, WHITE_AND_SLOW)
     return fitted if free.distrusted else free
@@ -347,7 +347,7 @@ def _applicable(effect: Effect, base: Fitted, present: Iterable[str]) -> bool:
     grid = base.problem.setup.grid
     record, jumps = grid.record, base.heavy_tails and grid.readings is not None
     applicable = effect.detect is None and not effect.shape and effect.id not in present
-    applicable = applicable and not (effect.sporadic and jumps) and not (effect.band and base.noise.white_only)
+    applicable = applicable and not (effect.sporadic and jumps) and not (effect.band and base.noise.held)
     applicable = applicable and not replaced_by(base.effects, effect.forms)
     return applicable and all(record.knows(need) for need in effect.needs)
 

@@ -29,6 +29,8 @@ NEAR = 0.1
 """Logarithm of the left-out error by which a chain of fewer terms may predict worse than the best one."""
 OVER_REST = 2.0
 """Largest spread of a zero that moves, beside terms, over that of the torque at rest."""
+WANDERS = 0.3
+"""Share of a model's error from which the scatter of its means at rest counts as a zero that wanders."""
 NAMES_SHARE = 0.5
 """Share of the log evidence gained by terms alone that names must gain where something is left beside them."""
 UNSURE = 0.85

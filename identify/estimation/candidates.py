@@ -63,7 +63,7 @@ def trusted(base: Fitted) -> Fitted:
     The other optimum is taken where it is the likelier one; else white noise where it predicts left-out blocks better.
     """
     noise = base.noise
-    if noise.white_only or noise.band or min(noise.share, 1.0) < SLOW_SHARE or noise.ar1 < SLOW:
+    if noise.held or noise.band or min(noise.share, 1.0) < SLOW_SHARE or noise.ar1 < SLOW:
         return base
     if not (any(find_effect(name).shape for name, _ in base.effects) or knows_joint(base)):
         return base
@@ -82,7 +82,7 @@ def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
         sentences.append(
             f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted."
         )
-    if fitted.noise.white_only:
+    if fitted.noise.held:
         sentences.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
     return [*sentences, *likelihood_warnings(fitted)]
 
