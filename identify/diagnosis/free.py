@@ -33,7 +33,7 @@ from stimrig.identify.effects.base import Effect, replaced_by
 from stimrig.identify.effects.terms import tried_at
 from stimrig.identify.estimation.effect_fit import try_effect
 from stimrig.identify.estimation.left_out import Difference, difference, leave_out
-from stimrig.identify.estimation.rests import wander_nm
+from stimrig.identify.estimation.rests import zero_scatter_nm
 from stimrig.identify.estimation.samples import Raw, fitted_rows
 from stimrig.identify.estimation.solve import LARGEST_SLOPE, Fitted, solve, solve_scaled, start_from
 from stimrig.identify.noise import WHITE, beside_zero
@@ -123,7 +123,7 @@ def _in_held_noise(chain: Chain) -> Chain:
     last = chain[-1].searched
     setup = last.problem.setup
     fitted = last if last.noise.held else solve(last.problem, last.theta, WHITE)
-    wander = wander_nm(setup.grid, setup.fitted, fitted.residual_nm)
+    wander = zero_scatter_nm(setup.grid, setup.fitted, fitted.residual_nm)
     noise = WHITE
     if wander > thresholds.WANDERS * fitted.rms_nm:
         noise = beside_zero(wander, fitted.rms_nm, ZERO_MEMORY_S, setup.grid.step_s)

@@ -83,7 +83,10 @@ def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
             f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted."
         )
     if fitted.noise.held:
-        sentences.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
+        zero = ", beside a zero that wanders as it does at rest" if fitted.noise.share > 0.0 else ""
+        sentences.append(
+            f"The noise was taken as white{zero}: slow noise would have taken up what the structure leaves."
+        )
     return [*sentences, *likelihood_warnings(fitted)]
 
 

@@ -71,7 +71,7 @@ def scatter_at_rest(grid: Grid, rests: np.ndarray, values_nm: np.ndarray) -> tup
     return (float(sum(squares)) / free if free else 0.0), free
 
 
-def wander_nm(grid: Grid, rows: np.ndarray, residual_nm: np.ndarray) -> float:
+def zero_scatter_nm(grid: Grid, rows: np.ndarray, residual_nm: np.ndarray) -> float:
     """Return how far the zero moves from rest to rest, N·m: the scatter of a residual's means there."""
     rests = [rest for rest in grid.stretches(rows & relaxed(grid, RELAXED_S)) if rest.stop - rest.start > SHORT]
     return float(np.sqrt(np.mean([np.mean(residual_nm[rest]) ** 2 for rest in rests]))) if len(rests) > 1 else 0.0

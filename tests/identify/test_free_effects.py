@@ -307,6 +307,19 @@ def test_a_zero_that_moves_more_than_rests_show_is_not_one(rests: float, shows: 
     assert free._shows_at_rest(solve(problem, start, WHITE, max_steps=0)) is shows
 
 
+@pytest.mark.parametrize(("zero_nm", "held"), [(0.0, False), (0.2, True), (-0.2, True)])
+def test_a_zero_that_moves_from_rest_to_rest_is_held_as_slow_noise(zero_nm: float, held: bool):
+    """Else terms would take it up; the rest of the error stays white, however slow it is."""
+    record = hidden_muscles.record(rate_hz=100)
+    moving = zero_nm * np.sin(0.17 * record.time_s)
+    grid, raw = prepare(record.with_torque(record.torque_nm + moving))
+    plain = search_effects(grid, raw, fitted_rows(grid, None), silent, max_effects=0)
+    noise = free._in_held_noise(tuple(plain.steps))[-1].searched.noise
+    assert noise.held and not noise.at_bound and (noise.share > 0.0) is held
+    if held:
+        assert 0.5 < noise.sd_nm * noise.share**0.5 / np.std(moving) < 1.5
+
+
 @pytest.mark.parametrize(
     ("wrong", "says"),
     [
