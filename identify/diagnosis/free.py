@@ -2,8 +2,8 @@
 
 The library's effects ask "is it this?"; terms describe. They are tried only where structure is left. One derivative of
 the model by the sizes of all terms at zero tells what each would gain; the most promising are fitted, and the likeliest
-one stays. Left-out blocks then say how many terms stay. The noise is held as the rests show it: slow noise of any size would
-take up what a term is to describe, and ask for the increments alone.
+one stays. Left-out blocks then say how many terms stay. The noise is held as the rests show it: slow noise of any size
+would take up what a term is to describe, and ask for the increments alone.
 """
 
 from __future__ import annotations
