@@ -69,8 +69,7 @@ def _cell(table, place):  # pragma: no cover
 
 @njit(cache=True, nogil=True, fastmath=True, error_model="numpy")
 def run_terms(
-    drive, drives, slow, slows, ratio, width, widths, present, rest_s, curve, curves, owner, lags, lag_slopes, places,
-    drivers, sizes, lag,
+    drive, drives, width, widths, present, rest_s, curve, curves, owner, lags, lag_slopes, places, drivers, sizes, lag,
     own, begins, initial, initials, scale_nm, step_s,
 ):  # pragma: no cover  # fmt: skip
     """Torque, N·m, and its rate at the boundaries, (K + 1,), and their derivatives by P parameters, (P, K + 1).
@@ -79,9 +78,6 @@ def run_terms(
     ----------
     drive, drives
         The mean drive of each interval, (K,), and its derivatives, (P, K).
-    slow, slows, ratio
-        Share of the drive that a second pair of lags follows, (K,), its derivatives, (P, K), or none, (0,) and (P, 0);
-        and the ratio of its time constants to the first, and the number of the logarithm's parameter, (2,).
     width, widths, present, rest_s
         Width over the largest, (K,), and its derivatives by the first W parameters, (W, K); share of the interval in
         which a pulse acts, and further rest before it, s, (K,).
@@ -105,10 +101,7 @@ def run_terms(
             active = j + 1
     x, dx = np.zeros(terms), np.zeros((active, count))
     z, zt, dz = np.zeros(6), np.zeros(6), np.zeros((6, count))
-    ways = 2 if slow.size else 1
-    ys, heads, dys, heads_by = np.zeros(ways), np.zeros(ways), np.zeros((ways, count)), np.zeros((ways, count))
-    y, dy, old, mid_y, pull, pulls = 0.0, np.zeros(count), np.zeros(count), 0.0, 0.0, np.zeros(count)
-    slower, of_ratio, dws = np.array([1.0, ratio[0]]), int(ratio[1]), np.zeros(count)
+    y, a, dy, da, k2 = 0.0, 0.0, np.zeros(count), np.zeros(count), lags[1]
     dw, values, slopes = np.zeros(count), np.zeros(8), np.zeros((8, count))
     by_drive, by_torque, by_rise = slopes[Driver.DRIVE], slopes[Driver.TORQUE], slopes[Driver.RISE]
     by_fall, by_first, by_second = slopes[Driver.FALL], dz[Place.FIRST_RATE], dz[Place.SECOND_RATE]
@@ -136,17 +129,10 @@ def run_terms(
                     if j < active:
                         dx[j] = 0.0
             y = initial[part, 0]
-            for b in range(ways):
-                ahead = slower[b] / (lags[1] * ways)
-                ys[b] = y / ways
-                heads[b] = ys[b] + initial[part, 1] * ahead
-                for p in range(count):
-                    dys[b, p] = initials[p, part, 0] / ways
-                    heads_by[b, p] = dys[b, p] + (initials[p, part, 1] - initial[part, 1] * lag_slopes[p, 1]) * ahead
-                if b and of_ratio >= 0:
-                    heads_by[b, of_ratio] += initial[part, 1] * ahead
+            a = y + initial[part, 1] / lags[1]
             for p in range(count):
                 dy[p] = initials[p, part, 0]
+                da[p] = dy[p] + initials[p, part, 1] / lags[1] - initial[part, 1] / lags[1] * lag_slopes[p, 1]
             torque[k], rate[k] = y, initial[part, 1]
             torques[k], rates[k] = dy, initials[:, part, 1]
             part += 1
@@ -198,61 +184,31 @@ def run_terms(
                 row = dz[Place.STRENGTH]
                 for p in range(count):
                     dw[p] = factor * dw[p] + w * row[p]
-            # ---- a trapezoidal step of y' = k2 (a - y), a' = k1 (w - (1 - κ) a - κ y), of each way
-            before, y, mid_y, pull, quick = y, 0.0, 0.0, 0.0, QUICK_S * small / h
-            m, n = 1.0 - lags[2], lags[2]
+            k1, k2 = lags[0] * np.exp(zt[Place.FIRST_RATE]), lags[1] * np.exp(zt[Place.SECOND_RATE])
+            # ---- a trapezoidal step of y' = k2 (a - y), a' = k1 (w - (1 - κ) a - κ y)
+            i, g, m, n = 0.5 * h * k2, 0.5 * h * k1, 1.0 - lags[2], lags[2]
+            ry = (1.0 - i) * y + i * a
+            ra = -g * n * y + (1.0 - g * m) * a + 2.0 * g * w
+            inverse = 1.0 / ((1.0 + i) * (1.0 + g * m) + i * g * n)
+            new_y = inverse * ((1.0 + g * m) * ry + i * ra)
+            new_a = inverse * ((1.0 + i) * ra - g * n * ry)
+            mid_y, mid_a = 0.5 * (y + new_y), 0.5 * (a + new_a)
+            pull_y, pull_a = 2.0 * i * (mid_a - mid_y), 2.0 * g * (w - m * mid_a - n * mid_y)
+            pull_k = 2.0 * g * (mid_a - mid_y)
+            c1, c2, c3, c4, quick = (1.0 - i), -g * n, (1.0 - g * m), 2.0 * g, QUICK_S * small / h
+            d1, d2, d3, d4 = inverse * (1.0 + g * m), inverse * i, inverse * (1.0 + i), -inverse * g * n
             for p in range(count):
-                old[p] = dy[p]
-                dy[p], pulls[p] = 0.0, 0.0
-            for b in range(ways):
-                weight, sign = 1.0, 0.0
-                if ways == 2:
-                    weight, sign = (slow[k], 1.0) if b else (1.0 - slow[k], -1.0)
-                k1 = lags[0] * np.exp(zt[Place.FIRST_RATE]) / slower[b]
-                k2 = lags[1] * np.exp(zt[Place.SECOND_RATE]) / slower[b]
-                i, g, v = 0.5 * h * k2, 0.5 * h * k1, weight * w
-                dyb, dab = dys[b], heads_by[b]
-                ry = (1.0 - i) * ys[b] + i * heads[b]
-                ra = -g * n * ys[b] + (1.0 - g * m) * heads[b] + 2.0 * g * v
-                inverse = 1.0 / ((1.0 + i) * (1.0 + g * m) + i * g * n)
-                new_y = inverse * ((1.0 + g * m) * ry + i * ra)
-                new_a = inverse * ((1.0 + i) * ra - g * n * ry)
-                way_y, way_a = 0.5 * (ys[b] + new_y), 0.5 * (heads[b] + new_a)
-                pull_y, pull_a = 2.0 * i * (way_a - way_y), 2.0 * g * (v - m * way_a - n * way_y)
-                pull_k = 2.0 * g * (way_a - way_y)
-                c1, c2, c3, c4 = (1.0 - i), -g * n, (1.0 - g * m), 2.0 * g
-                d1, d2, d3, d4 = inverse * (1.0 + g * m), inverse * i, inverse * (1.0 + i), -inverse * g * n
-                end = k2 * (new_a - new_y)
-                dv = dw
-                if ways == 2:
-                    dv = dws
-                    for p in range(count):
-                        dws[p] = weight * dw[p] + sign * w * slows[p, k]
-                for p in range(count):
-                    less = lag_second[p] + by_second[p]
-                    sy = c1 * dyb[p] + i * dab[p] + pull_y * less
-                    sa = c2 * dyb[p] + c3 * dab[p] + c4 * dv[p] + pull_k * lag_kappa[p]
-                    sa += pull_a * (lag_first[p] + by_first[p])
-                    next_y = d1 * sy + d2 * sa
-                    dab[p] = d3 * sa + d4 * sy
-                    dyb[p] = next_y
-                    dy[p] += next_y
-                    pulls[p] += k2 * (dab[p] - next_y) + end * less
-                if b and of_ratio >= 0:
-                    more_y, more_a = -d1 * pull_y - d2 * pull_a, -d3 * pull_a - d4 * pull_y
-                    dyb[of_ratio] += more_y
-                    dab[of_ratio] += more_a
-                    dy[of_ratio] += more_y
-                    pulls[of_ratio] += k2 * (more_a - more_y) - end
-                ys[b], heads[b] = new_y, new_a
-                y += new_y
-                mid_y += way_y
-                pull += end
-            for p in range(count):
-                by_torque[p] = 0.5 * small * (old[p] + dy[p])
-                by_rise[p] = quick * (dy[p] - old[p])
+                sy = c1 * dy[p] + i * da[p] + pull_y * (lag_second[p] + by_second[p])
+                sa = (
+                    c2 * dy[p] + c3 * da[p] + c4 * dw[p] + pull_a * (lag_first[p] + by_first[p]) + pull_k * lag_kappa[p]
+                )
+                next_y = d1 * sy + d2 * sa
+                da[p] = d3 * sa + d4 * sy
+                by_torque[p] = 0.5 * small * (dy[p] + next_y)
+                by_rise[p] = quick * (next_y - dy[p])
+                dy[p] = next_y
             # ---- the drivers
-            change = (y - before) * QUICK_S / (h * scale_nm)
+            change = (new_y - y) * QUICK_S / (h * scale_nm)
             root = np.sqrt(change * change + EDGE * EDGE)
             values[Driver.DRIVE], values[Driver.PULSES] = drive[k] / scale_nm, present[k]
             values[Driver.TORQUE] = mid_y / scale_nm
@@ -265,6 +221,7 @@ def run_terms(
                 by_fall[p] = (up - 1.0) * by_rise[p]
                 by_rise[p] *= up
                 by_drive[p] = driven[p] * small
+            y, a = new_y, new_a
             for j in range(terms):
                 d, mine = drivers[j], own[j, 1]
                 if d < Driver.SQUARE:
@@ -293,11 +250,12 @@ def run_terms(
                                 dx[j, p] = dy[p] * small if of_torque else 0.0
                             if mine >= 0:
                                 dx[j, mine] -= side * lag[j]
+        pull = k2 * (a - y)
         torque[k + 1], rate[k + 1] = y, pull
         torque_row, rate_row = torques[k + 1], rates[k + 1]
         for p in range(count):
             torque_row[p] = dy[p]
-            rate_row[p] = pulls[p]
+            rate_row[p] = k2 * (da[p] - dy[p]) + pull * (lag_second[p] + by_second[p])
         if used[Place.TORQUE] or used[Place.FACTOR]:
             z[Place.TORQUE], z[Place.FACTOR] = 0.0, 0.0
             dz[Place.TORQUE], dz[Place.FACTOR] = 0.0, 0.0

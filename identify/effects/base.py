@@ -466,10 +466,7 @@ def adapt(
 
 
 def replaced_by(present: Sequence[tuple[str, Form]], forms: Iterable[Form]) -> str | None:
-    """The effect of a model that cannot stand beside these forms: terms set the lags, so do speed laws and branches.
-
-    Branches of which the law says that they are two `ways` may stand there: terms act on both.
-    """
+    """The effect of a model that cannot stand beside these forms: terms set the lags, so do speed laws and branches."""
     against = {"term": ("speed", "branch"), "speed": ("term",), "branch": ("term",)}
-    stages = {stage for form in forms if "ways" not in form.law for stage in against.get(form.stage, ())}
-    return next((name for name, form in present if form.stage in stages and "ways" not in form.law), None)
+    stages = {stage for form in forms for stage in against.get(form.stage, ())}
+    return next((name for name, form in present if form.stage in stages), None)

@@ -10,11 +10,7 @@ _SHARE = Parameter("slow_share", "1", 0.0, 0.9, 0.0, (0.3, 0.15), about="share o
 _RATIO = Parameter("ratio", "1", 1.4, 12.0, 2.0, (2.0, 4.0), "log", about="slow time constant divided by fast")
 
 
-_WAYS = {"ways": 2}
-"""So that terms may stand beside them."""
-
-
-@form("branch", "y = (1 - s) G(T) f + s G(ratio·T) f", _SHARE, _RATIO, law=_WAYS)
+@form("branch", "y = (1 - s) G(T) f + s G(ratio·T) f", _SHARE, _RATIO)
 def parallel(drive: np.ndarray, p: Values, _scene: Scene) -> list:
     share = p["slow_share"]
     return [((1.0 - share) * drive, np.ones_like(share)), (share * drive, p["ratio"])]
@@ -26,7 +22,6 @@ def parallel(drive: np.ndarray, p: Values, _scene: Scene) -> list:
     _SHARE,
     _RATIO,
     Parameter("order", "1", -0.9, 3.0, 0.0, (1.0, -0.4), about="order of recruitment"),
-    law=_WAYS,
 )
 def ordered(drive: np.ndarray, p: Values, scene: Scene) -> list:
     level = np.minimum(np.abs(drive) / scene.scale_nm, 1.0) + 1e-9

@@ -279,13 +279,7 @@ class _StagePass:
         )
         if terms and (self.derivatives or any(values[0, 0] for _, values in terms)):
             self.cores = self.grown(core)
-            slow, slower = np.zeros((len(drive), 0)), (1.0, -1.0)
-            for chosen, p in self.joined("branch"):
-                drive = self.grown(drive)
-                (first, _), (second, by) = chosen.form.call(drive, p, self.setup.scene)
-                slow = np.asarray(second) / np.where(np.abs(first + second) > 0, first + second, 1.0)
-                slower = float(by[0, 0]), next((n for n, (q, _) in enumerate(self.owners) if q == chosen.places[1]), -1)
-            return self.by_terms(drive, (slow, slower), terms, initial[0])
+            return self.by_terms(drive, terms, initial[0])
         branches = [(drive, np.ones((len(drive), 1)))]
         for chosen, p in self.joined("branch"):
             branches = [
@@ -318,11 +312,7 @@ class _StagePass:
         return sum(torque for torque, _ in responses), sum(rate for _, rate in responses)  # type: ignore
 
     def by_terms(
-        self,
-        drive: np.ndarray,
-        second: tuple[np.ndarray, tuple[float, float]],
-        terms: list[tuple[Chosen, np.ndarray]],
-        initial: np.ndarray,
+        self, drive: np.ndarray, terms: list[tuple[Chosen, np.ndarray]], initial: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Response where terms act on the lags: each further row is row 0 and a step along its exact derivative."""
         setup, problem = self.setup, self.problem
@@ -330,9 +320,6 @@ class _StagePass:
         steps = np.array([step for _, step in self.owners])
         drives = np.zeros((steps.size, drive.shape[1]))
         drives[: len(drive) - 1] = (drive[1:] - drive[0]) / steps[: len(drive) - 1, None]
-        slow, slower = second
-        slows = np.zeros((steps.size, slow.shape[1]))
-        slows[: len(slow) - 1] = (slow[1:] - slow[0]) / steps[: len(slow) - 1, None]
         lags, by_lag = lags_of(*self.value[:2])
         lag_slopes = np.zeros((steps.size, 3))
         initials = np.zeros((steps.size, initial.size))
@@ -350,9 +337,6 @@ class _StagePass:
         torque, rate, torques, rates = run_terms(
             np.ascontiguousarray(drive[0]),
             drives,
-            np.ascontiguousarray(slow[0]),
-            slows,
-            np.array(slower),
             self.width[0] / setup.basis.largest_us,
             (self.width[1:] - self.width[0]) / (steps[: len(self.width) - 1, None] * setup.basis.largest_us),
             setup.present,

@@ -106,10 +106,8 @@ def test_a_form_whose_start_promises_little_is_followed_behind_forms_that_hardly
 
 @pytest.fixture(scope="module")
 def of_two_parts() -> Setup:
-    """Two parts of six seconds, and 30 s of the pause between them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("stimrig.identify.records.join.PAUSE_S", 30.0)
-        grid, _ = prepare(join([record(400, name="a"), record(400, name="b", seed=2)], [0.0, 60.0]))
+    """Two parts of six seconds."""
+    grid, _ = prepare(join([record(400, name="a"), record(400, name="b", seed=2)], [0.0, 60.0]))
     return fit_plain(grid, grid.fitted).problem.setup
 
 
