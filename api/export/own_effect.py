@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from stimrig.identify.dynamics.linear import SecondOrder
-from stimrig.identify.dynamics.terms import LARGEST, QUICK_S, Driver, Place
+from stimrig.identify.dynamics.terms import EDGE, LARGEST, QUICK_S, Driver, Place
 from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.model import Model
@@ -16,19 +16,21 @@ STAGES = {Place.WIDTH: "pulse_width", Place.STRENGTH: "gain", Place.TORQUE: "fil
 """Stages of an own effect by places; a rate has none."""
 ROWS = 17
 """Points of the recruitment curve."""
+BENT = f"0.5 * (np.hypot({{0}}, {EDGE}) + {{0}} - {EDGE})"
+"""A rate where it is positive, as the terms bend it."""
 BEFORE = {
     Driver.DRIVE: "{share}",
     Driver.TORQUE: "torque",
-    Driver.RISE: f"max(torque - before, 0.0) * {QUICK_S} / scene.step_s",
-    Driver.FALL: f"max(before - torque, 0.0) * {QUICK_S} / scene.step_s",
-    Driver.PULSES: "scene.on[k]",
+    Driver.RISE: BENT.format(f"(torque - before) * {QUICK_S} / scene.step_s"),
+    Driver.FALL: BENT.format(f"(before - torque) * {QUICK_S} / scene.step_s"),
+    Driver.PULSES: "scene.acting[k]",
 }
 BEHIND = {
     Driver.DRIVE: "np.roll(np.interp(scene.pulse_width_us, WIDTHS_US, SHARES), 1)",
     Driver.TORQUE: "torque / scene.scale_nm",
-    Driver.RISE: f"np.maximum(rate, 0.0) * {QUICK_S} / scene.scale_nm",
-    Driver.FALL: f"np.maximum(-rate, 0.0) * {QUICK_S} / scene.scale_nm",
-    Driver.PULSES: "np.roll(scene.on, 1)",
+    Driver.RISE: BENT.format(f"rate * {QUICK_S} / scene.scale_nm"),
+    Driver.FALL: BENT.format(f"-rate * {QUICK_S} / scene.scale_nm"),
+    Driver.PULSES: "np.roll(scene.acting, 1)",
     Driver.SQUARE: "(torque / scene.scale_nm) ** 2",
     Driver.TORQUE_PLAY: "torque / scene.scale_nm",
     Driver.WIDTH_PLAY: "np.roll(scene.pulse_width_us, 1) / scene.largest_us",
@@ -41,7 +43,6 @@ Written by `stimrig explain --own`. Rename `id` and `name` to your hypothesis, e
 name this file's folder in STIMRIG_EFFECTS_DIR (docs/add-an-effect.md).{note}"""
 
 import numpy as np
-from scipy.signal import lfilter
 
 from stimrig.effects import Effect, Form, Parameter
 {constants}
@@ -71,13 +72,15 @@ LOOP = """\
     return acting
 """
 LAGGED = """\
-    keep = np.exp(-scene.step_s / p["lag_s"])
-    state = lfilter([1.0 - keep], [1.0, -keep], now)
+    keep, rested = np.exp(-scene.step_s / p["lag_s"]), np.exp(-scene.rest_s / p["lag_s"])
+    state = np.zeros(now.size)
+    for k in range(1, now.size):
+        state[k] = (now[k] + (state[k - 1] - now[k]) * keep) * rested[k]
 """
 PLAY = """\
-    state = now.copy()
+    state, anew = np.zeros(now.size), scene.begins if scene.begins is not None else np.zeros(now.size)
     for k in range(1, now.size):
-        state[k] = np.clip(state[k - 1], now[k] - p["reach"], now[k] + p["reach"])
+        state[k] = np.clip(0.0 if anew[k - 1] else state[k - 1], now[k] - p["reach"], now[k] + p["reach"])
 """
 RETURNS = {
     Place.TORQUE: '    return torque + scene.scale_nm * p["change"] * state, rate\n',
@@ -125,7 +128,7 @@ def own_effect(model: Model) -> str:
         widths_us = np.linspace(0.0, float(model.recruitment.basis.largest_us), ROWS)
         shares = np.abs(model.recruitment(widths_us)) / entry["settings"]["scale_nm"]
         constants += f"\nWIDTHS_US = np.linspace(0.0, {widths_us[-1]:g}, {ROWS})\nSHARES = {shares.round(3).tolist()}"
-    text = FILE.format(
+    return FILE.format(
         words=entry["shape"]["words"],
         note=note,
         constants=f"{constants}\n" if constants else "",
@@ -140,7 +143,6 @@ def own_effect(model: Model) -> str:
         resembles=tuple(entry["shape"]["behaves_as"]),
         separated_by=described.separated_by,
     )
-    return text if "lfilter(" in body else text.replace("from scipy.signal import lfilter\n", "")
 
 
 def _law(entry: dict[str, Any]) -> tuple[Place, Driver]:

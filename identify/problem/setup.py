@@ -114,7 +114,8 @@ class Setup:
         """At the ends of the intervals, shape (K + 1,)."""
         grid = self.grid
         widths_us = np.r_[grid.pulse_width_us, grid.pulse_width_us[-1]]
-        return self._scene(np.arange(grid.size + 1) * grid.step_s, widths_us, grid.begins)
+        scene = self._scene(np.arange(grid.size + 1) * grid.step_s, widths_us, grid.begins)
+        return replace(scene, pauses_s=np.r_[self.scene.rest_s, 0.0])
 
     @cached_property
     def scene_at_samples(self) -> Scene:

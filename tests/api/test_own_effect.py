@@ -9,6 +9,7 @@ from stimrig import identify
 from stimrig.api.charts.model_charts import model_figures
 from stimrig.api.export.own_effect import own_effect
 from stimrig.identify.effects import find_effect, registry
+from stimrig.identify.records.join import join
 from tests.identify import hidden_muscles
 
 TERM = "free_width_by_torque"
@@ -47,6 +48,24 @@ def test_every_term_that_a_stage_can_express_is_written_and_loaded(plain, tmp_pa
         (tmp_path / f"{effect}.py").write_text(own_effect(model_with(effect, plain)))
     monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
     assert len(registry().keys() & {effect.replace("free_", "own_", 1) for effect in free}) == len(free)
+
+
+def test_what_is_written_predicts_as_the_term_does_in_a_joined_record_too(plain, tmp_path, monkeypatch):
+    first = hidden_muscles.record(rate_hz=40)
+    second = first.with_torque(first.torque_nm + np.random.default_rng(1).normal(0.0, 0.01, first.torque_nm.size))
+    record = join([first, second], [0.0, float(first.time_s[-1]) + 20.0])
+    terms = ("torque_by_drive", "factor_by_fall", "torque_by_pulses", "torque_by_torque_play", "strength_by_rise")
+    models = {name: model_with(f"free_{name}", plain) for name in terms}
+    for model in models.values():
+        for parameter, value in model.effects[0]["parameters"].items():
+            value["value"] = 8.0 if parameter == "lag_s" else value["value"]
+    for name, model in models.items():
+        (tmp_path / f"{name}.py").write_text(own_effect(model))
+    monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
+    for name, model in models.items():
+        entry = {key: value for key, value in model.effects[0].items() if key != "shape"} | {"id": f"own_{name}"}
+        term, own, none = (each.predict(record) for each in (model, model.with_(effects=(entry,)), plain))
+        assert np.std(own - term) < 0.03 * np.std(term - none), name
 
 
 def test_without_a_term_or_with_a_rate_nothing_is_written(plain):
