@@ -193,12 +193,13 @@ def _error_shares(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
 ) -> dict[str, list[dict[str, Any]]]:
     """Tables of `Comparison.by`, of the samples that count."""
-    sign = direction_of(record)
+    sign, time_s = direction_of(record), record.time_s - record.time_s[0]
+    edges_s = np.linspace(0.0, time_s[-1] + 1e-9, SPANS + 1)
     kinds: dict[str, Groups] = {
         "segment": [(name, record.segment == i) for i, name in enumerate(record.segment_names)],
         "level": _levels(record.pulse_width_us),
         "direction": [("rising", sign > 0), ("falling", sign < 0), ("held", sign == 0)],
-        "time": _spans(record.time_s - record.time_s[0]),
+        "time": [(f"{a:.1f}-{b:.1f} s", (time_s >= a) & (time_s < b)) for a, b in pairwise(edges_s)],
     }
     tables = {kind: _table(groups, residual_nm, noise_sd_nm, counted) for kind, groups in kinds.items()}
     return tables | {"frequency": _frequency_rows(record.sample_rate_hz, residual_nm, noise_sd_nm, counted)}
@@ -211,12 +212,6 @@ def _levels(width_us: np.ndarray) -> Groups:
         rows = (width_us > max(low, 0.0)) & (width_us <= high) if high > 0 else np.zeros(width_us.size, bool)
         groups.append((f"{low:.0f}-{high:.0f} µs", rows))
     return groups
-
-
-def _spans(time_s: np.ndarray) -> Groups:
-    """Equal spans from the start."""
-    edges = np.linspace(0.0, time_s[-1] + 1e-9, SPANS + 1)
-    return [(f"{a:.1f}-{b:.1f} s", (time_s >= a) & (time_s < b)) for a, b in pairwise(edges)]
 
 
 def _table(groups: Groups, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray) -> list[dict[str, Any]]:

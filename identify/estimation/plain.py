@@ -349,7 +349,9 @@ def renewed_curve(base: Fitted) -> Fitted:
     returned as it is if its curve was chosen with all rows already (also where the joint was nowhere still for long
     enough), if no effect of it depends on the joint, or if its curve is no smoothed spline.
     """
-    if not _can_be_renewed(base):
+    setup = base.problem.setup
+    smoothed = isinstance(setup.basis, SplineBasis) and np.any(setup.roughness) and not np.any(setup.curve_nm)
+    if not (smoothed and knows_joint(base)) or np.all(still_rows(setup.grid, setup.fitted)[setup.fitted]):
         return base
     with suppress(np.linalg.LinAlgError):  # then the curve as it is remains the best one known
         for _ in range(TIMES):
@@ -358,12 +360,6 @@ def renewed_curve(base: Fitted) -> Fitted:
                 break
             base = renewed
     return base
-
-
-def _can_be_renewed(base: Fitted) -> bool:
-    setup = base.problem.setup
-    smoothed = isinstance(setup.basis, SplineBasis) and np.any(setup.roughness) and not np.any(setup.curve_nm)
-    return bool(smoothed and knows_joint(base) and not np.all(still_rows(setup.grid, setup.fitted)[setup.fitted]))
 
 
 def _renewed(base: Fitted) -> Fitted:

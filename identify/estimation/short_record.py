@@ -278,7 +278,9 @@ class _Search:
             noise = self.noise(prior.basis, linear, x, noise)
             posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, x))
             near = posterior.modes(np.r_[mode.z[: 3 + n + extras], np.zeros(3)], near)
-            weights = _probabilities(near)
+            evidence = np.array([other.log_evidence for other in near])
+            weights = np.exp(COARSE * (evidence - evidence.max()))
+            weights /= weights.sum()
             kind = int(np.argmax(weights))
             if kind == chosen or turn == OUTER - 1:
                 break
@@ -323,9 +325,3 @@ def _dynamics_sd(mode: Mode) -> np.ndarray:
     """Standard deviations of the three changes of the dynamics at a mode."""
     inverse = np.linalg.solve(mode.root, np.eye(mode.z.size)[:, -3:])
     return np.sqrt(np.maximum(np.sum(inverse**2, axis=0), 1e-18))
-
-
-def _probabilities(modes: list[Mode]) -> np.ndarray:
-    evidence = np.array([mode.log_evidence for mode in modes])
-    weights = np.exp(COARSE * (evidence - evidence.max()))
-    return weights / weights.sum()
