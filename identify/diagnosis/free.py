@@ -195,7 +195,8 @@ def _shows_at_rest(fitted: Fitted) -> bool:
 def _promising(base: Fitted) -> list[Start]:
     """The terms that promise the largest gains of log-likelihood by one step from the model, the best lag of each."""
     terms = [effect for effect in registry().values() if effect.shape and effect.id not in dict(base.effects)]
-    if not terms or replaced_by(base.effects, terms[0].forms):
+    present = sum(form.stage == "term" for _, form in base.effects)
+    if not terms or present >= MAX_TERMS or replaced_by(base.effects, terms[0].forms):
         return []
     tried = [(effect, value) for effect in terms for value in tried_at(effect.forms[0])]
     forms = [

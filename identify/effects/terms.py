@@ -46,6 +46,8 @@ BEHAVIOURS: tuple[tuple[str, Sequence[Place], Sequence[Driver], float, float, in
     ("recruitment_hysteresis", AFTER_LAGS, (Driver.WIDTH_PLAY,), 0.0, 0.0, 0),
 )
 """Effects of the library that act as a term does: its places, drivers, lags from and to, s, and sign (0: either)."""
+BOUNDED = {"change": "its size", "lag_s": "its lag", "reach": "its play"}
+"""Parameters in words, where one lies at its bound: its interval then ends there, whatever the record says."""
 LEVEL = np.linspace(0.0, 1.0, 41)
 PERCENTILES = 2.5, 97.5
 """Those of draws between which 95 % lie."""
@@ -133,10 +135,13 @@ def _shape(form: Form, values: Mapping[str, np.ndarray]) -> Shape:
         lines = {"rising": np.maximum(LEVEL - other, 0.0), "falling": np.minimum(LEVEL + other, 1.0 - other)}
         at, along = LEVEL, f"{what.removesuffix(' with play').capitalize()} (share of the largest)"
     name = where.removeprefix("factor of the ")
+    parameters = zip(form.parameters, values.values(), strict=True)
+    ends = [BOUNDED[p.name] for p, drawn in parameters if np.isclose(drawn[0, 0], (p.lower, p.upper), rtol=1e-3).any()]
+    at_bound = f" At the bound of what is tried: {' and '.join(ends)}." if ends else ""
     return Shape(
         place=where,
         driven_by=what,
-        words=f"{words}: {_sized(place, driver, full)}.",
+        words=f"{words}: {_sized(place, driver, full)}.{at_bound}",
         driver=along,
         at=at,
         effect="Torque added (share of the largest)" if place == Place.TORQUE else f"{name.capitalize()} (factor)",

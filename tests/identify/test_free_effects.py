@@ -224,6 +224,15 @@ def test_no_terms_are_taken_where_held_out_rows_speak_against_each(monkeypatch: 
     assert not search.names("free") and verdict.kind == "unexplained_structure"
 
 
+def test_a_model_has_no_more_terms_than_are_allowed_however_often_it_is_searched(monkeypatch: pytest.MonkeyPatch):
+    grid, _ = prepare(strange())
+    plain = fit_plain(grid, fitted_rows(grid, None))
+    plain = solve(plain.problem, plain.theta, WHITE)
+    monkeypatch.setattr(free, "MAX_TERMS", 1)
+    one = free._with_term(plain, *free._promising(plain)[0], 1)
+    assert free._promising(one) == []
+
+
 def test_where_nothing_is_missing_nothing_free_is_added():
     record = hidden_muscles.record(seed=3, rate_hz=100)
     with few_effects.only(*(effect.id for effect in FREE), "fatigue"):

@@ -51,6 +51,19 @@ def test_words_give_place_driver_lag_and_size_with_intervals(effect, values, wor
 
 
 @pytest.mark.parametrize(
+    ("change", "lag_s", "said"),
+    [(0.5, 0.3, ""), (-3.0, 0.3, "its size"), (0.5, 30.0, "its lag"), (3.0, 0.02, "its size and its lag")],
+)
+def test_a_term_at_the_bound_of_its_search_says_so(change, lag_s, said):
+    term = find_effect("free_width_by_torque")
+    bounds = {p.name: (p.lower, p.upper) for p in term.forms[0].parameters}
+    drawn = {"change": change + 0.1 * DRAWS, "lag_s": lag_s * (1.0 + 0.1 * DRAWS)}
+    values = {name: np.clip(value, *bounds[name]) for name, value in drawn.items()}
+    ending = f"At the bound of what is tried: {said}." if said else "%)."
+    assert term.shape(term.forms[0], values).words.endswith(ending)
+
+
+@pytest.mark.parametrize(
     ("place", "driver", "size", "lag_s", "effects"),
     [
         (Place.STRENGTH, Driver.DRIVE, -0.5, 20.0, ("fatigue",)),
