@@ -14,7 +14,7 @@ import pytest
 
 from stimrig.api.cli.errors import LaunchError
 from stimrig.api.cli.supervisor import Child, Services
-from stimrig.api.client.errors import Conflict
+from stimrig.api.client.errors import Conflict, Unavailable
 from stimrig.api.client.rest import Client
 from stimrig.api.settings import Settings
 from tests.api.conftest import TOKEN, soon
@@ -40,8 +40,20 @@ def running(tmp_path: Path) -> Iterator[tuple[Services, Client]]:
 
 
 def begin(client: Client) -> str:
-    """Begin a test and wait until it has played for more than a second."""
-    test_id = client.start_test(client.ensure_participant("P1").code).id
+    """Begin a test and wait until it has played for more than a second.
+
+    A start is rightly refused where the machine stalled so long that a device seemed silent.
+    """
+    code = client.ensure_participant("P1").code
+
+    def started() -> str | None:
+        try:
+            return client.start_test(code).id
+        except Unavailable as error:
+            assert "does not answer" in str(error)
+            return None
+
+    test_id = soon(started)
     soon(lambda: client.rig().elapsed_s > 1.0)
     return test_id
 
