@@ -107,6 +107,7 @@ def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
     return replace(
         before,
         kind=before.kind if named else "unexplained_structure",
+        probability=before.probability if named else 0.9,
         probabilities={effect: before.probabilities.get(effect, thresholds.DOUBTED) for effect in there},
         explained=_explained(search),
         structure=search.residual.ratio,

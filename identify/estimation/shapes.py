@@ -73,10 +73,11 @@ def _course(fitted: Fitted, chosen: Chosen) -> dict[str, list[float]]:
     size, other = (*fitted.physical[list(chosen.places)].tolist(), 0.0)[:2]
     states = np.array(share)
     if driver != Driver.SQUARE:
-        keep = math.exp(-setup.grid.step_s / other)
+        keep, starts = math.exp(-setup.grid.step_s / other), set(setup.grid.starts.tolist())
         for k, (now, rest_s) in enumerate(zip(share.tolist(), setup.scene.rest_s.tolist(), strict=True)):
             lagging = now + (x * math.exp(-rest_s / other) - now) * keep
-            x = lagging if later(driver) else min(max(x, now - other), now + other)
+            behind = 0.0 if k in starts else x  # a play begins anew with each part
+            x = lagging if later(driver) else min(max(behind, now - other), now + other)
             states[k] = x
     shown = slice(None, None, math.ceil(share.size / POINTS))
     times_s = setup.scene.time_s + setup.grid.start_s

@@ -13,7 +13,7 @@ import pytest
 from stimrig.identify.diagnosis import search, verdict
 from stimrig.identify.diagnosis.residual import HeldOutError, ResidualStructure
 from stimrig.identify.diagnosis.search import EffectSearch, Step
-from stimrig.identify.diagnosis.verdict import Verdict, judge, shares
+from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free, shares
 from stimrig.identify.effects import find_effect
 from stimrig.identify.records.readings import Readings
 
@@ -325,3 +325,16 @@ def test_little_to_explain_is_not_divided_by(made: Made):
     made.add(FIRST, 6.0, 0.5)
     made.leaves(ideal=-19.9)
     assert made.judged().explained == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize(("named", "kind", "probability"), [(False, "unexplained_structure", 0.9), (True, None, 0.62)])
+def test_terms_in_place_of_a_name_leave_nothing_of_its_probability(
+    monkeypatch: pytest.MonkeyPatch, named: bool, kind: str | None, probability: float
+):
+    for rule, value in (("_notes", []), ("_held_out", (None, False)), ("_explained", 0.9)):
+        monkeypatch.setattr(verdict, rule, lambda *_, value=value: value)
+    steps = [SimpleNamespace(added=None), SimpleNamespace(added="free_strength_by_drive")]
+    made: Any = SimpleNamespace(steps=steps, residual=SimpleNamespace(ratio=3.0))
+    before = Verdict("effect_missing", {FIRST: 0.62}, {}, 0.5, 5.0, 0.62)
+    after = judge_free(made, before, named)
+    assert (after.kind, after.probability, after.probabilities) == (kind or before.kind, probability, {})
