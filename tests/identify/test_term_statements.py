@@ -82,9 +82,9 @@ def test_a_term_behaves_as_an_effect_of_the_library_or_as_none(place, driver, si
 @pytest.mark.parametrize("driver", Driver)
 def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque(driver):
     """A play begins anew with each part of a joined record."""
-    record = join(
-        [hidden_muscles.record(seed=seed, rate_hz=100) for seed in (0, 1)], [0.0, 600.0]
-    )  # a play begins anew with each part
+    record = hidden_muscles.record(rate_hz=100)
+    if driver > Driver.SQUARE:
+        record = join([record, hidden_muscles.record(seed=2, rate_hz=100)], [0.0, 600.0])
     effect, values = f"free_factor_by_{driver.name.lower()}", (-0.5, 0.4 if driver > Driver.SQUARE else 0.5)
     names = [parameter.name for parameter in find_effect(effect).forms[0].parameters]
     parameters = {name: {"value": value, "sd": 0.0} for name, value in zip(names, values, strict=False)}
@@ -103,3 +103,5 @@ def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque(dr
         assert course["value"][np.searchsorted(course["time_s"], begun_s)] == 1.0
     off = np.abs(changed[working] / torque[working] - expected)  # a course of few points misses where a driver jumps
     assert np.median(off) < 0.01 and np.mean(off) < 0.03 and np.min(expected) < 0.95
+    if driver == Driver.TORQUE:
+        assert np.max(off) < 0.015 and np.min(expected) < 0.7
