@@ -27,7 +27,7 @@ from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.estimation.solve import solve, start_from
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
-from stimrig.identify.noise import WHITE
+from stimrig.identify.noise import WHITE, beside_zero
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.problem.setup import Setup
 from stimrig.identify.records.join import join
@@ -327,6 +327,13 @@ def test_a_zero_that_moves_from_rest_to_rest_is_held_as_slow_noise(zero_nm: floa
     assert noise.held and not noise.at_bound and (noise.share > 0.0) is held
     if held:
         assert 0.5 < noise.sd_nm * noise.share**0.5 / np.std(moving) < 1.5
+
+
+@pytest.mark.parametrize(("error_nm", "white_nm2"), [(0.5, 0.21), (0.1, 0.0025)])
+def test_beside_a_zero_the_rest_of_the_error_is_white_and_a_quarter_of_it_at_least(error_nm: float, white_nm2: float):
+    noise = beside_zero(0.2, error_nm, 20.0, STEP_S)
+    assert (1.0 - noise.share) * noise.sd_nm**2 == pytest.approx(white_nm2)
+    assert noise.share * noise.sd_nm**2 == pytest.approx(0.04) and noise.ar1 == pytest.approx(np.exp(-STEP_S / 20.0))
 
 
 @pytest.mark.parametrize(

@@ -51,6 +51,14 @@ def test_words_give_place_driver_lag_and_size_with_intervals(effect, values, wor
     assert all(np.isfinite(line).all() and line.shape == (402, shape.at.size) for line in shape.lines.values())
 
 
+def test_the_picture_of_a_play_has_a_rising_and_a_falling_line_a_reach_apart():
+    term = find_effect("free_torque_by_width_play")
+    shape = term.shape(term.forms[0], {"change": 0.2 + 0.0 * DRAWS, "reach": 0.1 + 0.0 * DRAWS})
+    middle = np.searchsorted(shape.at, 0.5)
+    ends = {name: (lines[0, 0], lines[0, middle], lines[0, -1]) for name, lines in shape.lines.items()}
+    assert ends["rising"] == pytest.approx((0.0, 0.08, 0.18)) and ends["falling"] == pytest.approx((0.02, 0.12, 0.18))
+
+
 @pytest.mark.parametrize(
     ("change", "lag_s", "said"),
     [(0.5, 0.3, ""), (-3.0, 0.3, "its size"), (0.5, 30.0, "its lag"), (3.0, 0.02, "its size and its lag")],
