@@ -23,7 +23,6 @@ from stimrig.identify.diagnosis.search import (
     helpful,
     search_effects,
     silent,
-    without_effect,
 )
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free, leaves_more
@@ -31,8 +30,7 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Effect, replaced_by
 from stimrig.identify.effects.terms import tried_at
-from stimrig.identify.estimation.effect_fit import try_effect
-from stimrig.identify.estimation.left_out import Difference, difference, leave_out
+from stimrig.identify.estimation.left_out import Difference, difference
 from stimrig.identify.estimation.rests import zero_scatter_nm
 from stimrig.identify.estimation.samples import Raw, fitted_rows
 from stimrig.identify.estimation.solve import LARGEST_SLOPE, Fitted, solve, solve_scaled, start_from
@@ -41,7 +39,6 @@ from stimrig.identify.problem.problem import Problem
 
 MAX_TERMS, FITTED_TERMS = 6, 5
 """Terms at most; and so many, of those that promise most, are fitted in each round."""
-DRIFT = "baseline_drift"
 ZERO_MEMORY_S = 20.0
 """Memory of a zero that wanders."""
 STEPS = 5
@@ -132,21 +129,8 @@ def _in_held_noise(chain: Chain) -> Chain:
     return (*chain[:-1], replace(chain[-1], searched=fitted, known=None))
 
 
-def _without_drift(chain: Chain) -> Chain:
-    """The chain without a moving zero that was added, where left-out blocks do not ask for it."""
-    added = [number for number, step in enumerate(chain) if step.added == DRIFT and step.origin == "free"]
-    if not added:
-        return chain
-    later = [replace(step, searched=without_effect(step.searched, DRIFT)) for step in chain[added[0] + 1 :]]
-    shorter = (*chain[: added[0]], *later)
-    return shorter if later and _better(chain, shorter).errors > -thresholds.BETTER else chain
-
-
 def _extended(base: Chain, progress: Progress) -> Chain:
-    """The base with the terms that left-out blocks ask for; of chains that predict them about equally the shortest.
-
-    A zero that moves competes with them.
-    """
+    """The base with the terms that left-out blocks ask for; of chains that predict them about equally the shortest."""
     chains = [base]
     for number in range(MAX_TERMS):
         chains[-1] = _in_held_noise(chains[-1])
@@ -162,10 +146,6 @@ def _extended(base: Chain, progress: Progress) -> Chain:
             progress((number + len(fits) / len(starts)) / MAX_TERMS, f"tried {starts[at][0].name.lower()}")
             fits.append(replace(fitted, problem=_problem(last, [starts[at][0]])))
         best = max(fits, key=lambda fitted: fitted.log_evidence, default=last)
-        drift = registry().get(DRIFT) if starts and DRIFT not in dict(last.effects) else None
-        zero = None if drift is None else try_effect(drift, last)
-        if zero is not None and zero.fitted.log_evidence > best.log_evidence and _shows_at_rest(zero.fitted):
-            best = zero.fitted
         best = solve(best.problem, best.theta, best.noise)
         if best.log_evidence < last.log_evidence + thresholds.TERM_MARGIN:
             break
@@ -180,16 +160,7 @@ def _extended(base: Chain, progress: Progress) -> Chain:
             allowed.append(chain)
     gains = [_better(chains[0], chain).gain for chain in allowed]
     near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= max(gains) - thresholds.NEAR)
-    return (*base, *_without_drift(near)[len(base) :])
-
-
-def _shows_at_rest(fitted: Fitted) -> bool:
-    """Return True if a zero moves no more than rests show, or there are none: else it takes up what the muscle does."""
-    setup, theta, wander_nm = fitted.problem.setup, fitted.theta, leave_out(fitted).wander_nm
-    added_nm = fitted.problem.run(theta)[0] - fitted.problem.run(theta, skip=frozenset([DRIFT]))[0]
-    parts = [added_nm[setup.fitted & (setup.grid.part == part)] for part in range(setup.grid.begins.size)]
-    spread_nm = np.std(np.concatenate([part - np.mean(part) for part in parts if part.size]))
-    return wander_nm == 0.0 or bool(spread_nm <= thresholds.OVER_REST * wander_nm)
+    return (*base, *near[len(base) :])  # the base as it was searched
 
 
 def _promising(base: Fitted) -> list[Start]:

@@ -20,11 +20,10 @@ from stimrig.identify.dynamics.terms import LARGEST, REACH, Driver, Place, lags_
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.terms import DRIVERS, PLACES
 from stimrig.identify.errors import BadModel, BadRequest
-from stimrig.identify.estimation.left_out import leave_out
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.quality import _stable
 from stimrig.identify.estimation.samples import fitted_rows, prepare
-from stimrig.identify.estimation.solve import solve, start_from
+from stimrig.identify.estimation.solve import solve
 from stimrig.identify.inversion import Reference, invert
 from stimrig.identify.model import Model
 from stimrig.identify.noise import WHITE, beside_zero
@@ -305,15 +304,6 @@ def test_a_further_test_is_planned_beside_a_name_that_leaves_more_than_noise(
     assert result._undecided(search, verdict, planned) is wanted
     search.names = lambda *_: ["fatigue", "voluntary_effort"]  # efforts leave more on rows that were not fitted
     assert not result._undecided(search, verdict, planned)
-
-
-@pytest.mark.parametrize(("rests", "shows"), [(1.0, True), (10.0, False)])
-def test_a_zero_that_moves_more_than_rests_show_is_not_one(rests: float, shows: bool):
-    grid, _ = prepare(hidden_muscles.record(seed=3, rate_hz=100))
-    plain, form = fit_plain(grid, grid.fitted), registry()[free.DRIFT].form("wander")
-    problem, knot_nm = Problem(plain.problem.setup, [(free.DRIFT, form)]), rests * leave_out(plain).wander_nm
-    start = start_from(problem, plain, {0: {p.name: knot_nm * (-1) ** n for n, p in enumerate(form.parameters)}})
-    assert free._shows_at_rest(solve(problem, start, WHITE, max_steps=0)) is shows
 
 
 @pytest.mark.parametrize(("zero_nm", "held"), [(0.0, False), (0.2, True), (-0.2, True)])
