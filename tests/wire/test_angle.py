@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import h5py
 import numpy as np
@@ -22,7 +21,7 @@ PPM = 150.0
 MOUNTED = ("--angle-offset-deg", "31.5", "--angle-direction", "-1")
 CLOCK = ("--angle-clock-ppm", f"{PPM:g}", "--angle-jitter-us", "200")
 MOVING = {"cmd": "arm", "mode": "robot", "from_deg": 30.0, "to_deg": 100.0, "deg_s": 40.0}
-PLAN = {"kind": "moving", "angle": {"range_rad": [0.2, 2.2], "still_s": 2.0}}
+PLAN = {"kind": "passive", "angle": {"range_rad": [0.2, 2.2], "still_s": 2.0}}
 STEPS = [
     {"name": "rest", "sequence": "rest", "settings": {"duration_s": 0.5}},
     {"name": "steps", "sequence": "steps", "settings": {"on_s": 2.5, "off_s": 1.0, "repeats": 1}},
@@ -59,19 +58,19 @@ def at(bench: Bench, client: RigClient, degrees: float) -> None:
         time.sleep(0.05)
 
 
-def played(client: RigClient, test_id: str, **fields: Any) -> dict[str, Any]:
-    client.ask("subscribe")
-    reply = client.start(default_plan(test_id, **{"segments": STEPS, **fields}))
-    assert reply["ok"], reply
-    event = client.wait_finished(test_id)
-    assert event["outcome"] == "completed", event
-    return event
-
-
-def test_angles_are_recorded_and_stand_within_a_millisecond_of_the_torque(ready: tuple[Bench, RigClient]):
+def test_a_passive_test_records_angles_within_a_millisecond_of_the_torque_and_no_pulse(ready: tuple[Bench, RigClient]):
     bench, client = ready
     assert bench.fault(**MOVING)["ok"]
-    path = Path(played(client, "t", **PLAN)["recording_path"])
+    before = bench.state()["pulses_received"]
+    refused = client.ask("start", plan=default_plan("wide", **PLAN, segments=STEPS))
+    assert "passive test" in refused["problem"]["detail"]
+    client.ask("subscribe")
+    reply = client.start(default_plan("passive", **PLAN, segments=REST))
+    assert reply["ok"], reply
+    event = client.wait_finished("passive")
+    assert event["outcome"] == "completed", event
+    assert bench.state()["pulses_received"] == before
+    path = Path(event["recording_path"])
     assert archive.verify(path)
     with h5py.File(path) as file:
         group, torque = file["angle"], file["torque"]
@@ -87,16 +86,6 @@ def test_angles_are_recorded_and_stand_within_a_millisecond_of_the_torque(ready:
         assert np.max(np.abs(time_s - true_s)[20:-20]) < 1e-3
     record = identify.read(path)
     assert record.angle_rad is not None and record.velocity_rad_s is not None
-
-
-def test_no_pulse_is_felt_in_a_passive_test(ready: tuple[Bench, RigClient]):
-    bench, client = ready
-    assert bench.fault(**MOVING)["ok"]
-    before = bench.state()["pulses_received"]
-    refused = client.ask("start", plan=default_plan("wide", **{**PLAN, "kind": "passive", "segments": STEPS}))
-    assert "passive test" in refused["problem"]["detail"]
-    played(client, "passive", **{**PLAN, "kind": "passive", "segments": REST})
-    assert bench.state()["pulses_received"] == before
 
 
 def test_a_sensor_that_is_plugged_in_again_is_found_by_itself(ready: tuple[Bench, RigClient]):
