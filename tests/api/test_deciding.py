@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
+from stimrig import identify
 from stimrig.api.cli import deciding
+from stimrig.api.cli.commands import diagnose, explain
 from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.errors import InputError
 from stimrig.api.client.errors import NotFound, ServiceError
@@ -170,6 +172,32 @@ def test_where_an_adaptive_tests_structure_does_not_fit_the_best_model_is_given(
     client: Any = rig
     assert verb.play(client, "P1", {})["model"] == model
     assert rig.improved == (["plain"] if problem else [])
+
+
+@pytest.mark.parametrize("model", [None, Path("old one.json")])
+@pytest.mark.parametrize("output", [None, Path("/dev/null")])
+def test_the_commands_that_follow_begin_with_the_model_that_was_examined(
+    model: Path | None, output: Path | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    open_: Any = {"add": ["fatigue"], "deciding_experiment": DECIDING, "to_dict": dict}
+    left = SimpleNamespace(conclusion=SimpleNamespace(kind="missing"), **open_)
+    explained = SimpleNamespace(left=left, to_dict=dict, improvement=SimpleNamespace(models=[""]))
+    given = "--model 'old one.json' " if model else ""
+    for module in (diagnose, explain):
+        monkeypatch.setattr(module, "load_structure", lambda *_: (None, None, []))
+    monkeypatch.setattr(identify, "diagnose", lambda *_: left)
+    monkeypatch.setattr(identify, "explain", lambda *_: explained)
+    diagnose.diagnose([], model)
+    printed = capsys.readouterr().out
+    assert f"`stimrig explain {given}DATA -o NEW.json` adds it" in printed
+    assert ("the plain structure asks" in printed) == (model is not None)
+    explain.explain([], model, output=output)
+    last = "--model /dev/null DATA -o NEW.json` adds it" if output else f"{given}DATA -o NEW.json` writes the last"
+    assert f"`stimrig explain {last}" in capsys.readouterr().out
+    left.conclusion.kind = "nothing"
+    diagnose.diagnose([], model)
+    writes = f"improve {given}" if model else "fit "
+    assert f"`stimrig {writes}DATA -o NEW.json` writes this model." in capsys.readouterr().out
 
 
 SITE = ("right", "biceps brachii", None)

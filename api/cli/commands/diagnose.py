@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+from shlex import quote
+
 from stimrig import identify
 from stimrig.api.cli.files import load_structure
 from stimrig.api.cli.options import ColumnMap, HeldModel, Json, SeveralData
@@ -20,12 +23,25 @@ def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap
     with progress_bar() as progress:
         diagnosis = identify.diagnose(record, model, progress)
     words = f"The structure examined is {in_words(structure)}."
-    report({"structure": structure, **diagnosis.to_dict()}, as_json, diagnosis, words, *next_commands(diagnosis))
-
-
-def next_commands(diagnosis: identify.Diagnosis) -> list[str]:
-    """Name the commands that do what is advised."""
+    commands = next_commands(diagnosis, model_json)
     if diagnosis.conclusion.kind == "nothing":
-        return ["`stimrig fit DATA -o MODEL.json` writes this model."]
-    add = ["`stimrig explain DATA -o MODEL.json` adds it, and shows how the error falls."] if diagnosis.add else []
-    return add + ["`stimrig test --decide DATA` plays the next test."] * bool(diagnosis.deciding_experiment)
+        writes = f"improve {begin_with(model_json)}" if model_json else "fit "
+        commands = [f"`stimrig {writes}DATA -o NEW.json` writes this model."]
+    report({"structure": structure, **diagnosis.to_dict()}, as_json, diagnosis, words, *commands)
+
+
+def next_commands(diagnosis: identify.Diagnosis, examined: Path | None) -> list[str]:
+    """Name the commands that do what is advised; `examined`: the model that was diagnosed, None for the plain one."""
+    explain = f"`stimrig explain {begin_with(examined)}DATA -o NEW.json` adds it, and shows how the error falls."
+    return [explain] * bool(diagnosis.add) + test_command(diagnosis, examined)
+
+
+def begin_with(model_json: Path | None) -> str:
+    """Write the option that names a model, if there is one."""
+    return f"--model {quote(str(model_json))} " if model_json else ""
+
+
+def test_command(diagnosis: identify.Diagnosis, given: Path | None) -> list[str]:
+    """Name the command that plays the next test, if there is one; it knows nothing of a `given` model."""
+    plain = ", as the plain structure asks for it" if given else ""
+    return [f"`stimrig test --decide DATA` plays the next test{plain}."] * bool(diagnosis.deciding_experiment)
