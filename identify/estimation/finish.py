@@ -156,6 +156,7 @@ def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
 def describe_parameters(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, dict[str, Any]]:
     """Value, sd and unit of an effect's parameters by name; with `direction` if the record has the opposite sign.
 
+    What was estimated from the samples, before the fit, has no sd: the fit's would be that of the prior.
     Torques of an effect are positive in the direction in which the muscle pulls, except those of the sensor, which have
     the sign of the record.
     """
@@ -163,7 +164,11 @@ def describe_parameters(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[
     values = fitted.physical
     turned = fitted.problem.setup.sign < 0 and chosen.form.stage != "sensor"
     return {
-        p.name: {"value": float(values[i]), "sd": float(np.sqrt(max(matrix[i, i], 0.0))), "unit": p.unit}
+        p.name: {
+            "value": float(values[i]),
+            "sd": None if chosen.form.fixed else float(np.sqrt(max(matrix[i, i], 0.0))),
+            "unit": p.unit,
+        }
         | ({"direction": "as the muscle pulls"} if turned and p.unit.startswith("N·m") else {})
         for i, p in zip(chosen.places, chosen.parameters, strict=True)
     }

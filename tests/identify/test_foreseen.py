@@ -93,6 +93,12 @@ def test_held_out_rows_are_judged_without_it_and_their_ceiling_knows_why(case):
     assert model.quality["gates"]["gap"]["severity"] != "refuse" or model.quality["gates"]["gap"]["passed"]
 
 
+def test_hum_is_printed_without_the_deviation_of_the_fits_prior():
+    _, _, model = of_one_record("mains_hum")
+    row = next(line for line in str(model).splitlines() if line.startswith("mains_hum"))
+    assert "frequency_hz 50 Hz" in row and "±" not in row
+
+
 def test_rows_left_out_in_turn_are_judged_without_it_too():
     record, _, _ = of_one_record("mains_hum")
     fitted = identify.fit(record.take(~record.held_out), effects=["mains_hum"]).fit
