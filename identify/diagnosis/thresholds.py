@@ -62,4 +62,5 @@ FORM_ERROR = 0.01
 LEAST_HELD_OUT_ROWS = 40
 """With fewer held-out pulse intervals (1 s at 40 pulses/s) nothing is concluded from them."""
 NAMED_BUT = 1.3
-"""Error on held-out pulses, divided by what is allowed there, from which free effects are tried beside named ones."""
+"""Error from which free effects are tried beside named ones, and a further test is planned: on held-out pulses divided
+by what is allowed there, or on the fitted rows by the white noise alone."""

@@ -89,6 +89,7 @@ def behaves_as(place: Place, driver: Driver, size: np.ndarray, lag_s: float) -> 
 
 def _number(value: float, sign: str = "") -> str:
     """Two digits that count, never with an exponent."""
+    value = float(f"{value:.1e}")  # first: 9.96 becomes 10, and not 10.0
     return f"{value:{sign}.{max(1 - math.floor(math.log10(abs(value) or 1.0)), 0)}f}"
 
 

@@ -11,7 +11,7 @@ from stimrig import identify
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.terms import Driver, Place
 from stimrig.identify.effects import find_effect, registry
-from stimrig.identify.effects.terms import BEHAVIOURS, behaves_as
+from stimrig.identify.effects.terms import BEHAVIOURS, _number, behaves_as
 from stimrig.identify.estimation.shapes import _course
 from stimrig.identify.problem.predict import problem_of
 from stimrig.identify.records.join import join
@@ -49,6 +49,13 @@ def test_words_give_place_driver_lag_and_size_with_intervals(effect, values, wor
     shape = described.shape(described.forms[0], values)
     assert (shape.words, shape.equation) == (words, equation)
     assert all(np.isfinite(line).all() and line.shape == (402, shape.at.size) for line in shape.lines.values())
+
+
+@pytest.mark.parametrize(
+    ("value", "words"), [(9.96, "+10"), (0.0996, "+0.10"), (-99.6, "-100"), (0.0, "+0.0"), (4.44, "+4.4")]
+)
+def test_a_number_has_two_digits_where_rounding_adds_one_too(value, words):
+    assert _number(value, "+") == words
 
 
 def test_the_picture_of_a_play_has_a_rising_and_a_falling_line_a_reach_apart():
