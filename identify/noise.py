@@ -47,6 +47,10 @@ class NoiseLevel:
         """The same on a grid of such steps, on which the slowest noise has a memory of `SLOWEST_S`."""
         return replace(self, shortest=step_s / SLOWEST_S)
 
+    def band_s(self, step_s: float) -> float:
+        """Time in which a wave of the narrow band dies away to 1/e, s."""
+        return step_s / max(1.0 - self.decay, 1e-6)
+
     @property
     def is_white(self) -> bool:
         """Return true if hardly any of it is correlated from one interval to the next."""
@@ -120,7 +124,7 @@ def _profile_band(
     bounds = np.array(
         [
             [np.log(near.shortest), 0.0, near.slowest, np.log(0.0008), 0.001],
-            [0.0, 1.0, near.fastest, np.log(0.12), 0.999],
+            [0.0, 1.0, near.fastest, np.log(20.0 * near.shortest), 0.999],
         ]
     )
     step = wide * np.array([1.5, 0.4, 0.12, 1.5, 0.4])

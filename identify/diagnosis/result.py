@@ -93,7 +93,7 @@ def _effects(search: EffectSearch, verdict: Verdict) -> tuple[list[dict[str, Any
 def _named(search: EffectSearch, verdict: Verdict, before: Step, step: Step) -> dict[str, Any]:
     """What is said of an effect that is named, beside its form and its parameters."""
     described = find_effect(str(step.added))
-    rivals = verdict.rivals.get(described.id, {}) if step.tried else {}  # a drift beside terms was compared with none
+    rivals = verdict.rivals.get(described.id, {})
     tried = {candidate.effect.id: candidate for candidate in step.tried}
     confused = sorted(
         (name for name in rivals if name and name != described.id and _is_rival(tried, rivals, described, name)),

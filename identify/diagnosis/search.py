@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.diagnosis.candidate_terms import fit_terms, in_held_noise
 from stimrig.identify.diagnosis.residual import ResidualStructure, quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.dynamics.grid import Grid
@@ -206,14 +207,11 @@ def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
     for place, candidate in enumerate(candidates):
         if candidate.gain < search.margin(number) or (accepted and not last.searched.distrusted):
             break
-        comparison, required = (
-            difference(last.left_out, leave_out(candidate.fitted)),
-            required_errors(search, candidate),
-        )
-        if comparison.errors >= required:
-            accepted.append((comparison.gain, candidate))
+        refusal = _refusal(search, candidate)
+        if refusal is None:
+            accepted.append((difference(last.left_out, leave_out(candidate.fitted)).gain, candidate))
         else:
-            candidates[place] = replace(candidate, refused=comparison, required=required)
+            candidates[place] = replace(candidate, refusal=refusal)
     if not accepted:
         search.refused = tuple(candidates)
         return False
@@ -231,7 +229,8 @@ def _exchange(search: EffectSearch) -> None:
         if without.log_evidence > last.log_evidence - thresholds.TEMPERATURE:
             _rebuild(search, without, [other for other in found if other is not step])
             return
-        for rival in [c for c in step.tried if c.effect.id not in search.names("library") and not c.effect.band][:2]:
+        left = [c for c in step.tried if c.effect.id not in search.names("library") and not c.effect.band]
+        for rival in [c for c in left if c.refusal is None or not c.effect.sporadic][:2]:
             refitted = fit_form(rival.effect, rival.form, without, without.residual_nm, {})
             if refitted is not None and refitted.log_evidence > last.log_evidence + thresholds.TEMPERATURE:
                 replaced = replace(step, added=rival.effect.id)
@@ -263,6 +262,31 @@ def _rebuild(search: EffectSearch, last: Fitted, found: Sequence[Step]) -> None:
         others = [replace(c, gain=min(c.gain, candidate.gain)) for c in step.tried if c.effect.id != effect.id]
         tried = tuple(sorted([candidate, *others], key=_by_gain))
         search.steps.append(replace(search.steps[0], added=effect.id, searched=fitted, origin="library", tried=tried))
+
+
+def _refusal(search: EffectSearch, candidate: Candidate) -> str | None:
+    """Why left-out blocks refuse a candidate, in words; None if they do not.
+
+    An effort that hardly comes at rest is refused, too, where a term predicts them better: the pulses cause it.
+    """
+    after, required = leave_out(candidate.fitted), required_errors(search, candidate)
+    comparison = difference(search.steps[-1].left_out, after)
+    if not comparison.errors >= required:
+        needed = "It must not rise."
+        if required > 0.0:
+            needed = f"It must fall by {required:g} of its standard errors at least."
+        elif required < 0.0:
+            needed = f"It may rise by {-required:g} of its standard errors at most."
+        return f"{comparison.words} {needed}"
+    if not only_at_work(search.quiet, candidate.fitted, candidate.effect.id):
+        return None
+    term = max(fit_terms(in_held_noise(search.last), silent), key=lambda fitted: fitted.log_evidence, default=None)
+    if term is None or (comparison := difference(after, leave_out(term))).gain <= 0.0:
+        return None
+    name = find_effect(term.effects[-1][0]).name.lower()
+    return (
+        f"It hardly comes at rest, and {name} explains more: with it in place of efforts the error {comparison.change}."
+    )
 
 
 def required_errors(search: EffectSearch, candidate: Candidate) -> float:

@@ -37,6 +37,8 @@ also the largest probability of an effect that may only repair the inexact form 
 do not appear at rest: the stimulation itself may cause them."""
 SHARE_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
+SHORTEST_WAVE_S = 0.3
+"""Time, s, in which a tremor dies away at the soonest; a limb on a spring swings for less after a pulse."""
 TEMPERATURE = 2.0
 """Log evidence that the best form of a rival may lose by chance."""
 RELATIVE = 0.03

@@ -31,7 +31,7 @@ class Verdict:
     probability: float  # of the verdict as a whole
     held_out_error: HeldOutError | None = None  # of the last model; None if held-out pulses cannot be judged
     notes: list[str] = field(default_factory=list)  # reasons, for people
-    objections: dict[str, str] = field(default_factory=dict)  # by effect: what held-out pulses say against it
+    objections: dict[str, str] = field(default_factory=dict)  # by effect: what speaks against it
 
 
 def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[str, float]:
@@ -61,6 +61,11 @@ def _no_effort(search: EffectSearch) -> bool:
     step = search.found[0][1]
     effort, holder = str(step.added), step.searched
     return only_at_work(search.quiet, holder, effort) and "resisting" in dict(holder.effects)[effort].name
+
+
+def _swings(fitted: Fitted) -> bool:
+    """Return True if the narrow band dies away sooner than a tremor does."""
+    return fitted.noise.band_s(fitted.problem.setup.grid.step_s) < thresholds.SHORTEST_WAVE_S
 
 
 def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
@@ -108,7 +113,7 @@ def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
         before,
         kind=before.kind if named else "unexplained_structure",
         probability=before.probability if named else 0.9,
-        probabilities={effect: before.probabilities.get(effect, thresholds.DOUBTED) for effect in there},
+        probabilities={effect: before.probabilities[effect] for effect in there},
         explained=_explained(search),
         structure=search.residual.ratio,
         held_out_error=error,
@@ -131,9 +136,12 @@ def judge(search: EffectSearch) -> Verdict:
         if repairs or only_at_work(search.quiet, step.searched, effect):
             largest = min(largest, thresholds.UNSURE)
         if objection := vetoed(before.searched, step.searched):
+            notes.append(f"The error on held-out pulses rises with this effect: {find_effect(effect).name}.")
+        elif find_effect(effect).band and _swings(step.searched):
+            objection = "Its wave dies away so soon that the pulses may set it off: a limb may swing."
+        if objection:
             objections[effect] = objection
             largest = min(largest, thresholds.DOUBTED)
-            notes.append(f"The error on held-out pulses rises with this effect: {find_effect(effect).name}.")
         probabilities[effect] = largest = min(largest, rivals[effect][effect])
     explained = _explained(search) if effects else 0.0
     if last.noise.band > 0.0:
@@ -173,7 +181,7 @@ def leaves_more(search: EffectSearch, verdict: Verdict) -> bool:
 def _rivals(search: EffectSearch, step: Step) -> dict[str, float]:
     """Probabilities of the effects tried in the round of a step, without those of other rounds."""
     others = {*search.names("library")} - {step.added}
-    competitors = [c for c in step.tried if c.refused is None and c.effect.id not in others]
+    competitors = [c for c in step.tried if c.refusal is None and c.effect.id not in others]
     return shares(competitors, next(c.gain for c in competitors if c.effect.id == step.added))
 
 

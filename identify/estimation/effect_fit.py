@@ -12,7 +12,6 @@ from stimrig.identify.effects.base import STAGES, Effect, Form, Scene, replaced_
 from stimrig.identify.errors import BadRequest, NotIdentifiable
 from stimrig.identify.estimation.candidates import trusted
 from stimrig.identify.estimation.joint_sensor import with_angle_delay
-from stimrig.identify.estimation.left_out import Difference
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
 from stimrig.identify.estimation.solve import Fitted, solve, start_from
@@ -39,20 +38,7 @@ class Candidate:
     fitted: Fitted  # the model with it
     gain: float  # log evidence gained over the model without it, with the effect's prior odds
     forms: dict[str, float]  # gain by form
-    refused: Difference | None = None  # what left-out blocks say where they refuse it; None: not asked, or allowed
-    required: float = 0.0  # standard errors by which the error on those blocks had to fall, where they refuse it
-
-    @property
-    def refusal(self) -> str | None:
-        """Left-out error and the required one, in words; None if left-out blocks do not refuse the candidate."""
-        if self.refused is None:
-            return None
-        needed = "It must not rise."
-        if self.required > 0.0:
-            needed = f"It must fall by {self.required:g} of its standard errors at least."
-        elif self.required < 0.0:
-            needed = f"It may rise by {-self.required:g} of its standard errors at most."
-        return f"{self.refused.words} {needed}"
+    refusal: str | None = None  # in words, why left-out blocks refuse it; None: not asked, or allowed
 
 
 def try_effect(

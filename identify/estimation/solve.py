@@ -387,7 +387,7 @@ def band_as_effect(fitted: Fitted) -> Fitted:
     setup = fitted.problem.setup
     step_s, span_s = setup.grid.step_s, setup.scene.span_s
     wave = band_part(fitted.residual_nm, setup.stretches, fitted.noise)
-    memory_s = step_s / max(1.0 - fitted.noise.decay, 1e-6)
+    memory_s = fitted.noise.band_s(step_s)
     wanted = 1 if memory_s > 4 * span_s else 1 + span_s / max(0.35 * memory_s, 0.15)
     form = min(effect.forms, key=lambda f: abs(np.log(len(f.parameters) / (1 + 2 * wanted))))
     problem = Problem(setup, [*fitted.effects, (effect.id, form)])

@@ -12,7 +12,7 @@ import pytest
 
 from bench.muscles.physics_records import record_of_physics
 from stimrig import identify
-from stimrig.identify.diagnosis import free, result
+from stimrig.identify.diagnosis import candidate_terms, free, result
 from stimrig.identify.diagnosis.search import resembles_earlier, search_effects, silent
 from stimrig.identify.dynamics.linear import Discrete
 from stimrig.identify.dynamics.second_order import boundary_states
@@ -227,9 +227,9 @@ def test_a_model_has_no_more_terms_than_are_allowed_however_often_it_is_searched
     grid, _ = prepare(strange())
     plain = fit_plain(grid, fitted_rows(grid, None))
     plain = solve(plain.problem, plain.theta, WHITE)
-    monkeypatch.setattr(free, "MAX_TERMS", 1)
-    one = free._with_term(plain, *free._promising(plain)[0], 1)
-    assert free._promising(one) == []
+    monkeypatch.setattr(candidate_terms, "MAX_TERMS", 1)
+    one = candidate_terms.fit_term(plain, *candidate_terms.promising(plain)[0])
+    assert candidate_terms.promising(one) == []
 
 
 def test_where_nothing_is_missing_nothing_free_is_added():
@@ -313,7 +313,7 @@ def test_a_zero_that_moves_from_rest_to_rest_is_held_as_slow_noise(zero_nm: floa
     moving = zero_nm * np.sin(0.17 * record.time_s)
     grid, raw = prepare(record.with_torque(record.torque_nm + moving))
     plain = search_effects(grid, raw, fitted_rows(grid, None), silent, max_effects=0)
-    noise = free._in_held_noise(tuple(plain.steps))[-1].searched.noise
+    noise = candidate_terms.in_held_noise(plain.last).noise
     assert noise.held and not noise.at_bound and (noise.share > 0.0) is held
     if held:
         assert 0.5 < noise.sd_nm * noise.share**0.5 / np.std(moving) < 1.5

@@ -15,16 +15,17 @@ from stimrig.identify.diagnosis.residual import HeldOutError, ResidualStructure
 from stimrig.identify.diagnosis.search import EffectSearch, Step
 from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free, shares
 from stimrig.identify.effects import find_effect
+from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.readings import Readings
 
 FIRST, SECOND, EFFORT, TREMOR = "fatigue", "output_saturation", "voluntary_effort", "tremor"
 
 
 def candidate(effect: str, gain: float) -> Any:
-    return SimpleNamespace(effect=find_effect(effect), gain=gain, refused=None)
+    return SimpleNamespace(effect=find_effect(effect), gain=gain, refusal=None)
 
 
-def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters: float) -> Any:
+def fitted(log_likelihood: float, *effects: str, wave_s: float = 1.0, **parameters: float) -> Any:
     """A fit as the verdict sees it: 100 s of fitted rows at 40 intervals a second; the base has -20."""
 
     def parameters_of(effect: str) -> dict[str, float]:
@@ -38,7 +39,7 @@ def fitted(log_likelihood: float, *effects: str, band: float = 0.0, **parameters
         log_likelihood=log_likelihood - 20.0,
         heavy_tails=False,
         effects=forms,
-        noise=SimpleNamespace(band=band, at_bound=False),
+        noise=NoiseLevel(0.5, 0.5, 1.0, decay=1.0 - 0.025 / wave_s),
         parameters_of=parameters_of,
         problem=SimpleNamespace(setup=SimpleNamespace(fitted=np.ones(4000, bool), grid=SimpleNamespace(step_s=0.025))),
     )
@@ -187,11 +188,11 @@ def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
 EFFORTS = {f"centre_{i}": 10.0 * i for i in range(3)} | {"width_0": 1.0, "decay_0": 1.0}
 
 
-def trembling(made: Made, busy_nm: float, ratio: float) -> None:
+def trembling(made: Made, busy_nm: float, ratio: float, wave_s: float = 1.0) -> None:
     """Explained is what it took of the power above the white noise, 0.2 N·m here, of 0.3 N·m before."""
     made.left_by_first = made.left(busy_nm=0.3, white_nm=0.2)
-    made.add(TREMOR, 50.0, 90.0).leaves(ratio=ratio, busy_nm=busy_nm, white_nm=0.2)
-    made.last.noise.band = 0.5
+    made.add(TREMOR, 50.0, 90.0, wave_s=wave_s).leaves(ratio=ratio, busy_nm=busy_nm, white_nm=0.2)
+    made.last.noise = replace(made.last.noise, band=0.5)
     assert made.judged().explained == pytest.approx(1 - (busy_nm**2 - 0.04) / 0.05)
 
 
@@ -307,6 +308,14 @@ def test_efforts_are_looked_for_in_the_model_to_which_they_were_added(made: Made
     made.at_rest = 0.14
     found = made.add(EFFORT, 50.0, 80.0, **EFFORTS).add(FIRST, 50.0, 90.0).judged()
     assert found.probabilities == {EFFORT: 0.85, FIRST: 0.85}
+
+
+@pytest.mark.parametrize(("wave_s", "doubted"), [(0.29, True), (0.31, False)])
+def test_a_tremor_that_dies_away_too_soon_is_doubted(made: Made, wave_s: float, doubted: bool):
+    trembling(made, 0.22, 3.0, wave_s)
+    found = made.judged()
+    assert ("a limb may swing" in found.objections.get(TREMOR, "")) is doubted
+    assert (found.probabilities[TREMOR] <= 0.45) is doubted
 
 
 def test_a_law_that_shows_nothing_at_rest_is_as_certain_as_ever(made: Made):
