@@ -284,9 +284,7 @@ def _refusal(search: EffectSearch, candidate: Candidate) -> str | None:
     if term is None or (comparison := difference(after, leave_out(term))).gain <= 0.0:
         return None
     name = find_effect(term.effects[-1][0]).name.lower()
-    return (
-        f"It hardly comes at rest, and {name} explains more: with it in place of efforts the error {comparison.change}."
-    )
+    return f"It hardly comes at rest, and {name} predicts better: in its place the error {comparison.change}."
 
 
 def required_errors(search: EffectSearch, candidate: Candidate) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import cache
 from types import SimpleNamespace
 from typing import Any
@@ -230,6 +231,23 @@ def test_a_model_has_no_more_terms_than_are_allowed_however_often_it_is_searched
     monkeypatch.setattr(candidate_terms, "MAX_TERMS", 1)
     one = candidate_terms.fit_term(plain, *candidate_terms.promising(plain)[0])
     assert candidate_terms.promising(one) == []
+
+
+def efforts() -> Record:
+    """Two half sines while the muscle pulls, and none at rest."""
+    record = hidden_muscles.record(seed=3, rate_hz=100)
+    arches = (np.sin(np.pi * np.clip((record.time_s - begin_s) / 1.5, 0.0, 1.0)) for begin_s in (4.0, 9.0))
+    return record.with_torque(record.torque_nm + sum(arches))
+
+
+@pytest.mark.parametrize(("make", "refused"), [(strange, True), (efforts, False)])
+def test_efforts_at_work_are_refused_where_a_term_predicts_better(make: Callable[[], Record], refused: bool):
+    grid, raw = prepare(make())
+    with few_effects.only("voluntary_effort", "free_width_by_torque"):
+        search = search_effects(grid, raw, fitted_rows(grid, None))
+    assert search.names("library") == ([] if refused else ["voluntary_effort"])
+    (effort,) = search.rounds[0]
+    assert ("width by torque predicts better" in (effort.refusal or "")) is refused
 
 
 def test_where_nothing_is_missing_nothing_free_is_added():
