@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from stimrig.identify.dynamics.terms import LARGEST, Driver, Place
+from stimrig.identify.dynamics.terms import EDGE, LARGEST, QUICK_S, Driver, Place
 from stimrig.identify.effects.base import Effect, Form, Parameter, Shape
 
 PLACES = {
@@ -19,11 +19,14 @@ PLACES = {
     Place.FACTOR: ("factor of the torque at the cell", "y exp(z)"),
 }
 """Of each place its name, and how an exponent z acts there."""
+ROUNDED = f"(√(r² + {EDGE}²) + r - {EDGE})/2"
+"""max(r, 0) with the corner that the model rounds."""
+RATES_IN_WORDS = {Driver.RISE: f"; r = y'·{QUICK_S} s/y_max", Driver.FALL: f"; r = -y'·{QUICK_S} s/y_max"}
 DRIVERS = {
     Driver.DRIVE: ("drive", "f(u)/y_max", "at full drive"),
     Driver.TORQUE: ("torque", "y/y_max", "at full torque"),
-    Driver.RISE: ("rise of the torque", "max(y', 0)·0.1 s/y_max", "at a rise by the largest torque in 0.1 s"),
-    Driver.FALL: ("fall of the torque", "max(-y', 0)·0.1 s/y_max", "at a fall by the largest torque in 0.1 s"),
+    Driver.RISE: ("rise of the torque", ROUNDED, "at a rise by the largest torque in 0.1 s"),
+    Driver.FALL: ("fall of the torque", ROUNDED, "at a fall by the largest torque in 0.1 s"),
     Driver.PULSES: ("presence of pulses", "(1 under pulses)", "under pulses"),
     Driver.SQUARE: ("square of the torque", "(y/y_max)²", "at full torque"),
     Driver.TORQUE_PLAY: ("torque with play", "y/y_max", "at full torque"),
@@ -115,7 +118,7 @@ def _equation(place: Place, driver: Driver, size: str, other: str) -> str:
     if driver == Driver.SQUARE:
         return f"{acts}; z = {size}·{share}"
     state = f"x' = ({share} - x)/{other}" if later(driver) else f"x follows {share} behind a play of ±{other}"
-    return f"{acts}; z = {size}·x, {state}"
+    return f"{acts}; z = {size}·x, {state}{RATES_IN_WORDS.get(driver, '')}"
 
 
 def _shape(form: Form, values: Mapping[str, np.ndarray]) -> Shape:

@@ -36,6 +36,13 @@ DRAWS = np.r_[0.0, np.linspace(-1.0, 1.0, 401)][:, None]
             "y exp(z); z = 0.90·(y/y_max)²",
         ),
         (
+            "free_second_rate_by_fall",
+            {"change": 0.5 + 0.1 * DRAWS, "lag_s": 0.25 + 0.06 * DRAWS},
+            "Rate of the second lag <- fall of the torque, 0.25 s late (0.19 to 0.31 s): +64 % at a fall by the largest "
+            "torque in 0.1 s (+50 to +80 %).",
+            "1/T2 exp(z); z = 0.50·x, x' = ((√(r² + 0.02²) + r - 0.02)/2 - x)/0.25 s; r = -y'·0.1 s/y_max",
+        ),
+        (
             "free_torque_by_width_play",
             {"change": 0.2 + 0.02 * DRAWS, "reach": 0.1 + 0.01 * DRAWS},
             "Torque at the cell <- width with play of ±10 % (9.1 to 11 %): +18 % of the largest at the largest width "
