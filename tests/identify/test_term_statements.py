@@ -38,8 +38,8 @@ DRAWS = np.r_[0.0, np.linspace(-1.0, 1.0, 401)][:, None]
         (
             "free_second_rate_by_fall",
             {"change": 0.5 + 0.1 * DRAWS, "lag_s": 0.25 + 0.06 * DRAWS},
-            "Rate of the second lag <- fall of the torque, 0.25 s late (0.19 to 0.31 s): +64 % at a fall by the largest "
-            "torque in 0.1 s (+50 to +80 %).",
+            "Rate of the second lag <- fall of the torque, 0.25 s late (0.19 to 0.31 s): +64 % at a fall by the "
+            "largest torque in 0.1 s (+50 to +80 %).",
             "1/T2 exp(z); z = 0.50·x, x' = ((√(r² + 0.02²) + r - 0.02)/2 - x)/0.25 s; r = -y'·0.1 s/y_max",
         ),
         (

@@ -1,0 +1,54 @@
+"""Which terms are chosen and kept as rivals, on models made by hand."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from stimrig.identify.diagnosis import free
+from stimrig.identify.diagnosis.search import EffectSearch, Step, silent
+
+NAMED, TERM = "fatigue", "free_width_by_torque"
+
+
+def model(log_evidence: float, *effects: str) -> Any:
+    noise = SimpleNamespace(band=0.0)
+    return SimpleNamespace(
+        log_evidence=log_evidence, effects=[(name, None) for name in effects], noise=noise, problem=None, theta=None
+    )
+
+
+@pytest.fixture
+def made_by_hand(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """No model is fitted again, and left-out blocks and held-out pulses ask for every term."""
+    monkeypatch.setattr(free, "in_held_noise", lambda fitted: fitted)
+    monkeypatch.setattr(free, "vetoed", lambda *_: None)
+    monkeypatch.setattr(free, "_better", lambda before, after: SimpleNamespace(gain=float(len(after)), errors=9.0))
+    return monkeypatch
+
+
+def test_the_rivals_of_a_term_are_the_likeliest_others(made_by_hand: pytest.MonkeyPatch) -> None:
+    gains = {"free_width_by_drive": 7.0, TERM: 9.0, "free_width_by_pulses": 5.0, "free_torque_by_drive": 8.0}
+    rounds = iter([[model(gain, name) for name, gain in gains.items()], []])
+    made_by_hand.setattr(free, "fit_terms", lambda *_: next(rounds))
+    best = model(9.0, TERM)
+    made_by_hand.setattr(free, "solve", lambda *_: best)
+    step = free._extended((Step(None, model(0.0), "base"),), silent)[-1]
+    assert step.added == TERM
+    assert [rival.effects[0][0] for rival in step.others] == ["free_torque_by_drive", "free_width_by_drive"]
+
+
+@pytest.mark.parametrize(("by_names", "found"), [(49.0, [TERM]), (51.0, [])])
+def test_terms_take_the_place_of_names_that_explain_less_than_half(
+    by_names: float, found: list[str], made_by_hand: pytest.MonkeyPatch
+) -> None:
+    base, named = Step(None, model(0.0), "base"), Step(NAMED, model(by_names, NAMED), "library")
+    term = Step(TERM, model(100.0, TERM), "free")
+    made_by_hand.setattr(free, "_extended", lambda chain, _: chain if chain[-1] is named else (*chain, term))
+    raw: Any = None
+    search = EffectSearch(raw, np.ones(9, bool), base.searched, [base, named], np.zeros(9, bool))
+    freely = free.explain_freely(search, [base, named], silent)
+    assert freely.names("free") == found and freely.names("library") == ([] if found else [NAMED])
