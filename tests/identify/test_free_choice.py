@@ -26,7 +26,7 @@ def made_by_hand(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """No model is fitted again, and left-out blocks and held-out pulses ask for every term."""
     monkeypatch.setattr(free, "in_held_noise", lambda fitted: fitted)
     monkeypatch.setattr(free, "vetoed", lambda *_: None)
-    monkeypatch.setattr(free, "_better", lambda before, after: SimpleNamespace(gain=float(len(after)), errors=9.0))
+    monkeypatch.setattr(free, "_better", lambda _, after: SimpleNamespace(gain=float(len(after)), errors=9.0))
     return monkeypatch
 
 
