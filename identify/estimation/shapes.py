@@ -17,6 +17,8 @@ from stimrig.identify.problem.problem import Chosen
 DRAWS = 200
 POINTS = 500
 """Most points of a course."""
+CANCELLED = 0.5
+"""Two terms nearly cancel where their sum is smaller than this share of the larger one."""
 
 
 def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] | None:
@@ -43,20 +45,45 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
         lower, upper = np.percentile(drawn[1:], PERCENTILES, axis=0)
         lines[name] = {"value": drawn[0].tolist(), "lower": lower.tolist(), "upper": upper.tolist()}
     names = " or ".join(find_effect(name).name.lower() for name in described.behaves_as)
+    note = f" It behaves as {names}." if names else ""
+    if opposed := _opposed(fitted, chosen):
+        note = f" It counts only together with {opposed}: over this record the two nearly cancel."
     return {key: getattr(described, key) for key in ("place", "driven_by", "driver", "effect")} | {
-        "words": described.words + (f" It behaves as {names}." if names else ""),
+        "words": described.words + note,
         "equation": f"{described.equation}; y_max = {fitted.problem.setup.scale_nm:.3g} N·m",
-        "behaves_as": list(described.behaves_as),
+        "behaves_as": [] if opposed else list(described.behaves_as),
         "at": described.at.tolist(),
         "lines": lines,
         "course": _course(fitted, chosen),
     }
 
 
+def _opposed(fitted: Fitted, chosen: Chosen) -> str:
+    """Names of the terms each of which cancels most of a term at its place, over the fitted rows; empty if none does.
+
+    Two courses whose sum is so small are correlated below -0.86.
+    """
+    names, rows = [], fitted.problem.setup.fitted
+    for other in fitted.problem.chosen:
+        if other is not chosen and other.form.law.get("place") == chosen.form.law["place"]:
+            pair = np.array([_exponent(fitted, term)[2][rows] for term in (chosen, other)])
+            if np.linalg.norm(pair.sum(0)) < CANCELLED * np.max(np.linalg.norm(pair, axis=1)):
+                names.append(f"“{find_effect(other.effect).name}”")
+    return " and ".join(names)
+
+
 def _course(fitted: Fitted, chosen: Chosen) -> dict[str, list[float]]:
-    """The driver and the effect of a term over the record, by the model's own torque."""
+    """The driver and the effect of a term over the record, for a picture."""
+    time_s, share, exponent = _exponent(fitted, chosen)
+    shown = slice(None, None, math.ceil(share.size / POINTS))
+    columns = {"time_s": time_s, "driver": share, "value": acting(Place(int(chosen.form.law["place"])), exponent)}
+    return {name: [float(f"{each:.4g}") for each in column[shown]] for name, column in columns.items()}
+
+
+def _exponent(fitted: Fitted, chosen: Chosen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, s, driver and exponent of a term over the record, by the model's own torque; each of shape (K,)."""
     problem, setup, theta = fitted.problem, fitted.problem.setup, fitted.theta.copy()
-    place, driver = Place(int(chosen.form.law["place"])), Driver(int(chosen.form.law["driver"]))
+    driver = Driver(int(chosen.form.law["driver"]))
     # the torque that drives a term is that before the terms at the cell
     theta[[each.first for each in problem.chosen if each.form.law.get("place") in AFTER_LAGS]] = 0.0
     width_us, drive_nm, torque_nm = problem.inner_signals(theta)
@@ -79,7 +106,4 @@ def _course(fitted: Fitted, chosen: Chosen) -> dict[str, list[float]]:
             behind = 0.0 if k in starts else x  # a play begins anew with each part
             x = lagging if later(driver) else min(max(behind, now - other), now + other)
             states[k] = x
-    shown = slice(None, None, math.ceil(share.size / POINTS))
-    times_s = setup.scene.time_s + setup.grid.start_s
-    columns = {"time_s": times_s, "driver": share, "value": acting(place, size * states)}
-    return {name: [float(f"{each:.4g}") for each in column[shown]] for name, column in columns.items()}
+    return setup.scene.time_s + setup.grid.start_s, share, size * states

@@ -12,7 +12,7 @@ from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.terms import Driver, Place
 from stimrig.identify.effects import find_effect, registry
 from stimrig.identify.effects.terms import BEHAVIOURS, _number, behaves_as
-from stimrig.identify.estimation.shapes import _course
+from stimrig.identify.estimation.shapes import _course, shape_of
 from stimrig.identify.problem.predict import problem_of
 from stimrig.identify.records.join import join
 from tests.identify import hidden_muscles
@@ -127,3 +127,20 @@ def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque(dr
     assert np.median(off) < 0.01 and np.mean(off) < 0.03 and np.min(expected) < 0.95
     if driver == Driver.TORQUE:
         assert np.max(off) < 0.015 and np.min(expected) < 0.7
+
+
+@pytest.mark.parametrize(("sizes", "cancel"), [((-0.8, 0.8), True), ((0.8, 0.8), False), ((-0.8, 0.2), False)])
+def test_a_term_that_another_at_its_place_nearly_cancels_is_told_only_with_it(sizes, cancel):
+    """Drive and torque, each behind 20 s, have about the same course: what the first does alone is no fatigue."""
+    record, terms = hidden_muscles.record(rate_hz=100), ("free_strength_by_drive", "free_strength_by_torque")
+    entries = [
+        {"id": effect, "form": "term", "settings": {"scale_nm": 6.0}}
+        | {"parameters": {"change": {"value": size, "sd": 0.0}, "lag_s": {"value": 20.0, "sd": 0.0}}}
+        for effect, size in zip(terms, sizes, strict=True)
+    ]
+    problem, theta = problem_of(identify.fit(record).with_(effects=tuple(entries)), make_grid(record))
+    fitted = SimpleNamespace(problem=problem, theta=theta, physical=problem.physical(theta))
+    for index, other in enumerate(("“Strength by torque”", "“Strength by drive”")):
+        shape = shape_of(fitted, index, 1e-6 * np.eye(theta.size))
+        assert (f"It counts only together with {other}" in shape["words"]) == cancel
+        assert bool(shape["behaves_as"]) != cancel
