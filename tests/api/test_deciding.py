@@ -193,7 +193,8 @@ def test_the_commands_that_follow_begin_with_the_model_that_was_examined(
     assert ("the plain structure asks" in printed) == (model is not None)
     explain.explain([], model, output=output)
     last = "--model /dev/null DATA -o NEW.json` adds it" if output else f"{given}DATA -o NEW.json` writes the last"
-    assert f"`stimrig explain {last}" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert f"`stimrig explain {last}" in printed and ("the plain structure asks" in printed) == (model is not None)
     left.conclusion.kind = "nothing"
     diagnose.diagnose([], model)
     writes = f"improve {given}" if model else "fit "

@@ -23,17 +23,17 @@ def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap
     with progress_bar() as progress:
         diagnosis = identify.diagnose(record, model, progress)
     words = f"The structure examined is {in_words(structure)}."
-    commands = next_commands(diagnosis, model_json)
+    commands = add_command(diagnosis, model_json) + test_command(diagnosis, model_json)
     if diagnosis.conclusion.kind == "nothing":
         writes = f"improve {begin_with(model_json)}" if model_json else "fit "
         commands = [f"`stimrig {writes}DATA -o NEW.json` writes this model."]
     report({"structure": structure, **diagnosis.to_dict()}, as_json, diagnosis, words, *commands)
 
 
-def next_commands(diagnosis: identify.Diagnosis, examined: Path | None) -> list[str]:
-    """Name the commands that do what is advised; `examined`: the model that was diagnosed, None for the plain one."""
+def add_command(diagnosis: identify.Diagnosis, examined: Path | None) -> list[str]:
+    """Name the command that adds what is missing, if anything is; `examined`: the model, None for the plain one."""
     explain = f"`stimrig explain {begin_with(examined)}DATA -o NEW.json` adds it, and shows how the error falls."
-    return [explain] * bool(diagnosis.add) + test_command(diagnosis, examined)
+    return [explain] * bool(diagnosis.add)
 
 
 def begin_with(model_json: Path | None) -> str:

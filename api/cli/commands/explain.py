@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stimrig import identify
-from stimrig.api.cli.commands.diagnose import begin_with, next_commands, test_command
+from stimrig.api.cli.commands.diagnose import add_command, begin_with, test_command
 from stimrig.api.cli.files import html_report, load_structure, short, story_of, write
 from stimrig.api.cli.options import ColumnMap, HeldModel, Json, LastModel, SeveralData
 from stimrig.api.cli.terminal import print_aside, report
@@ -46,9 +46,9 @@ def explain(
                 write(figures / f"{name}.{kind}", figure.file(kind))
     document = {"structure": structure, **explained.to_dict()}
     commands = [f"`stimrig explain {begin_with(model_json)}DATA -o NEW.json` writes the last model."]
-    commands += test_command(explained.left, model_json)
     if output is not None:
-        commands = next_commands(explained.left, output)
+        commands = add_command(explained.left, output)
+    commands += test_command(explained.left, model_json)
     report(document, as_json, explained, *commands, files=[output, html, figures])
     if own is not None:  # last: without a term there is nothing to write
         from stimrig.api.export.own_effect import own_effect
