@@ -25,7 +25,7 @@ from stimrig.identify.summary import (
     quantity,
     torque,
 )
-from stimrig.identify.yardstick import repetition_words
+from stimrig.identify.yardstick import repetition_words, zero_words
 
 Row = Mapping[str, Any]
 CORRELATED_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
@@ -71,6 +71,9 @@ class Comparison(Result):
     series: Row
     """Values for plots, at most 2400 points: `time_s`, `torque_nm`, `predicted_torque_nm`, `lower_nm`, `upper_nm`,
     `residual_nm`, `pulse_width_us`, `segment`, `noise_band_nm`."""
+    wandering_zero_nm: float
+    """Root mean square of the residual's means in the rests; 0 where it is a small part of the error, the residual
+    looks like noise, or there are too few rests."""
     left_out: str  # how much was not counted, and why; empty if everything was counted
     plain: tuple[str, ...]  # sentences for people
 
@@ -86,6 +89,7 @@ class Comparison(Result):
             ("repetition", repetition_words(vars(self))),
             ("residual", f"not noise: correlated with {', '.join(alarms)}" if alarms else "looks like noise"),
         ]
+        rows += [("note", zero_words(self.wandering_zero_nm))] * bool(self.wandering_zero_nm)
         if not looks_like_noise(vars(self)):
             rows += _listed("worst place", [row["text"] for row in self.where[:FEW]])
             rows += [(f"by {kind}", _shares(self.by[kind])) for kind in ("segment", "direction") if self.by.get(kind)]
@@ -184,6 +188,7 @@ class Improvement(Result):
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')}, sd of a sample"),
             ("repetition", repetition_words(self.steps[-1])),
         ]
+        rows += [("note", text) for text in self.models[-1].reasons]
         rows += _listed("refused", [f"{row['effect']}: {row['reason']}" for row in self.refused[:FEW]])
         if len(self.refused) > FEW:
             rows.append(("", f"and {len(self.refused) - FEW} more effects"))

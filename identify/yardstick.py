@@ -42,6 +42,14 @@ def _repeating(repetition: Mapping[str, Any] | None) -> list[str]:
     return lines
 
 
+def zero_words(zero_nm: float) -> str:
+    """Say that the torque at rest is part of the error; it may be a zero, or force that no pulse explains."""
+    return (
+        f"At rest the model is off by {zero_nm:.2g} N·m, root mean square of the rests: a zero that wanders, or force "
+        "that lingers. It is part of the error, and no effect of the model describes it."
+    )
+
+
 def held_out_pulses(figures: Mapping[str, Any]) -> str:
     """The pulses whose errors these are, in a sentence."""
     return "parts left out in turn" if figures.get("held_out_by") == "cross-validation" else "held-out pulses"

@@ -18,13 +18,14 @@ from stimrig.identify.errors import BadRecord
 from stimrig.identify.estimation.fit_statistics import UNDEFINED, figures, rms
 from stimrig.identify.estimation.quality import range_warnings
 from stimrig.identify.estimation.repetition import repetition
+from stimrig.identify.estimation.rests import wandering_zero_nm
 from stimrig.identify.estimation.samples import block_means, inspect
 from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
 from stimrig.identify.model import Model
 from stimrig.identify.problem.predict import same_data
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Comparison
-from stimrig.identify.yardstick import repetition_sentences
+from stimrig.identify.yardstick import repetition_sentences, zero_words
 
 POINTS = 2400
 """Largest number of points of a plotted series."""
@@ -69,16 +70,19 @@ def compare(model: Model, record: Record) -> Comparison:
     residual = record.torque_nm - predicted
     noise = raw.noise_sd_nm
     tests = correlation_tests(grid, residual)
+    alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     counted = grid.counted
     places = worst_places(record, residual, noise, rows=counted)
     held_out_rows = record.held_out & counted
     whole = _figures(record, predicted, noise, counted)
     held_out = _figures(record, predicted, noise, held_out_rows) if held_out_rows.any() else None
-    left_out = _left_out(grid)
+    left_out, errors = _left_out(grid), block_means(grid, residual)
+    zero_nm = wandering_zero_nm(grid, ~grid.doubted & np.isfinite(errors), errors) if alarms else 0.0
     remarks = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
+    remarks += [zero_words(zero_nm)] * bool(zero_nm)
     clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
     fitted_repetition = model.fit.get("repetition") if same_data(model, record) else None  # by errors of left-out rows
-    repeats = fitted_repetition or repetition(clean, block_means(grid, residual), grid.fitted)
+    repeats = fitted_repetition or repetition(clean, errors, grid.fitted)
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
@@ -89,10 +93,11 @@ def compare(model: Model, record: Record) -> Comparison:
         by=_error_shares(record, residual, noise, counted),
         tests=tests,
         where=tuple(places),
+        wandering_zero_nm=zero_nm,
         left_out=left_out,
         series=_series(model, record, predicted, noise),
         plain=(
-            *_plain(whole, held_out, noise, tests, places),
+            *_plain(whole, held_out, noise, alarms, places),
             *repetition_sentences({"repetition": repeats}),
             *remarks,
             *outside,
@@ -136,7 +141,7 @@ def _plain(
     whole: dict[str, Any],
     held_out: dict[str, Any] | None,
     noise_sd_nm: float,
-    tests: dict[str, Any],
+    alarms: list[str],
     places: list[dict[str, Any]],
 ) -> list[str]:
     noise = f"the noise of {noise_sd_nm:.3g} N·m"
@@ -149,7 +154,6 @@ def _plain(
         if np.isfinite(held_out["fit_percent"]):
             share = f"{held_out['fit_percent']:.1f} %, where the noise allows {held_out['ceiling_percent']:.1f} %"
         lines.append(f"On held-out pulses its error is {held_out['rms_nm']:.3g} N·m ({share}).")
-    alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     lines.append(" ".join(alarms) if alarms else "The remaining error looks like noise: no correlation is significant.")
     if alarms:
         lines += [f"{place['text']}." for place in places[:3]]

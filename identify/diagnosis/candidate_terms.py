@@ -12,12 +12,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.base import Effect, replaced_by
 from stimrig.identify.effects.terms import tried_at
-from stimrig.identify.estimation.rests import zero_scatter_nm
+from stimrig.identify.estimation.rests import wandering_zero_nm
 from stimrig.identify.estimation.solve import LARGEST_SLOPE, Fitted, solve, solve_scaled, start_from
 from stimrig.identify.noise import WHITE, beside_zero
 from stimrig.identify.problem.problem import Problem
@@ -41,10 +40,8 @@ def in_held_noise(fitted: Fitted) -> Fitted:
     """
     setup, problem = fitted.problem.setup, fitted.problem
     fitted = fitted if fitted.noise.held else solve(problem, fitted.theta, WHITE)
-    wander = zero_scatter_nm(setup.grid, setup.fitted, fitted.residual_nm)
-    noise = WHITE
-    if wander > thresholds.WANDERS * fitted.rms_nm:
-        noise = beside_zero(wander, fitted.rms_nm, ZERO_MEMORY_S, setup.grid.step_s)
+    wander_nm = wandering_zero_nm(setup.grid, setup.fitted, fitted.residual_nm)
+    noise = beside_zero(wander_nm, fitted.rms_nm, ZERO_MEMORY_S, setup.grid.step_s) if wander_nm else WHITE
     return solve(problem, fitted.theta, noise) if noise.share or fitted.noise.share else fitted
 
 

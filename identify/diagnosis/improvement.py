@@ -12,7 +12,7 @@ from stimrig.identify.diagnosis.result import diagnosis_of
 from stimrig.identify.diagnosis.search import MAX_EFFECTS, EffectSearch, Progress, Step, helpful, silent
 from stimrig.identify.diagnosis.verdict import Verdict
 from stimrig.identify.effects import find_effect
-from stimrig.identify.estimation.candidates import words
+from stimrig.identify.estimation.candidates import likelihood_warnings, words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.left_out import difference, from_to, hold_out
@@ -125,7 +125,8 @@ def _improvement_of(
     steps = supported if max_effects is None else supported[: max_effects + 1]
     models, rows = [], []
     for number, step in enumerate(_with_forced(steps, force, search.raw)):
-        model = finish("maximum-likelihood", step.fitted, statistics=step.statistics)
+        reasons = likelihood_warnings(step.fitted)
+        model = finish("maximum-likelihood", step.fitted, reasons, statistics=step.statistics)
         parent = models[-1].model_id if models else None
         models.append(model.with_(extra=model.extra | {"parent": parent, "added": step.added, "step": number}))
         reason = _reason(search, steps[number - 1], step, models[-1]) if number < len(steps) else FORCED
@@ -174,7 +175,7 @@ def _reason(search: EffectSearch, before: Step, step: Step, model: Model) -> str
             (entry["shape"] for entry in model.effects if entry["id"] == step.added and "shape" in entry), {}
         )
         description = described.get("words", f"{find_effect(step.added).name}.")
-        return " ".join([description, comparison.words_of_choice, FREE])
+        return " ".join([description, comparison.words_of_choice, FREE, *likelihood_warnings(step.fitted)])
     gain = next(candidate.gain for candidate in step.tried if candidate.effect.id == step.added)
     margin = search.margin(search.names("library").index(step.added))
     reasons = [f"Log evidence rises by {gain:.0f}; at least {margin:.3g} is required.", comparison.words]

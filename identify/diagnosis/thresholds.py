@@ -27,8 +27,6 @@ TERM_MARGIN = 3.0
 """Log evidence that a further term must gain."""
 NEAR = 0.1
 """Logarithm of the left-out error by which a chain of fewer terms may predict worse than the best one."""
-WANDERS = 0.3
-"""Share of a model's error from which the scatter of its means at rest counts as a zero that wanders."""
 NAMES_SHARE = 0.5
 """Share of the log evidence gained by terms alone that names must gain where something is left beside them."""
 UNSURE = 0.85

@@ -83,17 +83,20 @@ def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
             f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted."
         )
     if fitted.noise.held:
-        zero = ", beside a zero that wanders as it does at rest" if fitted.noise.share > 0.0 else ""
-        sentences.append(
-            f"The noise was taken as white{zero}: slow noise would have taken up what the structure leaves."
-        )
+        sentences.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
     return [*sentences, *likelihood_warnings(fitted)]
 
 
 def likelihood_warnings(fitted: Fitted) -> list[str]:
-    """Why the likelihood of a fit is no evidence, in words; nothing where it is."""
-    sentences = []
-    if fitted.noise.at_bound:
+    """What the noise of a fit hides, and why its likelihood is no evidence, in words; nothing where it is."""
+    sentences, noise = [], fitted.noise
+    if noise.held and noise.share > 0.0:
+        zero_nm = noise.sd_nm * noise.share**0.5
+        sentences.append(
+            f"A zero that wanders was held as noise, {zero_nm:.2g} N·m from rest to rest: it is part of the error, and "
+            "no effect describes it."
+        )
+    if noise.at_bound:
         sentences.append(
             "The slow noise is as slow as it may be: left-out parts of the record decide, not the likelihood."
         )

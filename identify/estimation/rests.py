@@ -13,6 +13,8 @@ SLOW_S = 0.2
 """Time constant of a slow muscle: what it may still pull that long after its last pulse widens the zero's sd."""
 LEAST_SHARE = 0.05
 """The zero is not taken as better known than this share of the torque's range: a residual state may hold it up."""
+WANDERS = 0.3
+"""Share of a model's error from which the scatter of its means at rest counts as a zero that wanders."""
 SHORT = 8
 """Rests of no more intervals say nothing of the noise."""
 
@@ -71,7 +73,11 @@ def scatter_at_rest(grid: Grid, rests: np.ndarray, values_nm: np.ndarray) -> tup
     return (float(sum(squares)) / free if free else 0.0), free
 
 
-def zero_scatter_nm(grid: Grid, rows: np.ndarray, residual_nm: np.ndarray) -> float:
-    """Return how far the zero moves from rest to rest, N·m: the scatter of a residual's means there."""
+def wandering_zero_nm(grid: Grid, rows: np.ndarray, residual_nm: np.ndarray) -> float:
+    """Return how far the zero moves from rest to rest, N·m: the scatter of a residual's means there.
+
+    0 with fewer than two rests, and where it is less than `WANDERS` of the error on those rows.
+    """
     rests = [rest for rest in grid.stretches(rows & relaxed(grid, RELAXED_S)) if rest.stop - rest.start > SHORT]
-    return float(np.sqrt(np.mean([np.mean(residual_nm[rest]) ** 2 for rest in rests]))) if len(rests) > 1 else 0.0
+    scatter_nm = np.sqrt(np.mean([np.mean(residual_nm[rest]) ** 2 for rest in rests])) if len(rests) > 1 else 0.0
+    return float(scatter_nm) if scatter_nm > WANDERS * np.sqrt(np.mean(residual_nm[rows] ** 2)) else 0.0

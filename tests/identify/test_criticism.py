@@ -39,6 +39,15 @@ def test_the_tables_add_up_series_fit_a_screen_and_words_name_a_place(compared):
     json.dumps(result.to_dict(), allow_nan=False)
 
 
+@pytest.mark.parametrize(("zero_nm", "said"), [(0.0, False), (0.3, True)])
+def test_a_zero_that_wanders_in_another_record_is_named_beside_the_worst_places(zero_nm: float, said: bool):
+    record = hidden_muscles.record(seed=3, rate_hz=100)
+    other = record.with_torque(record.torque_nm + zero_nm * np.sin(0.17 * record.time_s))
+    result = compare(identify.fit(record), other)
+    assert (0.5 * zero_nm < result.wandering_zero_nm < zero_nm) == said
+    assert all((("a zero that wanders" in words) == said) for words in (str(result), " ".join(result.plain)))
+
+
 @pytest.mark.parametrize("others", [0, 30])
 def test_a_record_that_is_nearly_all_held_out_is_compared_as_a_whole(others: int):
     record = hidden_muscles.record(seed=3)

@@ -21,6 +21,7 @@ from stimrig.identify.dynamics.terms import LARGEST, REACH, Driver, Place, lags_
 from stimrig.identify.effects import registry
 from stimrig.identify.effects.terms import DRIVERS, PLACES
 from stimrig.identify.errors import BadModel, BadRequest
+from stimrig.identify.estimation.candidates import likelihood_warnings
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.quality import _stable
 from stimrig.identify.estimation.samples import fitted_rows, prepare
@@ -331,7 +332,9 @@ def test_a_zero_that_moves_from_rest_to_rest_is_held_as_slow_noise(zero_nm: floa
     moving = zero_nm * np.sin(0.17 * record.time_s)
     grid, raw = prepare(record.with_torque(record.torque_nm + moving))
     plain = search_effects(grid, raw, fitted_rows(grid, None), silent, max_effects=0)
-    noise = candidate_terms.in_held_noise(plain.last).noise
+    held_model = candidate_terms.in_held_noise(plain.last)
+    noise, said = held_model.noise, " ".join(likelihood_warnings(held_model))
+    assert ("A zero that wanders was held as noise" in said) is held
     assert noise.held and not noise.at_bound and (noise.share > 0.0) is held
     if held:
         assert 0.5 < noise.sd_nm * noise.share**0.5 / np.std(moving) < 1.5
