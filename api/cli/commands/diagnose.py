@@ -16,8 +16,9 @@ from stimrig.api.structure import in_words
 def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap = None, as_json: Json = False) -> None:
     """Name the effects missing in a model's structure, most probable first; or none; or structure that none explains.
 
-    Takes 5 to 30 s, longer where structure is left or with several recordings. DATA decides: a model given with --model
-    lends its structure, not its numbers.
+    Takes 5 to 60 s; up to three minutes where structure is left, with several recordings, or on a busy computer.
+
+    DATA decides: a model given with --model lends its structure, not its numbers.
     """
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:

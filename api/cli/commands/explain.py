@@ -27,7 +27,9 @@ def explain(
 ) -> None:
     """Explain a model's error step by step: where it fails, the missing effects, the error with them, and what is left.
 
-    Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o no model is kept.
+    Takes 5 to 60 s; up to three minutes where structure is left, with several recordings, or on a busy computer.
+
+    Without -o no model is kept.
     """
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:

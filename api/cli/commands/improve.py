@@ -19,7 +19,9 @@ def improve(
 ) -> None:
     """Add effects one by one to a model's structure as long as the evidence supports it; each step is a model.
 
-    Takes 5 to 40 s, longer where structure is left or with several recordings. Without -o nothing is kept.
+    Takes 5 to 60 s; up to three minutes where structure is left, with several recordings, or on a busy computer.
+
+    Without -o nothing is kept.
     """
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
