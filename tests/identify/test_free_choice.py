@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stimrig.identify.diagnosis import free
+from stimrig.identify.diagnosis import candidate_terms, free
 from stimrig.identify.diagnosis.search import EffectSearch, Step, silent
+from stimrig.identify.effects import find_effect
 
 NAMED, TERM = "fatigue", "free_width_by_torque"
 
@@ -52,3 +53,14 @@ def test_terms_take_the_place_of_names_that_explain_less_than_half(
     search = EffectSearch(raw, np.ones(9, bool), base.searched, [base, named], np.zeros(9, bool))
     freely = free.explain_freely(search, [base, named], silent)
     assert freely.names("free") == found and freely.names("library") == ([] if found else [NAMED])
+
+
+def test_the_size_of_a_term_is_cut_no_further_once_it_does_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The base itself runs away here, with any size."""
+    begun, runs = np.array([2.0, 0.5]), iter([(None, np.full((2, 3), np.inf))] * 20)
+    problem = SimpleNamespace(chosen=[SimpleNamespace(first=1)], run=lambda *_, **__: next(runs))
+    monkeypatch.setattr(candidate_terms, "_with_term", lambda *_: problem)
+    monkeypatch.setattr(candidate_terms, "start_from", lambda *_: begun)
+    monkeypatch.setattr(candidate_terms, "solve", lambda _problem, start, *_, **__: start)
+    start = candidate_terms.fit_term(model(0.0), find_effect(TERM), {})
+    assert start[0] == 2.0 and 0.0 < start[1] <= candidate_terms.LEAST_SIZE
