@@ -71,8 +71,8 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
     """The search with terms, where they describe the record better than what it found; else as it was.
 
     `named`: its steps with effects that are named, empty where none is. Terms are looked for beside them, and on the
-    model with what the samples show alone. A model without the names takes their place only where they explain less
-    than half of what it explains, and where it predicts left-out blocks better.
+    model with what the samples show alone. A model without what the search found takes its place only where it predicts
+    left-out blocks better; that of names only where they explain less than half of what it explains, too.
     """
     before, best = _held(tuple(search.steps)), search
     alone = [step for step in search.steps if step.origin != "library"]
@@ -86,7 +86,9 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
         if base is alone and own.errors >= thresholds.BETTER_IF_DOUBTFUL:
             start = _held(tuple(base))[-1].searched.log_evidence
             names, terms = (each[-1].searched.log_evidence - start for each in (before, chain))
-            replaces = not named or (other.errors >= thresholds.BETTER and names < thresholds.NAMES_SHARE * terms)
+            replaces = other.gain > 0.0
+            if named:
+                replaces = other.errors >= thresholds.BETTER and names < thresholds.NAMES_SHARE * terms
         else:
             replaces = base is named and own.errors >= thresholds.BETTER_THAN_ALIKE
         if replaces:

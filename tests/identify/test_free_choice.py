@@ -55,6 +55,22 @@ def test_terms_take_the_place_of_names_that_explain_less_than_half(
     assert freely.names("free") == found and freely.names("library") == ([] if found else [NAMED])
 
 
+@pytest.mark.parametrize(("gain", "found"), [(0.1, [TERM]), (-0.1, [])])
+def test_terms_replace_what_was_found_only_if_they_predict_better(
+    gain: float, found: list[str], made_by_hand: pytest.MonkeyPatch
+) -> None:
+    """A zero that wanders over a plain muscle was told as a term, where a drift had been found and was not named."""
+    base, drift = Step(None, model(0.0), "base"), Step("baseline_drift", model(90.0, "baseline_drift"), "library")
+    term = Step(TERM, model(40.0, TERM), "free")
+    better = {base: 1.0, drift: gain}
+    made_by_hand.setattr(free, "_better", lambda before, _: SimpleNamespace(gain=better[before[-1]], errors=9.0))
+    made_by_hand.setattr(free, "_held", lambda chain: chain)
+    made_by_hand.setattr(free, "_extended", lambda chain, _: (*chain, term))
+    raw: Any = None
+    search = EffectSearch(raw, np.ones(9, bool), base.searched, [base, drift], np.zeros(9, bool))
+    assert free.explain_freely(search, (), silent).names("free") == found
+
+
 def test_the_size_of_a_term_is_cut_no_further_once_it_does_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
     """The base itself runs away here, with any size."""
     begun, runs = np.array([2.0, 0.5]), iter([(None, np.full((2, 3), np.inf))] * 20)
