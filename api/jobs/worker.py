@@ -30,6 +30,8 @@ ENVIRONMENT = (
     "PYTHONDONTWRITEBYTECODE", "PYTHONUNBUFFERED", "NUMBA_CACHE_DIR", "STIMRIG_EFFECTS_DIR",
 )  # fmt: skip
 """Variables that workers may see."""
+KEPT_MEMORY = dict.fromkeys(("MALLOC_TRIM_THRESHOLD_", "MALLOC_MMAP_THRESHOLD_"), str(1 << 25))
+"""Memory below this size is kept once it is free: a fit makes and drops arrays all the time."""
 
 
 def limit_environment() -> None:
@@ -37,7 +39,7 @@ def limit_environment() -> None:
     for name in set(os.environ) - set(ENVIRONMENT):
         del os.environ[name]
     # small matrices gain nothing from a second thread; a recording names no plug-in to load
-    os.environ.update(OPENBLAS_NUM_THREADS="1", HDF5_PLUGIN_PRELOAD="::")
+    os.environ.update(OPENBLAS_NUM_THREADS="1", HDF5_PLUGIN_PRELOAD="::", **KEPT_MEMORY)
 
 
 class Worker:
