@@ -193,7 +193,8 @@ def _whitened(rows: np.ndarray, fitted: Fitted) -> np.ndarray:
 def _simulate(fitted: Fitted, record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Interval means of a fitted candidate on another record, without sporadic effects, and their slopes."""
     grid = make_grid(record)
-    setup = fitted.problem.setup.with_(grid=grid, target_nm=np.zeros(grid.size), fitted=np.ones(grid.size, bool))
+    blank = {"target_nm": np.zeros(grid.size), "fitted": np.ones(grid.size, bool), "rests_nm": None}
+    setup = fitted.problem.setup.with_(grid=grid, **blank)
     problem = Problem(setup, [(effect, form) for effect, form in fitted.effects if not find_effect(effect).sporadic])
     # Parameters are copied by name: the new test has one part, starts at rest, and has no sporadic effects.
     known = {name: place for place, name in enumerate(fitted.problem.names)}

@@ -82,6 +82,14 @@ def test_a_tremor_is_no_reason_to_choose_none():
     assert fitted.noise.band > 0.0 and found is not None and 0.0 < found < 1.0
 
 
+def test_one_is_planned_from_joined_records_too():
+    """Their parts have a zero each, and the new test has one part."""
+    parts = [hidden_muscles.record(seed=seed, rate_hz=100) for seed in (3, 4)]
+    both = join(parts, [0.0, 600.0])
+    found = plan_further(both, fitted_with(both, [])).expected_fall
+    assert found is not None and 0.0 < found < 1.0
+
+
 def test_it_is_there_where_structure_is_left_and_keeps_the_limits(made, diagnosis):
     found = identify.next_experiment(diagnosis)
     assert diagnosis.verdict == "unexplained_structure" and found is not None and found.text in str(diagnosis)
