@@ -104,6 +104,8 @@ def _advise_effects(diagnosis: Mapping[str, Any], missing: Sequence[Mapping[str,
     rows = [row for row in in_order(diagnosis) if row["effect"] in to_add]
     if not rows:
         further = [row["next_experiment"] for row in missing if row.get("next_experiment")][:1]
+        if diagnosis.get("deciding_experiment"):
+            further.append("Play the next experiment, relaxed: it is planned to decide.")
         return " ".join(["Add nothing yet: held-out pulses speak against adding any.", *further])
     rival = next((row for row in missing if row.get("confused_with")), None)
     first = f"Add {', then '.join(join_names([row]) for row in rows)} to the model."

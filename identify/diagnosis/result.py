@@ -145,13 +145,14 @@ def _deciding(search: EffectSearch, verdict: Verdict, diagnosis: dict[str, Any])
 def _undecided(search: EffectSearch, verdict: Verdict, planned: bool) -> bool:
     """Return True if a further test is planned for the structure that is left.
 
-    Beside effects that are named, where all could be foreseen, leave more than noise, and no test is `planned` for
-    their rivals.
+    Beside effects that are named, where no test is `planned` for their rivals: if all could be foreseen and leave more
+    than noise, or if something speaks against an effort, which does not come again with the pulses.
     None is planned for a moving joint, which has tests of its own, nor where the curve is a guess or the muscle hardly
     answers: the dose would be a guess, too.
     """
-    named = verdict.kind == "effect_missing" and not planned and leaves_more(search, verdict)
-    named = named and all(find_effect(name).predictable for name in search.names("library"))
+    named = verdict.kind == "effect_missing" and not planned
+    if named and not any(find_effect(name).sporadic for name in verdict.objections):
+        named = leaves_more(search, verdict) and all(find_effect(name).predictable for name in search.names("library"))
     if not named and verdict.kind != "unexplained_structure":
         return False
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)

@@ -319,10 +319,12 @@ def test_a_further_test_is_planned_beside_a_name_that_leaves_more_than_noise(
     )
     search: Any = SimpleNamespace(record=setup.grid.record, last=last, residual=SimpleNamespace(significant=False))
     search.names = lambda *_: ["fatigue"]
-    verdict: Any = SimpleNamespace(kind="effect_missing", held_out_error=None)
+    verdict: Any = SimpleNamespace(kind="effect_missing", held_out_error=None, objections={})
     assert result._undecided(search, verdict, planned) is wanted
     search.names = lambda *_: ["fatigue", "voluntary_effort"]  # efforts leave more on rows that were not fitted
     assert not result._undecided(search, verdict, planned)
+    verdict.objections = {"voluntary_effort": "held out, the error rises"}  # in a further test it does not come again
+    assert result._undecided(search, verdict, planned) is not planned
 
 
 @pytest.mark.parametrize(("zero_nm", "held"), [(0.0, False), (0.2, True), (-0.2, True)])
