@@ -222,25 +222,24 @@ def _gains(length, ar1, slow, turn, decay, band):  # pragma: no cover
 def _band_gains(gains, variances, ar1, slow, turn, decay, band):  # pragma: no cover
     """Gains and variances as in `_gains`, with an oscillator; the number of steps until they settle."""
     c, s = decay * np.cos(turn), decay * np.sin(turn)
-    f = np.array(((ar1, 0.0, 0.0), (0.0, c, -s), (0.0, s, c)))
-    p = np.array(((slow, 0.0, 0.0), (0.0, band, 0.0), (0.0, 0.0, band)))
-    q = np.array((slow * (1 - ar1 * ar1), band * (1 - decay * decay), band * (1 - decay * decay)))
-    h, after = np.empty(3), np.empty((3, 3))
+    fresh, new = slow * (1 - ar1 * ar1), band * (1 - decay * decay)
+    xx, xu, xv, uu, uv, vv = slow, 0.0, 0.0, band, 0.0, band  # covariance of the state
     for k in range(variances.size):
-        for i in range(3):
-            h[i] = p[i, 0] + p[i, 1]
-        variances[k] = h[0] + h[1] + max(1.0 - slow - band, 1e-9)
-        for i in range(3):
-            for j in range(3):
-                p[i, j] -= h[i] * h[j] / variances[k]
-                gains[k, i] += f[i, j] * h[j] / variances[k]
-        for i in range(3):
-            for j in range(3):
-                after[i, j] = q[i] if i == j else 0.0
-                for a in range(3):
-                    for b in range(3):
-                        after[i, j] += f[i, a] * p[a, b] * f[j, b]
-        p, after = after, p
+        x, u, v = xx + xu, xu + uu, xv + uv
+        variance = variances[k] = x + u + max(1.0 - slow - band, 1e-9)
+        gains[k, 0], gains[k, 1], gains[k, 2] = (
+            ar1 * x / variance,
+            (c * u - s * v) / variance,
+            (s * u + c * v) / variance,
+        )
+        xx, xu, xv = xx - x * x / variance, xu - x * u / variance, xv - x * v / variance
+        uu, uv, vv = uu - u * u / variance, uv - u * v / variance, vv - v * v / variance
+        xx, xu, xv = ar1 * ar1 * xx + fresh, ar1 * (c * xu - s * xv), ar1 * (s * xu + c * xv)
+        uu, uv, vv = (
+            c * c * uu - 2.0 * c * s * uv + s * s * vv + new,
+            c * s * (uu - vv) + (c * c - s * s) * uv,
+            s * s * uu + 2.0 * c * s * uv + c * c * vv + new,
+        )
         if k > 30 and abs(variances[k] - variances[k - 1]) < 1e-11:
             return k + 1
     return variances.size
@@ -263,15 +262,15 @@ def _whiten(rows, start, stop, ar1, slow, turn, decay, band):  # pragma: no cove
             for k in range(stop[i] - start[i]):
                 if k < settled:
                     g, by_cos, by_sin, size = gains[k, 0], gains[k, 1], gains[k, 2], scale[k]
-                e = rows[m, start[i] + k] - x - u
+                y = rows[m, start[i] + k] - u
+                e = y - x
                 white[m, f] = e * size
-                x = ar1 * x + g * e
+                x = (ar1 - g) * x + g * y  # = ar1 x + g e, with a shorter wait for the last x
                 if band > 0.0:
                     u, v = c * u - s * v + by_cos * e, s * u + c * v + by_sin * e
                 f += 1
     for i in range(start.size):
-        for k in range(stop[i] - start[i]):
-            log_det += half[min(k, settled - 1)]
+        log_det += np.sum(half[: stop[i] - start[i]]) + max(stop[i] - start[i] - settled, 0) * half[-1]
     return white, log_det
 
 

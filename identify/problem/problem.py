@@ -192,9 +192,10 @@ class _StagePass:
         """Add a perturbed row for each of some parameters; their values in all rows, in their units, (M, places)."""
         present = len(self.owners) + 1
         nominal = self.value[places.start : places.stop]
+        values = np.empty((present + len(places) * self.derivatives, len(places)))
+        values[:] = nominal
         if not self.derivatives:
-            return np.tile(nominal, (present, 1))
-        values = np.tile(nominal, (present + len(places), 1))
+            return values
         for i, place in enumerate(places):
             step = self.problem.step[place]
             if self.theta[place] + step > self.problem.upper[place]:
@@ -206,8 +207,11 @@ class _StagePass:
 
     def grown(self, rows: np.ndarray) -> np.ndarray:
         """An array of an earlier stage, with the rows that have come since then."""
-        since = len(self.owners) + 1 - len(rows)
-        return np.concatenate([rows, np.broadcast_to(rows[:1], (since, *rows.shape[1:]))]) if since else rows
+        if len(rows) == len(self.owners) + 1:
+            return rows
+        grown = np.empty((len(self.owners) + 1, *rows.shape[1:]), rows.dtype)
+        grown[: len(rows)], grown[len(rows) :] = rows, rows[0]
+        return grown
 
     def forms(self, stage: str) -> list[Chosen]:
         return [chosen for chosen in self.problem.chosen if chosen.form.stage == stage]
