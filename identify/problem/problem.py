@@ -192,11 +192,8 @@ class _StagePass:
         """Add a perturbed row for each of some parameters; their values in all rows, in their units, (M, places)."""
         present = len(self.owners) + 1
         nominal = self.value[places.start : places.stop]
-        values = np.empty((present + len(places) * self.derivatives, len(places)))
-        values[:] = nominal
-        if not self.derivatives:
-            return values
-        for i, place in enumerate(places):
+        values = np.full((present + len(places) * self.derivatives, len(places)), nominal)
+        for i, place in enumerate(places if self.derivatives else ()):
             step = self.problem.step[place]
             if self.theta[place] + step > self.problem.upper[place]:
                 step = -step
