@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +53,22 @@ def load_structure(path: Path | None, data: Sequence[Path], columns: list[str] |
         return record, model, held_by(model, record)
     except identify.IdentifyError as error:
         raise InputError(f"{path}: {error}") from error
+
+
+def check_outputs(inputs: Iterable[Path | None], *outputs: Path | None) -> None:
+    """Check before a verb computes that its outputs can be written, and that none replaces a file that it reads.
+
+    Raises InputError.
+    """
+    known = {Path(os.path.realpath(path)) for path in inputs if path is not None}
+    for path in filter(None, outputs):
+        place = Path(os.path.realpath(path))
+        if place in known:
+            raise InputError(f"{path}: it would replace a file of this command. Give another name.")
+        writable = place.parent.is_dir() and os.access(place if place.exists() else place.parent, os.W_OK)
+        if place.is_dir() or not writable:
+            raise InputError(f"{path}: give a file in a folder that can be written.")
+        known.add(place)
 
 
 def short(data: Sequence[Path]) -> str:

@@ -86,7 +86,7 @@ def test_a_record_of_another_tool_gives_the_same_and_what_was_assumed_is_said(
 def parts(tmp_path_factory: pytest.TempPathFactory, model: Path) -> dict[str, Path]:
     """A record, another one with an angle, and files that cannot be used."""
     folder = tmp_path_factory.mktemp("several")
-    names = {"plain": "csv", "moved": "csv", "short": "csv", "bad": "csv", "rate": "json"}
+    names = {"plain": "csv", "moved": "csv", "short": "csv", "bad": "csv", "rate": "json", "own": "py"}
     files = {name: folder / f"{name}.{suffix}" for name, suffix in names.items()}
     made_up_csv(files["plain"])
     head, *rows = (row.split(",") for row in files["plain"].read_text().splitlines())
@@ -94,6 +94,7 @@ def parts(tmp_path_factory: pytest.TempPathFactory, model: Path) -> dict[str, Pa
     files["moved"].write_text("\n".join([",".join([*head, "angle_rad", "velocity_rad_s"]), *more]))
     files["short"].write_text("\n".join(files["plain"].read_text().splitlines()[:6]))
     files["bad"].write_text("time_s,pulse_width_us,torque_nm,segment\n0.0,0,0.1,prbs\n0.025,abc,0.1,prbs\n")
+    files["own"].touch()
     files["rate"].write_text(json.dumps({**json.loads(model.read_text()), "pulse_rate_hz": 25.0}))
     return files
 
@@ -118,11 +119,22 @@ def parts(tmp_path_factory: pytest.TempPathFactory, model: Path) -> dict[str, Pa
         ("diagnose {record} --model {record}", "record.csv"),
         ("diagnose {record} --model {rate}", "rate.json: "),
         ("improve {record} --model {rate}", "25 pulses a second"),
-        ("fit {record} -o /nowhere/at/all/M.json", "/nowhere/at/all/M.json: No such file"),
+        ("fit {record} -o /nowhere/at/all/M.json", "/nowhere/at/all/M.json: give a file in a folder"),
+        ("fit {record} -o {record}", "record.csv: it would replace a file of this command"),
+        ("fit {record} --carry {model} -o {model}", "MODEL.json: it would replace"),
+        ("improve {record} -o x --html {record}", "record.csv: it would replace"),
+        ("improve {record} -o x --html x", "x: it would replace"),
+        ("compare {model} {record} --html {model}", "MODEL.json: it would replace"),
+        ("predict {model} {record} -o {record}", "record.csv: it would replace"),
+        ("invert {model} {record} -o {model}", "MODEL.json: it would replace"),
+        ("explain {record} --own {record}", "record.csv: give a name that ends in .py"),
+        ("explain {record} --own {own}", "own.py: it exists already: move it or give another name"),
+        ("explain {record} --own /nowhere/x.py", "/nowhere/x.py: give a file in a folder"),
+        ("explain {record} --figures {record}", "record.csv: File exists"),
         ("predict nowhere.json {record} -o x.csv", "nowhere.json"),
         ("predict {record} {record} -o x.csv", "record.csv"),
         ("predict {model} {record} -o /nowhere/x.csv", "/nowhere/x.csv: "),
-        ("predict {model} {record} -o {model}/x.csv", "MODEL.json/x.csv: Not a directory"),
+        ("predict {model} {record} -o {model}/x.csv", "MODEL.json/x.csv: give a file in a folder"),
         ("compare {model} nowhere.csv", "nowhere.csv"),
         ("table1 --trials 0", "--trials"),
         ("fit", "DATA"),

@@ -156,6 +156,7 @@ def test_audit_is_verified_and_exported_by_a_command(
     found = json.loads(capsys.readouterr().out)
     assert found["whole"] and found["entries"] >= 2
     assert main.run(["audit", "export", "--data", data, "-o", str(out)]) == 0
+    assert main.run(["audit", "export", "--data", data, "-o", str(service.data / "stimrig.db")]) == 2
     assert main.run(["audit", "verify", "--file", str(out), "--head", found["head"]]) == 0
     page = tmp_path / "page.jsonl"
     page.write_bytes(client.get("/administration/audit.jsonl").content)

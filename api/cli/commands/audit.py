@@ -8,13 +8,15 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from sqlalchemy import make_url
 
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.files import write
+from stimrig.api.cli.files import check_outputs, write
 from stimrig.api.cli.options import Json, set_options
 from stimrig.api.cli.terminal import print_lines, report
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store, audit
+from stimrig.api.store.database import sqlite_file
 from stimrig.api.store.tables import AuditEntry
 
 DataDir = Annotated[Path | None, typer.Option("--data", help="data folder; default ./var, or STIMRIG_DATA_DIR")]
@@ -56,7 +58,9 @@ def export(
     data: DataDir = None,
 ) -> None:
     """Write the trail, one entry a line; `verify --file` checks it without the database."""
-    entries = stored(settings_of(data))
+    settings = settings_of(data)
+    check_outputs([sqlite_file(make_url(settings.database))], output)
+    entries = stored(settings)
     write(output, "".join(json.dumps(entry.as_dict(), sort_keys=True) + "\n" for entry in entries))
     print_lines(f"{len(entries)} entries written to {output}; head {head_of(entries)}")
 

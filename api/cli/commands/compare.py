@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stimrig import identify
-from stimrig.api.cli.files import html_report, load_model, load_record, short, write
+from stimrig.api.cli.files import check_outputs, html_report, load_model, load_record, short, write
 from stimrig.api.cli.options import ColumnMap, Html, Json, ModelFile, SeveralData
 from stimrig.api.cli.terminal import report
 
@@ -15,6 +15,7 @@ def compare(
 
     The model runs free: it is given the pulse widths alone, never the measured torque.
     """
+    check_outputs([model_json, *data], html)
     model = load_model(model_json)
     record = load_record(data, columns)
     compared = identify.compare(model, record)

@@ -9,7 +9,8 @@ import typer
 
 from stimrig import identify
 from stimrig.api.cli.commands.diagnose import add_command, begin_with, test_command
-from stimrig.api.cli.files import html_report, load_structure, short, story_of, write
+from stimrig.api.cli.errors import InputError
+from stimrig.api.cli.files import check_outputs, html_report, load_structure, short, story_of, write
 from stimrig.api.cli.options import ColumnMap, HeldModel, Json, LastModel, SeveralData
 from stimrig.api.cli.terminal import print_aside, report
 from stimrig.api.progress_bar import progress_bar
@@ -31,6 +32,13 @@ def explain(
 
     Without -o no model is kept.
     """
+    if own is not None and own.suffix != ".py":
+        raise InputError(f"--own {own}: give a name that ends in .py.")
+    if own is not None and own.exists():
+        raise InputError(f"--own {own}: it exists already: move it or give another name.")
+    if figures is not None:
+        figures.mkdir(parents=True, exist_ok=True)
+    check_outputs([*data, model_json], output, html, own, figures and figures / "figure.svg")
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         explained = identify.explain(record, progress, model)
@@ -41,7 +49,6 @@ def explain(
         from stimrig.api.charts.diagnosis_charts import story_figures
         from stimrig.api.charts.figure import FILE_KINDS
 
-        figures.mkdir(parents=True, exist_ok=True)
         narrative = story_of(record, explained)
         for name, figure in story_figures(narrative["story"], narrative["before"], narrative["after"]).items():
             for kind in FILE_KINDS:

@@ -9,7 +9,7 @@ import typer
 
 from stimrig import identify
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.files import load_model, load_record, write
+from stimrig.api.cli.files import check_outputs, load_model, load_record, write
 from stimrig.api.cli.options import ColumnMap, Json, SeveralData, names
 from stimrig.api.cli.terminal import report
 from stimrig.api.progress_bar import progress_bar
@@ -52,6 +52,7 @@ def fit(
     """Identify a model: recruitment curve, linear dynamics, effects. Says how well it fits and whether it is usable."""
     if carry is not None and (method != METHOD or effects or fit_on):
         raise InputError("--carry takes the structure of its MODEL.json. Leave out --method, --effects and --fit-on.")
+    check_outputs([*data, carry], output)
     earlier = None if carry is None else load_model(carry)
     record = load_record(data, columns, names(effects))
     carried = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from stimrig import identify
-from stimrig.api.cli.files import html_report, load_structure, short, write
+from stimrig.api.cli.files import check_outputs, html_report, load_structure, short, write
 from stimrig.api.cli.options import ColumnMap, HeldModel, Html, Json, LastModel, SeveralData
 from stimrig.api.cli.terminal import report
 from stimrig.api.progress_bar import progress_bar
@@ -23,6 +23,7 @@ def improve(
 
     Without -o nothing is kept.
     """
+    check_outputs([*data, model_json], output, html)
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         if html is None:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from stimrig.api.cli.files import inversion_table, load_model, write
+from stimrig.api.cli.files import check_outputs, inversion_table, load_model, write
 from stimrig.api.cli.options import Json, ModelFile
 from stimrig.api.cli.terminal import report
 
@@ -31,6 +31,7 @@ def invert(
     from stimrig.identify.inversion import invert as widths_for
     from stimrig.identify.inversion.reference import read_reference
 
+    check_outputs([model_json, reference], output)
     model = load_model(model_json)
     wanted = read_reference(reference.read_bytes(), str(reference), model.pulse_rate_hz)
     inversion = widths_for(model, wanted, largest_us=largest_us, rise_us=rise_us, shortest_us=shortest_us)

@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from stimrig import identify
-from stimrig.api.cli.files import load_model, load_record
+from stimrig.api.cli.files import check_outputs, load_model, load_record
 from stimrig.api.cli.options import ColumnMap, Data, Json, ModelFile
 from stimrig.api.cli.terminal import report
 from stimrig.api.whole_file import whole_path
@@ -27,6 +27,7 @@ def predict(
     from stimrig.identify.estimation.fit_statistics import best_fit_percent
     from stimrig.identify.summary import fit_words
 
+    check_outputs([model_json, data], output)
     model = load_model(model_json)
     record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))

@@ -17,7 +17,7 @@ import typer
 from stimrig import identify
 from stimrig.api.cli import deciding
 from stimrig.api.cli.errors import CommandError, InputError
-from stimrig.api.cli.files import write
+from stimrig.api.cli.files import check_outputs, write
 from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, names, set_options
 from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
@@ -87,7 +87,9 @@ def test(
         raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
     if (adaptive, protocol is not None, bool(decide)).count(True) > 1:
         raise InputError("--adaptive, --protocol and --decide are three kinds of test. Give one of them.")
-    check_output(output)
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
+    check_outputs(decide or (), output)
     request = set_options(protocol=protocol, kind="adaptive" if adaptive else None, **bounds, **labels)
     if decide:
         request |= deciding.plan_experiment(decide, participant)
@@ -117,15 +119,6 @@ def _take_labels(verb: Any) -> None:
 
 
 _take_labels(test)
-
-
-def check_output(output: Path | None) -> None:
-    """Check before the test that the recording can be written after it. Raises InputError, OSError."""
-    if output is None:
-        return
-    output.parent.mkdir(parents=True, exist_ok=True)
-    if output.is_dir() or not os.access(output if output.exists() else output.parent, os.W_OK):
-        raise InputError(f"{output}: give a file in a folder that can be written.")
 
 
 def target_of(text: str) -> dict[str, float] | None:
