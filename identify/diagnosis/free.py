@@ -22,6 +22,7 @@ from stimrig.identify.diagnosis.search import (
     helpful,
     search_effects,
     silent,
+    without_effect,
 )
 from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free, leaves_more
 from stimrig.identify.dynamics.grid import Grid
@@ -104,7 +105,10 @@ def _held(chain: Chain) -> Chain:
 
 
 def _extended(base: Chain, progress: Progress) -> Chain:
-    """The base with the terms that left-out blocks ask for; of chains that predict them about equally the shortest."""
+    """The base with the terms that left-out blocks ask for; of chains that predict them about equally the shortest.
+
+    At last each term but the newest is left out in turn: a later one may have made it superfluous.
+    """
     chains = [base]
     for number in range(MAX_TERMS):
         chains[-1] = _held(chains[-1])
@@ -124,8 +128,27 @@ def _extended(base: Chain, progress: Progress) -> Chain:
         if not any(vetoed(shorter[-1].searched, chain[-1].searched) for shorter in allowed):
             allowed.append(chain)
     gains = [_better(chains[0], chain).gain for chain in allowed]
-    near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= max(gains) - thresholds.NEAR)
+    least = max(gains) - thresholds.NEAR
+    near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= least)
+    for step in near[len(base) : -1]:
+        shorter = _without(near, step)
+        if _better(near, shorter).errors > -thresholds.SUPERFLUOUS and not vetoed(
+            near[-1].searched, shorter[-1].searched
+        ):
+            near = shorter
     return (*base, *near[len(base) :])  # the base as it was searched
+
+
+def _without(chain: Chain, left: Step) -> Chain:
+    """The chain without one of its terms; the models after it are searched again."""
+    name = str(left.added)
+    steps = [step for step in chain if step is not left]
+    return tuple(
+        replace(step, searched=without_effect(step.searched, name), others=(), known=None)
+        if name in dict(step.searched.effects)
+        else step
+        for step in steps
+    )
 
 
 def _better(before: Sequence[Step], after: Sequence[Step]) -> Difference:

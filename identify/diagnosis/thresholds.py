@@ -25,6 +25,8 @@ FREE_FALL = 0.2
 """Logarithm by which that error must fall with a free effect, too: it is chosen among many."""
 TERM_MARGIN = 3.0
 """Log evidence that a further term must gain."""
+SUPERFLUOUS = 1.5
+"""Standard errors of the left-out error up to which it may rise without a term that later ones made superfluous."""
 NEAR = 0.1
 """Logarithm of the left-out error by which a chain of fewer terms may predict worse than the best one."""
 NAMES_SHARE = 0.5

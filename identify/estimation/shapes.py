@@ -18,7 +18,7 @@ DRAWS = 200
 POINTS = 500
 """Most points of a course."""
 CANCELLED = 0.5
-"""Two terms nearly cancel where their sum is smaller than this share of the larger one."""
+"""Two terms nearly cancel where both together change the torque by less than this share of what one of them does."""
 
 
 def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] | None:
@@ -59,15 +59,25 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
 
 
 def _opposed(fitted: Fitted, chosen: Chosen) -> str:
-    """Names of the terms each of which cancels most of a term at its place, over the fitted rows; empty if none does.
+    """Names of the terms each of which nearly cancels a term; empty if none does.
 
-    Two courses whose sum is so small are correlated below -0.86.
+    Without both, the torque of the fitted rows then differs less than half as much as without one of them.
     """
-    names, rows = [], fitted.problem.setup.fitted
-    for other in fitted.problem.chosen:
-        if other is not chosen and other.form.law.get("place") == chosen.form.law["place"]:
-            pair = np.array([_exponent(fitted, term)[2][rows] for term in (chosen, other)])
-            if np.linalg.norm(pair.sum(0)) < CANCELLED * np.max(np.linalg.norm(pair, axis=1)):
+    problem, rows, names = fitted.problem, fitted.problem.setup.fitted, []
+
+    def run_without(*terms: Chosen) -> np.ndarray:
+        theta = fitted.theta.copy()
+        theta[[term.first for term in terms]] = 0.0
+        return problem.run(theta)[0][rows]
+
+    torque_nm = run_without()
+    for other in problem.chosen:
+        if other is not chosen and other.form.stage == "term":
+            both, *alone = (
+                float(np.linalg.norm(torque_nm - run_without(*terms)))
+                for terms in ((chosen, other), (chosen,), (other,))
+            )
+            if both < CANCELLED * max(alone):
                 names.append(f"“{find_effect(other.effect).name}”")
     return " and ".join(names)
 

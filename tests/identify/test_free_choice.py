@@ -42,6 +42,23 @@ def test_the_rivals_of_a_term_are_the_likeliest_others(made_by_hand: pytest.Monk
     assert [rival.effects[0][0] for rival in step.others] == ["free_torque_by_drive", "free_width_by_drive"]
 
 
+@pytest.mark.parametrize(("errors", "kept"), [(-1.4, [TERM]), (-1.6, ["free_strength_by_drive", TERM])])
+def test_a_term_that_a_later_one_made_superfluous_is_taken_out(
+    errors: float, kept: list[str], made_by_hand: pytest.MonkeyPatch
+) -> None:
+    first = "free_strength_by_drive"
+    rounds = iter([[model(9.0, first)], [model(20.0, first, TERM)], []])
+    made_by_hand.setattr(free, "fit_terms", lambda *_: next(rounds))
+    steps = iter([model(9.0, first), model(20.0, first, TERM)])
+    made_by_hand.setattr(free, "solve", lambda *_: next(steps, model(20.0, first, TERM)))
+    made_by_hand.setattr(free, "without_effect", lambda *_: model(19.0, TERM))
+    made_by_hand.setattr(
+        free, "_better", lambda before, after: SimpleNamespace(gain=float(len(after) - len(before)), errors=errors)
+    )
+    chain = free._extended((Step(None, model(0.0), "base"),), silent)[1:]
+    assert [step.added for step in chain] == [name for name, _ in chain[-1].searched.effects] == kept
+
+
 @pytest.mark.parametrize(("by_names", "found"), [(49.0, [TERM]), (51.0, [])])
 def test_terms_take_the_place_of_names_that_explain_less_than_half(
     by_names: float, found: list[str], made_by_hand: pytest.MonkeyPatch

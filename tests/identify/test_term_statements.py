@@ -130,9 +130,10 @@ def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque(dr
 
 
 @pytest.mark.parametrize(("sizes", "cancel"), [((-0.8, 0.8), True), ((0.8, 0.8), False), ((-0.8, 0.2), False)])
-def test_a_term_that_another_at_its_place_nearly_cancels_is_told_only_with_it(sizes, cancel):
+@pytest.mark.parametrize("second", ["free_strength_by_torque", "free_factor_by_torque"])
+def test_a_term_that_another_nearly_cancels_is_told_only_with_it(sizes, cancel, second):
     """Drive and torque, each behind 20 s, have about the same course: what the first does alone is no fatigue."""
-    record, terms = hidden_muscles.record(rate_hz=100), ("free_strength_by_drive", "free_strength_by_torque")
+    record, terms = hidden_muscles.record(rate_hz=100), ("free_strength_by_drive", second)
     entries = [
         {"id": effect, "form": "term", "settings": {"scale_nm": 6.0}}
         | {"parameters": {"change": {"value": size, "sd": 0.0}, "lag_s": {"value": 20.0, "sd": 0.0}}}
@@ -140,7 +141,7 @@ def test_a_term_that_another_at_its_place_nearly_cancels_is_told_only_with_it(si
     ]
     problem, theta = problem_of(identify.fit(record).with_(effects=tuple(entries)), make_grid(record))
     fitted = SimpleNamespace(problem=problem, theta=theta, physical=problem.physical(theta))
-    for index, other in enumerate(("“Strength by torque”", "“Strength by drive”")):
+    for index, other in enumerate((f"“{registry()[second].name}”", "“Strength by drive”")):
         shape = shape_of(fitted, index, 1e-6 * np.eye(theta.size))
         assert (f"It counts only together with {other}" in shape["words"]) == cancel
         assert bool(shape["behaves_as"]) != cancel
