@@ -282,17 +282,17 @@ def _from_dict(data: dict[str, Any]) -> Model:
         if values.shape != (size,) or matrix.shape != (size, size):
             message, place = "names, values and matrix differ in size", "uncertainty.covariance"
             raise BadModel(message, place=place, fix=model_schema.FIX)
-    torque_nm, rate_nm_s = data.get("initial", (0.0, 0.0))[:2]
+    torque_nm, rate_nm_s = data["initial"][:2]
     return Model(
         method=str(data["method"]),
         recruitment=Curve(basis, coefficients),
         linear=linear_from_dict(data["linear"]),
         pulse_rate_hz=float(data["pulse_rate_hz"]),
         sample_rate_hz=float(data.get("record_rate_hz", data["sample_rate_hz"])),
-        baseline_nm=float(data.get("baseline_nm", 0.0)),
+        baseline_nm=float(data["baseline_nm"]),
         initial=(float(torque_nm), float(rate_nm_s)),
         noise=Noise(**{key: data["noise"][key] for key in vars(Noise()) if data.get("noise", {}).get(key) is not None}),
-        effects=tuple(data.get("effects", ())),
+        effects=tuple(data["effects"]),
         covariance=covariance,
         bands=uncertainty.get("bands", {}),
         reasons=tuple(data.get("reasons", ())),
@@ -311,14 +311,14 @@ def _check_effect(entry: dict[str, Any], place: str, largest_us: float) -> None:
     if known is None:
         return
     effect, form = known
-    settings = {"scale_nm": 1.0} | entry.get("settings", {})
+    settings = entry["settings"]
     scene = Scene(
         time_s=np.array([0.0, model_schema.PLAUSIBLE]),  # the length of the fitted record is not in the file
         pulse_width_us=np.zeros(2),
         step_s=1.0,
         scale_nm=settings["scale_nm"],
         largest_us=largest_us,
-        zero_nm=settings.get("zero_nm", 0.0),
+        zero_nm=settings["zero_nm"],
     )
     wanted = {}
     for p in (p.on(scene) for p in form.parameters):

@@ -60,6 +60,8 @@ def check_model(document: dict[str, Any]) -> None:
         largest = max((index for term in narx["terms"] for index in term), default=-1)
         if not (largest < len(narx["variables"])):
             raise BadModel(f"a term uses variable {largest}, which does not exist", place="extra.narx.terms", fix=FIX)
+    elif document["method"] == "narx":
+        raise BadModel("the key is missing", place="extra.narx", fix=FIX)
 
 
 def parameter_value(value: Any) -> Any:

@@ -161,13 +161,13 @@ Linear = SecondOrder | Discrete
 def linear_from_dict(data: dict) -> Linear:
     """The block that `to_dict` and the coefficients b, a, delay_samples describe."""
     if data.get("kind", "discrete") == "second-order":
-        return SecondOrder(float(data["time_constant_s"]), float(data["damping"]), float(data.get("delay_s", 0.0)))
+        return SecondOrder(float(data["time_constant_s"]), float(data["damping"]), float(data["delay_s"]))
     return Discrete(
         b=tuple(float(x) for x in data["b"]),
         a=tuple(float(x) for x in data["a"]),
         delay_samples=int(data["delay_samples"]),
         step_s=float(data["step_s"]),
-        centre=float(data.get("centre", 0.0)),
+        centre=float(data["centre"]),
     )
 
 

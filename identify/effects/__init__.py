@@ -99,7 +99,7 @@ def known_form(entry: Mapping[str, Any]) -> tuple[Effect, Form] | None:
     """
     try:
         effect = registry()[entry["id"]]
-        return effect, effect.form(entry.get("form", ""))
+        return effect, effect.form(entry["form"])
     except KeyError:
         return None
 

@@ -133,9 +133,9 @@ def problem_of(
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
     settings = model.effects[0].get("settings", {}) if model.effects else {}
-    if "reference_rad" not in settings and depend_on_joint(entry["id"] for entry in model.effects):
-        message = "the model does not say at which angle its curve holds"
-        raise BadModel(message, place="effects.0.settings.reference_rad", fix="Fit its record again with this version.")
+    for key in sorted({"reference_rad", "angle_range_rad"} - settings.keys()):
+        if depend_on_joint(entry["id"] for entry in model.effects):
+            raise BadModel("the key is missing", place=f"effects.0.settings.{key}", fix=model_schema.FIX)
     own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     setup = Setup(
         grid=grid,

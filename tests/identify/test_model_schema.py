@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 import json
 import math
 from collections.abc import Iterator, Sequence
+from functools import reduce
 from typing import Any
 
 import jsonschema_rs
+import numpy as np
 import pytest
 
 from stimrig import identify
@@ -59,6 +62,23 @@ def document() -> dict[str, Any]:
     joint = {"reference_angle_rad": 0.1, "angle_rad": [0.0, 1.0], "velocity_rad_s": [0.0], "g": [[1.0], [1.0]]}
     joint |= {"h_nm": [[0.0], [0.0]], "inertia_nm_s2_per_rad": 0.0, "seen_g": [[1], [2]], "seen_h": [[1], [2]]}
     return json.loads(json.dumps(found | {"joint": joint}))
+
+
+@pytest.mark.parametrize("method", ["maximum-likelihood", "two-stage", "separable-least-squares", "narx"])
+def test_without_a_key_a_model_predicts_the_same_or_is_refused(method: str) -> None:
+    record = hidden_muscles.record(rate_hz=100)
+    effects = ["free_width_by_torque", "fatigue", "output_saturation"] if method == "maximum-likelihood" else []
+    document = json.loads(identify.fit(record, method=method, effects=effects).to_json())
+    record = record.with_torque(0.9 * record.torque_nm)  # another one: no key says what its first torque is
+    torque_nm, silent = identify.Model.from_dict(document).predict(record), []
+    for *way, name in filter(None, places(document)):
+        holder = reduce(lambda node, key: node[key], way, shorter := copy.deepcopy(document))
+        if isinstance(holder, dict):
+            del holder[name]
+            with contextlib.suppress(identify.IdentifyError):
+                if not np.array_equal(identify.Model.from_dict(shorter).predict(record), torque_nm):
+                    silent.append((*way, name))
+    assert silent == []
 
 
 def as_read(node: Any) -> Any:

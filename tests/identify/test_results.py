@@ -153,7 +153,7 @@ def test_words_of_a_file_stay_words(results):
 
 def test_a_model_of_another_version_with_little_in_it_still_shows_itself(results):
     bare = results["model"].to_dict()
-    for key in ("fit", "quality", "valid_for", "data", "created", "model_id", "noise", "effects"):
+    for key in ("fit", "quality", "valid_for", "data", "created", "model_id", "noise"):
         del bare[key]
     model = identify.Model.from_dict(bare)
     assert "fit –, held out –" in repr(model) and "recruitment  largest" in str(model)

@@ -50,7 +50,8 @@ def having(model: Model, effect_id: str, name: str, **more: Any) -> Model:
     """The model with an effect at its starting values."""
     form = effects()[effect_id].form(name)
     entry = {"id": effect_id, "form": name, "parameters": {p.name: p.start[0] for p in form.parameters}}
-    return model.with_(effects=({**entry, "settings": {"scale_nm": 8.0}, **more},))
+    settings = {"scale_nm": 8.0, "zero_nm": 0.0, "sign": 1.0, "reference_s": 0.0}
+    return model.with_(effects=({**entry, "settings": settings, **more},))
 
 
 def record_of(widths_us: np.ndarray, begun_s: float | None = None, torque_nm: np.ndarray | None = None) -> Record:
