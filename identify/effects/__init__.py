@@ -35,11 +35,11 @@ def _library() -> list[Effect]:
 @lru_cache(maxsize=8)
 def _everything(folder: str) -> dict[str, Effect]:
     effects = {effect.id: effect for effect in _library()}
-    places: dict[str, str] = {}
+    places = dict.fromkeys(effects, "the library")
     for place, effect in [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]:
         if effect.id in places:
             message = f"the effect {effect.id!r} is also in {places[effect.id]}"
-            raise BadEffect(message, place=place, fix="Give one of them another id.")
+            raise BadEffect(message, place=place, fix="Give it another id.")
         places[effect.id] = place
         effects[effect.id] = effect
     return effects

@@ -140,6 +140,12 @@ def test_two_files_of_one_id_are_told(tmp_path, monkeypatch) -> None:
     assert "is also in " in told(tmp_path, monkeypatch, GOOD)
 
 
+@pytest.mark.parametrize("known", ["fatigue", "free_width_by_torque"])
+def test_an_own_effect_takes_no_name_of_the_library(tmp_path, monkeypatch, known: str) -> None:
+    line = told(tmp_path, monkeypatch, GOOD.replace('id="sensor_gain_swing"', f'id="{known}"'))
+    assert line == f"{tmp_path / 'mine.py'}: the effect '{known}' is also in the library. Give it another id."
+
+
 def test_the_command_line_says_it_in_one_line(tmp_path: Path, monkeypatch, capsys) -> None:
     (tmp_path / "mine.py").write_text(GOOD.replace('stage="output"', 'stage="outptu"'))
     monkeypatch.setenv("STIMRIG_EFFECTS_DIR", str(tmp_path))
