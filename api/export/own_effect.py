@@ -128,6 +128,8 @@ def own_effect(model: Model) -> str:
         widths_us = np.linspace(0.0, float(model.recruitment.basis.largest_us), ROWS)
         shares = np.abs(model.recruitment(widths_us)) / entry["settings"]["scale_nm"]
         constants += f"\nWIDTHS_US = np.linspace(0.0, {widths_us[-1]:g}, {ROWS})\nSHARES = {shares.round(3).tolist()}"
+    if len(terms) > 1:
+        note += f"\nIts values are from the fit with all {len(terms)} terms together."
     return FILE.format(
         words=entry["shape"]["words"],
         note=note,

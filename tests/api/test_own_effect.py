@@ -50,6 +50,13 @@ def test_every_term_that_a_stage_can_express_is_written_and_loaded(plain, tmp_pa
     assert len(registry().keys() & {effect.replace("free_", "own_", 1) for effect in free}) == len(free)
 
 
+def test_the_first_of_several_terms_says_that_its_values_are_from_all(plain):
+    both = [model_with(name, plain).effects[0] for name in (TERM, "free_torque_by_drive")]
+    assert "from the fit" not in own_effect(plain.with_(effects=(both[0],)))
+    text = own_effect(plain.with_(effects=tuple(both)))
+    assert 'id="own_width_by_torque"' in text and "from the fit with all 2 terms together" in text
+
+
 def test_what_is_written_predicts_as_the_term_does_in_a_joined_record_too(plain, tmp_path, monkeypatch):
     first = hidden_muscles.record(rate_hz=40)
     second = first.with_torque(first.torque_nm + np.random.default_rng(1).normal(0.0, 0.01, first.torque_nm.size))

@@ -21,7 +21,7 @@ def explain(
     model_json: HeldModel = None,
     html: Annotated[Path | None, typer.Option(help="write the story with its figures here, one file")] = None,
     figures: Annotated[Path | None, typer.Option(help="write each figure as SVG, PDF and PNG into this folder")] = None,
-    own: Annotated[Path | None, typer.Option(help="write the strongest term as an own effect here, a .py file")] = None,
+    own: Annotated[Path | None, typer.Option(help="write the first term as an own effect here, a .py file")] = None,
     output: LastModel = None,
     columns: ColumnMap = None,
     as_json: Json = False,
