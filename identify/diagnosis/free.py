@@ -131,7 +131,7 @@ def _extended(base: Chain, progress: Progress) -> Chain:
     least = max(gains) - thresholds.NEAR
     near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= least)
     for step in near[len(base) : -1]:
-        shorter = _without(near, step)
+        shorter = _without(near, str(step.added))
         if _better(near, shorter).errors > -thresholds.SUPERFLUOUS and not vetoed(
             near[-1].searched, shorter[-1].searched
         ):
@@ -139,15 +139,14 @@ def _extended(base: Chain, progress: Progress) -> Chain:
     return (*base, *near[len(base) :])  # the base as it was searched
 
 
-def _without(chain: Chain, left: Step) -> Chain:
+def _without(chain: Chain, term: str) -> Chain:
     """The chain without one of its terms; the models after it are searched again."""
-    name = str(left.added)
-    steps = [step for step in chain if step is not left]
     return tuple(
-        replace(step, searched=without_effect(step.searched, name), others=(), known=None)
-        if name in dict(step.searched.effects)
+        replace(step, searched=without_effect(step.searched, term), others=(), known=None)
+        if term in dict(step.searched.effects)
         else step
-        for step in steps
+        for step in chain
+        if step.added != term
     )
 
 

@@ -42,16 +42,22 @@ def test_the_rivals_of_a_term_are_the_likeliest_others(made_by_hand: pytest.Monk
     assert [rival.effects[0][0] for rival in step.others] == ["free_torque_by_drive", "free_width_by_drive"]
 
 
-@pytest.mark.parametrize(("errors", "kept"), [(-1.4, [TERM]), (-1.6, ["free_strength_by_drive", TERM])])
+FIRST, SECOND = "free_strength_by_drive", "free_strength_by_torque"
+
+
+@pytest.mark.parametrize(("errors", "kept"), [(-1.4, [TERM]), (-1.6, [FIRST, SECOND, TERM])])
 def test_a_term_that_a_later_one_made_superfluous_is_taken_out(
     errors: float, kept: list[str], made_by_hand: pytest.MonkeyPatch
 ) -> None:
-    first = "free_strength_by_drive"
-    rounds = iter([[model(9.0, first)], [model(20.0, first, TERM)], []])
-    made_by_hand.setattr(free, "fit_terms", lambda *_: next(rounds))
-    steps = iter([model(9.0, first), model(20.0, first, TERM)])
-    made_by_hand.setattr(free, "solve", lambda *_: next(steps, model(20.0, first, TERM)))
-    made_by_hand.setattr(free, "without_effect", lambda *_: model(19.0, TERM))
+    models = [model(9.0, FIRST), model(20.0, FIRST, SECOND), model(30.0, FIRST, SECOND, TERM)]
+    rounds, steps = iter(models), iter(models)
+    made_by_hand.setattr(free, "fit_terms", lambda *_: [next(rounds, models[-1])])
+    made_by_hand.setattr(free, "solve", lambda *_: next(steps, models[-1]))
+
+    def leave(fitted: Any, name: str) -> Any:
+        return model(fitted.log_evidence, *(other for other, _ in fitted.effects if other != name))
+
+    made_by_hand.setattr(free, "without_effect", leave)
     made_by_hand.setattr(
         free, "_better", lambda before, after: SimpleNamespace(gain=float(len(after) - len(before)), errors=errors)
     )
