@@ -7,6 +7,7 @@ import io
 import json
 import re
 from pathlib import Path
+from threading import Thread
 
 import pytest
 
@@ -138,6 +139,16 @@ def test_a_folder_that_is_not_there_is_told(tmp_path, monkeypatch) -> None:
 def test_two_files_of_one_id_are_told(tmp_path, monkeypatch) -> None:
     (tmp_path / "again.py").write_text(GOOD)
     assert "is also in " in told(tmp_path, monkeypatch, GOOD)
+
+
+def test_a_loop_without_an_end_is_told_with_its_line_in_any_thread(tmp_path, monkeypatch) -> None:
+    monkeypatch.setattr(effects.own_file, "TRIAL_S", 0.3)
+    text = GOOD.replace("    return torque_nm", "    while True:\n        pass\n    return torque_nm")
+    lines: list[str] = []
+    trial = Thread(target=lambda: lines.append(told(tmp_path, monkeypatch, text)), daemon=True)
+    trial.start()
+    trial.join(30.0)
+    assert lines and "mine.py, line " in lines[0] and "apply fails: not done after 0.3 s" in lines[0]
 
 
 @pytest.mark.parametrize("known", ["fatigue", "free_width_by_torque"])
