@@ -52,6 +52,7 @@ def fit(
         "model": model.to_dict(),
         "notes": list(record.notes),
         "of": record.source.participant,
+        "current_ma": record.source.current_ma,
         "samples_sha256": record_files.samples_sha256(record),
     }
 

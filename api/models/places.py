@@ -28,6 +28,11 @@ def site_of_recording(recording: Recording, test: Test | None) -> Site | None:
     return stored_site(recording.site) if test is None else place_of(test)[:3]
 
 
+def current_of_recording(recording: Recording, test: Test | None) -> float | None:
+    """Return the current (mA) of a recording's test or of its file; None: unknown, or joined of several currents."""
+    return next(iter((recording.site or [])[3:]), None) if test is None else place_of(test)[3]
+
+
 def in_words(site: Site) -> str:
     """Return the site in words: left biceps brachii."""
     return " ".join(part for part in site if part) or "a side and muscle that nobody has said"

@@ -14,7 +14,7 @@ from sqlalchemy.orm import defer
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models import stored_model
-from stimrig.api.models.places import Site, in_words, place_of, site_of, site_of_recording, stored_site
+from stimrig.api.models.places import Site, current_of_recording, in_words, site_of, site_of_recording, stored_site
 from stimrig.api.models.tracking import Limits
 from stimrig.api.store import Store, audit, locking
 from stimrig.api.store.locking import Tags
@@ -179,7 +179,14 @@ class Versions:
         """Return the site and current (mA) of a version's recording; None: unknown."""
         recording: Recording = self.store.get(Recording, row.recording_id)
         test: Test | None = self.store.first(Test, Test.recording_id == recording.id)
-        return site_of_recording(recording, test), None if test is None else place_of(test)[3]
+        return site_of_recording(recording, test), current_of_recording(recording, test)
+
+    def why_not_joined(self, row: Model) -> str:
+        """Say why no further recording can be joined to that of a version; empty where one can."""
+        if self.measured_at(row)[1] is not None:
+            return ""
+        fix = "Take a model of the rig's own recordings (HDF5), of one current."
+        return f"{row.recording_id} does not say with what current it was made. {fix}"
 
     def decision(self, model_id: str) -> Approval | None:
         """Return the newest decision on a version."""

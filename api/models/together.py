@@ -12,7 +12,7 @@ from sqlalchemy.orm import Session
 
 from stimrig.api.errors import ApiError, require_found
 from stimrig.api.models.analyses import Analyses, OnCall
-from stimrig.api.models.places import site_of_recording
+from stimrig.api.models.places import current_of_recording, site_of_recording
 from stimrig.api.store import audit, uploads
 from stimrig.api.store.tables import Model, Recording, Test
 
@@ -87,12 +87,13 @@ def _store_joined(analyses: Analyses, path: Path, digest: str, participant: str,
     )
     with uploads.taken_in(path), analyses.store.write() as session:
         tests = {test.recording_id: test for test in session.scalars(select(Test).where(Test.recording_id.in_(parts)))}
-        rows = session.scalars(select(Recording).where(Recording.id.in_(parts)))
+        rows = session.scalars(select(Recording).where(Recording.id.in_(parts))).all()
         site, *others = (site_of_recording(part, tests.get(part.id)) for part in rows)
         if any(other != site for other in others):
             detail = "The recordings were made at different sites; what was learnt at one says nothing of another."
             raise ApiError(409, "other-site", "These recordings are of several sites", detail)
-        row.site = None if site is None else list(site)
+        currents_ma = {current_of_recording(part, tests.get(part.id)) for part in rows}
+        row.site = None if site is None else [*site, currents_ma.pop() if len(currents_ma) == 1 else None]
         row.warnings = list(dict.fromkeys(text for part in parts for text in warnings(session, part))) or None
         session.add(row)
         session.flush()

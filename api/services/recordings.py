@@ -97,7 +97,7 @@ async def take_in(
         raise
 
     def keep() -> tuple[Recording, Model]:
-        row = _store(context, new, principal.name, of, tags)
+        row = _store(context, new, principal.name, of, tags, fitted.get("current_ma"))
         return row, context.versions.add(fitted["json"], code, row.id, principal.name)
 
     row, plain = await asyncio.shield(asyncio.to_thread(keep))
@@ -160,13 +160,15 @@ def _about_the_upload(path: Path) -> Iterator[None]:
         raise
 
 
-def _store(context: Context, row: Recording, by: str, of: str, tags: Tags) -> Recording:
+def _store(
+    context: Context, row: Recording, by: str, of: str, tags: Tags, current_ma: float | None
+) -> Recording:  # fmt: skip
     row.created_utc = now = context.clock.utc()
     detail = {"participant": row.participant, "sha256": row.file_sha256, **({"of": of} if of else {})}
     with uploads.taken_in(Path(row.path)), context.store.write() as session:
         participant = participants.within(session, row.participant)
         locking.check(session, participant, tags)
-        row.site = list(site_of(participant))
+        row.site = [*site_of(participant), current_ma]
         session.add(row)
         session.flush()
         audit.write(session, now, by, "upload recording", row.id, **detail)

@@ -122,7 +122,7 @@ class Runner(Playing):
         return await self.kinds[body.kind].planned(body, plan, PREVIEW_S)
 
     def _check_joins(self, joins: str, participant: Participant, plan: messages.TestPlan) -> None:
-        """Refuse to join the recording to that of another participant's model, or of one of another place."""
+        """Refuse to join the recording to that of another participant's model, of another place or unknown current."""
         model = self.versions.get(joins)
         if model.participant != participant.code:
             detail = f"{model.id} is a model of {model.participant}, the test is for {participant.code}."
@@ -133,7 +133,9 @@ class Runner(Playing):
         if there is not None and there != here:
             detail = f"The model was measured at {in_words(there)}, this test is at {in_words(here)}."
             raise ApiError(409, "other-site", title, detail)
-        if before_ma not in (None, now_ma):
+        if unknown := self.versions.why_not_joined(model):
+            raise ApiError(409, "unknown-current", title, unknown)
+        if before_ma != now_ma:
             detail = f"The model was measured with {before_ma:g} mA, this test is with {now_ma:g} mA."
             raise ApiError(409, "other-current", title, detail)
 

@@ -92,8 +92,11 @@ class Recording(Table):
     created_utc: Mapped[str]
     warnings: Mapped[list[str] | None]
     """Doubts about an upload; those about a test are in its summary."""
-    site: Mapped[list[str | None] | None]
-    """Side, muscle and placement that were stimulated; None: from before they were kept."""
+    site: Mapped[list[Any] | None]
+    """Side, muscle and placement that were stimulated, and the current of an upload or a joined recording, mA.
+
+    None: from before they were kept.
+    """
 
 
 class Model(Table):

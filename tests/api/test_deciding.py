@@ -20,6 +20,7 @@ from stimrig.api.client.errors import NotFound, ServiceError
 from stimrig.api.errors import ApiError
 from stimrig.api.jobs.verbs import experiment
 from stimrig.api.models import explanation
+from stimrig.api.models.registry import Versions
 from stimrig.api.sessions.runner import Runner
 from stimrig.api.web.pages import starting
 from stimrig.api.web.responses.models import ExperimentOut
@@ -207,15 +208,16 @@ SITE = ("right", "biceps brachii", None)
 @pytest.mark.parametrize(
     ("measured_at", "kind"),
     [
-        ((SITE, 20.0), None), ((None, None), None), ((SITE, None), None),
+        ((SITE, 20.0), None), ((None, 20.0), None),
+        ((None, None), "unknown-current"), ((SITE, None), "unknown-current"),
         ((("left", *SITE[1:]), 20.0), "other-site"), (((None, None, None), 20.0), "other-site"),
         ((SITE, 16.0), "other-current"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_joined_is_refused_before_it_is_played(measured_at: Any, kind: str | None) -> None:
-    versions = SimpleNamespace(
-        get=lambda _: SimpleNamespace(id="M1", method="", participant="P1"), measured_at=lambda _: measured_at
-    )
+    model = SimpleNamespace(id="M1", method="", participant="P1", recording_id="R1")
+    versions: Any = SimpleNamespace(get=lambda _: model, measured_at=lambda _: measured_at)
+    versions.why_not_joined = partial(Versions.why_not_joined, versions)
     participant: Any = SimpleNamespace(code="P1", side=SITE[0], muscle=SITE[1], placement=SITE[2])
     plan: Any = SimpleNamespace(profile=SimpleNamespace(current_ma=20.0))
     check = partial(Runner._check_joins, SimpleNamespace(versions=versions), "M1", participant, plan)

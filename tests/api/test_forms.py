@@ -251,6 +251,16 @@ def test_a_rig_that_asks_for_a_calibration_offers_that_first(tab: httpx.Client, 
     assert "expired" in tab.get(PAGE).text and tab.get(WHERE).status_code == 409, "one of yesterday"
 
 
+def test_no_experiment_is_played_that_could_not_be_joined(tab: httpx.Client, client: httpx.Client, service: Service):
+    model = client.post("/v1/participants/P017/recordings", content=b"x").json()["model"]["id"]
+    client.get(f"/v1/models/{model}/diagnosis")
+    shown = tab.get(f"/models/{model}").text
+    assert "Run it now" not in shown and "does not say with what current it was made" in shown
+    assert tab.get(f"{WHERE}?kind=next-experiment&model={model}").status_code == 409
+    assert client.post("/v1/tests", json={"participant": "P017", "joins": model}).json()["type"].endswith("current")
+    assert service.rig.starts == 0
+
+
 def test_the_next_experiment_is_shown_the_same_way(tab: httpx.Client, client: httpx.Client, service: Service):
     model = run_test(client, "P017")["model_id"]
     client.get(f"/v1/models/{model}/diagnosis")

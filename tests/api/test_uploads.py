@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
 
+import h5py
 import httpx
 import pytest
 
@@ -45,10 +46,12 @@ def test_an_upload_that_a_worker_dies_of_is_refused_in_one_line(
 
 def test_the_same_samples_in_any_format_are_another_participants(tmp_path: Path, short_dir: Path) -> None:
     sealed = write(tmp_path / "s.h5", Session("P017"))
+    with h5py.File(sealed, "r+") as file:
+        file.attrs["current_ma"] = 20.0
     with serving(tmp_path, short_dir, REAL, workers=1) as (service, client):
         for code in ("P017", "P018"):
             assert client.post("/v1/participants", json={"code": code}).is_success
-        mine = client.post(UPLOAD, content=sealed.read_bytes()).json()["recording_id"]
+        mine = (sent := client.post(UPLOAD, content=sealed.read_bytes())).json()["recording_id"]
         with service.context.store.write() as session:  # as a recording of the rig, which was not read yet
             session.get(Recording, mine).samples_sha256 = None
         contents = [client.get(f"/v1/recordings/{mine}/csv").content]
@@ -58,7 +61,12 @@ def test_the_same_samples_in_any_format_are_another_participants(tmp_path: Path,
         for content in contents:
             refused = client.post("/v1/participants/P018/recordings", content=content)
             assert problem(refused, 409)["of"] == "P017", refused.text
-        assert client.post(UPLOAD, content=contents[0]).status_code == 201, "the person's own"
+        own = client.post(UPLOAD, content=contents[0])
+        assert own.status_code == 201, "the person's own"
+        versions = service.context.versions
+        models = [versions.get(each.json()["model"]["id"]) for each in (sent, own)]
+        said = ["with what current" in versions.why_not_joined(model) for model in models]
+        assert said == [False, True], "a sealed file says it, a table does not"
         assert client.post("/v1/participants/P018/recordings", content=contents[0], params={"of": "P017"}).is_success
 
 

@@ -180,6 +180,7 @@ def test_next_experiment_is_played_and_joined(client: httpx.Client, service: Ser
     assert document["state"] == "completed" and document["joins"] == model
     new = client.get(document["model_url"]).json()
     assert new["parent_id"] == model and new["recording_id"].startswith("joined-")
+    assert service.context.versions.why_not_joined(service.context.versions.get(new["id"])) == "", "a third can follow"
     parts = client.get(f"/v1/recordings/{new['recording_id']}").text.splitlines()
     old = client.get(f"/v1/models/{model}").json()["recording_id"]
     assert [Path(part).stem for part in parts] == [old, document["recording_id"]]

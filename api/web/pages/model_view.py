@@ -40,6 +40,7 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
     shown = await parts(context, row)
     version, document, why = shown["model"], shown["document"], shown["why"]
     findings, fit_words = advice.findings(document), advice.fit_sentence(document["fit"])
+    not_joined = await asyncio.to_thread(context.versions.why_not_joined, row)
     running = why is None and job is not None and job.state in ("running", "completed")
     others = [finding for finding in findings if not fit_words or finding.gate not in ("gap", "ceiling")]
 
@@ -60,7 +61,7 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
         "model.html",
         advice=advice.advice(
             version["verdict"], findings, why["likely"] if why else [], why and why["kind"],
-            diagnosing=running, experiment=bool(why and why["experiment"]),
+            diagnosing=running, experiment=bool(why and why["experiment"] and not not_joined),
         ),
         shown_findings=others[:MOST_FINDINGS],
         hidden_findings=others[MOST_FINDINGS:],
@@ -72,6 +73,7 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
         ask_password=not context.people.is_confirmed(principal),
         threshold_us=stored_model.threshold_us(row),
         risks=advice.risks(document, findings) if version["verdict"] in POOR else [],
+        not_joined=not_joined,
         what_to_write=WHAT_TO_WRITE,
         may_test=principal.may(Scope.RUN_TEST),
         may_approve=principal.may(Scope.APPROVE_MODEL),
