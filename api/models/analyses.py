@@ -18,7 +18,6 @@ from stimrig.api.models.registry import Versions
 from stimrig.api.settings import Settings
 from stimrig.api.store import Store
 from stimrig.api.store.tables import Analysis, Model, Recording
-from stimrig.identify.conclusion import effects_to_add
 
 log = logging.getLogger("stimrig.analyses")
 OnCall = Callable[[Job], None]
@@ -62,8 +61,7 @@ class Analyses:
 
     async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
         """Diagnose what the structure of a model lacks; versions with the plain structure share one diagnosis."""
-        diagnosis = await self._diagnose(model, on_call)
-        return explanation.remaining(diagnosis[2], model.effects, model.fit)
+        return (await self._diagnose(model, on_call))[2]
 
     async def _diagnose(self, model: Model, on_call: OnCall | None) -> tuple[Model, str, dict[str, Any]]:
         place, kind = await asyncio.to_thread(self._criticised, model)
@@ -72,30 +70,17 @@ class Analyses:
         return place, kind, diagnosis
 
     def _criticised(self, model: Model) -> tuple[Model, str]:
-        """Return the version and the name that a diagnosis is stored under.
-
-        A version with some of what was found missing at once has that diagnosis until all of it is added: a second
-        search from there could say something else of the same recording.
-        """
-        if is_plain(model):
-            # the diagnosis of the plain structure is stored with the first version made from the recording
-            same_recording = Model.recording_id == model.recording_id
-            return self.store.first(Model, same_recording, order=Model.created_utc), DIAGNOSIS
-        if model.parent_id and self.known(model.id, OWN_DIAGNOSIS) is None:  # one that was made of this version stays
-            parent: Model = self.store.get(Model, model.parent_id)
-            if parent.recording_id == model.recording_id:
-                place, kind = self._criticised(parent)
-                diagnosis = self.known(place.id, kind)
-                begun_with = [] if kind == DIAGNOSIS else place.effects
-                if diagnosis and effects_to_add(diagnosis) > set(model.effects) - set(begun_with):
-                    return place, kind
-        return model, OWN_DIAGNOSIS
+        """Return the version and the name that a diagnosis is stored under."""
+        if not is_plain(model):
+            return model, OWN_DIAGNOSIS
+        # the diagnosis of the plain structure is stored with the first version made from the recording
+        same_recording = Model.recording_id == model.recording_id
+        return self.store.first(Model, same_recording, order=Model.created_utc), DIAGNOSIS
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """Return the diagnosis, or None while there is none."""
         place, kind = self._criticised(model)
-        diagnosis = self.known(place.id, kind)
-        return diagnosis and explanation.remaining(diagnosis, model.effects, model.fit)
+        return self.known(place.id, kind)
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
         """Return a stored analysis, or None."""

@@ -52,6 +52,7 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
         "words": conclusion.words + mostly,
         "missing": [card(entry, library, diagnosis.get("base") or {}) for entry in missing],
         "free": [free_card(entry, library, entry["name"]) for entry in free],
+        "with_all": diagnosis.get("with_all") if free else None,
         "to_add": [entry["effect"] for entry in to_add],
         "likely": [name_of(entry["effect"], library) for entry in to_add if is_likely(entry)],
         "structure": effects_words(diagnosis.get("structure") or []) or "plain",
@@ -67,30 +68,6 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
         "notes": diagnosis.get("notes") or [],
         "noise_sd_nm": diagnosis.get("noise_sd_nm"),
     }
-
-
-def remaining(diagnosis: dict[str, Any], effects: Sequence[str], fit: Mapping[str, Any]) -> dict[str, Any]:
-    """Reduce a diagnosis to what is still missing in a version that has some of the effects it names.
-
-    `fit`: the statistics of that version.
-    """
-    rows = {key: diagnosis.get(key) or [] for key in ("missing", "free")}
-    named = {entry["effect"] for entries in rows.values() for entry in entries}
-    included = named & set(effects)
-    if not included:
-        return diagnosis
-    base, experiment = diagnosis.get("base") or {}, diagnosis.get("experiment")
-    reduced = {
-        **diagnosis,
-        **{key: [entry for entry in entries if entry["effect"] not in included] for key, entries in rows.items()},
-        "add": [effect for effect in diagnosis.get("add", sorted(named)) if effect not in included],
-        "base": {**base, **{key: fit[key] for key in base if key in fit}},
-        "structure": [*(diagnosis.get("structure") or []), *sorted(included)],
-        "experiment": None if experiment and experiment["effect"] in included else experiment,
-    }
-    conclusion = conclude(reduced)
-    plain = [f"{conclusion.title}. {conclusion.words}", conclusion.advice]
-    return {**reduced, "conclusion": asdict(conclusion), "plain": plain}
 
 
 def refusals(diagnosis: Mapping[str, Any], added: Sequence[str]) -> dict[str, str]:

@@ -114,7 +114,7 @@ def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -
     assert set(library()) == {effect for effect, known in effects.registry().items() if not known.shape}
 
 
-def test_a_model_with_a_free_effect_shows_it_and_the_diagnosis_does_not_offer_it_again() -> None:
+def test_a_model_with_a_free_effect_shows_it() -> None:
     shape = {
         "place": "strength", "driven_by": "torque", "words": "Strength <- torque.", "driver": "time (s)",
         "effect": "opening (1)", "at": [0.0, 0.5],
@@ -126,6 +126,3 @@ def test_a_model_with_a_free_effect_shows_it_and_the_diagnosis_does_not_offer_it
     drawn, templates = Figures(free_effects([card])), environment.get_template("model_parts.html")
     shown = templates.module.effect(card, drawn)
     assert "Strength &lt;- torque." in shown and f'data-figure="free-{free_id}"' in shown
-    row = {"effect": free_id, "name": "A term", "form": "term", "equation": "f(u) exp(z)", "parameters": {}}
-    diagnosis = {"verdict": "unexplained_structure", "missing": [], "structure": [], "experiment": None, "free": [row]}
-    assert explanation.remaining(diagnosis, [free_id], {})["free"] == []

@@ -281,24 +281,14 @@ def test_effects_are_shown_in_the_order_of_improve_and_only_the_likely_are_advis
     assert alone["likely"] == [] and "possibly missing" in alone["title"] and len(alone["missing"]) == 1
 
 
-LEFT = {**MISSING, "base": {"held_out_rms_nm": 0.2, "rms_nm": 0.3}, "plain": [], "add": ["fatigue", "tremor"],
-        "missing": [{**FATIGUE, "effect": name, "name": name} for name in ("tremor", "fatigue")]}  # fmt: skip
-
-
-def test_what_is_left_to_add_is_said_with_the_errors_of_the_version() -> None:
-    left = explanation.remaining(LEFT, ["fatigue"], {"held_out_rms_nm": 0.08, "rms_nm": 0.1, "figures": {}})
-    assert [row["effect"] for row in left["missing"]] == left["add"] == ["tremor"]
-    assert left["base"] == {"held_out_rms_nm": 0.08, "rms_nm": 0.1} and "2.0 times" in left["conclusion"]["words"]
-    assert explanation.remaining(LEFT, ["fatigue_of_mine"], {}) is LEFT
-
-
-def test_it_is_not_searched_anew_and_a_free_effect_has_the_form_that_was_found(
+def test_an_added_effect_has_the_form_that_was_found_and_its_version_is_diagnosed_anew(
     client: httpx.Client, service: Service, model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     analyses, pool = service.context.analyses, service.context.pool
     client.get(f"/v1/models/{model}/diagnosis")
     free = {"effect": "fatigue", "form": "fitness", "name": "Fatigue", "words": "", "parameters": {}}
-    analyses._store_result(model, "diagnosis", {**LEFT, "missing": LEFT["missing"][:1], "free": [free]})
+    two = {**MISSING, "missing": [{**FATIGUE, "effect": "tremor"}], "free": [free], "add": ["tremor", "fatigue"]}
+    analyses._store_result(model, "diagnosis", two)
     submit, submitted = pool.submit, []
     monkeypatch.setattr(pool, "submit", lambda *verb, **how: (submitted.append((*verb, how)), submit(*verb, **how))[1])
     body = {"effects": ["fatigue"], "force": True, "reason": "seen with the eye"}
@@ -306,14 +296,21 @@ def test_it_is_not_searched_anew_and_a_free_effect_has_the_form_that_was_found(
     assert child["without_evidence"] == [], "the recording asks for it"
     assert [how["effects"] for verb, how in submitted if verb == "fit"] == [["fatigue:fitness"]]
     told = client.get(f"/v1/models/{child['id']}/diagnosis").json()
-    assert (told["add"], told["structure"], told["conclusion"]["kind"]) == (["tremor"], ["fatigue"], "missing")
-    assert "diagnosis" not in [verb for verb, _ in submitted]
+    assert told["structure"] == ["fatigue"] and submitted[-1][0] == "diagnosis", "as `stimrig diagnose --model` does"
 
 
-def test_a_free_effect_that_is_left_to_add_is_no_nothing() -> None:
-    found = MISSING | {"free": [FREE], "add": ["fatigue", "free_width_by_rise"], "base": {"held_out_rms_nm": 0.2}}
-    left = explanation.remaining(found, ["fatigue"], {"held_out_rms_nm": 0.08})
-    assert left["conclusion"]["kind"] == "unexplained" and "Free level" in left["conclusion"]["advice"]
+def test_free_effects_are_added_together_and_shown_with_their_common_error(
+    client: httpx.Client, pages: httpx.Client, service: Service, model: str
+) -> None:
+    client.get(f"/v1/models/{model}/diagnosis")
+    law = {"lines": {}, "at": [0.0, 0.5], "driver": "torque (N·m)", "axis": "opening (1)"}
+    free = [FREE | law, {**FREE, **law, "effect": "free_strength_by_torque", "name": "Free strength"}]
+    with_all = {"rms_nm": 0.111, "held_out_rms_nm": 0.123}
+    found = NOTHING | {"verdict": "unexplained_structure", "free": free, "with_all": with_all}
+    service.context.analyses._store_result(model, "diagnosis", found)
+    shown = pages.get(f"/models/{model}").text
+    assert shown.count('value="free_width_by_rise free_strength_by_torque"') == 2 and "Add this effect" not in shown
+    assert all(words in shown for words in ("+ Free level and Free strength", "≈ 0.111", "≈ 0.123"))
 
 
 def test_places_are_shown_where_something_is_left() -> None:
