@@ -19,8 +19,8 @@ WORDS: dict[str, dict[str, str]] = {
         "step": "Step",
         "passive": "No stimulation",
         "moving": "Level while moving",
-        "widths": "Levels held at random",
-        "levels": "Levels held at random",
+        "widths": "Random levels",
+        "levels": "Random levels",
     },
     "kind": {
         "pre-session": "pre-session test",

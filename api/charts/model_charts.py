@@ -18,8 +18,8 @@ SHOWN_BEYOND = 1.5
 """The unplayed plan is drawn up to this multiple of the played time, plus 2 s."""
 PAUSE, PAUSE_S = 20.0, 2.0
 """A pause lasts more than so many of the usual steps in time, and more than so many seconds: no line crosses it."""
-LETTER = 0.007
-"""Width of a letter of a segment's name, as a share of a wide chart."""
+LETTER = 0.0113
+"""Width of a letter of a segment's name, as a share of the time axis in the first screen of a model's page."""
 OVERVIEW_PX, CURVE_PX = 320.0, 190.0
 """Heights of the measurement and of the recruitment curve in the first screen of a model's page."""
 PULSE_WIDTH = "Pulse width (µs)"

@@ -6,6 +6,7 @@ import math
 import re
 import xml.etree.ElementTree as ElementTree
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -194,6 +195,24 @@ def test_words_of_a_recording_are_words() -> None:
     words = words_of(str(LINE.svg()))
     assert {"<i>&", "<a href='x'> & $b$", "w", "1"} <= words
     assert "<i>&" not in words_of(str(LINE.svg(300.0))), "a narrow chart has no room for names"
+
+
+@pytest.mark.parametrize("second", ["levels", "a segment with a long name"])
+def test_names_of_short_segments_side_by_side_do_not_overlap(second: str) -> None:
+    """As the default test plays them, in the first screen of a model's page."""
+    matplotlib = pytest.importorskip("matplotlib")
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    times_s = {"prbs": (2.0, 8.3), second: (8.3, 14.7), "ramp": (17.7, 27.7), "validate": (29.7, 36.7)}
+    segments = [{"name": name, "start_s": start, "end_s": end} for name, (start, end) in times_s.items()]
+    segments.append({"name": "rest", "start_s": 36.7, "end_s": 38.7})
+    drawn = Figure(fig.time_axis(0.0, 38.7), [Axis("Torque (N·m)")], model_charts.segment_marks(segments))
+    with matplotlib.rc_context(fig.SETTINGS):
+        paper = fig._lay_out(drawn, 712.0, 320.0, fig.Figures.TOOLS_PX, dict.fromkeys(LIGHT, "black"))
+        renderer = FigureCanvasAgg(paper).get_renderer()
+        boxes = [text.get_window_extent(renderer) for text in paper.axes[0].texts]
+    assert all(left.x1 < right.x0 for left, right in pairwise(boxes))
+    assert len(boxes) == (4 if second == "levels" else 3)
 
 
 def test_plotly_gets_the_lines_in_roles_without_links_and_without_its_upload() -> None:

@@ -44,7 +44,7 @@ def test_it_goes_before_the_test_between_rivals_and_is_shown() -> None:
     found = experiment([{"effect": "fatigue", "confused_with": ["potentiation"], "next_experiment_plan": {}}], DECIDING)
     assert found is not None and found["effect"] == "" and found["text"] == DECIDING["text"]
     ExperimentOut.model_validate(found)
-    assert explanation.tidy_experiment(found)["shown"] == ["Levels held at random", "Rest 2 s"]
+    assert explanation.tidy_experiment(found)["shown"] == ["Random levels", "Rest 2 s"]
 
 
 def test_the_page_asks_for_it_at_the_rate_of_the_recording() -> None:
