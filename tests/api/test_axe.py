@@ -68,6 +68,13 @@ def visit(page: Any, service: Service, path: str, *figures: str, stop: bool = Tr
     examine(page, path, stop)
 
 
+def test_what_is_folded_fits_a_phone_once_it_is_open(tab: Any, service: Service) -> None:
+    participant(tab, service, "X2")
+    tab.set_viewport_size({"width": PHONE[0], "height": PHONE[1]})
+    tab.evaluate("document.querySelectorAll('details').forEach((part) => { part.open = true; })")
+    assert tab.evaluate("document.documentElement.scrollWidth <= innerWidth")
+
+
 def test_pages_without_a_test(browser: Any, tab: Any, service: Service) -> None:
     for path in ("/", "/models/none"):
         visit(tab, service, path)
