@@ -117,11 +117,12 @@ def _advise_effects(diagnosis: Mapping[str, Any], missing: Sequence[Mapping[str,
 def _advise_unexplained(diagnosis: Mapping[str, Any]) -> str:
     to_add = effects_to_add(diagnosis)
     parts = [f"Add {join_names([row])}: it explains a part." for row in in_order(diagnosis) if row["effect"] in to_add]
-    if diagnosis.get("free"):
-        parts.append(f"Add {join_names(diagnosis['free'])}: it describes what is left, and names no cause.")
+    if free := diagnosis.get("free"):
+        does, names = ("it describes", "names") if len(free) == 1 else ("they describe", "name")
+        parts.append(f"Add {join_names(free)}: {does} what is left, and {names} no cause.")
     if diagnosis.get("deciding_experiment"):
         remaining = "Play the next experiment: it teaches most about what is left."
-        parts.append("The next experiment teaches most about it." if diagnosis.get("free") else remaining)
+        parts.append("The next experiment teaches most about it." if free else remaining)
     return " ".join(parts) or "Look at the worst places and at electrodes, load cell and fixture, and record again."
 
 

@@ -184,6 +184,7 @@ def test_the_commands_that_follow_begin_with_the_model_that_was_examined(
     left = SimpleNamespace(conclusion=SimpleNamespace(kind="missing"), **open_)
     explained = SimpleNamespace(left=left, to_dict=dict, improvement=SimpleNamespace(models=[""]))
     given = "--model 'old one.json' " if model else ""
+    assert "adds them, and" in diagnose.add_command(SimpleNamespace(add=["fatigue", "tremor"]), model)[0]
     for module in (diagnose, explain):
         monkeypatch.setattr(module, "load_structure", lambda *_: (None, None, []))
     monkeypatch.setattr(identify, "diagnose", lambda *_: left)

@@ -254,6 +254,8 @@ def test_what_may_be_more_than_noise_is_not_called_noise(more: dict[str, Any], k
         (PART | {"add": ["fatigue", "free_width_by_rise"], "free": [FREE]} | PLAN, "a part of the error only",
          "Add “Fatigue”: it explains a part. Add “Free level”: it describes what is left, and names no cause. "
          "The next experiment teaches most about it.", "More"),
+        (PART | {"missing": [], "add": ["a", "b"], "free": [FREE, FREE]}, "structure that no effect",
+         "Add “Free level” and “Free level”: they describe what is left, and name no cause.", "More"),
         (PART | {"add": ["fatigue"]} | PLAN, "a part of the error only",
          "Add “Fatigue”: it explains a part. Play the next experiment: it teaches most about what is left.", "More"),
         (PART | {"add": []}, "structure that no effect of the library explains",

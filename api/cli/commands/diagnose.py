@@ -33,7 +33,8 @@ def diagnose(data: SeveralData, model_json: HeldModel = None, columns: ColumnMap
 
 def add_command(diagnosis: identify.Diagnosis, examined: Path | None) -> list[str]:
     """Name the command that adds what is missing, if anything is; `examined`: the model, None for the plain one."""
-    explain = f"`stimrig explain {begin_with(examined)}DATA -o NEW.json` adds it, and shows how the error falls."
+    them = "it" if len(diagnosis.add) == 1 else "them"
+    explain = f"`stimrig explain {begin_with(examined)}DATA -o NEW.json` adds {them}, and shows how the error falls."
     return [explain] * bool(diagnosis.add)
 
 
