@@ -33,7 +33,7 @@ Start = tuple[Effect, dict[str, float]]
 """A term and the values from which it is fitted."""
 
 
-def in_held_noise(fitted: Fitted) -> Fitted:
+def fix_noise(fitted: Fitted) -> Fitted:
     """The model searched again with white noise, beside what the rests show of the zero.
 
     A zero that moves is no white noise: terms would take it up.

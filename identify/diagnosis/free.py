@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.candidate_terms import MAX_TERMS, fit_terms, in_held_noise
+from stimrig.identify.diagnosis.candidate_terms import MAX_TERMS, fit_terms, fix_noise
 from stimrig.identify.diagnosis.residual import vetoed
 from stimrig.identify.diagnosis.search import (
     MAX_EFFECTS,
@@ -75,7 +75,7 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
     model with what the samples show alone. A model without what the search found takes its place only where it predicts
     left-out blocks better; that of names only where they explain less than half of what it explains, too.
     """
-    before, best = _held(tuple(search.steps)), search
+    before, best = _fix_noise(tuple(search.steps)), search
     alone = [step for step in search.steps if step.origin != "library"]
     for base in [named, alone] if len(named) > len(alone) else [alone]:
         if base[-1].searched.noise.band:  # a wave that terms, in white noise, would have to describe
@@ -85,7 +85,7 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
         if len(chain) == len(base) or own.gain < thresholds.FREE_FALL:
             continue
         if base is alone and own.errors >= thresholds.BETTER_IF_DOUBTFUL:
-            start = _held(tuple(base))[-1].searched.log_evidence
+            start = _fix_noise(tuple(base))[-1].searched.log_evidence
             names, terms = (each[-1].searched.log_evidence - start for each in (before, chain))
             replaces = other.gain > 0.0
             if named:
@@ -95,13 +95,13 @@ def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progre
         if replaces:
             whole = len(base) == len(search.steps)
             best = replace(search, steps=list(chain), refused=search.refused if whole else search.rounds[0])
-            before = _held(chain)
+            before = _fix_noise(chain)
     return best
 
 
-def _held(chain: Chain) -> Chain:
+def _fix_noise(chain: Chain) -> Chain:
     """The chain with its last model in held noise."""
-    return (*chain[:-1], replace(chain[-1], searched=in_held_noise(chain[-1].searched), known=None))
+    return (*chain[:-1], replace(chain[-1], searched=fix_noise(chain[-1].searched), known=None))
 
 
 def _extended(base: Chain, progress: Progress) -> Chain:
@@ -111,7 +111,7 @@ def _extended(base: Chain, progress: Progress) -> Chain:
     """
     chains = [base]
     for number in range(MAX_TERMS):
-        chains[-1] = _held(chains[-1])
+        chains[-1] = _fix_noise(chains[-1])
         last = chains[-1][-1].searched
         fits = fit_terms(last, lambda done, text, number=number: progress((number + done) / MAX_TERMS, text))
         best = max(fits, key=lambda fitted: fitted.log_evidence, default=last)

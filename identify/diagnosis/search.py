@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.candidate_terms import fit_terms, in_held_noise
+from stimrig.identify.diagnosis.candidate_terms import fit_terms, fix_noise
 from stimrig.identify.diagnosis.residual import ResidualStructure, quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.dynamics.grid import Grid
@@ -280,7 +280,7 @@ def _refusal(search: EffectSearch, candidate: Candidate) -> str | None:
         return f"{comparison.words} {needed}"
     if not only_at_work(search.quiet, candidate.fitted, candidate.effect.id):
         return None
-    term = max(fit_terms(in_held_noise(search.last), silent), key=lambda fitted: fitted.log_evidence, default=None)
+    term = max(fit_terms(fix_noise(search.last), silent), key=lambda fitted: fitted.log_evidence, default=None)
     if term is None or (comparison := difference(after, leave_out(term))).gain <= 0.0:
         return None
     name = find_effect(term.effects[-1][0]).name.lower()

@@ -25,7 +25,7 @@ def model(log_evidence: float, *effects: str) -> Any:
 @pytest.fixture
 def made_by_hand(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
     """No model is fitted again, and left-out blocks and held-out pulses ask for every term."""
-    monkeypatch.setattr(free, "in_held_noise", lambda fitted: fitted)
+    monkeypatch.setattr(free, "fix_noise", lambda fitted: fitted)
     monkeypatch.setattr(free, "vetoed", lambda *_: None)
     monkeypatch.setattr(free, "_better", lambda _, after: SimpleNamespace(gain=float(len(after)), errors=9.0))
     return monkeypatch
@@ -87,7 +87,7 @@ def test_terms_replace_what_was_found_only_if_they_predict_better(
     term = Step(TERM, model(40.0, TERM), "free")
     better = {base: 1.0, drift: gain}
     made_by_hand.setattr(free, "_better", lambda before, _: SimpleNamespace(gain=better[before[-1]], errors=9.0))
-    made_by_hand.setattr(free, "_held", lambda chain: chain)
+    made_by_hand.setattr(free, "_fix_noise", lambda chain: chain)
     made_by_hand.setattr(free, "_extended", lambda chain, _: (*chain, term))
     raw: Any = None
     search = EffectSearch(raw, np.ones(9, bool), base.searched, [base, drift], np.zeros(9, bool))

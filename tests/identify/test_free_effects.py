@@ -334,7 +334,7 @@ def test_a_zero_that_moves_from_rest_to_rest_is_held_as_slow_noise(zero_nm: floa
     moving = zero_nm * np.sin(0.17 * record.time_s)
     grid, raw = prepare(record.with_torque(record.torque_nm + moving))
     plain = search_effects(grid, raw, fitted_rows(grid, None), silent, max_effects=0)
-    held_model = candidate_terms.in_held_noise(plain.last)
+    held_model = candidate_terms.fix_noise(plain.last)
     noise, said = held_model.noise, " ".join(likelihood_warnings(held_model))
     assert ("A zero that wanders was held as noise" in said) is held
     assert noise.held and not noise.at_bound and (noise.share > 0.0) is held
