@@ -128,8 +128,7 @@ def _extended(base: Chain, progress: Progress) -> Chain:
         if not any(vetoed(shorter[-1].searched, chain[-1].searched) for shorter in allowed):
             allowed.append(chain)
     gains = [_better(chains[0], chain).gain for chain in allowed]
-    least = max(gains) - thresholds.NEAR
-    near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= least)
+    near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= max(gains) - thresholds.NEAR)
     for step in near[len(base) : -1]:
         shorter = _without(near, str(step.added))
         if _better(near, shorter).errors > -thresholds.SUPERFLUOUS and not vetoed(

@@ -32,7 +32,7 @@ from stimrig.identify.estimation.effect_fit import (
     try_effect,
 )
 from stimrig.identify.estimation.fit_statistics import evaluate
-from stimrig.identify.estimation.left_out import LeftOut, difference, leave_out
+from stimrig.identify.estimation.left_out import Difference, LeftOut, difference, leave_out
 from stimrig.identify.estimation.plain import fit_plain, renewed_curve
 from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.estimation.solve import Fitted, knows_joint, solve, start_from
@@ -207,9 +207,10 @@ def _add_best(search: EffectSearch, progress: Progress, number: int) -> bool:
     for place, candidate in enumerate(candidates):
         if candidate.gain < search.margin(number) or (accepted and not last.searched.distrusted):
             break
-        refusal = _refusal(search, candidate)
+        comparison = difference(last.left_out, leave_out(candidate.fitted))
+        refusal = _refusal(search, candidate, comparison)
         if refusal is None:
-            accepted.append((difference(last.left_out, leave_out(candidate.fitted)).gain, candidate))
+            accepted.append((comparison.gain, candidate))
         else:
             candidates[place] = replace(candidate, refusal=refusal)
     if not accepted:
@@ -264,13 +265,12 @@ def _rebuild(search: EffectSearch, last: Fitted, found: Sequence[Step]) -> None:
         search.steps.append(replace(search.steps[0], added=effect.id, searched=fitted, origin="library", tried=tried))
 
 
-def _refusal(search: EffectSearch, candidate: Candidate) -> str | None:
-    """Why left-out blocks refuse a candidate, in words; None if they do not.
+def _refusal(search: EffectSearch, candidate: Candidate, comparison: Difference) -> str | None:
+    """Why left-out blocks refuse a candidate, by a `comparison` with the last model, in words; None if they do not.
 
     An effort that hardly comes at rest is refused, too, where a term predicts them better: the pulses cause it.
     """
-    after, required = leave_out(candidate.fitted), required_errors(search, candidate)
-    comparison = difference(search.steps[-1].left_out, after)
+    required = required_errors(search, candidate)
     if not comparison.errors >= required:
         needed = "It must not rise."
         if required > 0.0:
@@ -281,10 +281,10 @@ def _refusal(search: EffectSearch, candidate: Candidate) -> str | None:
     if not only_at_work(search.quiet, candidate.fitted, candidate.effect.id):
         return None
     term = max(fit_terms(fix_noise(search.last), silent), key=lambda fitted: fitted.log_evidence, default=None)
-    if term is None or (comparison := difference(after, leave_out(term))).gain <= 0.0:
+    if term is None or (instead := difference(leave_out(candidate.fitted), leave_out(term))).gain <= 0.0:
         return None
     name = find_effect(term.effects[-1][0]).name.lower()
-    return f"It hardly comes at rest, and {name} predicts better: in its place the error {comparison.change}."
+    return f"It hardly comes at rest, and {name} predicts better: in its place the error {instead.change}."
 
 
 def required_errors(search: EffectSearch, candidate: Candidate) -> float:

@@ -83,17 +83,9 @@ def _opposed(fitted: Fitted, chosen: Chosen) -> str:
 
 
 def _course(fitted: Fitted, chosen: Chosen) -> dict[str, list[float]]:
-    """The driver and the effect of a term over the record, for a picture."""
-    time_s, share, exponent = _exponent(fitted, chosen)
-    shown = slice(None, None, math.ceil(share.size / POINTS))
-    columns = {"time_s": time_s, "driver": share, "value": acting(Place(int(chosen.form.law["place"])), exponent)}
-    return {name: [float(f"{each:.4g}") for each in column[shown]] for name, column in columns.items()}
-
-
-def _exponent(fitted: Fitted, chosen: Chosen) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Times, s, driver and exponent of a term over the record, by the model's own torque; each of shape (K,)."""
+    """The driver and the effect of a term over the record, by the model's own torque."""
     problem, setup, theta = fitted.problem, fitted.problem.setup, fitted.theta.copy()
-    driver = Driver(int(chosen.form.law["driver"]))
+    place, driver = Place(int(chosen.form.law["place"])), Driver(int(chosen.form.law["driver"]))
     # the torque that drives a term is that before the terms at the cell
     theta[[each.first for each in problem.chosen if each.form.law.get("place") in AFTER_LAGS]] = 0.0
     width_us, drive_nm, torque_nm = problem.inner_signals(theta)
@@ -116,4 +108,7 @@ def _exponent(fitted: Fitted, chosen: Chosen) -> tuple[np.ndarray, np.ndarray, n
             behind = 0.0 if k in starts else x  # a play begins anew with each part
             x = lagging if later(driver) else min(max(behind, now - other), now + other)
             states[k] = x
-    return setup.scene.time_s + setup.grid.start_s, share, size * states
+    shown = slice(None, None, math.ceil(share.size / POINTS))
+    times_s = setup.scene.time_s + setup.grid.start_s
+    columns = {"time_s": times_s, "driver": share, "value": acting(place, size * states)}
+    return {name: [float(f"{each:.4g}") for each in column[shown]] for name, column in columns.items()}
