@@ -160,9 +160,7 @@ def _about_the_upload(path: Path) -> Iterator[None]:
         raise
 
 
-def _store(
-    context: Context, row: Recording, by: str, of: str, tags: Tags, current_ma: float | None
-) -> Recording:  # fmt: skip
+def _store(context: Context, row: Recording, by: str, of: str, tags: Tags, current_ma: float | None) -> Recording:
     row.created_utc = now = context.clock.utc()
     detail = {"participant": row.participant, "sha256": row.file_sha256, **({"of": of} if of else {})}
     with uploads.taken_in(Path(row.path)), context.store.write() as session:

@@ -133,8 +133,8 @@ class Runner(Playing):
         if there is not None and there != here:
             detail = f"The model was measured at {in_words(there)}, this test is at {in_words(here)}."
             raise ApiError(409, "other-site", title, detail)
-        if unknown := self.versions.why_not_joined(model):
-            raise ApiError(409, "unknown-current", title, unknown)
+        if before_ma is None:
+            raise ApiError(409, "unknown-current", title, self.versions.why_not_joined(model))
         if before_ma != now_ma:
             detail = f"The model was measured with {before_ma:g} mA, this test is with {now_ma:g} mA."
             raise ApiError(409, "other-current", title, detail)
