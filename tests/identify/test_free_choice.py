@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from stimrig.identify.diagnosis import candidate_terms, free
+from stimrig.identify.diagnosis import candidate_terms, free, search
 from stimrig.identify.diagnosis.search import EffectSearch, Step, silent
 from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation.effect_fit import Candidate
 
 NAMED, TERM = "fatigue", "free_width_by_torque"
 
@@ -73,8 +74,8 @@ def test_terms_take_the_place_of_names_that_explain_less_than_half(
     term = Step(TERM, model(100.0, TERM), "free")
     made_by_hand.setattr(free, "_extended", lambda chain, _: chain if chain[-1] is named else (*chain, term))
     raw: Any = None
-    search = EffectSearch(raw, np.ones(9, bool), base.searched, [base, named], np.zeros(9, bool))
-    freely = free.explain_freely(search, [base, named], silent)
+    found_first = EffectSearch(raw, np.ones(9, bool), base.searched, [base, named], np.zeros(9, bool))
+    freely = free.explain_freely(found_first, [base, named], silent)
     assert freely.names("free") == found and freely.names("library") == ([] if found else [NAMED])
 
 
@@ -90,8 +91,8 @@ def test_terms_replace_what_was_found_only_if_they_predict_better(
     made_by_hand.setattr(free, "_fix_noise", lambda chain: chain)
     made_by_hand.setattr(free, "_extended", lambda chain, _: (*chain, term))
     raw: Any = None
-    search = EffectSearch(raw, np.ones(9, bool), base.searched, [base, drift], np.zeros(9, bool))
-    assert free.explain_freely(search, (), silent).names("free") == found
+    found_first = EffectSearch(raw, np.ones(9, bool), base.searched, [base, drift], np.zeros(9, bool))
+    assert free.explain_freely(found_first, (), silent).names("free") == found
 
 
 def test_the_size_of_a_term_is_cut_no_further_once_it_does_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,3 +104,16 @@ def test_the_size_of_a_term_is_cut_no_further_once_it_does_nothing(monkeypatch: 
     monkeypatch.setattr(candidate_terms, "solve", lambda _problem, start, *_, **__: start)
     start = candidate_terms.fit_term(model(0.0), find_effect(TERM), {})
     assert start[0] == 2.0 and 0.0 < start[1] <= candidate_terms.LEAST_SIZE
+
+
+def test_a_refused_effort_does_not_come_back_beside_a_later_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[str] = []
+    monkeypatch.setattr(search, "without_effect", lambda *_: SimpleNamespace(log_evidence=0.0, residual_nm=None))
+    monkeypatch.setattr(search, "fit_form", lambda effect, *_: asked.append(effect.id))
+    refused = [find_effect(name) for name in ("voluntary_effort", "potentiation")]
+    tried = tuple(Candidate(effect, effect.forms[0], model(0.0), 9.0, {}, "It must not rise.") for effect in refused)
+    steps = [Step(None, model(0.0), "base"), Step(NAMED, model(50.0, NAMED), "library", tried)]
+    steps.append(Step("catch_like", model(90.0, NAMED, "catch_like"), "library"))
+    raw: Any = None
+    search._exchange(EffectSearch(raw, np.ones(9, bool), steps[0].searched, steps, np.zeros(9, bool)))
+    assert asked == ["potentiation"]
