@@ -160,7 +160,7 @@ Linear = SecondOrder | Discrete
 
 def linear_from_dict(data: dict) -> Linear:
     """The block that `to_dict` and the coefficients b, a, delay_samples describe."""
-    if data.get("kind", "discrete") == "second-order":
+    if data["kind"] == "second-order":
         return SecondOrder(float(data["time_constant_s"]), float(data["damping"]), float(data["delay_s"]))
     return Discrete(
         b=tuple(float(x) for x in data["b"]),

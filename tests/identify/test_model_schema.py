@@ -136,7 +136,7 @@ def test_what_is_only_told_may_be_unknown(document: dict[str, Any]) -> None:
         assert refused(changed(document, way, None)) == "", way
     assert refused(changed(document, one_number, 300.0)) == ""
     assert identify.Model.from_dict(changed(document, band, None)).bands["recruitment"]["lower"][0] is None
-    for name in ("time_constant_s", "damping"):
+    for name in ("kind", "time_constant_s", "damping"):
         less = {key: value for key, value in document["linear"].items() if key != name}
         with pytest.raises(identify.BadModel, match=rf"linear\.{name}: the key is missing"):
             check_model(document | {"linear": less})
