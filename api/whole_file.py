@@ -16,10 +16,10 @@ def whole_path(path: Path) -> Iterator[Path]:
 
     A pipe, a device and the like are written directly. Raises OSError, with this file's name.
     """
-    target = Path(os.path.realpath(path))
-    if target.exists() and not target.is_file():
-        yield target
+    if path.exists() and not path.is_file():  # before links are resolved: /dev/stdout of a pipe leads to no path
+        yield path
         return
+    target = Path(os.path.realpath(path))
     aside = target.with_name(f".{target.name}.new{target.suffix}")
     try:
         yield aside

@@ -58,10 +58,12 @@ def load_structure(path: Path | None, data: Sequence[Path], columns: list[str] |
 def check_outputs(inputs: Iterable[Path | None], *outputs: Path | None) -> None:
     """Check before a verb computes that its outputs can be written, and that none replaces a file that it reads.
 
-    Raises InputError.
+    A device or a pipe is no file that could be replaced. Raises InputError.
     """
     known = {Path(os.path.realpath(path)) for path in inputs if path is not None}
     for path in filter(None, outputs):
+        if path.exists() and not path.is_file() and not path.is_dir() and os.access(path, os.W_OK):
+            continue
         place = Path(os.path.realpath(path))
         if place in known:
             raise InputError(f"{path}: it would replace a file of this command. Give another name.")

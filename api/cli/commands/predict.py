@@ -32,8 +32,8 @@ def predict(
     record = load_record([data], columns)
     predicted = np.asarray(identify.predict(model, record))
     rows = {"time_s": record.time_s, "torque_nm": record.torque_nm, "predicted_torque_nm": predicted}
-    with whole_path(output) as place:
-        np.savetxt(place, np.column_stack(list(rows.values())), "%.9g", ",", header=",".join(rows), comments="")
+    with whole_path(output) as place, place.open("w") as file:  # numpy would open a pipe twice
+        np.savetxt(file, np.column_stack(list(rows.values())), "%.9g", ",", header=",".join(rows), comments="")
     figures = {
         "fit_percent": best_fit_percent(record.torque_nm, predicted),
         "rms_nm": float(np.sqrt(np.mean((record.torque_nm - predicted) ** 2))),
