@@ -5,6 +5,11 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
+import pytest
+
+from stimrig.api.cli.commands import audit
+from stimrig.api.cli.commands import test as verb
+from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.files import check_outputs, write
 
 
@@ -17,3 +22,19 @@ def test_devices_and_pipes_are_written_directly(tmp_path: Path) -> None:
     os.close(writer)
     assert os.read(reader, 100) == b"content" and pipe.is_symlink()
     os.close(reader)
+
+
+@pytest.mark.parametrize("name", ["service.lock", "MODEL.json", "recordings/r.h5", "stimrig.db", "elsewhere.db-wal"])
+def test_a_file_of_the_service_is_not_replaced(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "var" / "recordings").mkdir(parents=True)
+    monkeypatch.setenv("STIMRIG_DATA_DIR", str(tmp_path / "var"))
+    output = tmp_path / "var" / name
+    if name.startswith("elsewhere"):
+        output = tmp_path / name
+        monkeypatch.setenv("STIMRIG_DATABASE_URL", f"sqlite:///{tmp_path}/elsewhere.db")
+    output.write_bytes(b"kept")
+    for command in (audit.export, verb.test):
+        with pytest.raises(InputError, match=rf"{name}: it would replace a file of .*\. Give another name\."):
+            command(output=output)
+    assert output.read_bytes() == b"kept"
+    assert not any((tmp_path / "var").glob("logs")), "no service was started"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterable
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated
@@ -59,7 +60,7 @@ def export(
 ) -> None:
     """Write the trail, one entry a line; `verify --file` checks it without the database."""
     settings = settings_of(data)
-    check_outputs([sqlite_file(make_url(settings.database))], output)
+    check_service_output(settings, [], output)
     entries = stored(settings)
     write(output, "".join(json.dumps(entry.as_dict(), sort_keys=True) + "\n" for entry in entries))
     print_lines(f"{len(entries)} entries written to {output}; head {head_of(entries)}")
@@ -73,6 +74,13 @@ def head_of(entries: list[AuditEntry]) -> str:
 def settings_of(data: Path | None) -> Settings:
     """Return the service's settings, with another data folder where one is given."""
     return Settings(**set_options(data_dir=data))
+
+
+def check_service_output(settings: Settings, inputs: Iterable[Path], output: Path | None) -> None:
+    """Check as `check_outputs` an output that may replace neither a file of the data folder nor the database."""
+    database = sqlite_file(make_url(settings.database))
+    files = [Path(f"{database}{suffix}") for suffix in ("", "-wal", "-shm", "-journal")] if database else []
+    check_outputs([*inputs, *files], output, data_dir=settings.data_dir)
 
 
 def open_store(settings: Settings) -> closing[Store]:

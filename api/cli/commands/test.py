@@ -16,8 +16,9 @@ import typer
 
 from stimrig import identify
 from stimrig.api.cli import deciding
+from stimrig.api.cli.commands.audit import check_service_output, settings_of
 from stimrig.api.cli.errors import CommandError, InputError
-from stimrig.api.cli.files import check_outputs, write
+from stimrig.api.cli.files import write
 from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, names, set_options
 from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
@@ -89,12 +90,13 @@ def test(
         raise InputError("--adaptive, --protocol and --decide are three kinds of test. Give one of them.")
     if output is not None:
         output.parent.mkdir(parents=True, exist_ok=True)
-    check_outputs(decide or (), output)
+    check_service_output(settings_of(data), decide or [], output)
     request = set_options(protocol=protocol, kind="adaptive" if adaptive else None, **bounds, **labels)
     if decide:
         request |= deciding.plan_experiment(decide, participant)
     over = Event()
     with service(url, rig, data, emulate, over) as (client, events):
+        check_service_output(settings_of(data), decide or [], output)  # again: the service has made its files now
         code = request.pop("participant", participant or "TEST")
         result = play(client, code, request, events, over.set)
     recording = result.pop("recording")
