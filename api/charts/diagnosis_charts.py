@@ -8,6 +8,7 @@ from typing import Any
 from stimrig.api.charts.figure import Axis, Figure, Line, Mark, Note, Rule, Shade, time_axis
 from stimrig.api.charts.model_charts import broken_at_pauses, free_effects, segment_marks
 from stimrig.api.models import explanation
+from stimrig.identify.effects import registry
 from stimrig.identify.healing import looks_like_noise
 from stimrig.identify.yardstick import floor_nm
 
@@ -103,6 +104,12 @@ def story_figures(story: dict[str, Any], before: dict[str, Any], after: dict[str
     if len(rows) > 1:
         figures["falling"] = falling(rows)
     return figures | free_effects(story["why"]["free"] if story["why"] else [])
+
+
+def story_names() -> list[str]:
+    """Return every name that `story_figures` may give."""
+    free = [f"{kind}-{effect.id}" for effect in registry().values() if effect.shape for kind in ("free", "course")]
+    return ["story-torque", "story-place", "falling", *free]
 
 
 def side_by_side(before: dict[str, Any], after: dict[str, Any], places: Places, close: bool = False) -> Figure:

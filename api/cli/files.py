@@ -55,13 +55,20 @@ def load_structure(path: Path | None, data: Sequence[Path], columns: list[str] |
         raise InputError(f"{path}: {error}") from error
 
 
-def check_outputs(inputs: Iterable[Path | None], *outputs: Path | None, data_dir: Path | None = None) -> None:
+def check_outputs(
+    inputs: Iterable[Path | None],
+    *outputs: Path | None,
+    data_dir: Path | None = None,
+    new_folder: Path | None = None,
+) -> None:
     """Check before a verb computes that its outputs can be written, and that none replaces a file that it reads.
 
     Nor a file of `data_dir`, the service's data folder. A device or a pipe is no file that could be replaced.
+    `new_folder`: the folder that the verb makes before it writes.
 
     Raises InputError.
     """
+    made = new_folder and Path(os.path.realpath(new_folder))
     known = {Path(os.path.realpath(path)) for path in inputs if path is not None}
     for path in filter(None, outputs):
         if path.exists() and not path.is_file() and not path.is_dir() and os.access(path, os.W_OK):
@@ -71,7 +78,10 @@ def check_outputs(inputs: Iterable[Path | None], *outputs: Path | None, data_dir
             raise InputError(f"{path}: it would replace a file of this command. Give another name.")
         if data_dir is not None and place.is_file() and place.is_relative_to(os.path.realpath(data_dir)):
             raise InputError(f"{path}: it would replace a file of the data folder. Give another name.")
-        writable = place.parent.is_dir() and os.access(place if place.exists() else place.parent, os.W_OK)
+        folder = place.parent
+        if made == folder:
+            folder = next(each for each in (made, *made.parents) if each.exists())
+        writable = folder.is_dir() and os.access(place if place.exists() else folder, os.W_OK)
         if place.is_dir() or not writable:
             raise InputError(f"{path}: give a file in a folder that can be written.")
         known.add(place)

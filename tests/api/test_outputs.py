@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from stimrig.api.cli.commands import audit
+from stimrig import identify
+from stimrig.api.cli.commands import audit, explain
 from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.errors import InputError
 from stimrig.api.cli.files import check_outputs, write
@@ -38,3 +39,15 @@ def test_a_file_of_the_service_is_not_replaced(name: str, tmp_path: Path, monkey
             command(output=output)
     assert output.read_bytes() == b"kept"
     assert not any((tmp_path / "var").glob("logs")), "no service was started"
+
+
+def test_a_refused_command_makes_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    data, new = tmp_path / "absent.csv", tmp_path / "new" / "deep"
+    check_outputs([], new / "story.html", new / "a.svg", new_folder=new)
+    for wrong in ({"html": new / "falling.svg"}, {"own": Path("/nowhere/x.py")}, {}):
+        with pytest.raises((InputError, identify.BadRecord, OSError)):
+            explain.explain([data], figures=new, **wrong)
+    with pytest.raises((InputError, identify.BadRecord, OSError)):
+        verb.test(decide=[data], output=new / "r.h5")
+    assert list(tmp_path.iterdir()) == []

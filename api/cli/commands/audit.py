@@ -76,11 +76,13 @@ def settings_of(data: Path | None) -> Settings:
     return Settings(**set_options(data_dir=data))
 
 
-def check_service_output(settings: Settings, inputs: Iterable[Path], output: Path | None) -> None:
+def check_service_output(
+    settings: Settings, inputs: Iterable[Path], output: Path | None, new_folder: Path | None = None
+) -> None:
     """Check as `check_outputs` an output that may replace neither a file of the data folder nor the database."""
     database = sqlite_file(make_url(settings.database))
     files = [Path(f"{database}{suffix}") for suffix in ("", "-wal", "-shm", "-journal")] if database else []
-    check_outputs([*inputs, *files], output, data_dir=settings.data_dir)
+    check_outputs([*inputs, *files], output, data_dir=settings.data_dir, new_folder=new_folder)
 
 
 def open_store(settings: Settings) -> closing[Store]:

@@ -36,19 +36,22 @@ def explain(
         raise InputError(f"--own {own}: give a name that ends in .py.")
     if own is not None and own.exists():
         raise InputError(f"--own {own}: it exists already: move it or give another name.")
+    drawn = []
     if figures is not None:
-        figures.mkdir(parents=True, exist_ok=True)
-    check_outputs([*data, model_json], output, html, own, figures and figures / "figure.svg")
+        from stimrig.api.charts.diagnosis_charts import story_figures, story_names
+        from stimrig.api.charts.figure import FILE_KINDS
+
+        drawn = [figures / f"{name}.{kind}" for name in story_names() for kind in FILE_KINDS]
+    check_outputs([*data, model_json], output, html, own, *drawn, new_folder=figures)
     record, model, structure = load_structure(model_json, data, columns)
     with progress_bar() as progress:
         explained = identify.explain(record, progress, model)
+    if figures is not None:
+        figures.mkdir(parents=True, exist_ok=True)
     write(output, explained.improvement.models[-1])
     if html is not None:
         write(html, html_report(explained, record, short(data)))
     if figures is not None:
-        from stimrig.api.charts.diagnosis_charts import story_figures
-        from stimrig.api.charts.figure import FILE_KINDS
-
         narrative = story_of(record, explained)
         for name, figure in story_figures(narrative["story"], narrative["before"], narrative["after"]).items():
             for kind in FILE_KINDS:

@@ -8,6 +8,7 @@ import os
 import secrets
 import sys
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Annotated, Any
@@ -88,18 +89,21 @@ def test(
         raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
     if (adaptive, protocol is not None, bool(decide)).count(True) > 1:
         raise InputError("--adaptive, --protocol and --decide are three kinds of test. Give one of them.")
-    if output is not None:
-        output.parent.mkdir(parents=True, exist_ok=True)
-    check_service_output(settings_of(data), decide or [], output)
+    check_output = partial(
+        check_service_output, settings_of(data), decide or [], output, new_folder=output and output.parent
+    )
+    check_output()
     request = set_options(protocol=protocol, kind="adaptive" if adaptive else None, **bounds, **labels)
     if decide:
         request |= deciding.plan_experiment(decide, participant)
     over = Event()
     with service(url, rig, data, emulate, over) as (client, events):
-        check_service_output(settings_of(data), decide or [], output)  # again: the service has made its files now
+        check_output()  # again: the service has made its files now
         code = request.pop("participant", participant or "TEST")
         result = play(client, code, request, events, over.set)
     recording = result.pop("recording")
+    if output is not None:
+        output.parent.mkdir(parents=True, exist_ok=True)
     write(output, recording)  # first, so that a later error cannot lose the recording
     lines: list[object] = [report_test(result["test"])]
     if decide:
