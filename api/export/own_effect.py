@@ -97,9 +97,9 @@ def own_effect(model: Model) -> str:
     terms = [entry for entry in model.effects if "shape" in entry]
     written = [entry for entry in terms if _law(entry)[0] in STAGES]
     if not terms:
-        raise BadRequest("no free effect was found: there is nothing to write", fix="Leave out --own.")
+        raise BadRequest("no free effect was found: there is nothing to write")
     if not written:
-        raise BadRequest("the free effect changes a rate, which no stage of an own effect can", fix="Leave out --own.")
+        raise BadRequest("the free effect changes a rate, which no stage of an own effect can")
     entry = written[0]
     place, driver = _law(entry)
     described = find_effect(entry["id"])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -51,3 +52,17 @@ def test_a_refused_command_makes_no_folder(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises((InputError, identify.BadRecord, OSError)):
         verb.test(decide=[data], output=new / "r.h5")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_without_a_term_the_other_outputs_are_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plain = type("Plain", (str,), {"effects": ()})("the model")
+    left = SimpleNamespace(add=[], deciding_experiment=None)
+    explained = SimpleNamespace(left=left, to_dict=dict, improvement=SimpleNamespace(models=[plain]))
+    monkeypatch.setattr(explain, "load_structure", lambda *_: (None, None, []))
+    monkeypatch.setattr(identify, "explain", lambda *_: explained)
+    output, own = tmp_path / "MODEL.json", tmp_path / "own.py"
+    explain.explain([], output=output, own=own)
+    assert output.read_text() == "the model" and not own.exists()
+    assert f"{own} is not written: no free effect was found" in capsys.readouterr().err

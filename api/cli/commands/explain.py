@@ -62,8 +62,11 @@ def explain(
         commands = add_command(explained.left, output)
     commands += test_command(explained.left, model_json)
     report(document, as_json, explained, *commands, files=[output, html, figures])
-    if own is not None:  # last: without a term there is nothing to write
+    if own is not None:
         from stimrig.api.export.own_effect import own_effect
 
-        write(own, own_effect(explained.improvement.models[-1]))
-        print_aside(f"own effect written to {own}")
+        try:
+            write(own, own_effect(explained.improvement.models[-1]))
+            print_aside(f"own effect written to {own}")
+        except identify.BadRequest as error:  # a finding about the record; the other outputs are as asked for
+            print_aside(f"{own} is not written: {error.message}")
