@@ -55,10 +55,9 @@ class Results:
         self._synced_s = time.monotonic()
 
     def __enter__(self) -> Self:
-        if self.output.is_dir():
-            raise CohortError(f"{self.output}: a folder. Give a file.")
+        if self.output.exists() and not self.output.is_file():
+            raise CohortError(f"{self.output}: a folder or a device. Give a file.")
         try:
-            self.journal.parent.mkdir(parents=True, exist_ok=True)
             self._file = self.journal.open("a+b")
         except OSError as error:
             raise CohortError(
@@ -69,11 +68,14 @@ class Results:
             if not self.journal.exists() or self.journal.stat().st_ino != os.fstat(self._file.fileno()).st_ino:
                 raise BlockingIOError  # the run that had the lock has removed the file
             self._read()
-        except BaseException as error:
+        except BlockingIOError:
             self._file.close()
-            if isinstance(error, BlockingIOError):
-                words = "another run writes it now. Wait for it, or give another -o."
-                raise CohortError(f"{self.output}: {words}") from None
+            words = "another run writes it now. Wait for it, or give another -o."
+            raise CohortError(f"{self.output}: {words}") from None
+        except BaseException:
+            if not self.journal.stat().st_size:  # it was made here
+                self.journal.unlink()
+            self._file.close()
             raise
         return self
 

@@ -13,6 +13,7 @@ import typer
 
 from stimrig.api.cli.commands.fit import METHOD
 from stimrig.api.cli.errors import INTERRUPTED, CommandError, InputError
+from stimrig.api.cli.files import check_outputs
 from stimrig.api.cli.options import Json, names
 from stimrig.api.cli.terminal import listed, report
 
@@ -77,6 +78,7 @@ def cohort(
 
     if verb != "fit" and (method != METHOD or effects):
         raise InputError(f"--method and --effects are options of `cohort fit`: {verb} begins with the plain structure.")
+    check_outputs(map(Path, data), output)
     try:
         document = run_cohort(
             verb, data, output, select=select, method=method, effects=names(effects), scheduler=scheduler,

@@ -85,6 +85,7 @@ def test_without_the_extra_it_says_what_to_install(
         (["--limit", "0"], "--limit"),
         (["--workers", "0"], "--workers"),
         (["/nowhere"], "/nowhere: no such file"),
+        (["x", "-o", "x"], "x: it would replace a file of this command"),
     ],
 )
 def test_wrong_options_are_one_line(

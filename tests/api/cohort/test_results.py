@@ -85,6 +85,14 @@ def test_run_that_did_nothing_leaves_nothing(output: Path) -> None:
     assert list(output.parent.iterdir()) == []
 
 
+def test_a_refused_output_is_left_as_it_was(output: Path) -> None:
+    output.write_bytes(b"a recording")
+    refuse(output, "no results of `stimrig cohort`")
+    refuse(Path("/dev/null"), "a folder or a device. Give a file")
+    refuse(output.parent / "absent" / "r.parquet", "Give a file in a folder that can be written")
+    assert list(output.parent.iterdir()) == [output] and output.read_bytes() == b"a recording"
+
+
 def test_killed_between_joining_and_removing_the_lines(output: Path) -> None:
     run(output, row("a"), failure("b", "timeout"), join=False)
     lines = Path(f"{output}.rows").read_bytes()
