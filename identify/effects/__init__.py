@@ -11,6 +11,9 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
+import re
+import subprocess
+import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
 from importlib.metadata import entry_points
@@ -24,6 +27,20 @@ from stimrig.identify.errors import BadRequest
 
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"
+TRIAL = """
+import faulthandler, sys
+from stimrig.identify import effects
+limit_s, folder = float(sys.argv[1]), sys.argv[2]
+faulthandler.dump_traceback_later(limit_s, exit=True)
+try:
+    for _ in effects._own_effects(folder):
+        faulthandler.dump_traceback_later(limit_s, exit=True)
+except BaseException:
+    pass  # the process that started this one meets it too, and reports it
+"""
+"""Program that loads the own effects and ends itself where one of them takes longer than a limit."""
+TRIAL_S = 20.0
+"""Longest time of an own effect, which takes milliseconds: an endless loop would hold up every verb in silence."""
 
 
 def _library() -> list[Effect]:
@@ -36,13 +53,36 @@ def _library() -> list[Effect]:
 def _everything(folder: str) -> dict[str, Effect]:
     effects = {effect.id: effect for effect in _library()}
     places = dict.fromkeys(effects, "the library")
-    for place, effect in [*_from_packages(), *(_from_folder(Path(folder)) if folder else ())]:
+    if folder or entry_points(group=GROUP):
+        _try_out(folder)
+    for place, effect in _own_effects(folder):
         if effect.id in places:
             message = f"the effect {effect.id!r} is also in {places[effect.id]}"
             raise BadEffect(message, place=place, fix="Give it another id.")
         places[effect.id] = place
         effects[effect.id] = effect
     return effects
+
+
+def _try_out(folder: str) -> None:
+    """Load the own effects in another process first: nothing else ends code that catches every exception.
+
+    Raises BadEffect: one of them does not end, or ends the process.
+    """
+    command = [sys.executable, "-X", "faulthandler", "-c", TRIAL, str(TRIAL_S), folder]
+    ended = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace")
+    if ended.returncode:
+        frames = [(Path(file), line) for file, line in re.findall(r'File "(.+)", line (\d+)', ended.stderr)]
+        own = [(Path(folder) / file.name, line) for file, line in frames if file.parent == Path(folder).absolute()]
+        place = next((f"{file}, line {line}" for file, line in own or frames), folder or GROUP)
+        message = f"not done after {TRIAL_S:g} s" if "Timeout (" in ended.stderr else "it ends Python"
+        raise BadEffect(message, place=place, fix=own_file.FIX)
+
+
+def _own_effects(folder: str) -> Iterator[tuple[str, Effect]]:
+    yield from _from_packages()
+    if folder:
+        yield from _from_folder(Path(folder))
 
 
 def _from_packages() -> Iterator[tuple[str, Effect]]:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib.util
 import re
-import threading
 import traceback
 from pathlib import Path
 from typing import Any
@@ -23,8 +21,6 @@ OWN_STAGES = tuple(stage for stage in STAGES if stage not in ("speed", "term"))
 ID = r"[a-z][a-z0-9_]{0,63}"
 ROWS = 80
 """Pulse intervals on which a form is tried."""
-TRIAL_S = 20.0
-"""Longest time of a trial, which takes milliseconds: a loop without an end would hold up every verb in silence."""
 MAX_STARTS = 32
 """Each is a fit."""
 
@@ -137,19 +133,11 @@ def _try_out(form: Form, where: str, path: Path | None) -> None:
     scene = Scene(turn, width_us, 0.025, 8.0, 200.0, np.sin(turn), np.cos(turn), fitted=np.ones(ROWS, bool))
     x = {"pulse_width": width_us, "additive": None, "delay": None}.get(form.stage, 8.0 * np.abs(np.sin(turn)))
     values = {p.name: np.full((1, 1), p.on(scene).start[0]) for p in form.parameters}
-    stop = ctypes.c_ulong(threading.get_ident()), ctypes.py_object(TimeoutError)
-    late = threading.Timer(TRIAL_S, ctypes.pythonapi.PyThreadState_SetAsyncExc, stop)  # a signal needs the main thread
-    late.daemon = True
-    late.start()
     try:
         result = np.asarray(form.call(x if x is None else x[None, :], values, scene), float)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         place = where if path is None else f"{_place(path, error)}, form {form.name!r}"
-        cause = f"not done after {TRIAL_S:g} s" if isinstance(error, TimeoutError) else in_one_line(error)
-        raise BadEffect(f"apply fails: {cause}", place=place, fix=FIX) from error
-    finally:
-        late.cancel()
-        late.join()
+        raise BadEffect(f"apply fails: {in_one_line(error)}", place=place, fix=FIX) from error
     if result.shape not in ((1, ROWS), (1, 1)):
         message = f"apply gives {result.size} numbers, not one for each of {ROWS} pulses"
         raise BadEffect(message, place=where, fix=FIX)

@@ -7,7 +7,6 @@ import io
 import json
 import re
 from pathlib import Path
-from threading import Thread
 
 import pytest
 
@@ -117,6 +116,7 @@ def test_what_cannot_be_an_effect_is_told_with_its_file(tmp_path, monkeypatch, o
         ("EFFECT = Effect(", "1 / 0\nEFFECT = Effect(", "ZeroDivisionError: division by zero"),
         ("EFFECT = Effect(", "exit()\nEFFECT = Effect(", "SystemExit"),
         ('p["period_s"]', 'p["period"]', "apply fails: KeyError: 'period'"),
+        ('p["period_s"]', "exit()", "apply fails: SystemExit"),
     ],
 )
 def test_an_error_in_the_file_is_told_with_its_line(tmp_path, monkeypatch, old: str, new: str, says: str) -> None:
@@ -141,14 +141,19 @@ def test_two_files_of_one_id_are_told(tmp_path, monkeypatch) -> None:
     assert "is also in " in told(tmp_path, monkeypatch, GOOD)
 
 
-def test_a_loop_without_an_end_is_told_with_its_line_in_any_thread(tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr(effects.own_file, "TRIAL_S", 0.3)
-    text = GOOD.replace("    return torque_nm", "    while True:\n        pass\n    return torque_nm")
-    lines: list[str] = []
-    trial = Thread(target=lambda: lines.append(told(tmp_path, monkeypatch, text)), daemon=True)
-    trial.start()
-    trial.join(30.0)
-    assert lines and "mine.py, line " in lines[0] and "apply fails: not done after 0.3 s" in lines[0]
+@pytest.mark.parametrize("at", ["    return torque_nm", "EFFECT = Effect("])
+@pytest.mark.parametrize("caught", ["ValueError", "TimeoutError", "BaseException"])
+def test_a_loop_without_an_end_is_told_with_its_line(tmp_path, monkeypatch, at: str, caught: str) -> None:
+    monkeypatch.setattr(effects, "TRIAL_S", 0.3)
+    dent = at[: -len(at.lstrip())]
+    loop = f"while True:\n{dent}    try:\n{dent}        pass\n{dent}    except {caught}:\n{dent}        break"
+    line = told(tmp_path, monkeypatch, GOOD.replace(at, f"{dent}{loop}\n{at}", 1))
+    assert re.match(rf"{tmp_path / 'mine.py'}, line \d+: not done after 0.3 s\. See docs", line), line
+
+
+def test_an_effect_that_ends_python_is_told_with_its_file(tmp_path, monkeypatch) -> None:
+    text = GOOD.replace("EFFECT = Effect(", "import ctypes\nctypes.string_at(0)\nEFFECT = Effect(")
+    assert re.match(rf"{tmp_path / 'mine.py'}, line \d+: it ends Python\.", told(tmp_path, monkeypatch, text))
 
 
 @pytest.mark.parametrize("known", ["fatigue", "free_width_by_torque"])
