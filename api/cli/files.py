@@ -56,14 +56,11 @@ def load_structure(path: Path | None, data: Sequence[Path], columns: list[str] |
 
 
 def check_outputs(
-    inputs: Iterable[Path | None],
-    *outputs: Path | None,
-    data_dir: Path | None = None,
-    new_folder: Path | None = None,
+    inputs: Iterable[Path | None], *outputs: Path | None, data_dir: Path | None = None, new_folder: Path | None = None
 ) -> None:
     """Check before a verb computes that its outputs can be written, and that none replaces a file that it reads.
 
-    Nor a file of `data_dir`, the service's data folder. A device or a pipe is no file that could be replaced.
+    Nor may one replace a file in `data_dir`, the service's data folder. Devices and pipes are always written.
     `new_folder`: the folder that the verb makes before it writes.
 
     Raises InputError.
