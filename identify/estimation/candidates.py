@@ -34,6 +34,7 @@ LONG_S = 1.0
 LEAST_BOUTS = 3
 COVERED = 0.95
 """Share of the rows to be predicted whose widths must be seen in bouts of their kind."""
+WHY_WHITE = "slow noise would have taken up what the structure leaves."
 
 
 def chosen(grid: Grid, rows: np.ndarray, best: Fitted, fit: Fit) -> Fitted:
@@ -82,8 +83,8 @@ def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
         sentences.append(
             f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted."
         )
-    if fitted.noise.held:
-        sentences.append("The noise was taken as white: slow noise would have taken up what the structure leaves.")
+    if fitted.noise.held and fitted.noise.share == 0.0:
+        sentences.append(f"The noise was taken as white: {WHY_WHITE}")
     return [*sentences, *likelihood_warnings(fitted)]
 
 
@@ -93,8 +94,8 @@ def likelihood_warnings(fitted: Fitted) -> list[str]:
     if noise.held and noise.share > 0.0:
         zero_nm = noise.sd_nm * noise.share**0.5
         sentences.append(
-            f"A zero that wanders was held as noise, {zero_nm:.2g} N·m from rest to rest: it is part of the error, and "
-            "no effect describes it."
+            f"The noise was taken as white, beside a zero that wanders by {zero_nm:.2g} N·m from rest to rest: "
+            f"{WHY_WHITE} The zero is part of the error, and no effect describes it."
         )
     if noise.at_bound:
         sentences.append(

@@ -336,7 +336,7 @@ def test_a_zero_that_moves_from_rest_to_rest_is_held_as_slow_noise(zero_nm: floa
     plain = search_effects(grid, raw, fitted_rows(grid, None), silent, max_effects=0)
     held_model = candidate_terms.fix_noise(plain.last)
     noise, said = held_model.noise, " ".join(likelihood_warnings(held_model))
-    assert ("A zero that wanders was held as noise" in said) is held
+    assert ("white, beside a zero that wanders by" in said) is held
     assert noise.held and not noise.at_bound and (noise.share > 0.0) is held
     if held:
         assert 0.5 < noise.sd_nm * noise.share**0.5 / np.std(moving) < 1.5
