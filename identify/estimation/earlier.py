@@ -51,28 +51,18 @@ def learn_change(models: Sequence[Model]) -> Change:
 
     `models`: with second-order dynamics; others are left out.
     """
-    known = [_marks(model) for model in models if isinstance(model.linear, SecondOrder)]
-    known = [marks for marks in known if marks is not None]
+    known = [Earlier(model) for model in models if isinstance(model.linear, SecondOrder) and _curve_marks(model)]
     if len(known) < 2:
         return USUAL
-    squares = np.sum(np.diff(np.array(known), axis=0) ** 2, axis=0)
+    marks = np.array([[*earlier.mean, *np.log(earlier.linear.core)] for earlier in known])
+    squares = np.sum(np.diff(marks, axis=0) ** 2, axis=0)
     usual = np.array([USUAL.gain_log, USUAL.middle_us, USUAL.width_log, USUAL.time_constant_log, USUAL.damping_log])
     sd = np.sqrt((USUAL_WEIGHT * usual**2 + squares) / (USUAL_WEIGHT + len(known) - 1))
     return Change(*(float(value) for value in sd), sessions=len(known))
 
 
-def _marks(model: Model) -> tuple[float, ...] | None:
-    """Log gain, middle (µs), log width, log T and log ζ of a model; None if its curve does not rise."""
-    marks = _curve_marks(model)
-    if marks is None:
-        return None
-    gain, low, middle, high = marks
-    t, z = model.linear.core  # type: ignore
-    return float(np.log(gain)), middle, float(np.log(max(high - low, 1.0))), float(np.log(t)), float(np.log(z))
-
-
 def _curve_marks(model: Model) -> tuple[float, float, float, float] | None:
-    """Plateau, N·m, and the widths at 10, 50 and 90 % of it, µs."""
+    """Plateau, N·m, and the widths at 10, 50 and 90 % of it, µs; None if the curve does not rise."""
     u, torque = model.recruitment.table()
     rising = np.maximum.accumulate(np.abs(torque))
     if not rising[-1] > 0.0:
@@ -150,13 +140,11 @@ class Earlier:
         Where a step may as well be many times as large, as below the widths that were played, its logarithm has no
         such covariance: there the prior's own doubt of the shape is all.
         """
-        known = self.model.covariance
+        known, basis = self.model.curve_covariance, self.model.recruitment.basis
         if known is None:
             return None
-        basis = self.model.recruitment.basis
-        chosen = [i for i, name in enumerate(known.names) if name.startswith("recruitment_")]
         slopes = np.diff(basis.design(np.minimum(prior.places_us, basis.largest_us)), axis=0)
-        covariance = slopes @ known.matrix[np.ix_(chosen, chosen)] @ slopes.T
+        covariance = slopes @ known @ slopes.T
         steps = np.exp(prior.log_steps(prior.mean))
         size = np.maximum(prior.blurred(steps), 1e-9 * steps.sum())
         determined = np.sqrt(np.maximum(np.diag(covariance), 0.0)) <= MAX_SD_SHARE * size
