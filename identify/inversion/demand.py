@@ -8,7 +8,7 @@ least squares with bounds is a quadratic programme whose matrices are banded. It
 from __future__ import annotations
 
 import numpy as np
-from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.linalg import blas, cho_solve_banded, cholesky_banded
 
 BEND = 0.02
 """Weight of the demand's second differences: a demand that jumps from pulse to pulse is nobody's wish."""
@@ -80,7 +80,7 @@ def _minimise(P: np.ndarray, q: np.ndarray, sides: list[tuple[Banded, float, np.
     slack = np.maximum(limit - constrained(v), 0.1)
     dual = np.full(slack.shape, 0.1)
     for _ in range(ROUNDS):
-        gradient = _times(P, v) + q + back(dual)
+        gradient = blas.dsbmv(bands - 1, 1.0, P, v, lower=1) + q + back(dual)  # type: ignore
         outside = constrained(v) + slack - limit
         gap = float(np.mean(slack * dual))
         if gap < CLOSE and np.max(np.abs(outside)) < CLOSE and np.max(np.abs(gradient)) < 100 * CLOSE:
@@ -104,13 +104,3 @@ def _longest(x: np.ndarray, dx: np.ndarray) -> float:
     """The longest step up to 1/0.99 that keeps x positive."""
     down = dx < 0.0
     return min(1.0 / 0.99, float(np.min(-x[down] / dx[down]))) if np.any(down) else 1.0 / 0.99
-
-
-def _times(bands: np.ndarray, v: np.ndarray) -> np.ndarray:
-    """A symmetric matrix in lower banded form times a column."""
-    out = bands[0] * v
-    for j in range(1, bands.shape[0]):
-        row = bands[j, : v.size - j]
-        out[j:] += row * v[: v.size - j]
-        out[: v.size - j] += row * v[j:]
-    return out
