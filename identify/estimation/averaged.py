@@ -85,7 +85,6 @@ def _setup(short: Short) -> Setup:
         target_nm=target,
         fitted=short.rows,
         basis=short.basis,
-        roughness=np.zeros((short.basis.size, short.basis.size)),
         scale_nm=max(float(np.percentile(np.abs(target[short.rows]), 99.5)), 1e-9),
         noise_sd_nm=grid.noise_sd_nm,
         delay_bounds_s=grid.delay_bounds_s,

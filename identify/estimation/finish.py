@@ -23,6 +23,7 @@ from stimrig.identify.model import Covariance, Model, Noise
 from stimrig.identify.noise import correlation
 from stimrig.identify.problem.joint_surface import Surfaces, joint_tables
 from stimrig.identify.problem.predict import fingerprint, predict_on
+from stimrig.identify.problem.setup import SETTINGS
 from stimrig.identify.recruitment import Curve
 
 AT_WORK = 0.05
@@ -129,22 +130,14 @@ def _effect(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any]:
     setup = fitted.problem.setup
     unpredictable = fitted.unpredictable_torque.get(chosen.effect)
     shape = shape_of(fitted, index, matrix)
-    joint = {"reference_rad": setup.reference_rad, "angle_range_rad": setup.angle_range_rad}
-    joint |= {"angle_late_s": setup.angle_late_s or None}
+    settings = {name: getattr(setup, name) for name in SETTINGS} | {"angle_late_s": setup.angle_late_s or None}
     entry = {
         "id": chosen.effect,
         "form": chosen.form.name,
         "stage": chosen.form.stage,
         "equation": chosen.form.equation,
         "parameters": describe_parameters(fitted, index, matrix),
-        "settings": {
-            "scale_nm": setup.scale_nm,
-            "noise_sd_nm": setup.noise_sd_nm,
-            "zero_nm": setup.zero_nm,
-            "sign": setup.sign,
-            "reference_s": setup.reference_s,
-        }
-        | {name: value for name, value in joint.items() if value is not None},
+        "settings": {name: value for name, value in settings.items() if value is not None},
     }
     if unpredictable is not None:
         entry["unforeseen"] = {"mean_nm": unpredictable[0], "rms_nm": unpredictable[1]}

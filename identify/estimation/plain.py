@@ -163,7 +163,6 @@ def plain_setup(grid: Grid, rows: np.ndarray, basis: Basis, delay_bounds_s: tupl
         target_nm=grid.torque_nm,
         fitted=rows,
         basis=basis,
-        roughness=np.zeros((basis.size, basis.size)),
         scale_nm=1.0,
         noise_sd_nm=grid.noise_sd_nm,
         delay_bounds_s=grid.delay_bounds_s if delay_bounds_s is None else delay_bounds_s,

@@ -153,7 +153,6 @@ class _Search:
                 target_nm=self.sign * self.grid.torque_nm,
                 fitted=self.rows,
                 basis=basis,
-                roughness=np.zeros((basis.size, basis.size)),
                 scale_nm=self.scale_nm,
                 noise_sd_nm=self.grid.noise_sd_nm,
                 delay_bounds_s=self.grid.delay_bounds_s,

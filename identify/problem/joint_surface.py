@@ -15,7 +15,7 @@ import numpy as np
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Effect, Form, Scene
 from stimrig.identify.errors import BadModel
-from stimrig.identify.model_schema import parameter_value
+from stimrig.identify.model_schema import FIX, parameter_value
 
 ANGLES = 61
 SPEEDS = (0.0, 0.01, 0.03, 0.06, 0.12, 0.25, 0.5, 0.75, 1.0)
@@ -45,7 +45,7 @@ class JointEffect:
         """
         try:
             effect = find_effect(entry["id"])
-            form = effect.form(entry.get("form", ""))
+            form = effect.form(entry["form"])
             values = {p.name: float(parameter_value(entry["parameters"][p.name])) for p in form.parameters}
         except Exception as error:
             raise BadModel(f"{error}", place=f"effects.{entry.get('id')}", fix="Install the effect's file.") from error
@@ -71,14 +71,15 @@ class Surfaces:
     def of(cls, effects: Sequence[Mapping[str, Any]]) -> Surfaces | None:
         """Those of a model's effects; None if none of them depends on the joint.
 
-        Raises BadModel: an effect or its form is unknown here, or the model does not say its reference angle.
+        Raises BadModel: an effect or its form is unknown here, or the model does not say at which angles it holds.
         """
         acting = [joint_effect for joint_effect in map(JointEffect.of, effects) if joint_effect.effect.moves_with_joint]
         if not acting:
             return None
-        settings = effects[0].get("settings", {})
-        if "reference_rad" not in settings:
-            raise BadModel("the model does not say at which angle its curve holds", fix="Fit its record again.")
+        settings = effects[0]["settings"]
+        for key in ("angle_range_rad", "reference_rad"):
+            if key not in settings:
+                raise BadModel("the key is missing", place=f"effects.0.settings.{key}", fix=FIX)
         return cls(tuple(acting), settings)
 
     @property
@@ -93,7 +94,7 @@ class Surfaces:
 
     @property
     def _sign(self) -> float:
-        return float(self.settings.get("sign", 1.0))
+        return float(self.settings["sign"])
 
     def g(self, angle_rad: np.ndarray, velocity_rad_s: np.ndarray) -> np.ndarray:
         """Share of the torque at the reference angle that is there, at rest 1 at that angle; of the inputs' shape."""
@@ -119,12 +120,12 @@ class Surfaces:
             time_s=np.zeros(angle.size),
             pulse_width_us=np.zeros(angle.size),
             step_s=1.0,
-            scale_nm=float(self.settings.get("scale_nm", 1.0)),
+            scale_nm=float(self.settings["scale_nm"]),
             largest_us=1.0,
             angle_rad=angle,
             velocity_rad_s=velocity,
             reference_rad=self.reference_rad,
-            angle_range_rad=angle_range(self.settings),
+            angle_range_rad=self.settings["angle_range_rad"],
             begins=np.ones(angle.size, bool),
         )
 
@@ -164,7 +165,7 @@ def joint_tables(
     surfaces = Surfaces.of(effects)
     if surfaces is None:
         return {}
-    low, high = surfaces.settings.get("angle_range_rad", (float(angle_rad.min()), float(angle_rad.max())))
+    low, high = surfaces.settings["angle_range_rad"]
     angles = np.unique(np.r_[np.linspace(low, high, ANGLES), np.clip(surfaces.reference_rad, low, high)])
     shares = np.array(SPEEDS)
     velocities = max(float(np.max(np.abs(velocity_rad_s))), 1e-3) * np.r_[-shares[:0:-1], shares]
@@ -197,9 +198,3 @@ def joint_tables(
         bounds = {"lower": (value - half).round(6), "upper": (value + half).round(6)}
         tables |= {f"{name}{unit}": value} | {f"{name}_{side}{unit}": bound for side, bound in bounds.items()}
     return tables
-
-
-def angle_range(settings: Mapping[str, Any]) -> tuple[float, float] | None:
-    """Smallest and largest angle that a model was fitted on, rad; None if it does not say."""
-    known = settings.get("angle_range_rad")
-    return None if known is None else (float(known[0]), float(known[1]))

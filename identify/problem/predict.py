@@ -5,19 +5,19 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from stimrig.identify import model_schema
 from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
-from stimrig.identify.effects import depend_on_joint, find_effect
+from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.base import Form, replaced_by
 from stimrig.identify.errors import BadModel, BadRequest, RunsAway
-from stimrig.identify.problem.joint_surface import JointEffect, angle_range
+from stimrig.identify.problem.joint_surface import JointEffect, Surfaces
 from stimrig.identify.problem.problem import Problem
-from stimrig.identify.problem.setup import Setup
+from stimrig.identify.problem.setup import SETTINGS, Setup
 from stimrig.identify.records.joint_motion import JointMotion
 from stimrig.identify.records.record import Record
 
@@ -132,27 +132,18 @@ def problem_of(
     """
     if not isinstance(model.linear, SecondOrder):
         raise BadModel("only second-order dynamics can have effects", fix="Fit with maximum-likelihood.")
-    settings = model.effects[0].get("settings", {}) if model.effects else {}
-    for key in sorted({"reference_rad", "angle_range_rad"} - settings.keys()):
-        if depend_on_joint(entry["id"] for entry in model.effects):
-            raise BadModel("the key is missing", place=f"effects.0.settings.{key}", fix=model_schema.FIX)
+    settings: dict[str, Any] = model.effects[0]["settings"] if model.effects else {"scale_nm": 1.0}
+    Surfaces.of(model.effects)  # refuses a model of a moving joint that does not say at which angles it holds
     own_record, baseline_nm = same_data(model, grid.record), model.baseline_nm
     setup = Setup(
         grid=grid,
         target_nm=np.zeros(grid.size),
         fitted=grid.fitted,
         basis=model.recruitment.basis,
-        roughness=np.zeros((model.recruitment.basis.size,) * 2),
-        scale_nm=float(settings.get("scale_nm", 1.0)),
-        noise_sd_nm=float(settings.get("noise_sd_nm", 0.0)),
         delay_bounds_s=(-math.inf, math.inf),
-        zero_nm=float(settings.get("zero_nm", 0.0)),
-        sign=float(settings.get("sign", 1.0)),
-        reference_s=float(settings.get("reference_s", 0.0)),
-        angle_late_s=float(settings.get("angle_late_s", 0.0)),
-        reference_rad=settings.get("reference_rad"),
-        angle_range_rad=angle_range(settings),
         states={} if own_record else states_of(model),
+        # as floats: kernels would be compiled anew for the whole numbers that JSON may hold
+        **{name: np.array(settings[name], float).tolist() for name in SETTINGS if name in settings},
     )
     acting = [(form.name, form, values) for form, values in further if form.stage == "gain"]
     for entry in model.effects:

@@ -16,6 +16,10 @@ from stimrig.identify.noise import NoiseLevel, whitened
 from stimrig.identify.records.joint_motion import MOTION, JointMotion
 from stimrig.identify.recruitment import Basis
 
+SETTINGS = (
+    "scale_nm", "noise_sd_nm", "zero_nm", "sign", "reference_s", "reference_rad", "angle_range_rad", "angle_late_s",
+)  # fmt: skip
+"""Fields of a `Setup` that MODEL.json keeps beside an effect."""
 TABLE = 271
 """Widths at which the curve is tabled for what changes them."""
 WITHIN = 5
@@ -43,12 +47,12 @@ class Setup:
     which the muscle pulls; NaN where there is none."""
     fitted: np.ndarray  # intervals that are fitted, bool, shape (K,)
     basis: Basis  # of the recruitment curve, common to all candidates
-    roughness: np.ndarray
-    """Prior precision of its coefficients, 1/(N·m)²; it limits how much the curve bends; shape (n, n)."""
     scale_nm: float  # largest torque, smoothed, N·m
-    noise_sd_nm: float  # white noise of a sample, N·m
     delay_bounds_s: tuple[float, float]
     """Bounds of the delay that every candidate has: about one sample in both directions."""
+    roughness: np.ndarray | float = 0.0
+    """Prior precision of the curve's coefficients, 1/(N·m)², which limits how much it bends; shape (n, n)."""
+    noise_sd_nm: float = 0.0  # white noise of a sample, N·m
     zero_nm: float = 0.0  # zero of the record's torque, N·m
     sign: float = 1.0  # 1 where stimulation raises the record's torque, -1 where it lowers it
     spread: np.ndarray | float = 1.0
@@ -193,7 +197,7 @@ class Setup:
 
     def without_penalty(self, basis: Basis) -> Setup:
         """The set-up with another basis of the curve, and no penalty on its coefficients."""
-        return self.with_(basis=basis, roughness=np.zeros((basis.size, basis.size)))
+        return self.with_(basis=basis, roughness=0.0)
 
 
 _STALE = {

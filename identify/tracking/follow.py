@@ -310,7 +310,7 @@ def moved_model(
         raise BadModel("only second-order dynamics are tracked", fix="Fit with maximum-likelihood.")
     gain, shift_us, time_scale = float(np.exp(levels[0])), float(levels[1]), float(np.exp(levels[2]))
     linear = replace(model.linear, time_constant_s=model.linear.time_constant_s * time_scale)
-    sign = float(model.effects[0].get("settings", {}).get("sign", 1.0)) if model.effects else 1.0
+    sign = float(model.effects[0]["settings"]["sign"]) if model.effects else 1.0
     coefficients_nm = gain * (model.recruitment.coefficients_nm + sign * curve_nm)
     curve = _shifted(replace(model.recruitment, coefficients_nm=coefficients_nm), shift_us)
     # Covariance and bands of the approved parameters do not hold for the moved ones.
