@@ -14,15 +14,7 @@ from stimrig.identify.dynamics.linear import Linear, SecondOrder, linear_from_di
 from stimrig.identify.errors import BadModel
 from stimrig.identify.json_text import BadJson, json_value, parse
 from stimrig.identify.recruitment import Curve, basis_from_dict, landmarks
-from stimrig.identify.summary import (
-    Sheet,
-    Summarised,
-    estimate,
-    fit_words,
-    held_out_label,
-    parameter_words,
-    quantity,
-)
+from stimrig.identify.summary import Sheet, Summarised, estimate, fit_words, held_out_label, parameter_words, quantity
 from stimrig.identify.yardstick import repetition_words
 
 if TYPE_CHECKING:

@@ -114,12 +114,7 @@ def correlation(residual: np.ndarray, stretches: Stretches, step_s: float) -> fl
 
 
 def _profile_band(
-    residual: np.ndarray,
-    stretches: Stretches,
-    x: np.ndarray,
-    wide: float,
-    smallest_step: float,
-    near: NoiseLevel,
+    residual: np.ndarray, stretches: Stretches, x: np.ndarray, wide: float, smallest_step: float, near: NoiseLevel
 ) -> tuple[NoiseLevel, float]:
     bounds = np.array(
         [

@@ -8,17 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numba import njit
 
-from stimrig.identify.effects.base import (
-    Apply,
-    Columns,
-    Effect,
-    Form,
-    Parameter,
-    Scene,
-    Values,
-    basis,
-    weighted,
-)
+from stimrig.identify.effects.base import Apply, Columns, Effect, Form, Parameter, Scene, Values, basis, weighted
 
 SIZES = (3.0, 3.0, 2.0, 2.0, 1.5, 1.0, 1.0, 1.0, 0.7, 0.5, 0.4, 0.3)
 """Sizes of the polynomials of the elastic part; the end of a joint's range bends within a tenth of it."""

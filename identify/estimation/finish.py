@@ -55,9 +55,7 @@ def finish(
         initial=(float(torque), float(rate)),
         covariance=covariance,
         noise=Noise(
-            white_sd_nm=statistics["noise_sd_nm"],
-            block_sd_nm=fitted.noise.sd_nm,
-            ar1=fitted.noise.correlation,
+            white_sd_nm=statistics["noise_sd_nm"], block_sd_nm=fitted.noise.sd_nm, ar1=fitted.noise.correlation
         ),
         effects=tuple(_effect(written, index, matrix) for index in range(len(problem.chosen))),
         fit=statistics,
