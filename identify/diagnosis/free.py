@@ -130,23 +130,19 @@ def _extended(base: Chain, progress: Progress) -> Chain:
     gains = [_better(chains[0], chain).gain for chain in allowed]
     near = next(chain for chain, gain in zip(allowed, gains, strict=True) if gain >= max(gains) - thresholds.NEAR)
     for step in near[len(base) : -1]:
-        shorter = _without(near, str(step.added))
-        if _better(near, shorter).errors > -thresholds.SUPERFLUOUS and not vetoed(
-            near[-1].searched, shorter[-1].searched
-        ):
-            near = shorter
+        last, term = near[-1], str(step.added)
+        without = _without(last, term)
+        worse = difference(last.left_out, without.left_out).errors <= -thresholds.SUPERFLUOUS
+        if not worse and not vetoed(last.searched, without.searched):
+            near = (*(_without(other, term) for other in near[:-1] if other is not step), without)
     return (*base, *near[len(base) :])  # the base as it was searched
 
 
-def _without(chain: Chain, term: str) -> Chain:
-    """The chain without one of its terms; the models after it are searched again."""
-    return tuple(
-        replace(step, searched=without_effect(step.searched, term), others=(), known=None)
-        if term in dict(step.searched.effects)
-        else step
-        for step in chain
-        if step.added != term
-    )
+def _without(step: Step, term: str) -> Step:
+    """The step with its model fitted again without a term, if it has it."""
+    if term not in dict(step.searched.effects):
+        return step
+    return replace(step, searched=without_effect(step.searched, term), others=(), known=None)
 
 
 def _better(before: Sequence[Step], after: Sequence[Step]) -> Difference:
