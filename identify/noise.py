@@ -116,19 +116,15 @@ def correlation(residual: np.ndarray, stretches: Stretches, step_s: float) -> fl
 def _profile_band(
     residual: np.ndarray, stretches: Stretches, x: np.ndarray, wide: float, smallest_step: float, near: NoiseLevel
 ) -> tuple[NoiseLevel, float]:
-    bounds = np.array(
-        [
-            [np.log(near.shortest), 0.0, near.slowest, np.log(0.0008), 0.001],
-            [0.0, 1.0, near.fastest, np.log(20.0 * near.shortest), 0.999],
-        ]
-    )
+    lower = [np.log(near.shortest), 0.0, near.slowest, np.log(0.0008), 0.001]
+    upper = [0.0, 1.0, near.fastest, np.log(20.0 * near.shortest), 0.999]
+    bounds = np.array([lower, upper])
     step = wide * np.array([1.5, 0.4, 0.12, 1.5, 0.4])
     x, sd, log_likelihood = _search(residual, *stretches, x[None, :], bounds, step, BAND_STEPS, smallest_step, 1e-7)
-    ar1, share, decay = float(1.0 - np.exp(x[0])), float(x[1] * (1.0 - x[4])), float(1.0 - np.exp(x[3]))
-    level = replace(
-        near, ar1=ar1, share=share, sd_nm=max(float(sd), 1e-9), turn=float(x[2]), decay=decay, band=float(x[4])
-    )
-    return level, log_likelihood
+    ar1, decay = (float(1.0 - np.exp(log)) for log in (x[0], x[3]))
+    share, turn, band = float(x[1] * (1.0 - x[4])), float(x[2]), float(x[4])
+    sd_nm = max(float(sd), 1e-9)
+    return replace(near, ar1=ar1, share=share, sd_nm=sd_nm, turn=turn, decay=decay, band=band), log_likelihood
 
 
 def find_band(residual: np.ndarray, stretches: Stretches, step_s: float) -> tuple[NoiseLevel, float]:

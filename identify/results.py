@@ -78,9 +78,8 @@ class Comparison(Result):
     plain: tuple[str, ...]  # sentences for people
 
     def _sheet(self) -> Sheet:
-        alarms = [
-            CORRELATED_WITH.get(test["with"], str(test["with"])) for test in self.tests["tests"] if not test["passed"]
-        ]
+        failed = [str(test["with"]) for test in self.tests["tests"] if not test["passed"]]
+        alarms = [CORRELATED_WITH.get(name, name) for name in failed]
         rows = [
             ("all rows", _figures(vars(self))),
             ("fitted pulses", _figures(self.fitted)),

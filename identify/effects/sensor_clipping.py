@@ -47,9 +47,8 @@ def _detect(raw: Any) -> tuple[str, dict[str, float]] | None:
     clipped = {name: value for name, value in levels.items() if value is not None}
     if not clipped:
         return None
-    return "both" if len(clipped) == 2 else next(iter(clipped)), {
-        f"{name}_nm": value for name, value in clipped.items()
-    }
+    parameters = {f"{name}_nm": value for name, value in clipped.items()}
+    return "both" if len(clipped) == 2 else next(iter(clipped)), parameters
 
 
 EFFECT = Effect(

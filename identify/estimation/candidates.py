@@ -79,10 +79,8 @@ def words(fitted: Fitted, rows: np.ndarray) -> list[str]:
     """Describe the choice and its reason; empty where the noise is usual and all rows were fitted."""
     fitted_rows, sentences = fitted.problem.setup.fitted, []
     if fitted_rows.sum() < rows.sum():
-        count, all_rows = int(fitted_rows.sum()), int(rows.sum())
-        sentences.append(
-            f"Of {all_rows} pulse intervals, the {count} in rests and in bouts like `validate` were fitted."
-        )
+        those = f"the {int(fitted_rows.sum())} in rests and in bouts like `validate`"
+        sentences.append(f"Of {int(rows.sum())} pulse intervals, {those} were fitted.")
     if fitted.noise.held and fitted.noise.share == 0.0:
         sentences.append(f"The noise was taken as white: {WHY_WHITE}")
     return [*sentences, *likelihood_warnings(fitted)]

@@ -61,10 +61,6 @@ class CurvePosterior:
         self.precision = precision
         self.mean = np.r_[prior.mean, np.zeros(self.n), data.mean]
 
-    def start(self, three: np.ndarray) -> np.ndarray:
-        """Unknowns at a shape, without deviation."""
-        return np.r_[three, np.zeros(self.n), self.data.mean]
-
     def _log_steps(self, z: np.ndarray, kind: int) -> np.ndarray:
         return self.prior.log_steps(z[:3]) + self.prior.roots[kind] @ z[3 : 3 + self.n]
 

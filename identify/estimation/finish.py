@@ -183,6 +183,7 @@ def finish_discrete(
     baseline = float(np.mean(residual[rows]))
     free = curve.basis.size + len(block.a) + len(block.b)
     spread = float(np.sum((residual - baseline)[rows] ** 2)) / max(int(rows.sum()) - free, 1)
+    ar1 = correlation(residual - baseline, ends_of(runs(rows)), grid.step_s)
     model = Model(
         method=method_id,
         recruitment=curve,
@@ -190,9 +191,7 @@ def finish_discrete(
         pulse_rate_hz=1.0 / grid.step_s,
         sample_rate_hz=grid.record.sample_rate_hz,
         baseline_nm=baseline,
-        noise=Noise(
-            block_sd_nm=float(np.sqrt(spread)), ar1=correlation(residual - baseline, ends_of(runs(rows)), grid.step_s)
-        ),
+        noise=Noise(block_sd_nm=float(np.sqrt(spread)), ar1=ar1),
         reasons=tuple(reasons),
         extra=extra or {},
     )

@@ -193,11 +193,9 @@ def _monotone(model: Model) -> dict[str, Any]:
 
 
 def _range(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
-    widths = np.unique(grid.pulse_width_us[rows])
-    message = (
-        f"only {widths.size} pulse widths were fitted: between them the recruitment curve is a guess; record a ramp"
-    )
-    return _gate(widths.size >= 8, "care", message)
+    count = np.unique(grid.pulse_width_us[rows]).size
+    message = f"only {count} pulse widths were fitted: between them the recruitment curve is a guess; record a ramp"
+    return _gate(count >= 8, "care", message)
 
 
 def _ceiling(model: Model) -> dict[str, Any]:
@@ -286,12 +284,10 @@ def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
     """Check that the joint moved enough in the tests of a model of a joint that moves."""
     if grid.angle_rad is None or not moving:
         return _gate(True, "care", "")
-    moved_rad = float(
-        np.diff(np.quantile(grid.angle_rad[rows], MOVED_QUANTILES))[0]
-    )  # one spike of the sensor is no movement
-    message = (
-        f"the joint moved by {math.degrees(moved_rad):.0f}° only: what depends on it is a guess; move it in a test"
-    )
+    # Quantiles, since one spike of the sensor is no movement.
+    moved_rad = float(np.ptp(np.quantile(grid.angle_rad[rows], MOVED_QUANTILES)))
+    message = f"the joint moved by {math.degrees(moved_rad):.0f}° only"
+    message += ": what depends on it is a guess; move it in a test"
     return _gate(moved_rad > LARGEST_MOVE_RAD, "care", message)
 
 

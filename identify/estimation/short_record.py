@@ -38,9 +38,8 @@ class Short:
     modes: tuple[Mode, ...]  # one for each kind of the curve's deviation from the known shape
     weights: np.ndarray  # their probabilities, shape (M,)
     noise: NoiseLevel  # of the intervals' means
-    most_probable: (
-        np.ndarray
-    )  # steps of the curve, baselines and initial states at the most probable mode, shape (n + E,)
+    most_probable: np.ndarray
+    """Steps of the curve, baselines and initial states at the most probable mode, shape (n + E,)."""
     rise_us: float  # rise from 10 to 90 % for which the knots were made, µs
     strange: float  # probability that the curve is far from the known shape
 
@@ -195,9 +194,8 @@ class _Search:
         residual = np.nan_to_num(problem.setup.target_nm) - mean
         sd = float(np.sqrt(np.mean(residual[self.rows] ** 2)))
         white = replace(self.quiet, sd_nm=max(sd, self.quiet.sd_nm))
-        slow, likelihood = profile(
-            residual, self.stretches, replace(WHITE_AND_SLOW, sd_nm=near.sd_nm).of_steps(self.grid.step_s), True
-        )
+        kind = replace(WHITE_AND_SLOW, sd_nm=near.sd_nm).of_steps(self.grid.step_s)
+        slow, likelihood = profile(residual, self.stretches, kind)
         flat = -0.5 * float(self.rows.sum()) * (np.log(2 * np.pi * sd * sd) + 1.0)
         return replace(slow, sd_nm=max(slow.sd_nm, white.sd_nm)) if likelihood > flat + CORRELATED else white
 
@@ -262,7 +260,7 @@ class _Search:
         posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, None))
         near = [] if self.near is None else list(self.near.modes)
         chosen = MIDDLING if self.near is None else int(np.argmax(self.near.weights))
-        z = near[chosen].z[: 3 + n + extras] if near else posterior.start(three)
+        z = near[chosen].z[: 3 + n + extras] if near else np.r_[three, np.zeros(n), posterior.data.mean]
         mode, weights = posterior.mode(z, chosen), np.zeros(0)
         for turn in range(OUTER):
             x = posterior.linear_of(mode)

@@ -29,9 +29,8 @@ def still_rows(grid: Grid, rows: np.ndarray) -> np.ndarray:
     still = rows & (np.abs(grid.velocity_rad_s) < STILL_RAD_S)
     if not still.any():
         return rows
-    at_one_angle = still & (
-        np.abs(grid.angle_rad - _middle(grid.angle_rad, still, grid.pulse_width_us)) < ONE_ANGLE_RAD
-    )
+    middle_rad = _middle(grid.angle_rad, still, grid.pulse_width_us)
+    at_one_angle = still & (np.abs(grid.angle_rad - middle_rad) < ONE_ANGLE_RAD)
     widths_us = grid.pulse_width_us[at_one_angle & (grid.pulse_width_us > 0)]
     enough = (
         widths_us.size * grid.step_s >= LEAST_S

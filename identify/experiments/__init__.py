@@ -65,9 +65,8 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     fits : mapping
         By effect id, or `NOTHING`.
     """
-    tests = [
-        (design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(float(record.pulse_width_us.max()))
-    ]
+    largest_us = float(record.pulse_width_us.max())
+    tests = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(largest_us)]
     gains = [expected_log_evidence(width, record, fits) for _, width in tests]
     # the shortest of those that decide; if none does, the one with the largest gain for its length
     decides = max(gains) >= ENOUGH
@@ -101,19 +100,15 @@ def plan_further(record: Record, fitted: Fitted, rivals: Sequence[Fitted] = ()) 
     rivals : Sequence[Fitted]
         Models with another last term that predict left-out parts as well.
     """
-    rate_hz = record.pulse_rate_hz
+    rate_hz, largest_us = record.pulse_rate_hz, float(record.pulse_width_us.max())
     # the smallest width with a tenth of the largest torque
     widths_us = np.linspace(0.0, fitted.problem.setup.basis.largest_us, 201)
     torque_nm = np.abs(_steady_nm(fitted, widths_us))
     threshold_us = float(widths_us[np.argmax(torque_nm >= 0.1 * torque_nm.max())])
-    tests, others = (
-        [
-            (design, design.pulse_widths(rate_hz))
-            for design in held_levels(float(record.pulse_width_us.max()), threshold_us, rate_hz, seed)
-        ]
-        for seed in (SEED, REFERENCE)
-    )
-    reference = _simulate(fitted, _blank(record, np.concatenate([width for _, width in others])))[1]
+    chosen, others = (held_levels(largest_us, threshold_us, rate_hz, seed) for seed in (SEED, REFERENCE))
+    tests = [(design, design.pulse_widths(rate_hz)) for design in chosen]
+    played_us = np.concatenate([design.pulse_widths(rate_hz) for design in others])
+    reference = _simulate(fitted, _blank(record, played_us))[1]
 
     def error_nm(information: np.ndarray | float) -> float:
         """Standard error of the model on the reference, N·m, once it knows so much more."""

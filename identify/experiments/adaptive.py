@@ -223,9 +223,8 @@ def _levels(short: Short, known: Knowledge, largest_us: float) -> np.ndarray:
 
 
 def _state(known: Knowledge) -> str:
-    return (
-        f"The curve is known within {known.curve.percent:.1f} %, the step response within {known.step.percent:.1f} %."
-    )
+    curve, step = f"{known.curve.percent:.1f} %", f"{known.step.percent:.1f} %"
+    return f"The curve is known within {curve}, the step response within {step}."
 
 
 # ---- what a test can reach ----
@@ -296,14 +295,11 @@ def _play(linear: SecondOrder, curve: Callable[[np.ndarray], np.ndarray], goal: 
     if decision.knowledge is None:
         words = "The torque-time or the time that is left does not allow a first piece: nothing can be reached."
         return Reach(False, float("inf"), float("inf"), 0.0, 0.0, words)
-    seconds, curve_percent, step_percent = (
-        widths.size / rate, decision.knowledge.curve.percent, decision.knowledge.step.percent,
-    )  # fmt: skip
-    there = decision.knowledge.reaches(goal.target)
+    seconds, known, there = widths.size / rate, decision.knowledge, decision.knowledge.reaches(goal.target)
     words = f"The target should be reached in about {seconds:.0f} s with {dose:.0f} N·m·s."
     if not there:
         words = (
             f"The target is probably out of reach: in {seconds:.0f} s and with {dose:.0f} N·m·s the curve would be "
-            f"known within {curve_percent:.1f} % and the step response within {step_percent:.1f} %."
+            f"known within {known.curve.percent:.1f} % and the step response within {known.step.percent:.1f} %."
         )
-    return Reach(there, curve_percent, step_percent, seconds, dose, words)
+    return Reach(there, known.curve.percent, known.step.percent, seconds, dose, words)

@@ -74,10 +74,6 @@ class Plant:
         """The largest demand, N·m."""
         return float(self.inverse_nm[-1])
 
-    def level(self, width_us: np.ndarray | float) -> np.ndarray:
-        """f, N·m."""
-        return np.asarray(np.interp(width_us, self.width_us, self.level_nm))
-
     def linear(self, demand_nm: np.ndarray) -> np.ndarray:
         """G times a demand, from rest, shape (K,)."""
         return recursion(self.a, np.convolve(self.b, demand_nm)[: demand_nm.size])
@@ -125,7 +121,8 @@ class Plant:
             if self.whole:
                 width = min(round(width), int(widest_us), int(last + (self.rise_us or widest_us)))
             widths[k] = last = width if width >= self.shortest_us else 0.0
-            owed = min(max(owed + demand - float(self.level(last)), -most_owed), most_owed) if demand > 0.0 else 0.0
+            given = float(np.interp(last, self.width_us, self.level_nm))
+            owed = min(max(owed + demand - given, -most_owed), most_owed) if demand > 0.0 else 0.0
         return widths
 
     def _lead_in(self, widths_us: np.ndarray) -> np.ndarray:
@@ -169,9 +166,8 @@ def _later(model: Model, rate_hz: float, widest_us: float) -> float:
     for variant in (model, plain):
         step = np.abs(above_rest(variant, np.full(size, widest_us), rate_hz, at_reference))
         peak = int(np.argmax(step))
-        half_s.append(
-            float(np.interp(step[peak] / 2, np.maximum.accumulate(step[: peak + 1]), np.arange(peak + 1))) / rate_hz
-        )
+        rising = np.maximum.accumulate(step[: peak + 1])
+        half_s.append(float(np.interp(step[peak] / 2, rising, np.arange(peak + 1))) / rate_hz)
     return max(half_s[0] - half_s[1], 0.0)
 
 

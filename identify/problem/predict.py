@@ -82,9 +82,7 @@ def _refuse_runaway(model: Model, record: Record, torque_nm: np.ndarray) -> np.n
 
 def _moved(problem: Problem, motion: JointMotion, **changes: float) -> Problem:
     """The problem with the joint moving in another way."""
-    return Problem(
-        problem.setup.with_(motion=motion, **changes), [(chosen.effect, chosen.form) for chosen in problem.chosen]
-    )
+    return Problem(problem.setup.with_(motion=motion, **changes), problem.effects)
 
 
 def predict_on(model: Model, grid: Grid) -> np.ndarray:
@@ -102,9 +100,8 @@ def _predict_samples(model: Model, record: Record, problem: Problem, theta: np.n
     whole, unpredictable = problem.at_samples(theta), unpredictable_torque(model)
     if not unpredictable or not same_data(model, record):
         return whole
-    predictable_nm = problem.at_samples(theta, frozenset(unpredictable)) + sum(
-        mean for mean, _ in unpredictable.values()
-    )
+    zero_nm = sum(mean for mean, _ in unpredictable.values())
+    predictable_nm = problem.at_samples(theta, frozenset(unpredictable)) + zero_nm
     return np.where(record.held_out, predictable_nm, whole)
 
 

@@ -275,9 +275,7 @@ class _StagePass:
 
     def dynamics(self, drive: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         core, initial = self.join(range(2)), self.join(self.problem.initials)
-        speeds, terms = (
-            [(chosen, self.join(chosen.places)) for chosen in self.forms(stage)] for stage in ("speed", "term")
-        )
+        speeds, terms = ([(each, self.join(each.places)) for each in self.forms(stage)] for stage in ("speed", "term"))
         if terms and (self.derivatives or any(values[0, 0] for _, values in terms)):
             self.cores = self.grown(core)
             return self.by_terms(drive, terms, initial[0])

@@ -155,10 +155,8 @@ class Setup:
         part = np.maximum(np.searchsorted(starts_s, time_s, side="right") - 1, 0)
         # What was read at a time had been so before; a delay leads out of no part.
         read_s = np.clip(time_s + self.angle_late_s, starts_s[part], ends_s[part])
-        columns = {name: getattr(motion, name, None) for name in MOTION}
-        return {
-            name: np.interp(read_s, record.time_s, column) for name, column in columns.items() if column is not None
-        }
+        known = {name: getattr(motion, name, None) for name in MOTION}
+        return {name: np.interp(read_s, record.time_s, column) for name, column in known.items() if column is not None}
 
     @cached_property
     def design(self) -> np.ndarray:

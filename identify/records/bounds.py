@@ -80,11 +80,8 @@ def check_sampling(rate_hz: float, place: str) -> None:
     if not (LOWEST_HZ <= rate_hz <= HIGHEST_HZ):
         units = {"ms": 1e-3, "µs": 1e-6, "ns": 1e-9, "d": 86400.0}
         fitting = [unit for unit, unit_s in units.items() if LOWEST_HZ <= rate_hz / unit_s <= HIGHEST_HZ]
-        fix = (
-            "40 Hz to 2 kHz can be used"
-            + "".join(f"; for time in {u}, give --map time_s=time_s:{u}" for u in fitting)
-            + "."
-        )
+        units_to_give = "".join(f"; for time in {unit}, give --map time_s=time_s:{unit}" for unit in fitting)
+        fix = f"40 Hz to 2 kHz can be used{units_to_give}."
         raise BadRecord(f"sampled at {rate_hz:.4g} Hz", place=place, fix=fix)
 
 

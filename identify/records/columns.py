@@ -164,9 +164,8 @@ def _in_unit(
     if not unit and cell == target:
         return Column(index)
     if not unit and (mapped or target == "pulse_rate_hz"):
-        return Column(
-            index, note=f"{target} is {short(cell)!r}, taken in {COMMON_UNITS[target][0]} as no unit is given"
-        )
+        taken = f"taken in {COMMON_UNITS[target][0]} as no unit is given"
+        return Column(index, note=f"{target} is {short(cell)!r}, {taken}")
     if not unit and target not in NEEDED:
         return None
     factor = factor_of(plain_unit(unit))

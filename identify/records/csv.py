@@ -174,9 +174,8 @@ class _Text:
             yield row
 
     def _check_width(self, row: str, number: int, least: int) -> None:
-        used = max(
-            (index for index, cell in enumerate(_cells(row, self.separator), start=1) if cell.strip()), default=0
-        )
+        cells = enumerate(_cells(row, self.separator), start=1)
+        used = max((index for index, cell in cells if cell.strip()), default=0)
         width = len(self.header)
         if least <= used <= width:
             return
@@ -260,12 +259,9 @@ class _Text:
         if firsts.size > bounds.MOST_PARTS:
             raise self.bad("too many parts", f"At most {bounds.MOST_PARTS} in one record.", self.lines[firsts[-1]])
         row_of = {self.lines[row]: row for row in firsts.tolist()}
-        lines = (
-            (row_of[number], _cells(line, self.separator))
-            for number, line in self._numbered_lines()
-            if number in row_of
-        )
-        return {row: dict(zip(self.header, map(as_written, cells), strict=False)) for row, cells in lines}
+        lines = ((row_of[number], line) for number, line in self._numbered_lines() if number in row_of)
+        cells = ((row, map(as_written, _cells(line, self.separator))) for row, line in lines)
+        return {row: dict(zip(self.header, texts, strict=False)) for row, texts in cells}
 
 
 def _cells(row: str, separator: str) -> list[str]:

@@ -50,14 +50,9 @@ def write_joined(record: Record, path: Path) -> None:
     described = {}
     for part, source in zip(record.parts, record.sources, strict=True):
         begun_s = "" if part.begun_s is None else repr(float(part.begun_s))
-        figures = (
-            repr(part.pause_s),
-            repr(part.folded_s),
-            repr(part.own_s),
-            begun_s,
-            repr(float(record.pulse_rate_hz)),
-        )
-        described[part.first] = (*figures, *map(_cell, (source.name, source.recording_id, source.sha256)))
+        times_s, rate_hz = map(repr, (part.pause_s, part.folded_s, part.own_s)), repr(float(record.pulse_rate_hz))
+        texts = map(_cell, (source.name, source.recording_id, source.sha256))
+        described[part.first] = (*times_s, begun_s, rate_hz, *texts)
     size = 0
     with path.open("w", encoding="utf-8", newline="") as file:
         file.write(",".join(header) + "\n")
@@ -276,13 +271,9 @@ def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
     for name in (*NEEDED, *OPTIONAL):
         each = [getattr(record, name) for record in moved]
         if name in ONLY_IF_SET and any(column is not None and column.any() for column in each):
-            kind = bool if name == "doubted" else float
-            columns[name] = np.concatenate(
-                [
-                    np.zeros(record.time_s.size, kind) if column is None else column
-                    for record, column in zip(moved, each, strict=True)
-                ]
-            )
+            nothing = [np.zeros(record.time_s.size, bool if name == "doubted" else float) for record in moved]
+            known = [zeros if column is None else column for column, zeros in zip(each, nothing, strict=True)]
+            columns[name] = np.concatenate(known)
         elif name not in ONLY_IF_SET and all(column is not None for column in each):
             columns[name] = np.concatenate(each)
     bounds.check_span(columns["time_s"], "the joined record")

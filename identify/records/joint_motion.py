@@ -170,10 +170,9 @@ class JointMotion:
 
     def read_again(self, time_s: np.ndarray, first: Sequence[int]) -> JointMotion:
         """The same movement with a new draw of the sensor's noise, to see the effect of its error on a model."""
-        read_rad = self.angle_rad + np.random.default_rng(0).normal(size=time_s.size) * np.repeat(
-            self.noise_rad, np.diff([*first, time_s.size])
-        )
-        return self._smoothed(time_s, read_rad, first)
+        noise_rad = np.repeat(self.noise_rad, np.diff([*first, time_s.size]))
+        noise_rad = noise_rad * np.random.default_rng(0).normal(size=time_s.size)
+        return self._smoothed(time_s, self.angle_rad + noise_rad, first)
 
     def extrapolated(self, late_s: float) -> JointMotion:
         """The motion `late_s` later, by velocity and acceleration: corrects for a sensor that reports late."""
@@ -223,9 +222,8 @@ def pace_of(time_s: np.ndarray, angle_rad: np.ndarray, noise_rad: float, jerk: f
     if not jerk > 0.0 or at_s.size <= LEAST_BLOCKS:
         return jerk, STEADY
     begins = [np.log([jerk, spring, drag]) for spring in PACES[0] for drag in PACES[1]]
-    best_fit = min(
-        (minimize(deviance, begin, method="Nelder-Mead", options=SETTLED) for begin in begins), key=lambda fit: fit.fun
-    )
+    fits = [minimize(deviance, begin, method="Nelder-Mead", options=SETTLED) for begin in begins]
+    best_fit = min(fits, key=lambda fit: fit.fun)
     steady = _forward(at_s, read_rad, noise, jerk, STEADY, UNKNOWN, *NO_STATES)
     if not best_fit.fun < steady[0] + steady[1]:
         return jerk, STEADY

@@ -92,9 +92,8 @@ def _read_columns(file: Any, known: Mapping[str, Column], name: str) -> tuple[di
             continue
         if _is_time(column.type):
             per_s, column = PER_S[column.type.unit], pc.cast(column, pa.int64())
-        if not any(
-            kind(column.type) for kind in (types.is_floating, types.is_integer, types.is_boolean, types.is_decimal)
-        ):
+        numeric = types.is_floating, types.is_integer, types.is_boolean, types.is_decimal
+        if not any(is_kind(column.type) for is_kind in numeric):
             raise BadRecord(f"no numbers, but {column.type}", place=place, fix="Write a column of numbers.")
         numbers[target] = np.array(pc.cast(column, pa.float64(), safe=False).to_numpy(), float) / per_s
     return numbers, segment_names

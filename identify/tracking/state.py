@@ -143,10 +143,8 @@ class State:
     @classmethod
     def from_dict(cls, data: dict[str, Any]) -> State:
         """The state that `to_dict` wrote."""
-        arrays: dict[str, Any] = {
-            name: np.array(data[name], float) for name in ("mean", "covariance", "odd") if data[name] is not None
-        }
-        return cls(**data | arrays)
+        known = [name for name in ("mean", "covariance", "odd") if data[name] is not None]
+        return cls(**data | {name: np.array(data[name], float) for name in known})
 
 
 # ---- how fast a person changes, learnt from earlier sessions of their own ----
