@@ -255,7 +255,6 @@ class Model(Summarised):
         return f"order {len(linear.a) - 1} in steps of {step}, delay {quantity(linear.delay_samples, 'steps')}"
 
     def _sd(self, name: str, factor: float = 1.0) -> float | None:
-        """Standard deviation of a parameter; None if the model has none."""
         known = self.covariance
         return factor * known.sd(name) if known is not None and name in known.names else None
 

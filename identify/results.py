@@ -266,7 +266,6 @@ class Carried(Result):
 
 
 def _listed(label: str, texts: Sequence[str]) -> list[tuple[str, str]]:
-    """Rows of which the first one has the label."""
     return list(zip([label, *[""] * len(texts)], texts, strict=False))
 
 

@@ -47,14 +47,7 @@ class Sheet:
 
 
 def register_plotter(plotter: Plotter) -> None:
-    """Set the function that draws results; it replaces an earlier one.
-
-    Parameters
-    ----------
-    plotter : callable
-        `plotter(result, record) -> figure`, with a `Model`, `Comparison`, `Diagnosis` or `Improvement` as result, and
-        a `Record` or None. It raises `BadRequest` if it cannot draw this result.
-    """
+    """Set the function that draws results, in place of an earlier one; it raises `BadRequest` if it cannot."""
     _plotters[:] = [plotter]
 
 

@@ -229,7 +229,6 @@ def _table(groups: Groups, residual_nm: np.ndarray, noise_sd_nm: float, counted:
 
 
 def _with_shares(table: list[dict[str, Any]], excess: list[float]) -> list[dict[str, Any]]:
-    """The rows with the share of each in the error above the noise."""
     above = [max(value, 0.0) for value in excess]
     total = sum(above)
     shares = [value / total if total > 0 else 0.0 for value in above]

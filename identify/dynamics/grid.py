@@ -210,7 +210,6 @@ class Grid:
 
     @cached_property
     def _evenly_sampled(self) -> bool:
-        """True if all intervals are sampled at the same places."""
         each = int(self.count[0])
         if not each or np.any(self.count != each):
             return False

@@ -432,21 +432,14 @@ def _filled(state, up, down, step_s):  # pragma: no cover
 
 
 @njit(cache=True, nogil=True)
-def adapt(
-    drive: np.ndarray,
-    onset_s: np.ndarray,
-    recovery_s: np.ndarray,
-    constant: bool,
-    step_s: float,
-    rest_s: np.ndarray,
-    begin: float = 0.0,
-) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+def adapt(drive, onset_s, recovery_s, constant, step_s, rest_s, begin):  # pragma: no cover
     """State x in [0, 1] with x' = a (1 - x)/onset - (1 - a) x/recovery; exact for a held drive a.
 
     With `constant`, recovery also continues under stimulation: x' = a (1 - x)/onset - x/recovery.
 
-    `drive` is a in [0, 1], shape (M, K), `rest_s`, shape (K,), additional rest before each interval, `begin` x before
-    the first. Returns the mean of x at the start and the end of each interval, shape (M, K), and x after the last.
+    `drive` is a in [0, 1], shape (M, K), both times have shape (M,); `rest_s`, shape (K,), is additional rest before
+    each interval, `begin` x before the first. Returns the mean of x at the start and the end of each interval, shape
+    (M, K), and x after the last.
     """
     rows, size = drive.shape
     out, last = np.empty((rows, size)), np.empty(rows)

@@ -19,12 +19,10 @@ _RECOVERY = Parameter(
 
 
 @njit(cache=True, nogil=True)
-def _train(
-    on: np.ndarray, step_s: float, least_gap_s: float = 0.0
-) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
-    """Time under pulses since the onset of the present train, and the silence before that train, s.
+def _train(on, step_s, least_gap_s=0.0):  # pragma: no cover
+    """Time under pulses since the onset of the present train, and the silence before that train, s, shape (K,).
 
-    A silence longer than `least_gap_s` ends a train.
+    `on`, shape (K,), is above 0 under pulses. A silence longer than `least_gap_s` ends a train.
     """
     since = np.full(on.size, 1e9)
     before = np.zeros(on.size)

@@ -18,7 +18,7 @@ def delay(_: None, p: Values, _scene: Scene) -> np.ndarray:
 
 
 @njit(cache=True, nogil=True)
-def _lagging(drive: np.ndarray, lag_s: np.ndarray, step_s: float) -> np.ndarray:  # pragma: no cover
+def _lagging(drive, lag_s, step_s):  # pragma: no cover
     """Mean over each interval of a, from 0; a' = (w - a)/lag; shapes (M, K), (M,). With a lag of 0, a is w."""
     out = np.empty(drive.shape)
     for m in range(len(drive)):

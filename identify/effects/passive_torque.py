@@ -87,12 +87,11 @@ def _over_intervals(columns: Callable[[Values, Scene], Columns]) -> Apply:
 
 
 @njit(cache=True, nogil=True)
-def relaxed(
-    value: np.ndarray, time_s: np.ndarray, begins: np.ndarray, relaxation_s: np.ndarray
-) -> np.ndarray:  # pragma: no cover
-    """First-order lag of a value, exact for a value that is linear between points; shape (M, K).
+def relaxed(value, time_s, begins, relaxation_s):  # pragma: no cover
+    """First-order lags of a value, exact for a value that is linear between points; shape (M, K).
 
     `value` and `time_s`, (K,), are what is followed, and when; it has already arrived where a recording `begins`, (K,).
+    `relaxation_s`, (M,), are the lags' time constants.
     """
     rows, size = relaxation_s.size, value.size
     out = np.empty((rows, size))

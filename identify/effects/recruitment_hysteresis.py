@@ -9,7 +9,7 @@ from stimrig.identify.effects.base import Effect, Parameter, Scene, Values, form
 
 
 @njit(cache=True, nogil=True)
-def _play(width_us: np.ndarray, half_us: np.ndarray, growth_per_us: np.ndarray) -> np.ndarray:  # pragma: no cover
+def _play(width_us, half_us, growth_per_us):  # pragma: no cover
     """Play operator: the output stays within half (1 + growth·input) of the input; it starts at 0.
 
     Shapes (M, K), (M,), (M,).
@@ -27,7 +27,7 @@ def _play(width_us: np.ndarray, half_us: np.ndarray, growth_per_us: np.ndarray) 
 
 
 @njit(cache=True, nogil=True)
-def _dahl(width_us: np.ndarray, reach_us: np.ndarray) -> np.ndarray:  # pragma: no cover
+def _dahl(width_us, reach_us):  # pragma: no cover
     """Dahl's friction, a memory of direction z in [-1, 1]: dz = (du - z |du|)/reach. Shapes (M, K), (M,).
 
     Before the first change z is 0.

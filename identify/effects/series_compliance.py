@@ -31,9 +31,7 @@ SPRING_PARTS = 12
 
 
 @njit(cache=True, nogil=True)
-def _follow(
-    x0: np.ndarray, v0: np.ndarray, omega: np.ndarray, damping: np.ndarray, toe: np.ndarray, step_s: float
-) -> tuple[np.ndarray, np.ndarray]:  # pragma: no cover
+def _follow(x0, v0, omega, damping, toe, step_s):  # pragma: no cover
     """A mass on a spring with a toe, driven by the cubic through boundary states x0 and, times the step, rates v0.
 
     q'' = ω² (x - z) - 2 ζ ω q', z = q (1 + β q²) is the spring's torque; `toe` is β, 1/(N·m)². Shapes (K, M) and (M,).

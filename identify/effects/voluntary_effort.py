@@ -105,9 +105,7 @@ _FLATNESS = Parameter("flatness", "1", 1.6, 6.0, 2.0, (2.0,), "log", about="2: G
 
 
 @njit(cache=True, nogil=True)
-def _sum_of_bumps(
-    time_s: np.ndarray, centre: np.ndarray, width: np.ndarray, height: np.ndarray, flatness: np.ndarray
-) -> np.ndarray:  # pragma: no cover
+def _sum_of_bumps(time_s, centre, width, height, flatness):  # pragma: no cover
     """Sum of bumps. Shapes (K,), (M, n) for each of three, flatness (M,); to (M, K). Negligible tails are skipped."""
     rows, count = centre.shape
     out = np.zeros((rows, time_s.size))

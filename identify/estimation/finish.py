@@ -97,7 +97,6 @@ def _parts(fitted: Fitted) -> dict[str, Any]:
 
 
 def _named(model: Model, grid: Grid) -> Model:
-    """The model with an id, the date, and the record that it was fitted on."""
     source = grid.record.source
     return model.with_(
         model_id=str(uuid4()),

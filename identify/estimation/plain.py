@@ -190,7 +190,6 @@ def _with_zeros(setup: Setup, zeros_nm: np.ndarray, sign: float) -> Setup:
 
 
 def _with_knots(first: Fitted, count: int, noise: NoiseLevel) -> Fitted:
-    """The plain structure with its final spline, from a pilot."""
     linear, torque_nm = first.linear, _points(first.curve)[1]
     sign = 1.0 if torque_nm[np.argmax(np.abs(torque_nm))] >= 0 else -1.0
     zeros_nm = first.problem.setup.to_record(first.physical[list(first.problem.baselines)])
@@ -220,7 +219,6 @@ def with_smoothness(fitted: Fitted, roughness: np.ndarray) -> Problem:
 
 
 def _smoothed(problem: Problem, roughness: np.ndarray, choice: Choice) -> Problem:
-    """The problem with the prior that a choice makes of the roughness."""
     stiffest = STIFFEST / max(float(np.trace(roughness)) * problem.setup.scale_nm**2, 1e-300)
     weight = min(choice.weight / choice.variance, stiffest)
     return Problem(problem.setup.with_(roughness=weight * roughness), problem.effects)

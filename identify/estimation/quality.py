@@ -171,7 +171,6 @@ def _tame(model: Model) -> bool:
 
 
 def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
-    """Check that stimulation changes the torque by more than the noise."""
     table = model.recruitment(np.linspace(0.0, float(np.max(grid.pulse_width_us)), 101))
     spread = float(np.ptp(table))
     measured_nm = float(np.ptp(grid.torque_nm[rows]))
@@ -258,7 +257,6 @@ def _reach(model: Model) -> tuple[float, float, str, float]:
 
 
 def _statistic(model: Model, name: str) -> float:
-    """A number of the fit statistics; NaN if there is none."""
     value = model.fit.get(name)
     return float("nan") if value is None else float(value)
 
@@ -271,7 +269,6 @@ def _residual(model: Model, span_nm: float) -> dict[str, Any]:
 
 
 def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
-    """Check that the joint did not move in a test whose model is one of a joint at rest."""
     if grid.angle_rad is None or moving:
         return _gate(True, "care", "")
     moved_rad = float(np.ptp(grid.angle_rad[rows]))
@@ -281,7 +278,6 @@ def _joint_at_rest(model: Model, grid: Grid, rows: np.ndarray, moving: bool) -> 
 
 
 def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
-    """Check that the joint moved enough in the tests of a model of a joint that moves."""
     if grid.angle_rad is None or not moving:
         return _gate(True, "care", "")
     # Quantiles, since one spike of the sensor is no movement.
@@ -292,7 +288,6 @@ def _joint_seen(grid: Grid, rows: np.ndarray, moving: bool) -> dict[str, Any]:
 
 
 def _sensor(grid: Grid, baseline_nm: float) -> dict[str, Any]:
-    """Check for clipping of the sensor while the muscle is stimulated."""
     torque = grid.record.torque_nm
     span = float(np.ptp(torque))
     if not span > 0:

@@ -59,10 +59,7 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
 
 
 def _opposed(fitted: Fitted, chosen: Chosen) -> str:
-    """Names of the terms each of which nearly cancels a term; empty if none does.
-
-    Without both, the torque of the fitted rows then differs less than half as much as without one of them.
-    """
+    """Names of the terms each of which nearly cancels a term (`CANCELLED`) over the fitted rows; empty if none does."""
     problem, rows, names = fitted.problem, fitted.problem.setup.fitted, []
 
     def run_without(*terms: Chosen) -> np.ndarray:

@@ -202,7 +202,6 @@ class _Search:
     # ---- the curve ----
 
     def prior(self, three: np.ndarray) -> NearShape:
-        """The prior of the curve on knots that suit a shape."""
         if self.last is not None:
             prior = self.last.curve_prior(self.largest_us, self.knots)
             self.near = self.near if self._on(prior.basis) else None
@@ -254,7 +253,6 @@ class _Search:
         return best, linear, three
 
     def fit(self, linear: SecondOrder, three: np.ndarray, noise: NoiseLevel, draws: int) -> Short:
-        """The whole fit, from dynamics, a shape and a noise."""
         prior = self.prior(three)
         n, extras = prior.basis.size, self.others_mean.size
         posterior = CurvePosterior(prior, self.quadratic(prior.basis, linear, noise, None))

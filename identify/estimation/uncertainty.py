@@ -233,8 +233,7 @@ def whole_factor(matrix: np.ndarray, sd: np.ndarray) -> float:
     if not known.any():
         return POINTWISE
     scaled = matrix[np.ix_(known, known)] / sd[known][:, None] / sd[known][None, :]
-    farthest = np.sort(np.max(np.abs(_draws(len(scaled)) @ square_root(scaled)), axis=1))
-    return float(np.interp(0.95 * (DRAWS - 1), np.arange(DRAWS), farthest))
+    return float(np.quantile(np.max(np.abs(_draws(len(scaled)) @ square_root(scaled)), axis=1), 0.95))
 
 
 def square_root(covariance: np.ndarray) -> np.ndarray:

@@ -191,7 +191,6 @@ def _unexplained(fitted: Fitted, white_nm: float) -> str | None:
 
 
 def _settled(short: Short) -> bool:
-    """Return true if the record is long enough to judge the structure by."""
     return short.grid.size * short.grid.step_s >= SETTLED_S
 
 

@@ -170,7 +170,6 @@ def invert(
 
 
 def _stretches(reasons: np.ndarray, error_nm: np.ndarray, pulse_rate_hz: float) -> tuple[Stretch, ...]:
-    """The stretches that are not reached, in order of time, by the reason and the error of each pulse."""
     stretches = []
     for index, reason in enumerate(REASONS):
         rows = reasons == index

@@ -81,7 +81,6 @@ def _refuse_runaway(model: Model, record: Record, torque_nm: np.ndarray) -> np.n
 
 
 def _moved(problem: Problem, motion: JointMotion, **changes: float) -> Problem:
-    """The problem with the joint moving in another way."""
     return Problem(problem.setup.with_(motion=motion, **changes), problem.effects)
 
 

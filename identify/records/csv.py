@@ -225,7 +225,6 @@ class _Text:
         raise self.bad(f"only {width} cells", CUT, column=short) from failure
 
     def _code(self, cell: str) -> int:
-        """The code of a segment's name."""
         code = self.segment_codes.get(cell)
         if code is None:
             name = as_written(cell.strip())
@@ -236,7 +235,6 @@ class _Text:
         return code
 
     def _number(self, column: str, cell: str) -> float:
-        """The number in a cell."""
         text = cell.strip()
         if text.lower() in MISSING:
             return np.nan

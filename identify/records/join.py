@@ -89,7 +89,6 @@ def record_of_parts(table: Table) -> Record:
 
 
 def _part(table: Table, number: int, row: int, cells: Mapping[str, str]) -> tuple[Part, Source]:
-    """A part and its source from the cells of its first row."""
 
     def figure(column: str, lowest: float, highest: float) -> float:
         text = cells.get(column, "")
@@ -248,7 +247,6 @@ def _block_means(piece: _Piece, each: int) -> Record:
 
 
 def _joined(pieces: list[_Piece], rate_hz: float) -> Record:
-    """One record of pieces at one rate."""
     total = sum(piece.record.time_s.size for piece in pieces)
     if total > bounds.LARGEST_ROWS:
         raise BadRecord(f"{total} samples together", fix=f"At most {bounds.LARGEST_ROWS} in one record.")

@@ -144,7 +144,6 @@ def _watched(sent: Sent, time_s: np.ndarray, period_s: float) -> np.ndarray:
 
 
 def _inside(time_s: np.ndarray, starts_s: np.ndarray, ends_s: np.ndarray) -> np.ndarray:
-    """Samples within any of the spans."""
     depth = np.zeros(time_s.size + 1, np.int64)
     np.add.at(depth, np.searchsorted(time_s, starts_s - 1e-9), 1)
     np.add.at(depth, np.searchsorted(time_s, ends_s + 1e-9), -1)

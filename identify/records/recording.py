@@ -99,7 +99,6 @@ def _check_rising(file: StrictFile, time_s: np.ndarray, path: str) -> None:
 
 
 def _sent(file: StrictFile, interval_s: float) -> Sent:
-    """The pulses as the host logged them."""
     names = ("planned_time_s", "sent_pulse_width_us", "written_time_s", "acknowledged_time_s", "status")
     planned_s, width_us, *host_s, status = file.columns("/pulses", names)
     width_us = np.where(np.isnan(width_us), 0.0, width_us)
