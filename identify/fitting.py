@@ -16,7 +16,7 @@ from stimrig.identify.estimation.effect_fit import add_effects
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.plain import renewed_curve
 from stimrig.identify.estimation.samples import Raw, fitted_rows, prepare
-from stimrig.identify.methods import check_options, method_of
+from stimrig.identify.methods import method_of
 from stimrig.identify.methods.maximum_likelihood import METHOD as MAXIMUM_LIKELIHOOD
 from stimrig.identify.methods.maximum_likelihood import start
 from stimrig.identify.model import Model
@@ -69,7 +69,7 @@ def fit(
     if names is not None and not names:
         raise BadRequest("no segment is named", place="fit_on", fix="Name segments, or leave out fit_on.")
     chosen = method_of(method)
-    check_options(chosen, options)
+    chosen.check_options(options)
     wanted = [effects] if isinstance(effects, str) else list(effects or ())
     twice = {name for name in wanted if wanted.count(name) > 1}
     if twice or not all(isinstance(name, str) for name in wanted):

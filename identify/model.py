@@ -13,7 +13,8 @@ from stimrig.identify import model_schema
 from stimrig.identify.dynamics.linear import Linear, SecondOrder, linear_from_dict
 from stimrig.identify.errors import BadModel
 from stimrig.identify.json_text import BadJson, json_value, parse
-from stimrig.identify.recruitment import Curve, basis_from_dict, landmarks
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import basis_from_dict
 from stimrig.identify.summary import Sheet, Summarised, estimate, fit_words, held_out_label, parameter_words, quantity
 from stimrig.identify.yardstick import repetition_words
 
@@ -96,7 +97,7 @@ class Model(Summarised):
 
         An `sd` is None if the model has no covariance.
         """
-        figures = landmarks(self.recruitment, self.curve_covariance)
+        figures = self.recruitment.landmarks(self.curve_covariance)
         if isinstance(self.linear, SecondOrder):
             for name, unit in (("time_constant_s", "s"), ("damping", "1"), ("delay_s", "s")):
                 figures[name] = {"value": getattr(self.linear, name), "sd": self._sd(name), "unit": unit}

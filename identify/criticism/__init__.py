@@ -197,7 +197,7 @@ def _error_shares(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, counted: np.ndarray
 ) -> dict[str, list[dict[str, Any]]]:
     """Tables of `Comparison.by`, of the samples that count."""
-    sign, time_s = direction_of(record), record.time_s - record.time_s[0]
+    sign, time_s = _direction_of(record), record.time_s - record.time_s[0]
     edges_s = np.linspace(0.0, time_s[-1] + 1e-9, SPANS + 1)
     kinds: dict[str, Groups] = {
         "segment": [(name, record.segment == i) for i, name in enumerate(record.segment_names)],
@@ -269,14 +269,8 @@ MAX_PLACES = 5
 """Largest number of places."""
 
 
-def direction_of(record: Record) -> np.ndarray:
-    """+1 where the pulse width rose over the last 0.3 s, -1 where it fell, 0 where it was held; shape (N,).
-
-    Parameters
-    ----------
-    record : Record
-        The measurement.
-    """
+def _direction_of(record: Record) -> np.ndarray:
+    """+1 where the pulse width rose over the last 0.3 s, -1 where it fell, 0 where it was held; shape (N,)."""
     u = record.pulse_width_us
     back = max(round(0.3 * record.sample_rate_hz), 1)
     change = u - np.r_[np.full(back, u[0]), u[:-back]]
@@ -308,7 +302,7 @@ def worst_places(
         Worst first.
     """
     length = max(round(STRETCH_S * record.sample_rate_hz), 1)
-    rising, pieces = direction_of(record), []
+    rising, pieces = _direction_of(record), []
     for run in np.split(np.arange(record.time_s.size), np.flatnonzero(np.diff(record.segment)) + 1):
         for part in np.split(run, range(length, run.size, length)):
             counted_rows = part[rows[part]]

@@ -16,6 +16,7 @@ _QUICK = Parameter("decay_s", "s", 0.05, 1.2, 0.3, (0.12, 0.4), "log", about="ti
 _RECOVERY = Parameter(
     "recovery_s", "s", 0.02, 4.0, 0.3, (0.1, 1.0), "log", about="time constant of recovery in silence"
 )
+_TRAIN = (_GAIN, _QUICK, _RECOVERY)
 
 
 @njit(cache=True, nogil=True)
@@ -43,9 +44,7 @@ def _train(on, step_s, least_gap_s=0.0):  # pragma: no cover
 @form(
     "gain",
     "w = (1 + gain (1 - exp(-silence/recovery)) (z + 0.3) exp(-z)) f(u), z = t/decay, t since pulses recruit",
-    _GAIN,
-    _QUICK,
-    _RECOVERY,
+    *_TRAIN,
     source="stiffness of the series elastic element at the onset: Parmiggiani, Stein 1981",
 )
 def engaged(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
@@ -62,9 +61,7 @@ def engaged(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:
     "gain",
     "w = (1 + gain (1 - exp(-silence/recovery)) exp(-t/decay)) f(u), t since the onset of the train; a silence of less "
     f"than {ENDS_S:g} s does not end one",
-    _GAIN,
-    _QUICK,
-    _RECOVERY,
+    *_TRAIN,
     name="trains_120_ms",
 )
 def trains(drive: np.ndarray, p: Values, scene: Scene) -> np.ndarray:

@@ -114,9 +114,7 @@ def fit_statistics(
     result: dict[str, Any] = {
         **figures(measured[used], predicted_nm[used], sd_nm),
         "noise_sd_nm": sd_nm,
-        "held_out_fit_percent": None,
-        "held_out_ceiling_percent": None,
-        "held_out_rms_nm": None,
+        **dict.fromkeys(("held_out_fit_percent", "held_out_ceiling_percent", "held_out_rms_nm")),
         "held_out_by": "none",
         "samples": int(used.sum()),
         "held_out_samples": int(judged.sum()),

@@ -28,6 +28,13 @@ class Method:
     options: Mapping[str, str]  # each option's name and what it does
     fit: Callable[..., Model]  # the function that fits
 
+    def check_options(self, options: Mapping[str, Any]) -> None:
+        """Refuse options that the method does not have. Raises BadRequest: with the name, and the known ones."""
+        for name in options:
+            if name not in self.options:
+                known = ", ".join(self.options) or "none"
+                raise BadRequest(f"unknown option {name!r} of {self.id}", place=name, fix=f"Known: {known}.")
+
 
 @cache
 def methods() -> dict[str, Method]:
@@ -48,21 +55,3 @@ def method_of(name: str) -> Method:
     if name not in methods():
         raise BadRequest(f"unknown method {name!r}", place="method", fix=f"Known: {', '.join(methods())}.")
     return methods()[name]
-
-
-def check_options(chosen: Method, options: Mapping[str, Any]) -> None:
-    """Refuse options that a method does not have.
-
-    Raises BadRequest: with the name of the option, and the known ones.
-
-    Parameters
-    ----------
-    chosen : Method
-        The method.
-    options : mapping
-        By name.
-    """
-    for name in options:
-        if name not in chosen.options:
-            known = ", ".join(chosen.options) or "none"
-            raise BadRequest(f"unknown option {name!r} of {chosen.id}", place=name, fix=f"Known: {known}.")

@@ -9,6 +9,9 @@ import numpy as np
 
 from stimrig.identify.recruitment.bases import PowerBasis, SigmoidBasis, SplineBasis
 
+THRESHOLD_SHARE = 0.05
+"""At the threshold the curve has gone this share of its way to the plateau; at saturation all but this share."""
+
 
 @dataclass(frozen=True)
 class Curve:
@@ -54,6 +57,37 @@ class Curve:
         share = np.where(reached > before, (level - top[before]) / rise, 0.0)
         return sign * level, u[before] + share * (u[reached] - u[before])
 
+    def landmarks(self, covariance_nm2: np.ndarray | None = None) -> dict[str, dict[str, Any]]:
+        """Threshold, plateau and saturation by name, each with `value`, `sd` and `unit`.
+
+        A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients,
+        N²·m², shape (basis.size, basis.size). Where the curve falls, its plateau is below zero.
+        """
+        width_us, torque_nm = self.table()
+        top = int(np.argmax(np.abs(torque_nm)))
+        plateau_nm = float(torque_nm[top])
+        at_top = self.basis.design(width_us[top : top + 1])[0]
+
+        def crossing(share: float) -> dict[str, Any]:
+            level = share * abs(plateau_nm)
+            reached = np.flatnonzero(np.sign(plateau_nm) * torque_nm[1:] >= level)
+            if reached.size == 0 or level == 0.0:
+                return {"value": None, "sd": None, "unit": "µs"}
+            pair = slice(reached[0], reached[0] + 2)
+            at_us = float(np.interp(level, np.sign(plateau_nm) * torque_nm[pair], width_us[pair]))
+            place = np.array([at_us])
+            # The width at which f(u) = share · plateau moves by the change of that difference over the curve's slope.
+            moved = _sd(self.basis.design(place)[0] - share * at_top, covariance_nm2)
+            slope = abs(float(self(place, 1)[0]))
+            sd_us = moved / slope if moved is not None and slope > 0.0 else None
+            return {"value": at_us, "sd": sd_us, "unit": "µs"}
+
+        return {
+            "threshold_us": crossing(THRESHOLD_SHARE),
+            "plateau_nm": {"value": plateau_nm, "sd": _sd(at_top, covariance_nm2), "unit": "N·m"},
+            "saturation_us": crossing(1.0 - THRESHOLD_SHARE),
+        }
+
     def to_dict(self) -> dict:
         """As MODEL.json has it."""
         return {"basis": self.basis.to_dict() | {"coefficients_nm": [float(x) for x in self.coefficients_nm]}}
@@ -82,66 +116,6 @@ class FixedShape:
 
 Basis = SplineBasis | PowerBasis | SigmoidBasis | FixedShape
 """The basis functions of one kind of recruitment curve; all are zero at zero pulse width."""
-
-
-def basis_from_dict(data: dict[str, Any]) -> Basis:
-    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to.
-
-    Parameters
-    ----------
-    data : dict
-        What `to_dict` of a basis gave.
-    """
-    match data["kind"]:
-        case "cubic-spline":
-            return SplineBasis(np.asarray(data["knots_us"], float))
-        case "power-series":
-            return PowerBasis(int(data["order"]), float(data["scale_us"]))
-        case _:
-            return SigmoidBasis(float(data["a2_per_us"]), float(data["a3"]), float(data.get("largest_us", 300.0)))
-
-
-THRESHOLD_SHARE = 0.05
-"""At the threshold the curve has gone this share of its way to the plateau; at saturation all but this share."""
-
-
-def landmarks(curve: Curve, covariance_nm2: np.ndarray | None = None) -> dict[str, dict[str, Any]]:
-    """The landmarks by name, each with `value`, `sd` and `unit`.
-
-    A value is None if the curve does not get there; an `sd` is None without a covariance of the coefficients, N²·m².
-    Where the curve falls, its plateau is below zero.
-
-    Parameters
-    ----------
-    curve : Curve
-        f(u).
-    covariance_nm2 : ndarray, optional
-        Of the coefficients, N²·m², shape (basis.size, basis.size).
-    """
-    width_us, torque_nm = curve.table()
-    top = int(np.argmax(np.abs(torque_nm)))
-    plateau_nm = float(torque_nm[top])
-    at_top = curve.basis.design(width_us[top : top + 1])[0]
-
-    def crossing(share: float) -> dict[str, Any]:
-        level = share * abs(plateau_nm)
-        reached = np.flatnonzero(np.sign(plateau_nm) * torque_nm[1:] >= level)
-        if reached.size == 0 or level == 0.0:
-            return {"value": None, "sd": None, "unit": "µs"}
-        pair = slice(reached[0], reached[0] + 2)
-        at_us = float(np.interp(level, np.sign(plateau_nm) * torque_nm[pair], width_us[pair]))
-        place = np.array([at_us])
-        # The width at which f(u) = share · plateau moves by the change of that difference over the curve's slope.
-        moved = _sd(curve.basis.design(place)[0] - share * at_top, covariance_nm2)
-        slope = abs(float(curve(place, 1)[0]))
-        sd_us = moved / slope if moved is not None and slope > 0.0 else None
-        return {"value": at_us, "sd": sd_us, "unit": "µs"}
-
-    return {
-        "threshold_us": crossing(THRESHOLD_SHARE),
-        "plateau_nm": {"value": plateau_nm, "sd": _sd(at_top, covariance_nm2), "unit": "N·m"},
-        "saturation_us": crossing(1.0 - THRESHOLD_SHARE),
-    }
 
 
 def _sd(slopes: np.ndarray, covariance: np.ndarray | None) -> float | None:

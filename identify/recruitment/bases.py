@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -143,6 +144,17 @@ class SigmoidBasis:
 
     def to_dict(self) -> dict:
         return {"kind": "sigmoid", "a2_per_us": self.a2_per_us, "a3": self.a3, "largest_us": self.largest_us}
+
+
+def basis_from_dict(data: dict[str, Any]) -> SplineBasis | PowerBasis | SigmoidBasis:
+    """The basis that `to_dict` describes; that its kind is known, `identify.model_schema` sees to."""
+    match data["kind"]:
+        case "cubic-spline":
+            return SplineBasis(np.asarray(data["knots_us"], float))
+        case "power-series":
+            return PowerBasis(int(data["order"]), float(data["scale_us"]))
+        case _:
+            return SigmoidBasis(float(data["a2_per_us"]), float(data["a3"]), float(data.get("largest_us", 300.0)))
 
 
 def fit_sigmoid(
