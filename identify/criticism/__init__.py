@@ -27,6 +27,8 @@ from stimrig.identify.records.record import Record
 from stimrig.identify.results import Comparison
 from stimrig.identify.yardstick import repetition_sentences, zero_words
 
+__all__ = ["compare"]
+
 POINTS = 2400
 """Largest number of points of a plotted series."""
 REPORTED_LATE_S = 5e-3
@@ -281,25 +283,10 @@ def _direction_of(record: Record) -> np.ndarray:
 def worst_places(
     record: Record, residual_nm: np.ndarray, noise_sd_nm: float, *, rows: np.ndarray
 ) -> list[dict[str, Any]]:
-    """The stretches with most of the error above the noise, among some rows.
+    """The stretches with most of the error above the noise, among `rows` that count, bool, shape (N,).
 
     As `where` in `diagnose --json`, worst first, with `mean_error_nm` (positive: the model is too low) and `text`.
-
-    Parameters
-    ----------
-    record : Record
-        The measurement.
-    residual_nm : ndarray
-        Measured less predicted, N·m, shape (N,).
-    noise_sd_nm : float
-        White noise of a sample, N·m.
-    rows : ndarray
-        Rows that count, bool, shape (N,).
-
-    Returns
-    -------
-    list of dict
-        Worst first.
+    `residual_nm`: measured less predicted, shape (N,); `noise_sd_nm`: white noise of a sample.
     """
     length = max(round(STRETCH_S * record.sample_rate_hz), 1)
     rising, pieces = _direction_of(record), []

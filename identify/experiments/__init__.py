@@ -19,6 +19,8 @@ from stimrig.identify.records.record import Record
 from stimrig.identify.results import Result
 from stimrig.identify.summary import Sheet
 
+__all__ = ["Experiment"]
+
 ENOUGH = 7.0
 """Expected log evidence that is enough to decide: odds of about 1000 to 1."""
 PER_PULSE = 4
@@ -56,14 +58,9 @@ def _short(value: Any) -> str:
 
 
 def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
-    """The shortest test that separates rivals, each simulated as it was fitted to a record.
+    """The shortest test that separates rivals, each simulated as it was fitted to a record that does not.
 
-    Parameters
-    ----------
-    record : Record
-        Which does not separate the rivals.
-    fits : mapping
-        By effect id, or `NOTHING`.
+    `fits`: by effect id, or `NOTHING`.
     """
     largest_us = float(record.pulse_width_us.max())
     tests = [(design, design.pulse_widths(record.pulse_rate_hz)) for design in designs(largest_us)]
@@ -91,14 +88,7 @@ def plan_further(record: Record, fitted: Fitted, rivals: Sequence[Fitted] = ()) 
     the model's own standard error on other such levels is smallest. Jumps of level while stimulated are what the
     paper's test lacks. A further ramp alone taught muscles of other physics nothing.
 
-    Parameters
-    ----------
-    record : Record
-        In which structure is left.
-    fitted : Fitted
-        The last model.
-    rivals : Sequence[Fitted]
-        Models with another last term that predict left-out parts as well.
+    `fitted`: the last model; `rivals`: models with another last term that predict left-out parts as well.
     """
     rate_hz, largest_us = record.pulse_rate_hz, float(record.pulse_width_us.max())
     # the smallest width with a tenth of the largest torque
@@ -137,14 +127,7 @@ def expected_log_evidence(width_us: np.ndarray, record: Record, fits: Mapping[st
 
     If one of a pair is true, the other is fitted again to the new test, with its fit to the old record as prior.
 
-    Parameters
-    ----------
-    width_us : ndarray
-        Of the new test, µs, one for each pulse.
-    record : Record
-        Which does not separate the rivals.
-    fits : mapping
-        By effect id, or `NOTHING`.
+    `width_us`: one for each pulse of the new test; `fits`: to the old record, by effect id, or `NOTHING`.
     """
     blank, gains = _blank(record, width_us), []
     simulated = {name: _simulate(fitted, blank) for name, fitted in fits.items()}
