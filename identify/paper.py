@@ -117,20 +117,12 @@ def table1(
 ) -> dict[str, Any]:
     """Compute the table.
 
-    Parameters
-    ----------
-    trials : int
-        Records per noise level (without noise: one, since all would be equal).
-    progress : callable, optional
-        Called with the share done, 0 to 1, and a line of text.
-    noise_levels_nm : tuple of float
-        Standard deviations of the output noise, N·m, at 40 samples a second; the paper has 1600, with 40 pulses/s.
+    `trials`: records per noise level (without noise: one, since all would be equal). `progress`: called with the share
+    done, 0 to 1, and a line of text. `noise_levels_nm`: standard deviations of the output noise, N·m, at 40 samples a
+    second; the paper has 1600, with 40 pulses/s.
 
-    Returns
-    -------
-    dict
-        `rows`: one per noise level and method, with noise_nm, method, paper, paper_sd, ours, ours_sd, ceiling, clean,
-        unseen (means over trials, %); and the settings.
+    Returns `rows`: one per noise level and method, with noise_nm, method, paper, paper_sd, ours, ours_sd, ceiling,
+    clean, unseen (means over trials, %); and the settings.
     """
     rows: list[dict[str, Any]] = []
     total = len(noise_levels_nm) * len(OURS)

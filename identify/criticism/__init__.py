@@ -165,7 +165,10 @@ def _plain(
 def _left_out(grid: Grid) -> str:
     """One sentence: how much is left out, since it is not known which pulses acted there; empty if nothing was."""
     late = np.zeros(grid.size) if grid.late_s is None else np.where(grid.pulse_width_us > 0, grid.late_s, 0.0)
-    pulses = int(np.sum(np.abs(late) >= REPORTED_LATE_S)) + _lost(grid)
+    pulses = int(np.sum(np.abs(late) >= REPORTED_LATE_S))
+    if (known := grid.record.pulses) is not None:
+        inside = (known.time_s >= grid.start_s - grid.step_s) & (known.time_s <= grid.record.time_s[-1])
+        pulses += int(np.sum(known.lost & inside))
     seconds = float(np.sum(grid.doubted[grid.count > 0])) * grid.step_s
     if not pulses and not seconds:
         return ""
@@ -176,14 +179,6 @@ def _left_out(grid: Grid) -> str:
     if not pulses:
         return f"{seconds:.1f} s are left out: the stimulation there is not known."
     return f"{affected}; {seconds:.1f} s are left out, where the time of the pulses is not known."
-
-
-def _lost(grid: Grid) -> int:
-    known = grid.record.pulses
-    if known is None:
-        return 0
-    inside = (known.time_s >= grid.start_s - grid.step_s) & (known.time_s <= grid.record.time_s[-1])
-    return int(np.sum(known.lost & inside))
 
 
 # ---- shares of the error ----
@@ -215,8 +210,7 @@ def _levels(width_us: np.ndarray) -> Groups:
     """Zero, then equal ranges up to the largest width."""
     groups = [("0 µs", width_us <= 0)]
     for low, high in pairwise(np.linspace(0.0, float(width_us.max()), LEVELS + 1)):
-        rows = (width_us > max(low, 0.0)) & (width_us <= high) if high > 0 else np.zeros(width_us.size, bool)
-        groups.append((f"{low:.0f}-{high:.0f} µs", rows))
+        groups.append((f"{low:.0f}-{high:.0f} µs", (width_us > low) & (width_us <= high)))
     return groups
 
 
@@ -313,15 +307,8 @@ def _merge(pieces: list[list[Any]], record: Record) -> list[list[Any]]:
     result: list[list[Any]] = []
     for piece in pieces:
         strong = piece[2] / (piece[1] - piece[0]) > level
-        last = result[-1] if result else None
-        if (
-            last is not None
-            and strong
-            and last[4]
-            and last[1] == piece[0]
-            and last[3] == piece[3]
-            and record.segment[last[0]] == record.segment[piece[0]]
-        ):
+        last = result[-1] if strong and result and result[-1][4] else None
+        if last and last[1] == piece[0] and last[3] == piece[3] and record.segment[last[0]] == record.segment[piece[0]]:
             last[1], last[2] = piece[1], last[2] + piece[2]
         else:
             result.append([*piece, strong])

@@ -22,19 +22,8 @@ from stimrig.identify.noise import WHITE, WHITE_AND_SLOW, NoiseLevel
 from stimrig.identify.problem.problem import Problem
 from stimrig.identify.problem.setup import Setup
 from stimrig.identify.records.record import Record
-from stimrig.identify.recruitment import Basis, Curve
+from stimrig.identify.recruitment import Basis, Curve, smoothing
 from stimrig.identify.recruitment.bases import SplineBasis
-from stimrig.identify.recruitment.smoothing import (
-    KNOTS,
-    PILOT_KNOTS,
-    QUIET_KNOTS,
-    Choice,
-    bending_order,
-    choose_weight,
-    fitting_spline,
-    knots_for,
-    spline_roughness,
-)
 
 STARTS_S = (0.12, 0.4)
 USUAL_NOISE = 0.02
@@ -86,11 +75,11 @@ def fit_spline(
     """The plain structure on all given rows, with a noise of the kind of `noise`."""
     still = still_rows(grid, rows)
     first = pilot(grid, still, delay_s)
-    count = knots or (QUIET_KNOTS if _is_quiet(first) else knots_for(_points(first.curve)))
+    count = knots or (smoothing.QUIET_KNOTS if _is_quiet(first) else smoothing.knots_for(_points(first.curve)))
     fitted = _with_knots(first, count, noise)
-    if knots is None and count < KNOTS and not fitted.noise.is_white:
+    if knots is None and count < smoothing.KNOTS and not fitted.noise.is_white:
         # The correlation may come from a bend that few knots cannot follow.
-        fitted = _with_knots(first, KNOTS, noise)
+        fitted = _with_knots(first, smoothing.KNOTS, noise)
     if still is not rows:
         fitted = _on_rows(fitted, rows)
     values = fitted.physical
@@ -113,8 +102,8 @@ def pilot(grid: Grid, rows: np.ndarray, delay_s: float | None = None) -> Fitted:
         raise NotIdentifiable("the pulse width never changes in the fitted pulses", fix="Record a PRBS and a ramp.")
     if not np.ptp(grid.torque_nm[rows]) > 0:
         raise NotIdentifiable("the torque never changes", fix="Check the load cell and the electrodes.")
-    basis = SplineBasis(np.linspace(0.0, float(np.max(grid.pulse_width_us)), PILOT_KNOTS))
-    roughness = spline_roughness(basis, order=bending_order(widths_us))
+    basis = SplineBasis(np.linspace(0.0, float(np.max(grid.pulse_width_us)), smoothing.PILOT_KNOTS))
+    roughness = smoothing.spline_roughness(basis, order=smoothing.bending_order(widths_us))
     bounds_s = None if delay_s is None else (delay_s, delay_s)
     return fit_from(plain_setup(grid, rows, basis, bounds_s), STARTS_S, roughness)
 
@@ -218,13 +207,13 @@ def with_smoothness(fitted: Fitted, roughness: np.ndarray) -> Problem:
     return _smoothed(problem, roughness, _smoothness(products, precision, roughness, int(setup.fitted.sum())))
 
 
-def _smoothed(problem: Problem, roughness: np.ndarray, choice: Choice) -> Problem:
+def _smoothed(problem: Problem, roughness: np.ndarray, choice: smoothing.Choice) -> Problem:
     stiffest = STIFFEST / max(float(np.trace(roughness)) * problem.setup.scale_nm**2, 1e-300)
     weight = min(choice.weight / choice.variance, stiffest)
     return Problem(problem.setup.with_(roughness=weight * roughness), problem.effects)
 
 
-def _smoothness(products: np.ndarray, precision: np.ndarray, roughness: np.ndarray, rows: int) -> Choice:
+def _smoothness(products: np.ndarray, precision: np.ndarray, roughness: np.ndarray, rows: int) -> smoothing.Choice:
     """The weight of the roughness that the data ask for (REML), with all parameters but the curve's projected out.
 
     `products`: of the target, the slopes by the curve's coefficients and those by the others, whitened, `rows` of each;
@@ -235,10 +224,10 @@ def _smoothness(products: np.ndarray, precision: np.ndarray, roughness: np.ndarr
     projected = products[:inner, :inner] - products[:inner, inner:] @ np.linalg.solve(bound, products[inner:, :inner])
     design, moment = ((projected + projected.T) / 2)[1:, 1:].copy(), projected[1:, 0].copy()
     if np.any(roughness):
-        choice = choose_weight(design, moment, float(projected[0, 0]), rows, roughness, others)
-        return Choice(choice.weight, max(choice.variance, NO_NOISE))
+        choice = smoothing.choose_weight(design, moment, float(projected[0, 0]), rows, roughness, others)
+        return smoothing.Choice(choice.weight, max(choice.variance, NO_NOISE))
     explained = float(moment @ np.linalg.lstsq(design, moment, rcond=None)[0])
-    return Choice(0.0, max((float(projected[0, 0]) - explained) / max(rows - inner - others, 1), NO_NOISE))
+    return smoothing.Choice(0.0, max((float(projected[0, 0]) - explained) / max(rows - inner - others, 1), NO_NOISE))
 
 
 def _on_rows(fitted: Fitted, rows: np.ndarray) -> Fitted:
@@ -265,12 +254,12 @@ def final_spline(setup: Setup, linear: SecondOrder, pilot: Curve, count: int) ->
     repeating this once improves a steep rise.
     """
     largest_us, widths_us = pilot.basis.largest_us, setup.grid.pulse_width_us[setup.fitted]
-    basis, roughness = fitting_spline(_points(pilot), largest_us, count, widths_us)
+    basis, roughness = smoothing.fitting_spline(_points(pilot), largest_us, count, widths_us)
     for _ in range(2):
         setup = setup.without_penalty(basis)
         curve = curve_at(setup, linear, roughness)
         known = basis, curve.coefficients_nm
-        basis, roughness = fitting_spline(_points(curve), largest_us, count, widths_us, known)
+        basis, roughness = smoothing.fitting_spline(_points(curve), largest_us, count, widths_us, known)
     return basis, roughness
 
 
@@ -367,8 +356,8 @@ def _renewed(base: Fitted) -> Fitted:
     curve_nm = values[place]
     u = np.linspace(0.0, old.largest_us, RENEWED_POINTS)
     torque_nm = old.design(u) @ curve_nm
-    widths_us, curve = setup.grid.pulse_width_us[setup.fitted], (u[::5], torque_nm[::5])
-    basis, roughness = fitting_spline(curve, old.largest_us, QUIET_KNOTS, widths_us, (old, curve_nm))
+    curve, widths_us, known = (u[::5], torque_nm[::5]), setup.grid.pulse_width_us[setup.fitted], (old, curve_nm)
+    basis, roughness = smoothing.fitting_spline(curve, old.largest_us, smoothing.QUIET_KNOTS, widths_us, known)
     start_nm = np.linalg.lstsq(basis.design(u), torque_nm, rcond=None)[0]
     rough = Problem(setup.with_(basis=basis, roughness=roughness), base.effects)
     theta = rough.from_physical(np.concatenate([values[: place.start], start_nm, values[place.stop :]]))

@@ -40,22 +40,13 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
     `validate` alone if enough of it repeats. In an estimate s² is the torque's variance about straight lines in the
     rests, and v is the variance of the torque less s².
 
-    Parameters
-    ----------
-    grid : Grid
-        The record.
-    error_nm : ndarray, shape (K,)
-        Measured minus predicted, N·m; of fitted intervals as predicted when they were left out of the fit, if known.
-    rows : ndarray of bool, shape (K,)
-        Intervals that were fitted.
+    `error_nm`, shape (K,): measured minus predicted; of fitted intervals as predicted when they were left out of the
+    fit, if known. `rows`, bool, shape (K,): intervals that were fitted.
 
-    Returns
-    -------
-    dict
-        `found_by` ("exact repeats", "estimate" or None), `repeats` (how often the same input came, in the mean),
-        `seconds` (time that counts), `rms_nm` (between repeats), `model_rms_nm` and `explained_percent` there,
-        `held_out_rms_nm` (a plain repetition on `validate`) and `held_out_model_rms_nm` (the model on the same
-        intervals). None where it is not known.
+    Returns `found_by` ("exact repeats", "estimate" or None), `repeats` (how often the same input came, in the mean),
+    `seconds` (time that counts), `rms_nm` (between repeats), `model_rms_nm` and `explained_percent` there,
+    `held_out_rms_nm` (a plain repetition on `validate`) and `held_out_model_rms_nm` (the model on the same
+    intervals). None where it is not known.
     """
     usable = grid.comparable & (rows | grid.held_out)
     min_rows = LEAST_S / grid.step_s
