@@ -218,11 +218,8 @@ def _band_gains(gains, variances, ar1, slow, turn, decay, band):  # pragma: no c
     for k in range(variances.size):
         x, u, v = xx + xu, xu + uu, xv + uv
         variance = variances[k] = x + u + max(1.0 - slow - band, 1e-9)
-        gains[k, 0], gains[k, 1], gains[k, 2] = (
-            ar1 * x / variance,
-            (c * u - s * v) / variance,
-            (s * u + c * v) / variance,
-        )
+        gains[k, 0] = ar1 * x / variance
+        gains[k, 1], gains[k, 2] = (c * u - s * v) / variance, (s * u + c * v) / variance
         xx, xu, xv = xx - x * x / variance, xu - x * u / variance, xv - x * v / variance
         uu, uv, vv = uu - u * u / variance, uv - u * v / variance, vv - v * v / variance
         xx, xu, xv = ar1 * ar1 * xx + fresh, ar1 * (c * xu - s * xv), ar1 * (s * xu + c * xv)

@@ -32,12 +32,8 @@ def step_matrix(time_constant_s, damping, step_s):  # pragma: no cover
         c, s = np.cos(arg), np.sin(arg) / root
     else:
         c, s = np.cosh(arg), np.sinh(arg) / root
-    return (
-        decay * (c + damping * s),
-        decay * s * time_constant_s,
-        -decay * s / time_constant_s,
-        decay * (c - damping * s),
-    )
+    first, last = decay * (c + damping * s), decay * (c - damping * s)
+    return first, decay * s * time_constant_s, -decay * s / time_constant_s, last
 
 
 def transition(time_constant_s: float, damping: float, step_s: float) -> tuple[np.ndarray, np.ndarray]:

@@ -212,10 +212,8 @@ def run_terms(
             root = np.sqrt(change * change + EDGE * EDGE)
             values[Driver.DRIVE], values[Driver.PULSES] = drive[k] / scale_nm, present[k]
             values[Driver.TORQUE] = mid_y / scale_nm
-            values[Driver.RISE], values[Driver.FALL] = (
-                0.5 * (root + change) - 0.5 * EDGE,
-                0.5 * (root - change) - 0.5 * EDGE,
-            )
+            values[Driver.RISE] = 0.5 * (root + change) - 0.5 * EDGE
+            values[Driver.FALL] = 0.5 * (root - change) - 0.5 * EDGE
             up = 0.5 * (1.0 + change / root)
             for p in range(count):
                 by_fall[p] = (up - 1.0) * by_rise[p]

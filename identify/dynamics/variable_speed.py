@@ -67,9 +67,8 @@ def _factor(law, w, y, v, scale_nm, lag_s):  # pragma: no cover
     if law[SpeedLaw.EXPONENTIAL] != 0.0:
         f *= np.exp(law[SpeedLaw.EXPONENTIAL] * level)
     if law[SpeedLaw.PUMP] != 0.0:  # w/(1 + s w) - a/(1 + s a) drives a towards w
-        f *= _line(law[SpeedLaw.PUMP], _share(w / scale_nm)) * _line(
-            law[SpeedLaw.PUMP], _share((y + lag_s * v) / scale_nm)
-        )
+        slope, a = law[SpeedLaw.PUMP], y + lag_s * v
+        f *= _line(slope, _share(w / scale_nm)) * _line(slope, _share(a / scale_nm))
     return _bounded(f)
 
 
@@ -142,12 +141,8 @@ def run_core(drive, time_constant_s, damping, law, begins, initial, scale_nm, st
                 gap = y - w
                 y, v = w + q11 * gap + q12 * v, q21 * gap + q22 * v
                 p21, p22 = turned * p21, turned * p22
-                p11, p12, p21, p22 = (
-                    q11 * p11 + q12 * p21,
-                    q11 * p12 + q12 * p22,
-                    q21 * p11 + q22 * p21,
-                    q21 * p12 + q22 * p22,
-                )
+                p11, p21 = q11 * p11 + q12 * p21, q21 * p11 + q22 * p21
+                p12, p22 = q11 * p12 + q12 * p22, q21 * p12 + q22 * p22
             if m == 0:
                 varied = True
                 first[0, k], first[1, k], first[2, k], first[3, k] = p11, p12, p21, p22

@@ -54,15 +54,14 @@ _FREE = (
 
 def _surface(p: Values, scene: Scene) -> Columns:
     velocity, place = scene.speed, scene.place
+    acceleration = np.zeros_like(velocity) if scene.acceleration_rad_s2 is None else scene.acceleration_rad_s2
     below_rad_s, row = np.unique(p["dry_below_rad_s"], return_inverse=True)
     return {f"elastic_{i}_nm": bend for i, bend in enumerate(scene.bends(len(SIZES)), start=1)} | {
         _VISCOUS.name: velocity,
         "tilt_nm_s_per_rad": place * velocity,
         "bow_nm_s_per_rad": place**2 * velocity,
         "dry_nm": np.tanh(velocity / below_rad_s[:, None])[row.ravel()],
-        "inertia_nm_s2_per_rad": np.zeros_like(velocity)
-        if scene.acceleration_rad_s2 is None
-        else scene.acceleration_rad_s2,
+        "inertia_nm_s2_per_rad": acceleration,
     }
 
 

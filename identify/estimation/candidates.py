@@ -120,11 +120,8 @@ def similar_bout_rows(grid: Grid, rows: np.ndarray) -> np.ndarray | None:
     similar_bouts = [bout for bout, kind in kinds.items() if kind in wanted and np.any(rows & (number == bout))]
     similar_rows = rows & np.isin(number, similar_bouts)
     predicted = grid.held_out & (grid.pulse_width_us > 0)
-    if (
-        len(similar_bouts) < LEAST_BOUTS
-        or similar_rows.sum() == rows.sum()
-        or np.mean(near_widths(grid, similar_rows)[predicted]) < COVERED
-    ):
+    few_or_all = len(similar_bouts) < LEAST_BOUTS or similar_rows.sum() == rows.sum()
+    if few_or_all or np.mean(near_widths(grid, similar_rows)[predicted]) < COVERED:
         return None
     return similar_rows | (rows & relaxed(grid, FORGOTTEN_S))
 

@@ -281,23 +281,10 @@ class _Search:
                 break
             chosen, mode = kind, near[kind]
             linear = self.moved(linear, mode.z[-3:])
-        return self._short(posterior, linear, noise, near, weights, draws)
-
-    def _short(
-        self,
-        posterior: CurvePosterior,
-        linear: SecondOrder,
-        noise: NoiseLevel,
-        modes: list[Mode],
-        weights: np.ndarray,
-        draws: int,
-    ) -> Short:
-        prior = posterior.prior
-        n, extras = prior.basis.size, self.others_mean.size
-        samples = posterior.draws(modes, weights, draws, seed=draws)
+        samples = posterior.draws(near, weights, draws, seed=draws)
         dynamics = np.c_[np.exp(samples[:, n + extras : -1]) * linear.core, linear.delay_s + samples[:, -1]]
         lower, upper = np.array([TIME_CONSTANT_BOUNDS_S, DAMPING_BOUNDS, self.grid.delay_bounds_s]).T
-        best = posterior.linear_of(modes[int(np.argmax(weights))])
+        best = posterior.linear_of(near[int(np.argmax(weights))])
         return Short(
             grid=self.grid,
             rows=self.rows,
@@ -307,7 +294,7 @@ class _Search:
             coefficients_nm=np.cumsum(samples[:, :n], axis=1),
             dynamics=np.clip(dynamics, lower, upper),
             others_nm=samples[:, n : n + extras],
-            modes=tuple(modes),
+            modes=tuple(near),
             weights=weights,
             noise=noise,
             most_probable=best[: n + extras],
