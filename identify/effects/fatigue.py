@@ -11,7 +11,6 @@ _ONSET = Parameter("onset_s", "s", 3.0, 250.0, 30.0, (15.0, 50.0), "log", about=
 _RECOVERY = Parameter("recovery_s", "s", 4.0, 400.0, 50.0, (40.0, 90.0), "log", about="time constant at rest")
 _form = partial(slow_gain, "fatigue", (_DEPTH, _ONSET, _RECOVERY), lambda p, x: 1.0 - p["depth"] * x)
 
-
 EFFECT = Effect(
     id="fatigue",
     name="Fatigue",

@@ -133,7 +133,6 @@ relaxing = Form(
     source="standard linear solid, Fung 1981",
 )
 
-
 EFFECT = Effect(
     id="passive_torque",
     name="Passive torque of the joint",

@@ -11,7 +11,6 @@ _ONSET = Parameter("onset_s", "s", 1.2, 80.0, 5.0, (4.0, 15.0), "log", about="ti
 _RECOVERY = Parameter("recovery_s", "s", 2.0, 400.0, 60.0, (20.0, 80.0), "log", about="time constant at rest")
 _form = partial(slow_gain, "potentiation", (_GAIN, _ONSET, _RECOVERY), lambda p, x: 1.0 + p["gain"] * x)
 
-
 EFFECT = Effect(
     id="potentiation",
     name="Potentiation",

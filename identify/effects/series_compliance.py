@@ -24,8 +24,6 @@ _RESONANCE = (
     Parameter("resonance_hz", "Hz", 1.2, 16.0, np.inf, (3.0, 6.0, 10.0), "log", about="resonance of the series spring"),
     Parameter("damping", "1", 0.02, 0.7, 0.2, (0.15,), "log", about="damping of the resonance, 1 is critical"),
 )
-
-
 SPRING_PARTS = 12
 """Leapfrog steps per interval: at 16 Hz and 40 pulses/s a step is a fifth of a radian."""
 

@@ -20,8 +20,6 @@ from stimrig.identify.recruitment.near_shape import KNOTS, Deviation, NearShape,
 
 EARLIER_DEVIATIONS = (Deviation(0.05, 1.0), Deviation(0.3, 0.8), Deviation(0.9, 0.8), Deviation(2.2, 0.2))
 """As `DEVIATIONS`, from the earlier curve: the posterior decides how far the shape itself changed."""
-
-
 MAX_SD_SHARE = 1.5
 """Largest standard deviation of the log of a step that is taken from the last model."""
 

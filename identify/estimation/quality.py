@@ -75,17 +75,14 @@ def range_warnings(model: Model, record: Record) -> list[str]:
     warnings = []
     low, high = model.valid_for.get("pulse_rate_hz", (0.0, np.inf))
     if not low <= record.pulse_rate_hz <= high:
-        warnings.append(
-            f"fitted at {model.pulse_rate_hz:g} pulses/s, but used at {record.pulse_rate_hz:g} pulses/s: "
-            "fit a model at that rate"
-        )
+        used = f"fitted at {model.pulse_rate_hz:g} pulses/s, but used at {record.pulse_rate_hz:g} pulses/s"
+        warnings.append(f"{used}: fit a model at that rate")
     largest = model.valid_for.get("pulse_width_us", (0.0, np.inf))[1]
     beyond = record.pulse_width_us > largest * (1 + 1e-6)
     if np.any(beyond):
-        warnings.append(
-            f"{100 * float(np.mean(beyond)):.0f} % of the pulse widths are above the largest fitted width, "
-            f"{largest:g} µs: the recruitment curve is constant there"
-        )
+        share = f"{100 * float(np.mean(beyond)):.0f} % of the pulse widths"
+        above = f"above the largest fitted width, {largest:g} µs"
+        warnings.append(f"{share} are {above}: the recruitment curve is constant there")
     return warnings + _joint_warnings(model, record)
 
 
@@ -101,10 +98,8 @@ def _joint_warnings(model: Model, record: Record) -> list[str]:
             continue
         outside = float(np.mean(~((column >= span[0] - slack) & (column <= span[1] + slack))))
         if outside > 0.0:
-            warnings.append(
-                f"in {max(100 * outside, 1):.0f} % of the samples the joint's {name} is outside {span[0]:.2f} to "
-                f"{span[1]:.2f} {unit}: the model was fitted there only"
-            )
+            share, fitted = f"{max(100 * outside, 1):.0f} % of the samples", f"{span[0]:.2f} to {span[1]:.2f} {unit}"
+            warnings.append(f"in {share} the joint's {name} is outside {fitted}: the model was fitted there only")
     return warnings
 
 

@@ -200,18 +200,15 @@ def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarra
     if covariance is None or not isinstance(linear, SecondOrder):
         raise ValueError("this model has no covariance")
     grid = make_grid(record)
-    sd = _sd(slopes(model, grid, covariance.names), covariance)
+    lever = slopes(model, grid, covariance.names)
+    variance = np.einsum("ij,jk,ik->i", lever, covariance.matrix, lever, optimize=True)
     middle = grid.start_s + (np.arange(grid.size) + float(np.mean(grid.fraction))) * grid.step_s
     share = np.sqrt(sum(rms**2 for _, rms in unpredictable_torque(model).values()))
-    sd = np.hypot(sd, model.fit.get("unexplained_nm", 0.0))
+    sd = np.hypot(np.sqrt(np.maximum(variance, 0.0)), model.fit.get("unexplained_nm", 0.0))
     was_fitted = ~record.held_out if same_data(model, record) else np.zeros(record.time_s.size, bool)
     half = POINTWISE * np.hypot(np.interp(record.time_s, middle, sd), np.where(was_fitted, 0.0, share))
     predicted = model.predict(record)
     return predicted - half, predicted + half
-
-
-def _sd(slopes: np.ndarray, covariance: Covariance) -> np.ndarray:
-    return np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, covariance.matrix, slopes, optimize=True), 0.0))
 
 
 def _band(value: np.ndarray, slopes: np.ndarray, covariance: Covariance) -> dict[str, np.ndarray]:

@@ -74,10 +74,8 @@ def plan(record: Record, fits: Mapping[str, Fitted]) -> Experiment:
     test = f"{tests[best][0].words} ({played[1]:.0f} s)"
     text = f"{test} should separate {those}: expected log evidence {gain:.0f}."
     if not decides:
-        text = (
-            f"{test} is the best test to separate {those}, but it may not be enough: expected log evidence "
-            f"{gain:.1f}; at least {ENOUGH:g} is required."
-        )
+        lacking = f"expected log evidence {gain:.1f}; at least {ENOUGH:g} is required"
+        text = f"{test} is the best test to separate {those}, but it may not be enough: {lacking}."
     return Experiment(names, *played, gain, decides, text)
 
 
@@ -115,10 +113,8 @@ def plan_further(record: Record, fitted: Fitted, rivals: Sequence[Fitted] = ()) 
     fall, played = 1.0 - after[best] / error_nm(0.0), _played(*tests[best], record, fitted)
     those = " from ".join(find_effect(name).name.lower() for name in [*fits][:2])
     teaches = f"should best separate {those} and" if rivals else "would"
-    text = (
-        f"{tests[best][0].words} ({played[1]:.0f} s) {teaches} teach most about what is left: the model's own standard "
-        f"error on levels is expected to fall by {100.0 * fall:.0f} %."
-    )
+    expected = f"the model's own standard error on levels is expected to fall by {100.0 * fall:.0f} %"
+    text = f"{tests[best][0].words} ({played[1]:.0f} s) {teaches} teach most about what is left: {expected}."
     return Experiment((), *played, gains[best], gains[best] >= ENOUGH, text, fall)
 
 

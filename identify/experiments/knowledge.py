@@ -88,8 +88,7 @@ class Knowledge:
 
     def to_dict(self) -> dict:
         """Plain values for a page: bands in N·m and as shares."""
-        unit = self.plateau_nm
-        curve, step = self.curve, self.step
+        unit, curve, step = self.plateau_nm, self.curve, self.step
         return {
             "plateau_nm": unit,
             "curve_percent": curve.percent,

@@ -42,7 +42,6 @@ def fit(grid: Grid, fit_on: tuple[str, ...] | None, **options: Any) -> Model:
     drive, baseline = deconvolved(grid, ramp, linear)
     width, slope = grid.pulse_width_us, np.gradient(grid.pulse_width_us)
     halves = {"rising": ramp & (slope > 0), "falling": ramp & (slope < 0)}
-
     ramp_us = width[ramp]
 
     def with_gain(basis: SigmoidBasis) -> Curve:

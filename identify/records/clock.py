@@ -106,10 +106,8 @@ def regular(table: Table) -> Table:
         return _resampled(table, step_s)
     worst, note = max(parts, key=lambda part: part.jitter_s), ""
     if worst.jitter_s:
-        note = (
-            f"time stamps jitter by up to {1e3 * worst.jitter_s:.3g} ms: samples are taken as even, at "
-            f"{1 / worst.step_s:.5g} Hz, which suits the torque better"
-        )
+        jitter = f"time stamps jitter by up to {1e3 * worst.jitter_s:.3g} ms"
+        note = f"{jitter}: samples are taken as even, at {1 / worst.step_s:.5g} Hz, which suits the torque better"
     lost = _lost_note(table, time_s, np.concatenate([part.lost for part in parts]))
     return table.noting(note, lost, columns={"time_s": np.concatenate(even)})
 
@@ -225,11 +223,9 @@ def _resampled(table: Table, step_s: float) -> Table:
         for name, column in table.columns.items()
     }
     width_us = _width_in_slots(table, even_s, before)
-    note = (
-        f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms): resampled to "
-        f"{1 / step_s:.5g} Hz, torque on straight lines between samples: "
-        "noise and error figures come out too small"
-    )
+    stamps = f"uneven time stamps (steps of {1e3 * usual.min():.3g} to {1e3 * usual.max():.3g} ms)"
+    made = f"resampled to {1 / step_s:.5g} Hz, torque on straight lines between samples"
+    note = f"{stamps}: {made}: noise and error figures come out too small"
     columns |= {"time_s": even_s, "pulse_width_us": width_us}
     return table.noting(note, _lost_note(table, time_s, gaps), columns=columns)
 
