@@ -132,9 +132,9 @@ def _extended(base: Chain, progress: Progress) -> Chain:
     for step in near[len(base) : -1]:
         last, term = near[-1], str(step.added)
         without = _without(last, term)
-        worse = difference(last.left_out, without.left_out).errors <= -thresholds.SUPERFLUOUS
+        worse = _better(near, (without,)).errors <= -thresholds.SUPERFLUOUS
         if not worse and not vetoed(last.searched, without.searched):
-            near = (*(_without(other, term) for other in near[:-1] if other is not step), without)
+            near = (*(_without(other, term) for other in near[:-1] if other.added != term), without)
     return (*base, *near[len(base) :])  # the base as it was searched
 
 

@@ -38,7 +38,7 @@ def explain(
         raise InputError(f"--own {own}: it exists already: move it or give another name.")
     drawn = []
     if figures is not None:
-        from stimrig.api.charts.diagnosis_charts import story_figures, story_names
+        from stimrig.api.charts.diagnosis_charts import story_names
         from stimrig.api.charts.figure import FILE_KINDS
 
         drawn = [figures / f"{name}.{kind}" for name in story_names() for kind in FILE_KINDS]
@@ -52,6 +52,9 @@ def explain(
     if html is not None:
         write(html, html_report(explained, record, short(data)))
     if figures is not None:
+        from stimrig.api.charts.diagnosis_charts import story_figures
+        from stimrig.api.charts.figure import FILE_KINDS
+
         narrative = story_of(record, explained)
         for name, figure in story_figures(narrative["story"], narrative["before"], narrative["after"]).items():
             for kind in FILE_KINDS:
