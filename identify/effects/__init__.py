@@ -16,8 +16,9 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping
 from functools import lru_cache
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 from stimrig.identify.effects import own_file
@@ -28,17 +29,30 @@ from stimrig.identify.errors import BadRequest
 FOLDER_VARIABLE = "STIMRIG_EFFECTS_DIR"
 GROUP = "stimrig.effects"
 TRIAL = """
-import faulthandler, sys
+import faulthandler, os, sys, traceback
+place, limit_s, folder, *sys.path = sys.argv[1], float(sys.argv[2]), *sys.argv[3:]
 from stimrig.identify import effects
-limit_s, folder = float(sys.argv[1]), sys.argv[2]
-faulthandler.dump_traceback_later(limit_s, exit=True)
+report = open(place, "w", encoding="ascii", errors="backslashreplace")
+faulthandler.enable(report)
 try:
-    for _ in effects._own_effects(folder):
-        faulthandler.dump_traceback_later(limit_s, exit=True)
-except BaseException:
+    faulthandler.dump_traceback_later(limit_s, exit=True, file=report)
+    for _ in effects._own_effects(folder, effects.entry_points(group=effects.GROUP)):
+        faulthandler.dump_traceback_later(limit_s, exit=True, file=report)
+except (Exception, SystemExit):
     pass  # the process that started this one meets it too, and reports it
+except BaseException:
+    traceback.print_exc(file=report)
+    report.flush()
+    os._exit(1)
+os._exit(effects.TRIED)
 """
-"""Program that loads the own effects and ends itself where one of them takes longer than a limit."""
+"""Program that loads the own effects and ends itself where one of them takes longer than a limit.
+
+It looks for modules where its parent does, not in the current folder. Its report is a file, since a pipe would be kept
+open by whatever an effect starts.
+"""
+TRIED = 77
+"""Status with which it ends: an effect may end it with any other."""
 TRIAL_S = 20.0
 """Longest time of an own effect, which takes milliseconds: an endless loop would hold up every verb in silence."""
 
@@ -53,9 +67,10 @@ def _library() -> list[Effect]:
 def _everything(folder: str) -> dict[str, Effect]:
     effects = {effect.id: effect for effect in _library()}
     places = dict.fromkeys(effects, "the library")
-    if folder or entry_points(group=GROUP):
+    points = entry_points(group=GROUP)
+    if folder or points:
         _try_out(folder)
-    for place, effect in _own_effects(folder):
+    for place, effect in _own_effects(folder, points):
         if effect.id in places:
             message = f"the effect {effect.id!r} is also in {places[effect.id]}"
             raise BadEffect(message, place=place, fix="Give it another id.")
@@ -69,24 +84,28 @@ def _try_out(folder: str) -> None:
 
     Raises BadEffect: one of them does not end, or ends the process.
     """
-    command = [sys.executable, "-X", "faulthandler", "-c", TRIAL, str(TRIAL_S), folder]
-    ended = subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, errors="replace")
-    if ended.returncode:
-        frames = [(Path(file), line) for file, line in re.findall(r'File "(.+)", line (\d+)', ended.stderr)]
-        own = [(Path(folder) / file.name, line) for file, line in frames if file.parent == Path(folder).absolute()]
-        place = next((f"{file}, line {line}" for file, line in own or frames), folder or GROUP)
-        message = f"not done after {TRIAL_S:g} s" if "Timeout (" in ended.stderr else "it ends Python"
-        raise BadEffect(message, place=place, fix=own_file.FIX)
+    with TemporaryDirectory(prefix="stimrig-") as there:
+        place = Path(there) / "report"
+        command = [sys.executable, "-c", TRIAL, str(place), str(TRIAL_S), folder, *sys.path]
+        ended = subprocess.run(command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        text = place.read_text("ascii") if place.exists() else ""
+    if ended.returncode != TRIED:
+        own = {ascii(str(path.absolute()))[1:-1]: path for path in Path(folder or ".").glob("*.py") if folder}
+        frames = re.findall(r'File "(.+)", line (\d+)', text)
+        places = [f"{own[file]}, line {line}" for file, line in frames if file in own]
+        places += [f"{file}, line {line}" for file, line in frames]
+        message = f"not done after {TRIAL_S:g} s" if "Timeout (" in text else "it ends Python"
+        raise BadEffect(message, place=[*places, folder or GROUP][0], fix=own_file.FIX)
 
 
-def _own_effects(folder: str) -> Iterator[tuple[str, Effect]]:
-    yield from _from_packages()
+def _own_effects(folder: str, points: Iterable[EntryPoint]) -> Iterator[tuple[str, Effect]]:
+    yield from _from_packages(points)
     if folder:
         yield from _from_folder(Path(folder))
 
 
-def _from_packages() -> Iterator[tuple[str, Effect]]:
-    for point in entry_points(group=GROUP):
+def _from_packages(points: Iterable[EntryPoint]) -> Iterator[tuple[str, Effect]]:
+    for point in points:
         place = f"entry point {point.name} = {point.value}"
         try:
             effect = point.load()

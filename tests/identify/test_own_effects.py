@@ -5,7 +5,9 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
+import signal
 from pathlib import Path
 
 import pytest
@@ -144,16 +146,42 @@ def test_two_files_of_one_id_are_told(tmp_path, monkeypatch) -> None:
 @pytest.mark.parametrize("at", ["    return torque_nm", "EFFECT = Effect("])
 @pytest.mark.parametrize("caught", ["ValueError", "TimeoutError", "BaseException"])
 def test_a_loop_without_an_end_is_told_with_its_line(tmp_path, monkeypatch, at: str, caught: str) -> None:
-    monkeypatch.setattr(effects, "TRIAL_S", 0.3)
+    monkeypatch.setattr(effects, "TRIAL_S", 1.2)  # a machine may pause for 0.8 s
     dent = at[: -len(at.lstrip())]
     loop = f"while True:\n{dent}    try:\n{dent}        pass\n{dent}    except {caught}:\n{dent}        break"
     line = told(tmp_path, monkeypatch, GOOD.replace(at, f"{dent}{loop}\n{at}", 1))
-    assert re.match(rf"{tmp_path / 'mine.py'}, line \d+: not done after 0.3 s\. See docs", line), line
+    assert re.match(rf"{tmp_path / 'mine.py'}, line \d+: not done after 1.2 s\. See docs", line), line
 
 
-def test_an_effect_that_ends_python_is_told_with_its_file(tmp_path, monkeypatch) -> None:
-    text = GOOD.replace("EFFECT = Effect(", "import ctypes\nctypes.string_at(0)\nEFFECT = Effect(")
-    assert re.match(rf"{tmp_path / 'mine.py'}, line \d+: it ends Python\.", told(tmp_path, monkeypatch, text))
+@pytest.mark.parametrize("end", ["import ctypes; ctypes.string_at(0)", "raise KeyboardInterrupt"])
+def test_an_effect_that_ends_python_is_told_with_its_line(tmp_path, monkeypatch, end: str) -> None:
+    folder = tmp_path / "ü"
+    line = told(folder, monkeypatch, GOOD.replace("EFFECT = Effect(", f"{end}\nEFFECT = Effect("))
+    assert re.match(rf"{folder / 'mine.py'}, line \d+: it ends Python\.", line), line
+
+
+def test_an_effect_that_ends_python_without_an_error_is_told_with_its_folder(tmp_path, monkeypatch) -> None:
+    line = told(tmp_path, monkeypatch, "import os; os._exit(0)")
+    assert line.startswith(f"{tmp_path}: it ends Python.")
+
+
+def test_what_an_effect_starts_does_not_prolong_its_trial(tmp_path, monkeypatch) -> None:
+    pids = tmp_path / "pids"
+    start = f"import os\npid = os.posix_spawnp('sleep', ['sleep', '600'], os.environ)\nfile = open({str(pids)!r}, 'a')"
+    try:
+        assert "no EFFECT in it" in told(tmp_path, monkeypatch, f"{start}\nprint(pid, file=file, flush=True)")
+    finally:
+        in_the_trial, here = (int(pid) for pid in pids.read_text().split())
+        for pid in (in_the_trial, here):
+            os.kill(pid, signal.SIGKILL)
+        os.waitpid(here, 0)
+
+
+def test_a_module_of_the_current_folder_is_not_loaded(tmp_path, monkeypatch) -> None:
+    (tmp_path / "numba.py").write_text("raise SystemExit(3)")
+    (tmp_path / "effects").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert "no EFFECT in it" in told(tmp_path / "effects", monkeypatch, "")
 
 
 @pytest.mark.parametrize("known", ["fatigue", "free_width_by_torque"])
