@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 from typing import Any
 
 import numpy as np
@@ -10,7 +11,7 @@ import numpy as np
 from stimrig.identify.dynamics.terms import QUICK_S, Driver, Place
 from stimrig.identify.effects import find_effect
 from stimrig.identify.effects.terms import AFTER_LAGS, PERCENTILES, acting, later
-from stimrig.identify.estimation.solve import Fitted
+from stimrig.identify.estimation.solve import Fitted, once
 from stimrig.identify.estimation.uncertainty import square_root
 from stimrig.identify.problem.problem import Chosen
 
@@ -46,8 +47,8 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
         lines[name] = {"value": drawn[0].tolist(), "lower": lower.tolist(), "upper": upper.tolist()}
     names = " or ".join(find_effect(name).name.lower() for name in described.behaves_as)
     note = f" It behaves as {names}." if names else ""
-    if opposed := _opposed(fitted, chosen):
-        note = f" It counts only together with {opposed}: over this record the two nearly cancel."
+    if opposed := _opposed(fitted).get(chosen.effect, []):
+        note = f" It counts only together with {' and '.join(opposed)}: over this record they nearly cancel."
     return {key: getattr(described, key) for key in ("place", "driven_by", "driver", "effect")} | {
         "words": described.words + note,
         "equation": f"{described.equation}; y_max = {fitted.problem.setup.scale_nm:.3g} N·m",
@@ -58,25 +59,26 @@ def shape_of(fitted: Fitted, index: int, matrix: np.ndarray) -> dict[str, Any] |
     }
 
 
-def _opposed(fitted: Fitted, chosen: Chosen) -> str:
-    """Names of the terms each of which nearly cancels a term (`CANCELLED`) over the fitted rows; empty if none does."""
-    problem, rows, names = fitted.problem, fitted.problem.setup.fitted, []
+@once
+def _opposed(fitted: Fitted) -> dict[str, list[str]]:
+    """By term, the names of those each of which nearly cancels it (`CANCELLED`) over the fitted rows."""
+    problem, rows = fitted.problem, fitted.problem.setup.fitted
+    terms = [chosen for chosen in problem.chosen if chosen.form.stage == "term"]
+    opposed: dict[str, list[str]] = {term.effect: [] for term in terms}
 
-    def run_without(*terms: Chosen) -> np.ndarray:
+    def run_without(*left_out: Chosen) -> np.ndarray:
         theta = fitted.theta.copy()
-        theta[[term.first for term in terms]] = 0.0
+        theta[[term.first for term in left_out]] = 0.0
         return problem.run(theta)[0][rows]
 
     torque_nm = run_without()
-    for other in problem.chosen:
-        if other is not chosen and other.form.stage == "term":
-            both, *alone = (
-                float(np.linalg.norm(torque_nm - run_without(*terms)))
-                for terms in ((chosen, other), (chosen,), (other,))
-            )
-            if both < CANCELLED * max(alone):
-                names.append(f"“{find_effect(other.effect).name}”")
-    return " and ".join(names)
+    alone = {term.effect: np.linalg.norm(torque_nm - run_without(term)) for term in terms}
+    for term, other in combinations(terms, 2):
+        both = np.linalg.norm(torque_nm - run_without(term, other))
+        if both < CANCELLED * max(alone[term.effect], alone[other.effect]):
+            for one, against in ((term, other), (other, term)):
+                opposed[one.effect].append(f"“{find_effect(against.effect).name}”")
+    return opposed
 
 
 def _course(fitted: Fitted, chosen: Chosen) -> dict[str, list[float]]:

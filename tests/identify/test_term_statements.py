@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -113,7 +113,7 @@ def test_the_course_of_a_factor_is_that_by_which_the_model_changes_the_torque(dr
     term = {"id": effect, "form": "term", "parameters": parameters, "settings": {"scale_nm": 6.0}}
     model = identify.fit(record).with_(effects=(term,))
     problem, theta = problem_of(model, make_grid(record))
-    fitted = SimpleNamespace(problem=problem, theta=theta, physical=problem.physical(theta))
+    fitted = Mock(problem=problem, theta=theta, physical=problem.physical(theta))
     course, without = _course(fitted, problem.chosen[0]), theta.copy()
     without[problem.chosen[0].first] = 0.0
     zero = problem.physical(theta)[problem.baselines][problem.setup.grid.part]
@@ -140,7 +140,7 @@ def test_a_term_that_another_nearly_cancels_is_told_only_with_it(sizes, cancel, 
         for effect, size in zip(terms, sizes, strict=True)
     ]
     problem, theta = problem_of(identify.fit(record).with_(effects=tuple(entries)), make_grid(record))
-    fitted = SimpleNamespace(problem=problem, theta=theta, physical=problem.physical(theta))
+    fitted = Mock(problem=problem, theta=theta, physical=problem.physical(theta))
     for index, other in enumerate((f"“{registry()[second].name}”", "“Strength by drive”")):
         shape = shape_of(fitted, index, 1e-6 * np.eye(theta.size))
         assert (f"It counts only together with {other}" in shape["words"]) == cancel
