@@ -40,7 +40,8 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
     shown = await parts(context, row)
     version, document, why = shown["model"], shown["document"], shown["why"]
     findings, fit_words = advice.findings(document), advice.fit_sentence(document["fit"])
-    not_joined = await asyncio.to_thread(context.versions.why_not_joined, row)
+    planned = bool(why and why["experiment"])
+    not_joined = await asyncio.to_thread(context.versions.why_not_joined, row) if planned else ""
     running = why is None and job is not None and job.state in ("running", "completed")
     others = [finding for finding in findings if not fit_words or finding.gate not in ("gap", "ceiling")]
 
@@ -61,7 +62,7 @@ async def model(request: Request, context: Ctx, principal: ModelReader, row: Ver
         "model.html",
         advice=advice.advice(
             version["verdict"], findings, why["likely"] if why else [], why and why["kind"],
-            diagnosing=running, experiment=bool(why and why["experiment"] and not not_joined),
+            diagnosing=running, experiment=planned and not not_joined,
         ),
         shown_findings=others[:MOST_FINDINGS],
         hidden_findings=others[MOST_FINDINGS:],
