@@ -84,6 +84,11 @@ def check_outputs(
         known.add(place)
 
 
+def make_folder(folder: Path) -> None:
+    """Make a `new_folder` of `check_outputs`; where a link leads to it, what the link names."""
+    Path(os.path.realpath(folder)).mkdir(parents=True, exist_ok=True)
+
+
 def short(data: Sequence[Path]) -> str:
     """Name files at the head of a report."""
     return ", ".join(path.name for path in data)

@@ -12,7 +12,7 @@ from stimrig import identify
 from stimrig.api.cli.commands import audit, explain
 from stimrig.api.cli.commands import test as verb
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.files import check_outputs, write
+from stimrig.api.cli.files import check_outputs, make_folder, write
 
 
 def test_devices_and_pipes_are_written_directly(tmp_path: Path) -> None:
@@ -42,6 +42,14 @@ def test_a_file_of_the_service_is_not_replaced(name: str, tmp_path: Path, monkey
     assert not any((tmp_path / "var").glob("logs")), "no service was started"
 
 
+def test_with_an_address_this_machine_s_settings_are_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("STIMRIG_TOKEN", "STIMRIG_ADMIN_TOKEN"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("STIMRIG_PORT", "abc")
+    with pytest.raises(InputError, match="needs a token in STIMRIG_TOKEN"):
+        verb.test(url="http://127.0.0.1:9")
+
+
 def test_a_refused_command_makes_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     data, new = tmp_path / "absent.csv", tmp_path / "new" / "deep"
@@ -52,6 +60,15 @@ def test_a_refused_command_makes_no_folder(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises((InputError, identify.BadRecord, OSError)):
         verb.test(decide=[data], output=new / "r.h5")
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_new_folder_is_made_where_a_link_leads(tmp_path: Path) -> None:
+    link, folder = tmp_path / "link", tmp_path / "new" / "deep"
+    link.symlink_to(folder)
+    check_outputs([], link / "r.h5", new_folder=link)
+    make_folder(link)
+    write(link / "r.h5", "content")
+    assert (folder / "r.h5").read_text() == "content"
 
 
 def test_without_a_term_the_other_outputs_are_written(

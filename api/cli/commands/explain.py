@@ -10,7 +10,7 @@ import typer
 from stimrig import identify
 from stimrig.api.cli.commands.diagnose import add_command, begin_with, test_command
 from stimrig.api.cli.errors import InputError
-from stimrig.api.cli.files import check_outputs, html_report, load_structure, short, story_of, write
+from stimrig.api.cli.files import check_outputs, html_report, load_structure, make_folder, short, story_of, write
 from stimrig.api.cli.options import ColumnMap, HeldModel, Json, LastModel, SeveralData
 from stimrig.api.cli.terminal import print_aside, report
 from stimrig.api.progress_bar import progress_bar
@@ -21,7 +21,9 @@ def explain(
     model_json: HeldModel = None,
     html: Annotated[Path | None, typer.Option(help="write the story with its figures here, one file")] = None,
     figures: Annotated[Path | None, typer.Option(help="write each figure as SVG, PDF and PNG into this folder")] = None,
-    own: Annotated[Path | None, typer.Option(help="write the first term as an own effect here, a .py file")] = None,
+    own: Annotated[
+        Path | None, typer.Option(help="write the first free effect, if any, as an own effect here, a .py file")
+    ] = None,
     output: LastModel = None,
     columns: ColumnMap = None,
     as_json: Json = False,
@@ -47,7 +49,7 @@ def explain(
     with progress_bar() as progress:
         explained = identify.explain(record, progress, model)
     if figures is not None:
-        figures.mkdir(parents=True, exist_ok=True)
+        make_folder(figures)
     write(output, explained.improvement.models[-1])
     if html is not None:
         write(html, html_report(explained, record, short(data)))

@@ -19,7 +19,7 @@ from stimrig import identify
 from stimrig.api.cli import deciding
 from stimrig.api.cli.commands.audit import check_service_output, settings_of
 from stimrig.api.cli.errors import CommandError, InputError
-from stimrig.api.cli.files import write
+from stimrig.api.cli.files import check_outputs, make_folder, write
 from stimrig.api.cli.options import DataDir, Emulate, Json, RigFile, names, set_options
 from stimrig.api.cli.reports import report_test
 from stimrig.api.cli.stop_key import StopKey, at_rig, at_service
@@ -89,9 +89,8 @@ def test(
         raise InputError("--target, --max-time, --max-torque-time and --anyway go with --adaptive.")
     if (adaptive, protocol is not None, bool(decide)).count(True) > 1:
         raise InputError("--adaptive, --protocol and --decide are three kinds of test. Give one of them.")
-    check_output = partial(
-        check_service_output, settings_of(data), decide or [], output, new_folder=output and output.parent
-    )
+    check = check_outputs if url else partial(check_service_output, settings_of(data))
+    check_output = partial(check, decide or [], output, new_folder=output and output.parent)
     check_output()
     request = set_options(protocol=protocol, kind="adaptive" if adaptive else None, **bounds, **labels)
     if decide:
@@ -99,11 +98,11 @@ def test(
     over = Event()
     with service(url, rig, data, emulate, over) as (client, events):
         check_output()  # again: the service has made its files now
+        if output is not None:
+            make_folder(output.parent)
         code = request.pop("participant", participant or "TEST")
         result = play(client, code, request, events, over.set)
     recording = result.pop("recording")
-    if output is not None:
-        output.parent.mkdir(parents=True, exist_ok=True)
     write(output, recording)  # first, so that a later error cannot lose the recording
     lines: list[object] = [report_test(result["test"])]
     if decide:
