@@ -47,7 +47,7 @@ class Sheet:
 
 
 def register_plotter(plotter: Plotter) -> None:
-    """Set the function that draws results, in place of an earlier one; it raises `BadRequest` if it cannot."""
+    """Set the function that draws results, in place of an earlier one (see `Plotter`)."""
     _plotters[:] = [plotter]
 
 
