@@ -66,21 +66,21 @@ def carry(data: str, progress: Progress, model_json: str) -> dict[str, Any]:
 
 
 def diagnosis(data: str, progress: Progress, model_json: str | None = None) -> dict[str, Any]:
-    """Diagnose what is missing in a model's structure, what each effect would explain, and the test that decides.
+    """Search for what a model's structure lacks; without a model it is the plain structure.
 
-    Without a model it is the plain structure. The first four fifths of the progress are identify's diagnosis;
-    `improvement` holds the models that come of it.
+    `improvement` holds the models of the search, and `rows` what is missing in each of them, what each effect would
+    explain, and the test that decides.
     """
     record = identify.read(Path(data))
     model = None if model_json is None else identify.Model.from_json(model_json)
-    structure = held_by(model, record)
-    found, improvement = identify.diagnose_and_improve(record, progress, model)
-    return json_value({
-        **with_experiment(record, found, structure),
-        "signatures": signatures(record, improvement),
-        "refused": list(improvement.refused),
-        "improvement": {**improvement.to_dict(), "structure": list(structure)},
-    })  # fmt: skip
+    diagnoses, improvement = identify.diagnose_and_improve(record, progress, model)
+    structures = [held_by(model, record), *(held_by(later, record) for later in improvement.models[1:])]
+    more = {"signatures": signatures(record, improvement), "refused": list(improvement.refused)}
+    rows = [
+        {**with_experiment(record, found, structure), **more}
+        for found, structure in zip(diagnoses, structures, strict=True)
+    ]
+    return json_value({"rows": rows, "improvement": improvement.to_dict()})
 
 
 def with_experiment(record: Any, diagnosis: Any, structure: Sequence[str]) -> dict[str, Any]:

@@ -7,7 +7,7 @@ import hashlib
 import json
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
@@ -23,14 +23,22 @@ log = logging.getLogger("stimrig.analyses")
 OnCall = Callable[[Job], None]
 """Takes the job of a worker that begins: a page shows its progress."""
 DIAGNOSIS, OWN_DIAGNOSIS = "diagnosis", "diagnosis of its structure"
-"""Names of the stored diagnosis: of the plain structure, and of a version's own structure."""
+"""Names of the stored search for what is missing: from the plain structure, and from a version's own structure."""
 IMPROVEMENT = "improvement"
-"""By-product of a diagnosis, stored separately: the models with the effects that it names."""
+"""The models of a search, stored separately."""
 
 
 def is_plain(model: Model) -> bool:
     """Return whether the version has the plain structure: no effects around f(u) and a G of second order."""
     return not model.effects and stored_model.is_plain(stored_model.read(model))
+
+
+class Found(NamedTuple):
+    """The search that tells what a version lacks: where it is stored, and which of its models has that structure."""
+
+    place: Model
+    kind: str
+    number: int
 
 
 class Analyses:
@@ -60,27 +68,34 @@ class Analyses:
         return await self._find(model, "curves", "curves", model_json=stored_model.text(model))
 
     async def diagnosis(self, model: Model, on_call: OnCall | None = None) -> dict[str, Any]:
-        """Diagnose what the structure of a model lacks; versions with the plain structure share one diagnosis."""
-        return (await self._diagnose(model, on_call))[2]
+        """Diagnose what the structure of a model lacks; versions whose structures one search contains share it."""
+        return (await self._diagnose(model, on_call))[1]
 
-    async def _diagnose(self, model: Model, on_call: OnCall | None) -> tuple[Model, str, dict[str, Any]]:
-        place, kind = await asyncio.to_thread(self._criticised, model)
-        structure = {"model_json": stored_model.text(place)} if kind == OWN_DIAGNOSIS else {}
-        diagnosis = await self._find(place, kind, "diagnosis", on_call=on_call, **structure)
-        return place, kind, diagnosis
+    async def _diagnose(self, model: Model, on_call: OnCall | None) -> tuple[Found, dict[str, Any]]:
+        found = await asyncio.to_thread(self._search_of, model)
+        structure = {"model_json": stored_model.text(model)} if found.kind == OWN_DIAGNOSIS else {}
+        search = await self._find(found.place, found.kind, "diagnosis", on_call=on_call, **structure)
+        return found, _rows(search)[found.number]
 
-    def _criticised(self, model: Model) -> tuple[Model, str]:
-        """Return the version and the name that a diagnosis is stored under."""
-        if not is_plain(model):
-            return model, OWN_DIAGNOSIS
-        # the diagnosis of the plain structure is stored with the first version made from the recording
-        same_recording = Model.recording_id == model.recording_id
-        return self.store.first(Model, same_recording, order=Model.created_utc), DIAGNOSIS
+    def _search_of(self, model: Model) -> Found:
+        """Return the search from the plain structure, stored with the recording's first version, or the version's own.
+
+        A version is not searched again if a model of the plain one's search has its structure.
+        """
+        first = self.store.first(Model, Model.recording_id == model.recording_id, order=Model.created_utc)
+        if is_plain(model):
+            return Found(first, DIAGNOSIS, 0)
+        structure = {*stored_model.structure(stored_model.read(model)).values()}
+        for number, row in enumerate(_rows(self.known(first.id, DIAGNOSIS))):
+            if structure and {*row.get("structure", ())} == structure:
+                return Found(first, DIAGNOSIS, number)
+        return Found(model, OWN_DIAGNOSIS, 0)
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """Return the diagnosis, or None while there is none."""
-        place, kind = self._criticised(model)
-        return self.known(place.id, kind)
+        found = self._search_of(model)
+        rows = _rows(self.known(found.place.id, found.kind))
+        return rows[found.number] if rows else None
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
         """Return a stored analysis, or None."""
@@ -160,20 +175,32 @@ class Analyses:
             detail += " To add it against the evidence, send `force` and a reason; the held-out error shows its effect."
             title = "The recording gives no evidence for this effect"
             raise ApiError(409, "effect-not-there", title, detail, reasons=against)
-        free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in (diagnosis or {}).get("free") or []}
-        forms = free | stored_model.structure(stored_model.read(model))
-        with_forms = [forms.get(effect, effect) for effect in effects]
-        path = await asyncio.to_thread(self.path, model.recording_id)
-        fitted = await self.run("fit", on_call, data=path, method=model.method, effects=with_forms)
+        document = await asyncio.to_thread(self._searched, model, effects)
+        if document is None:
+            free = {row["effect"]: f"{row['effect']}:{row['form']}" for row in (diagnosis or {}).get("free") or []}
+            forms = free | stored_model.structure(stored_model.read(model))
+            with_forms = [forms.get(effect, effect) for effect in effects]
+            path = await asyncio.to_thread(self.path, model.recording_id)
+            fitted = await self.run("fit", on_call, data=path, method=model.method, effects=with_forms)
+            document = json.loads(fitted["json"])
 
         def store() -> Model:
-            row = self._child(model, added, json.loads(fitted["json"]), by, list(against))
+            row = self._child(model, added, document, by, list(against))
             if against or reason:
                 action = "force effect" if against else "add effect"
                 self.store.note(self.clock, by, action, row.id, effects=added, reason=reason)
             return row
 
         return await asyncio.to_thread(store)
+
+    def _searched(self, model: Model, effects: list[str]) -> dict[str, Any] | None:
+        """Return the model with these effects, if the search for what a version lacks contains it."""
+        found = self._search_of(model)
+        improvement = self.known(found.place.id, f"{IMPROVEMENT} of {found.kind}") or {"models": []}
+        for document in improvement["models"]:
+            if document["method"] == model.method and {each["id"] for each in document["effects"]} == {*effects}:
+                return document
+        return None
 
     async def check_known(self, effects: list[str]) -> None:
         """Refuse effects that are not in the library."""
@@ -188,19 +215,21 @@ class Analyses:
 
         They descend from the version whose structure was diagnosed; of the plain one there may be several.
         """
-        place, kind, _diagnosis = await self._diagnose(model, on_call)
+        found, diagnosis = await self._diagnose(model, on_call)
 
         def store() -> tuple[dict[str, Any], list[Model]]:
-            improvement = self.known(place.id, f"{IMPROVEMENT} of {kind}")
+            improvement = self.known(found.place.id, f"{IMPROVEMENT} of {found.kind}")
             assert improvement is not None, "kept with the diagnosis"
-            rows = [place]
-            if kind == DIAGNOSIS:
-                rows = [next((row for row in [place, *self.versions.ancestry(model)] if is_plain(row)), model)]
-            for step, document in zip(improvement["steps"], improvement.pop("models"), strict=True):
-                if step["added"] is not None:
-                    rows.append(self._child(rows[-1], [step["added"]], document, by))
+            rows = [model]
+            if (found.kind, found.number) == (DIAGNOSIS, 0):
+                rows = [next((row for row in [found.place, *self.versions.ancestry(model)] if is_plain(row)), model)]
+            first, *steps = improvement["steps"][found.number :]
+            for step, document in zip(steps, improvement.pop("models")[found.number + 1 :], strict=True):
+                rows.append(self._child(rows[-1], [step["added"]], document, by))
                 step["model_id"] = rows[-1].id
-            return improvement, rows
+            steps = [{**first, "added": None, "model_id": rows[0].id}, *steps]
+            about = {key: diagnosis[key] for key in ("verdict", "structure")}
+            return {**improvement, **about, "steps": steps}, rows
 
         return await asyncio.to_thread(store)
 
@@ -215,3 +244,8 @@ class Analyses:
         document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
         of = (parent.participant, parent.recording_id)
         return self.versions.add(json.dumps(document), *of, by, parent.id, ",".join(added))
+
+
+def _rows(search: dict[str, Any] | None) -> list[dict[str, Any]]:
+    """Return the diagnoses of a search's models; a search that an older version stored is that of its first one."""
+    return [] if search is None else search.get("rows", [search])

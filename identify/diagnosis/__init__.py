@@ -5,16 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from stimrig.identify.diagnosis.free import searched
+from stimrig.identify.diagnosis.free import search_record
 from stimrig.identify.diagnosis.result import diagnosis_of
-from stimrig.identify.diagnosis.search import Progress
+from stimrig.identify.diagnosis.search import EffectSearch, Progress
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.effects import find_effect
 from stimrig.identify.errors import BadRequest
 from stimrig.identify.estimation.effect_fit import fitted_with
-from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.experiments import NOTHING, Experiment, plan
 from stimrig.identify.model import Model
+from stimrig.identify.problem.predict import same_data
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Diagnosis
 
@@ -47,12 +47,25 @@ def diagnose(record: Record, model: Model | None = None, progress: Progress | No
     NotIdentifiable
         Less than three seconds may be fitted, or the record does not determine the model.
     """
-    structure = structure_of(model)
-    grid, raw = prepare(record)
-    result = diagnosis_of(*searched(grid, raw, progress, structure=structure))
+    result = diagnosis_of(search_for(record, model, progress))
     if progress is not None:
         progress(1.0, "done")
     return result
+
+
+def search_for(record: Record, model: Model | None = None, progress: Progress | None = None) -> EffectSearch:
+    """Search for what a model lacks on a record.
+
+    The model of a step of an earlier search of the same record is not searched again as such: that search is run, and
+    what the model lacks are the later steps. Parameters and errors are those of `diagnose`.
+    """
+    structure = structure_of(model)
+    if model is not None and "begun_with" in model.extra and same_data(model, record):
+        search = search_record(record, progress, model.extra["begun_with"])
+        number = model.extra.get("step", 0)
+        if number < len(search.steps) and search.steps[number].structure == structure:
+            return search.from_step(number)
+    return search_record(record, progress, structure)
 
 
 def structure_of(model: Model | None) -> list[str]:

@@ -15,7 +15,6 @@ from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.candidate_terms import MAX_TERMS, fit_terms, fix_noise
 from stimrig.identify.diagnosis.residual import vetoed
 from stimrig.identify.diagnosis.search import (
-    MAX_EFFECTS,
     EffectSearch,
     Progress,
     Step,
@@ -24,11 +23,11 @@ from stimrig.identify.diagnosis.search import (
     silent,
     without_effect,
 )
-from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free, leaves_more
-from stimrig.identify.dynamics.grid import Grid
+from stimrig.identify.diagnosis.verdict import judge, leaves_more
 from stimrig.identify.estimation.left_out import Difference, difference
-from stimrig.identify.estimation.samples import Raw, fitted_rows
+from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.estimation.solve import solve
+from stimrig.identify.records.record import Record
 
 RIVALS = 2
 """Terms kept beside the chosen one of a round: its likeliest rivals."""
@@ -36,36 +35,25 @@ Chain = tuple[Step, ...]
 """Steps of a search from its base on, the last ones with terms."""
 
 
-def searched(
-    grid: Grid,
-    raw: Raw,
-    progress: Progress | None = None,
-    *,
-    rows: np.ndarray | None = None,
-    max_effects: int = MAX_EFFECTS,
-    structure: Sequence[str] = (),
-) -> tuple[EffectSearch, Verdict]:
-    """The search for effects of the library, and then, where structure is left, for terms; and its verdict.
+def search_record(
+    record: Record, progress: Progress | None = None, structure: Sequence[str] = (), rows: np.ndarray | None = None
+) -> EffectSearch:
+    """Search a record for effects of the library, and then, where structure is left, for terms.
 
-    As `search_effects`; by default on all rows that may be fitted. A term is no name: where one is needed, the verdict
-    stays that structure is left.
+    As `search_effects`; by default on all rows that may be fitted.
     """
     report = progress or silent
+    grid, raw = prepare(record)
     rows = fitted_rows(grid, None) if rows is None else rows
-    search = search_effects(
-        grid, raw, rows, lambda done, text: report(0.7 * done, text), max_effects=max_effects, structure=structure
-    )
+    search = search_effects(grid, raw, rows, lambda done, text: report(0.7 * done, text), structure=structure)
     verdict = judge(search)
-    if max_effects == 0 or verdict.kind == "nothing_missing":
-        return search, verdict
+    if verdict.kind == "nothing_missing":
+        return search
     supported = helpful(search)[0]
     named = verdict.kind == "effect_missing" and bool(supported[-1].origin == "library" or not search.found)
     if named and not leaves_more(search, verdict):
-        return search, verdict
-    freely = explain_freely(search, supported if named else (), lambda done, text: report(0.7 + 0.25 * done, text))
-    if not freely.names("free"):
-        return search, verdict
-    return freely, judge_free(freely, verdict, named and freely.steps[: len(supported)] == [*supported])
+        return search
+    return explain_freely(search, supported if named else (), lambda done, text: report(0.7 + 0.25 * done, text))
 
 
 def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progress) -> EffectSearch:

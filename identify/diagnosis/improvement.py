@@ -6,17 +6,16 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from stimrig.identify.criticism import compare
-from stimrig.identify.diagnosis import diagnose, structure_of
-from stimrig.identify.diagnosis.free import searched
+from stimrig.identify.diagnosis import search_for
 from stimrig.identify.diagnosis.result import diagnosis_of
-from stimrig.identify.diagnosis.search import MAX_EFFECTS, EffectSearch, Progress, Step, helpful, silent
-from stimrig.identify.diagnosis.verdict import Verdict
+from stimrig.identify.diagnosis.search import EffectSearch, Progress, Step, helpful
+from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import likelihood_warnings, words
 from stimrig.identify.estimation.effect_fit import add_effect, effect_names
 from stimrig.identify.estimation.finish import finish
 from stimrig.identify.estimation.left_out import difference, from_to, hold_out
-from stimrig.identify.estimation.samples import Raw, prepare
+from stimrig.identify.estimation.samples import Raw
 from stimrig.identify.model import Model
 from stimrig.identify.records.record import HELD_OUT, Record
 from stimrig.identify.results import Diagnosis, Explanation, Improvement
@@ -62,15 +61,13 @@ def improve(
     """
     for effect in force:
         find_effect(effect)
-    limit = MAX_EFFECTS if max_effects is None else min(max_effects, MAX_EFFECTS)
-    structure = structure_of(model)
-    grid, raw = prepare(record)
-    search, verdict = searched(grid, raw, progress, max_effects=limit, structure=structure)
-    return _improvement_of(search, verdict, max_effects, force)
+    return _improvement_of(search_for(record, model, progress), max_effects, force)
 
 
 def explain(record: Record, progress: Progress | None = None, model: Model | None = None) -> Explanation:
-    """Compare, diagnose, improve, compare and diagnose again: how the model of a record was improved, and why.
+    """Say where the model of a record fails, what it lacks, how its error falls with that, and why that ends.
+
+    All of it comes from one search.
 
     Parameters
     ----------
@@ -87,21 +84,17 @@ def explain(record: Record, progress: Progress | None = None, model: Model | Non
     BadRequest, NotIdentifiable
         As `improve` and `diagnose` raise them.
     """
-    report = progress or silent
-    diagnosis, improvement = diagnose_and_improve(record, lambda share, text: report(0.6 * share, text), model)
-    first, last = improvement.models[0], improvement.models[-1]
-    remaining = diagnosis
-    if last is not first:  # a further search tries all forms beside what was added, as one of the last model would
-        remaining = diagnose(record, last, lambda share, text: report(0.6 + 0.4 * share, text))
-    before, after = (compare(compared, record) for compared in (first, last))
-    report(1.0, "done")
-    return Explanation(diagnosis=diagnosis, improvement=improvement, left=remaining, before=before, after=after)
+    diagnoses, improvement = diagnose_and_improve(record, progress, model)
+    before, after = (compare(compared, record) for compared in (improvement.models[0], improvement.models[-1]))
+    return Explanation(diagnosis=diagnoses[0], improvement=improvement, left=diagnoses[-1], before=before, after=after)
 
 
 def diagnose_and_improve(
     record: Record, progress: Progress | None = None, model: Model | None = None
-) -> tuple[Diagnosis, Improvement]:
-    """Return the results of `diagnose` and `improve` from one search. Parameters and errors are those of `improve`.
+) -> tuple[list[Diagnosis], Improvement]:
+    """Return what `improve` gives, and the diagnosis of each of its models, from one search.
+
+    Parameters and errors are those of `improve`.
 
     Parameters
     ----------
@@ -112,15 +105,15 @@ def diagnose_and_improve(
     model : Model, optional
         To begin with; default: the plain one.
     """
-    structure = structure_of(model)
-    grid, raw = prepare(record)
-    search, verdict = searched(grid, raw, progress, structure=structure)
-    return diagnosis_of(search, verdict), _improvement_of(search, verdict)
+    search = search_for(record, model, progress)
+    improvement = _improvement_of(search)
+    diagnoses = [diagnosis_of(search.from_step(number)) for number in range(len(improvement.models))]
+    if progress is not None:
+        progress(1.0, "done")
+    return diagnoses, improvement
 
 
-def _improvement_of(
-    search: EffectSearch, verdict: Verdict, max_effects: int | None = None, force: Sequence[str] = ()
-) -> Improvement:
+def _improvement_of(search: EffectSearch, max_effects: int | None = None, force: Sequence[str] = ()) -> Improvement:
     supported, against = helpful(search)
     steps = supported if max_effects is None else supported[: max_effects + 1]
     models, rows = [], []
@@ -128,7 +121,8 @@ def _improvement_of(
         reasons = likelihood_warnings(step.fitted)
         model = finish("maximum-likelihood", step.fitted, reasons, statistics=step.statistics)
         parent = models[-1].model_id if models else None
-        models.append(model.with_(extra=model.extra | {"parent": parent, "added": step.added, "step": number}))
+        found = {"parent": parent, "added": step.added, "step": search.number + number}
+        models.append(model.with_(extra=model.extra | found | {"begun_with": list(search.begun_with)}))
         reason = _reason(search, steps[number - 1], step, models[-1]) if number < len(steps) else FORCED
         rows.append(
             {"added": step.added}
@@ -137,7 +131,7 @@ def _improvement_of(
         )
     return Improvement(
         noise_sd_nm=search.raw.noise_sd_nm,
-        verdict=verdict.kind,
+        verdict=judge(search).kind,
         steps=tuple(rows),
         models=tuple(models),
         refused=(*against, *refused(search)),

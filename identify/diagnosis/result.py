@@ -12,7 +12,7 @@ from stimrig.identify.conclusion import conclude, only_open
 from stimrig.identify.criticism import worst_places
 from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful
 from stimrig.identify.diagnosis.thresholds import CLOSE, UNKNOWN_FORM
-from stimrig.identify.diagnosis.verdict import Verdict, leaves_more
+from stimrig.identify.diagnosis.verdict import Verdict, judge, leaves_more
 from stimrig.identify.effects import Effect, find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.finish import describe_parameters, finish
@@ -33,8 +33,9 @@ STATISTICS = (
 )  # fmt: skip
 
 
-def diagnosis_of(search: EffectSearch, verdict: Verdict) -> Diagnosis:
-    """The `Diagnosis` that a search and its verdict give."""
+def diagnosis_of(search: EffectSearch) -> Diagnosis:
+    """The `Diagnosis` that a search gives."""
+    verdict = judge(search)
     base, final = search.steps[0].statistics, search.steps[-1].statistics
     missing, free = _effects(search, verdict)
     residual = search.record.torque_nm - predict_fitted(search.base)[0]

@@ -71,6 +71,11 @@ class Step:
     known: LeftOut | None = None  # its errors on left-out blocks, where another process computed them
 
     @property
+    def structure(self) -> list[str]:
+        """Its effects with their forms, as MODEL.json lists them."""
+        return [f"{name}:{form.name}" for name, form in self.searched.written.effects]
+
+    @property
     def left_out(self) -> LeftOut:
         """Its errors on left-out blocks."""
         return leave_out(self.searched) if self.known is None else self.known
@@ -101,10 +106,12 @@ class EffectSearch:
 
     raw: Raw  # what the samples show before any fit
     rows: np.ndarray  # intervals that may be fitted, bool, shape (K,)
+    begun_with: tuple[str, ...]  # the structure from which it began: effects, "id" or "id:form"
     plain: Fitted  # the model without effects
     steps: list[Step]  # the model of the examined structure, then one effect more in each
     quiet: np.ndarray  # intervals in which the muscle rests, bool, shape (K,)
     refused: tuple[Candidate, ...] = ()  # effects of a last round in which none was chosen, best first
+    number: int = 0  # of the step that is examined, counted from that beginning
 
     @property
     def record(self) -> Record:
@@ -148,7 +155,14 @@ class EffectSearch:
 
     def margin(self, number: int) -> float:
         """Log evidence that an effect must gain in a round."""
-        return thresholds.NEXT_MARGIN if number or self.base_effects else thresholds.FIRST_MARGIN
+        seen = {effect for effect, _, _ in detected_effects(self.raw)}
+        return thresholds.NEXT_MARGIN if number or {*self.base_effects} - seen else thresholds.FIRST_MARGIN
+
+    def from_step(self, number: int) -> EffectSearch:
+        """The same search as one that examines the model of a step: what it lacks are the effects added after it."""
+        steps = self.steps[number:]
+        base = replace(steps[0], added=None, origin="base", tried=(), others=())
+        return replace(self, steps=[base, *steps[1:]], number=self.number + number)
 
     @property
     def residual(self) -> ResidualStructure:
@@ -162,12 +176,11 @@ def search_effects(
     rows: np.ndarray,
     progress: Progress | None = None,
     *,
-    max_effects: int = MAX_EFFECTS,
     structure: Sequence[str] = (),
 ) -> EffectSearch:
     """Try all effects on a record, add the best, and continue while the evidence is sufficient.
 
-    `grid` and `raw` are as `prepare` makes them, `rows` the pulse intervals to fit. At most `max_effects` effects are
+    `grid` and `raw` are as `prepare` makes them, `rows` the pulse intervals to fit. At most `MAX_EFFECTS` effects are
     added. `structure`: effects, "id" or "id:form", that the examined model already has. `progress` may raise
     `Cancelled`.
 
@@ -183,8 +196,8 @@ def search_effects(
         if effect not in effect_names(steps[-1].searched):
             fitted = fit_from(steps[-1].searched, effect, detected_form, values)
             steps.append(replace(steps[0], added=effect, searched=fitted, origin="detected"))
-    search = EffectSearch(raw, rows, plain, steps, quiet_rows(steps[-1].searched))
-    for number in range(max_effects):
+    search = EffectSearch(raw, rows, tuple(structure), plain, steps, quiet_rows(steps[-1].searched))
+    for number in range(MAX_EFFECTS):
         if not _add_best(search, progress or silent, number):
             break
         _exchange(search)

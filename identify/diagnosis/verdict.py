@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -104,23 +104,6 @@ def _notes(search: EffectSearch) -> list[str]:
     return [*([] if readings is None else [readings.words]), *likelihood_warnings(search.last)]
 
 
-def judge_free(search: EffectSearch, before: Verdict, named: bool) -> Verdict:
-    """The verdict with free effects. They name nothing: what was `named` of the library's effects stays."""
-    notes = _notes(search)
-    error = _held_out(search, notes)[0]
-    there = [str(step.added) for step in search.steps[1:] if not find_effect(str(step.added)).shape]
-    return replace(
-        before,
-        kind=before.kind if named else "unexplained_structure",
-        probability=before.probability if named else 0.9,
-        probabilities={effect: before.probabilities[effect] for effect in there},
-        explained=_explained(search),
-        structure=search.residual.ratio,
-        held_out_error=error,
-        notes=notes,
-    )
-
-
 def judge(search: EffectSearch) -> Verdict:
     """The verdict on a search for effects."""
     last, residual, notes = search.last, search.residual, _notes(search)
@@ -150,7 +133,8 @@ def judge(search: EffectSearch) -> Verdict:
         power = max(first.busy_nm**2 - residual.white_nm**2, 1e-12)
         explained = 1.0 - max(residual.busy_nm**2 - residual.white_nm**2, 0.0) / power
     error, contradicted = _held_out(search, notes)
-    if contradicted or _strange(search, effects, explained):
+    free = bool(search.names("free")) and not search.found
+    if contradicted or free or _strange(search, effects, explained):
         probabilities = {effect: min(p, thresholds.DOUBTED) for effect, p in probabilities.items()}
         kind, probability = "unexplained_structure", 0.9
     elif probabilities:

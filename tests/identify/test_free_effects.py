@@ -15,6 +15,7 @@ from bench.muscles.physics_records import record_of_physics
 from stimrig import identify
 from stimrig.identify.diagnosis import candidate_terms, free, result
 from stimrig.identify.diagnosis.search import resembles_earlier, search_effects, silent
+from stimrig.identify.diagnosis.verdict import judge
 from stimrig.identify.dynamics.linear import Discrete
 from stimrig.identify.dynamics.second_order import boundary_states
 from stimrig.identify.dynamics.terms import LARGEST, REACH, Driver, Place, lags_of, run_terms
@@ -153,7 +154,8 @@ def shortening() -> dict[str, Any]:
 @cache
 def found() -> tuple[Diagnosis, Improvement]:
     with few_effects.only(*TRIED):
-        return identify.diagnose_and_improve(strange())
+        diagnoses, improvement = identify.diagnose_and_improve(strange())
+        return diagnoses[0], improvement
 
 
 def unseen_error(model: Model) -> float:
@@ -220,9 +222,9 @@ def test_no_terms_are_taken_where_held_out_rows_speak_against_each(monkeypatch: 
     asked = []
     monkeypatch.setattr(free, "vetoed", lambda _before, after: asked.append(after.effects[-1][0]) or "no")
     with few_effects.only(*TRIED):
-        search, verdict = free.searched(*prepare(strange()))
+        search = free.search_record(strange())
     assert asked[0] == "free_width_by_torque" and len(asked) == len({*asked})
-    assert not search.names("free") and verdict.kind == "unexplained_structure"
+    assert not search.names("free") and judge(search).kind == "unexplained_structure"
 
 
 def test_a_model_has_no_more_terms_than_are_allowed_however_often_it_is_searched(monkeypatch: pytest.MonkeyPatch):
@@ -254,7 +256,7 @@ def test_efforts_at_work_are_refused_where_a_term_predicts_better(make: Callable
 def test_where_nothing_is_missing_nothing_free_is_added():
     record = hidden_muscles.record(seed=3, rate_hz=100)
     with few_effects.only(*(effect.id for effect in FREE), "fatigue"):
-        diagnosis, improvement = identify.diagnose_and_improve(record)
+        (diagnosis,), improvement = identify.diagnose_and_improve(record)
         assert improvement.steps[1:] == () and diagnosis.free == ()
         grid, raw = prepare(record)
         search = search_effects(grid, raw, fitted_rows(grid, None))
@@ -332,9 +334,8 @@ def test_a_zero_that_moves_from_rest_to_rest_is_held_as_slow_noise(zero_nm: floa
     """Else terms would take it up; the rest of the error stays white, however slow it is."""
     record = hidden_muscles.record(rate_hz=100)
     moving = zero_nm * np.sin(0.17 * record.time_s)
-    grid, raw = prepare(record.with_torque(record.torque_nm + moving))
-    plain = search_effects(grid, raw, fitted_rows(grid, None), silent, max_effects=0)
-    held_model = candidate_terms.fix_noise(plain.last)
+    grid, _ = prepare(record.with_torque(record.torque_nm + moving))
+    held_model = candidate_terms.fix_noise(fit_plain(grid, fitted_rows(grid, None)))
     noise, said = held_model.noise, " ".join(likelihood_warnings(held_model))
     assert ("white, beside a zero that wanders by" in said) is held
     assert noise.held and not noise.at_bound and (noise.share > 0.0) is held

@@ -286,7 +286,7 @@ def test_a_curve_that_is_no_smoothed_spline_stays_of_its_kind():
 def test_what_a_search_finds_is_shown_with_a_renewed_curve():
     with few_effects.only("passive_torque"):
         grid, raw = prepare(whole())
-        search = search_effects(grid, raw, fitted_rows(grid, None), max_effects=1)
+        search = search_effects(grid, raw, fitted_rows(grid, None))
         plain, found = search.steps
     assert plain.fitted is search.base and found.added == "passive_torque"
     assert found.fitted.log_evidence > search.last.log_evidence

@@ -13,7 +13,7 @@ import pytest
 from stimrig.identify.diagnosis import search, verdict
 from stimrig.identify.diagnosis.residual import HeldOutError, ResidualStructure
 from stimrig.identify.diagnosis.search import EffectSearch, Step
-from stimrig.identify.diagnosis.verdict import Verdict, judge, judge_free, shares
+from stimrig.identify.diagnosis.verdict import Verdict, judge, shares
 from stimrig.identify.effects import find_effect
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.readings import Readings
@@ -57,7 +57,7 @@ class Made:
         self.raw = SimpleNamespace(readings=None)
         self.left_by_first = self.left_by_last = self.left()
         self.search = EffectSearch(
-            raw=self.raw, rows=np.ones(4000, bool), plain=base, steps=[Step(None, base, "base")],
+            raw=self.raw, rows=np.ones(4000, bool), begun_with=(), plain=base, steps=[Step(None, base, "base")],
             quiet=np.zeros(4000, bool), refused=(candidate(FIRST, 1.0),),
         )  # fmt: skip
         monkeypatch.setattr(search, "share_at_rest", self._share_at_rest)
@@ -336,14 +336,18 @@ def test_little_to_explain_is_not_divided_by(made: Made):
     assert made.judged().explained == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize(("named", "kind", "probability"), [(False, "unexplained_structure", 0.9), (True, None, 0.62)])
-def test_terms_in_place_of_a_name_leave_nothing_of_its_probability(
-    monkeypatch: pytest.MonkeyPatch, named: bool, kind: str | None, probability: float
-):
-    for rule, value in (("_notes", []), ("_held_out", (None, False)), ("_explained", 0.9)):
-        monkeypatch.setattr(verdict, rule, lambda *_, value=value: value)
-    steps = [SimpleNamespace(added=None), SimpleNamespace(added="free_strength_by_drive")]
-    made: Any = SimpleNamespace(steps=steps, residual=SimpleNamespace(ratio=3.0))
-    before = Verdict("effect_missing", {FIRST: 0.62}, {}, 0.5, 5.0, 0.62)
-    after = judge_free(made, before, named)
-    assert (after.kind, after.probability, after.probabilities) == (kind or before.kind, probability, {})
+@pytest.mark.parametrize(("names", "kind"), [((), "unexplained_structure"), ((FIRST,), "effect_missing")])
+def test_terms_beside_no_name_leave_the_cause_open(made: Made, names: tuple[str, ...], kind: str):
+    for name in names:
+        made.add(name, 50.0, 90.0)
+    made.search.steps.append(Step("free_strength_by_drive", fitted(95.0, *names, "free_strength_by_drive"), "free"))
+    assert made.judged().kind == kind
+    assert made.judged().probabilities.keys() == {*names}
+
+
+def test_the_model_of_a_step_lacks_what_was_added_after_it(made: Made):
+    made.add(FIRST, 50.0, 60.0).add(SECOND, 20.0, 90.0)
+    whole = made.judged()
+    later = judge(made.search.from_step(1))
+    assert later.probabilities == {SECOND: whole.probabilities[SECOND]}
+    assert judge(made.search.from_step(2)).kind == "nothing_missing"
