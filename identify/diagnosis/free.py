@@ -23,7 +23,7 @@ from stimrig.identify.diagnosis.search import (
     silent,
     without_effect,
 )
-from stimrig.identify.diagnosis.verdict import judge, leaves_more
+from stimrig.identify.diagnosis.verdict import judge, leaves_more, remainder_of
 from stimrig.identify.estimation.left_out import Difference, difference
 from stimrig.identify.estimation.samples import fitted_rows, prepare
 from stimrig.identify.estimation.solve import solve
@@ -46,14 +46,31 @@ def search_record(
     grid, raw = prepare(record)
     rows = fitted_rows(grid, None) if rows is None else rows
     search = search_effects(grid, raw, rows, lambda done, text: report(0.7 * done, text), structure=structure)
-    verdict = judge(search)
-    if verdict.kind == "nothing_missing":
+    search = replace(search, known=remainder_of(search))
+    free = _with_terms(search, lambda done, text: report(0.7 + 0.25 * done, text))
+    return _without_doubted(search if free is search else replace(free, known=remainder_of(free)))
+
+
+def _without_doubted(search: EffectSearch) -> EffectSearch:
+    """The search up to the first of its models that, more probably, lacks nothing."""
+    for number in range(len(search.steps) - 1):
+        if judge(search.from_step(number)).kind == "nothing_missing":
+            first, doubted = search.steps[: number + 1], tuple(search.steps[number + 1 :])
+            why = "The evidence is for it, but records like this one showed it mostly where it was not there."
+            refused = [replace(c, refusal=why) if c.effect.id == doubted[0].added else c for c in doubted[0].tried]
+            return replace(search, steps=first, doubted=doubted, refused=tuple(refused))
+    return search
+
+
+def _with_terms(search: EffectSearch, progress: Progress) -> EffectSearch:
+    """The search with terms, where its effects leave more than noise."""
+    structure, supported = search.remainder.structure, helpful(search)[0]
+    if not structure and not search.names("detected", "library"):
         return search
-    supported = helpful(search)[0]
-    named = verdict.kind == "effect_missing" and bool(supported[-1].origin == "library" or not search.found)
-    if named and not leaves_more(search, verdict):
+    named = not structure and (supported[-1].origin == "library" or not search.found)
+    if named and not leaves_more(search):
         return search
-    return explain_freely(search, supported if named else (), lambda done, text: report(0.7 + 0.25 * done, text))
+    return explain_freely(search, supported if named else (), progress)
 
 
 def explain_freely(search: EffectSearch, named: Sequence[Step], progress: Progress) -> EffectSearch:

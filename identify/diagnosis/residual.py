@@ -141,3 +141,15 @@ def vetoed(before: Fitted, after: Fitted) -> str | None:
         return None
     errors = f"{old.rms_nm:.3g}", f"{new.rms_nm:.3g}"
     return f"Held out, the error of a pulse interval's mean torque would rise from {errors[0]} to {errors[1]} N·m."
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """What the last model of a search leaves."""
+
+    structure: bool  # whether the fitted or the held-out rows show that structure is left
+    explained: float  # share of the explainable log-likelihood that the effects explain
+    ratio: float  # log-likelihood by which the residuals at work and at rest still differ
+    held_out: HeldOutError | None  # None if held-out pulses cannot be judged
+    open_gain: float  # log evidence of the best effect that was tried last and is not in the model
+    notes: tuple[str, ...] = ()  # reasons, for people

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from itertools import pairwise
 from typing import Any
 
@@ -40,7 +41,7 @@ def diagnosis_of(search: EffectSearch) -> Diagnosis:
     missing, free = _effects(search, verdict)
     residual = search.record.torque_nm - predict_fitted(search.base)[0]
     counted = search.base.problem.setup.grid.counted
-    error = verdict.held_out_error
+    remainder = search.remainder
     fields: dict[str, Any] = {
         "noise_sd_nm": search.raw.noise_sd_nm,
         "slow_noise": {
@@ -56,11 +57,11 @@ def diagnosis_of(search: EffectSearch) -> Diagnosis:
         "where": tuple(worst_places(search.record, residual, search.raw.noise_sd_nm, rows=counted)),
         "with_all": {key: final[key] for key in STATISTICS} | {"noise_sd_nm": final["noise_sd_nm"]},
         "residual_check": _is_noise(search) if verdict.kind == "nothing_missing" else None,
-        "explained": verdict.explained,
-        "structure_left": verdict.structure,
-        "unseen": error and {"rms_nm": error.rms_nm, "allowed_nm": error.allowed_nm},
+        "explained": remainder.explained,
+        "structure_left": remainder.ratio,
+        "unseen": remainder.held_out and asdict(remainder.held_out),
         "candidates": tuple([_candidate(candidate) for candidate in tried] for tried in search.rounds),
-        "notes": tuple(verdict.notes),
+        "notes": remainder.notes,
     }
     fields["deciding_experiment"] = _deciding(search, verdict, fields)
     return Diagnosis(**fields, plain=tuple(_plain(search, fields)))
@@ -100,13 +101,15 @@ def _named(search: EffectSearch, verdict: Verdict, before: Step, step: Step) -> 
         (name for name in rivals if name and name != described.id and _is_rival(tried, rivals, described, name)),
         key=lambda name: -rivals[name],
     )
+    chance, others = verdict.probabilities[described.id], max(1.0 - rivals.get(described.id, 0.0), 1e-9)
+    chances = {name: (1.0 - chance) * share / others for name, share in rivals.items() if name}
     experiment = None
     if confused and not (described.band or find_effect(confused[0]).band):
         fits = {name: tried[name].fitted for name in (described.id, confused[0])}
         experiment = plan(search.record, fits)
     return {
         "part": described.part,
-        "probability": verdict.probabilities[described.id],
+        "probability": chance,
         "rms_before_nm": before.statistics["rms_nm"],
         "rms_after_nm": step.statistics["rms_nm"],
         "held_out_rms_before_nm": before.statistics["held_out_rms_nm"],
@@ -115,7 +118,7 @@ def _named(search: EffectSearch, verdict: Verdict, before: Step, step: Step) -> 
         "next_experiment": experiment.text if experiment else described.separated_by,
         "next_experiment_plan": experiment and _plan(experiment),
         "objection": verdict.objections.get(described.id),
-        "rival_probabilities": {name: p for name, p in rivals.items() if name and p >= 0.005},
+        "rival_probabilities": {name: p for name, p in (chances | {described.id: chance}).items() if p >= 0.005},
         "plain": described.plain,
     }
 
@@ -153,7 +156,7 @@ def _undecided(search: EffectSearch, verdict: Verdict, planned: bool) -> bool:
     """
     named = verdict.kind == "effect_missing" and not planned
     if named and not any(find_effect(name).sporadic for name in verdict.objections):
-        named = leaves_more(search, verdict) and all(find_effect(name).predictable for name in search.names("library"))
+        named = leaves_more(search) and all(find_effect(name).predictable for name in search.names("library"))
     if not named and verdict.kind != "unexplained_structure":
         return False
     still = search.record.angle_rad is None or not moves(search.last.problem.setup.grid, search.rows)

@@ -9,13 +9,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.candidate_terms import fit_terms, fix_noise
-from stimrig.identify.diagnosis.residual import ResidualStructure, quiet_rows, residual_structure, vetoed
+from stimrig.identify.diagnosis.residual import Remainder, ResidualStructure, quiet_rows, residual_structure, vetoed
 from stimrig.identify.diagnosis.side_by_side import side_by_side
 from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.effects import Effect, Form, find_effect, registry
@@ -112,6 +113,8 @@ class EffectSearch:
     quiet: np.ndarray  # intervals in which the muscle rests, bool, shape (K,)
     refused: tuple[Candidate, ...] = ()  # effects of a last round in which none was chosen, best first
     number: int = 0  # of the step that is examined, counted from that beginning
+    known: Remainder | None = None  # what the last model leaves, once the search has ended
+    doubted: tuple[Step, ...] = ()  # the steps that would follow: more probably, nothing is missing
 
     @property
     def record(self) -> Record:
@@ -140,8 +143,12 @@ class EffectSearch:
     @property
     def found(self) -> list[tuple[Step, Step]]:
         """For each effect of the library that was added, the step before it and its own."""
-        pairs = zip(self.steps, self.steps[1:], strict=False)
-        return [(before, step) for before, step in pairs if step.origin == "library"]
+        return [(before, step) for before, step in pairwise(self.steps) if step.origin == "library"]
+
+    @property
+    def open(self) -> list[tuple[Step, Step]]:
+        """The same for the effects that are doubted."""
+        return list(pairwise([self.steps[-1], *self.doubted]))
 
     @property
     def start(self) -> Step:
@@ -155,8 +162,18 @@ class EffectSearch:
 
     def margin(self, number: int) -> float:
         """Log evidence that an effect must gain in a round."""
-        seen = {effect for effect, _, _ in detected_effects(self.raw)}
-        return thresholds.NEXT_MARGIN if number or {*self.base_effects} - seen else thresholds.FIRST_MARGIN
+        return thresholds.NEXT_MARGIN if number or {*self.base_effects} - self.seen else thresholds.FIRST_MARGIN
+
+    @property
+    def seen(self) -> set[str]:
+        """Effects that the samples show."""
+        return {effect for effect, _, _ in detected_effects(self.raw)}
+
+    @property
+    def remainder(self) -> Remainder:
+        """What the last model leaves: the same from whichever step it is looked at."""
+        assert self.known is not None, "the search has ended"
+        return self.known
 
     def from_step(self, number: int) -> EffectSearch:
         """The same search as one that examines the model of a step: what it lacks are the effects added after it."""

@@ -1,4 +1,4 @@
-"""The verdict of a search for effects, with probabilities calibrated on development records (docs/diagnosis.md)."""
+"""The verdict of a search for effects."""
 
 from __future__ import annotations
 
@@ -8,13 +8,15 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
-from stimrig.identify.diagnosis.residual import HeldOutError, held_out_error, residual_structure, vetoed
-from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work, resembles_earlier
+from stimrig.identify.diagnosis.probability import probability, scores_of_effect, scores_of_remainder
+from stimrig.identify.diagnosis.residual import HeldOutError, Remainder, held_out_error, residual_structure, vetoed
+from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import likelihood_warnings
-from stimrig.identify.estimation.effect_fit import Candidate
+from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.solve import Fitted
 
+LIKELIER_THAN_NOT = 0.5
 LONGEST_HELD_S = 0.05
 """A reading that is held for longer than two pulses hides how the torque rises and falls."""
 
@@ -24,18 +26,16 @@ class Verdict:
     """The verdict on a search for effects."""
 
     kind: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
-    probabilities: dict[str, float]  # by effect, of those added
-    rivals: dict[str, dict[str, float]]  # for each effect found: probabilities of all effects tried in the same round
-    explained: float  # share of the explainable log-likelihood that the effects explain
-    structure: float  # log-likelihood by which the residuals at work and at rest still differ
     probability: float  # of the verdict as a whole
-    held_out_error: HeldOutError | None = None  # of the last model; None if held-out pulses cannot be judged
-    notes: list[str] = field(default_factory=list)  # reasons, for people
+    probabilities: dict[str, float]  # by effect, of those added
+    left: float  # probability that something else is missing
+    rivals: dict[str, dict[str, float]] = field(default_factory=dict)
+    """For each effect found: the shares of all effects tried in the same round."""
     objections: dict[str, str] = field(default_factory=dict)  # by effect: what speaks against it
 
 
 def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[str, float]:
-    """Probability of each candidate, and under the key "" that none of them is there.
+    """Share of probability of each candidate, and under the key "" that none of them is there.
 
     Gains are limited to `max_gain`, that of the effect which was added: where the likelihood decides nothing, a
     likelier candidate is only a rival.
@@ -48,12 +48,70 @@ def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[st
     # An effect whose gain equals the margin has a probability of one half.
     weights[""] = float(np.exp(np.clip(thresholds.FIRST_MARGIN - top, -60.0, 60.0)))
     total = sum(weights.values())
-    return {name: (1.0 - thresholds.UNKNOWN_FORM) * weight / total for name, weight in weights.items()}
+    return {name: weight / total for name, weight in weights.items()}
 
 
-def _nothing(candidates: Sequence[Candidate]) -> float:
-    """Probability that none of the candidates is there."""
-    return 1.0 / (1.0 + sum(float(np.exp(min(c.gain - thresholds.FIRST_MARGIN, 60.0))) for c in candidates))
+def judge(search: EffectSearch) -> Verdict:
+    """The verdict on a search that has ended."""
+    probabilities = dict.fromkeys(search.names("detected"), probability("seen", {}))
+    rivals, objections, doubts = {}, {}, 1.0
+    for before, step in [*search.found, *search.open]:
+        effect, shares_there, objection = str(step.added), _rivals(search, step), _objection(before, step)
+        scores = scores_of_effect(search, before, step, shares_there[effect], objection is not None)
+        doubts *= 1.0 - (chance := probability("missing", scores))
+        if step not in search.doubted:
+            probabilities[effect], rivals[effect] = chance, shares_there
+            objections |= {effect: objection} if objection else {}
+    free = bool(search.names("free"))
+    left = probability("left", scores_of_remainder(search))
+    nothing = (1.0 - left) * doubts * float(not search.names("detected"))
+    best, named = max(probabilities.values(), default=0.0), bool(search.found) or not free
+    if best >= LIKELIER_THAN_NOT and named and not search.remainder.structure:
+        kind, certainty = "effect_missing", best
+    elif nothing >= LIKELIER_THAN_NOT and not free:
+        kind, certainty = "nothing_missing", nothing
+    else:
+        kind, certainty = "unexplained_structure", left if best >= LIKELIER_THAN_NOT else 1.0 - nothing
+    return Verdict(kind, certainty, probabilities, left, rivals, objections)
+
+
+def _objection(before: Step, step: Step) -> str | None:
+    """Return what speaks against an effect, in words; None if nothing does."""
+    if objection := vetoed(before.searched, step.searched):
+        return objection
+    if find_effect(str(step.added)).band and _swings(step.searched):
+        return "Its wave dies away so soon that the pulses may set it off: a limb may swing."
+    return None
+
+
+def remainder_of(search: EffectSearch) -> Remainder:
+    """Look at what the last model of a search leaves, by rules; `judge` makes probabilities of it."""
+    last, residual, readings = search.last, search.residual, search.raw.readings
+    effects = [*search.base_effects, *search.names("detected", "library")]
+    explained = _explained(search) if effects else 0.0
+    if last.noise.band > 0.0:
+        # The narrow band itself is not structure: what counts is what remains beside it.
+        first = residual_structure(search.start.searched, search.quiet)
+        power = max(first.busy_nm**2 - residual.white_nm**2, 1e-12)
+        explained = 1.0 - max(residual.busy_nm**2 - residual.white_nm**2, 0.0) / power
+    before, after = (held_out_error(fitted, last) for fitted in (_first(search), last))
+    contradicted = after is not None and _contradicted(before, after)
+    notes = [*([] if readings is None else [readings.words]), *likelihood_warnings(last)]
+    if after is not None and contradicted:
+        notes.append(
+            f"On held-out pulses the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
+            "allow: something is still missing."
+        )
+    held = effect_names(last)
+    tried = next(reversed(search.rounds), ())
+    return Remainder(
+        structure=contradicted or _strange(search, effects, explained),
+        explained=float(explained),
+        ratio=float(residual.ratio),
+        held_out=after,
+        open_gain=max((candidate.gain for candidate in tried if candidate.effect.id not in held), default=0.0),
+        notes=tuple(notes),
+    )
 
 
 def _no_effort(search: EffectSearch) -> bool:
@@ -75,18 +133,6 @@ def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
     return before is None or after.excess_nm > thresholds.HELD_OUT_SHARE * before.excess_nm
 
 
-def _held_out(search: EffectSearch, notes: list[str]) -> tuple[HeldOutError | None, bool]:
-    """The last model's error on held-out pulses, and whether it shows that structure is left; then with a note."""
-    before, after = (held_out_error(fitted, search.last) for fitted in (_first(search), search.last))
-    contradicted = after is not None and _contradicted(before, after)
-    if after is not None and contradicted:
-        notes.append(
-            f"On held-out pulses the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
-            "allow: something is still missing."
-        )
-    return after, contradicted
-
-
 def _first(search: EffectSearch) -> Fitted:
     """The model from which it is measured what effects explain."""
     return search.plain if search.base_effects else search.start.searched
@@ -99,80 +145,19 @@ def _explained(search: EffectSearch) -> float:
     return float((search.last.log_likelihood - first.log_likelihood) / max(possible, 1.0))
 
 
-def _notes(search: EffectSearch) -> list[str]:
-    readings = search.raw.readings
-    return [*([] if readings is None else [readings.words]), *likelihood_warnings(search.last)]
-
-
-def judge(search: EffectSearch) -> Verdict:
-    """The verdict on a search for effects."""
-    last, residual, notes = search.last, search.residual, _notes(search)
-    effects = [*search.base_effects, *search.names("detected", "library")]
-    probabilities: dict[str, float] = dict.fromkeys(search.names("detected"), 0.99)
-    rivals: dict[str, dict[str, float]] = {}
-    objections: dict[str, str] = {}
-    largest = 1.0  # a later effect is at most as probable as those before it
-    for before, step in search.found:
-        effect = str(step.added)
-        rivals[effect] = _rivals(search, step)
-        repairs = resembles_earlier(before.searched, find_effect(effect), _stage(step), search.names("detected"))
-        if repairs or only_at_work(search.quiet, step.searched, effect):
-            largest = min(largest, thresholds.UNSURE)
-        if objection := vetoed(before.searched, step.searched):
-            notes.append(f"The error on held-out pulses rises with this effect: {find_effect(effect).name}.")
-        elif find_effect(effect).band and _swings(step.searched):
-            objection = "Its wave dies away so soon that the pulses may set it off: a limb may swing."
-        if objection:
-            objections[effect] = objection
-            largest = min(largest, thresholds.DOUBTED)
-        probabilities[effect] = largest = min(largest, rivals[effect][effect])
-    explained = _explained(search) if effects else 0.0
-    if last.noise.band > 0.0:
-        # The narrow band itself is not structure: what counts is what remains beside it.
-        first = residual_structure(search.start.searched, search.quiet)
-        power = max(first.busy_nm**2 - residual.white_nm**2, 1e-12)
-        explained = 1.0 - max(residual.busy_nm**2 - residual.white_nm**2, 0.0) / power
-    error, contradicted = _held_out(search, notes)
-    free = bool(search.names("free")) and not search.found
-    if contradicted or free or _strange(search, effects, explained):
-        probabilities = {effect: min(p, thresholds.DOUBTED) for effect, p in probabilities.items()}
-        kind, probability = "unexplained_structure", 0.9
-    elif probabilities:
-        kind, probability = "effect_missing", max(probabilities.values())
-    else:
-        kind, probability = "nothing_missing", _nothing(search.rounds[0] if search.rounds else [])
-    return Verdict(
-        kind,
-        probabilities,
-        rivals,
-        float(explained),
-        float(residual.ratio),
-        float(probability),
-        error,
-        notes,
-        objections,
-    )
-
-
-def leaves_more(search: EffectSearch, verdict: Verdict) -> bool:
+def leaves_more(search: EffectSearch) -> bool:
     """Return True if the last model leaves more than noise: its effects may be true, and another one missing."""
-    error, setup = verdict.held_out_error, search.last.problem.setup
+    error, setup = search.remainder.held_out, search.last.problem.setup
     noise_nm = setup.grid.mean_noise_nm(setup.fitted)
     unseen = error is not None and error.ratio > thresholds.NAMED_BUT
     return unseen or search.residual.significant or search.last.rms_nm > thresholds.NAMED_BUT * noise_nm
 
 
 def _rivals(search: EffectSearch, step: Step) -> dict[str, float]:
-    """Probabilities of the effects tried in the round of a step, without those of other rounds."""
-    others = {*search.names("library")} - {step.added}
+    """Shares of the effects tried in the round of a step, without those of other rounds."""
+    others = {*effect_names(search.last)} - {step.added}
     competitors = [c for c in step.tried if c.refusal is None and c.effect.id not in others]
     return shares(competitors, next(c.gain for c in competitors if c.effect.id == step.added))
-
-
-def _stage(step: Step) -> str:
-    """The stage of the form that was added; of a narrow band, the first form's."""
-    added = find_effect(str(step.added))
-    return dict(step.searched.effects).get(added.id, added.forms[0]).stage
 
 
 def _strange(search: EffectSearch, effects: list[str], explained: float) -> bool:

@@ -1,0 +1,74 @@
+"""Probabilities of what a diagnosis states: logistic functions of what the search found.
+
+Their weights were fitted on records with known truth (`python -m bench.calibration`), and no score speaks against a
+statement where it should speak for it: all weights are positive. docs/diagnosis.md says how well they hold.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import cache
+from importlib.resources import files
+
+import numpy as np
+
+from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work, resembles_earlier
+from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation.effect_fit import effect_names
+from stimrig.identify.estimation.left_out import difference
+
+Scores = dict[str, float]
+"""What speaks for a statement, by name; larger values make it more probable."""
+GAINS = (3.0, 3000.0)
+"""Log evidence between which more of it makes an effect more probable."""
+LARGEST_ODDS = 5.0
+"""Largest logarithm of the odds against rivals that counts."""
+FALLS = (-2.0, 8.0)
+"""Standard errors of the left-out error between which its fall counts."""
+
+
+@cache
+def weights() -> Mapping[str, Scores]:
+    """The weights of the scores of each statement; "" is the constant."""
+    text = (files("stimrig.identify.diagnosis") / "probability.json").read_text("utf-8")
+    return json.loads(text)["weights"]
+
+
+def probability(statement: str, scores: Scores) -> float:
+    """Probability, 0 to 1, of a statement, one of `weights`, from its scores."""
+    known = weights()[statement]
+    return float(1.0 / (1.0 + np.exp(-known[""] - sum(known[name] * value for name, value in scores.items()))))
+
+
+def scores_of_remainder(search: EffectSearch) -> Scores:
+    """Return what speaks for something that is missing beside the effects which are named."""
+    remainder = search.remainder
+    held_out = remainder.held_out.ratio if remainder.held_out else 1.0
+    return {
+        "structure": float(remainder.structure),
+        "terms": float(bool(search.names("free"))),
+        "held out": float(np.log(np.clip(held_out, 0.5, 6.0))),
+        "work and rest": float(np.log1p(max(remainder.ratio, 0.0))),
+        "open": float(np.log1p(np.clip(remainder.open_gain, 0.0, 300.0))),
+    }
+
+
+def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: float, objected: bool) -> Scores:
+    """Return what speaks for an effect that a search added; `share`: its share of probability among its rivals."""
+    effect = find_effect(str(step.added))
+    gain = next(candidate.gain for candidate in step.tried if candidate.effect.id == effect.id)
+    stage = dict(step.searched.effects).get(effect.id, effect.forms[0]).stage
+    left = scores_of_remainder(search)
+    fall = difference(before.left_out, step.left_out).errors if effect.predictable else FALLS[0]
+    return {
+        "gain": float(np.log(np.clip(gain, *GAINS))),
+        "rivals": float(np.clip(np.log(share / max(1.0 - share, 1e-9)), -LARGEST_ODDS, LARGEST_ODDS)),
+        "fall": float(np.clip(fall, *FALLS)),
+        "first": -float(any(name not in search.seen for name in effect_names(before.searched))),
+        "no repair": -float(resembles_earlier(before.searched, effect, stage, search.seen)),
+        "at rest": -float(only_at_work(search.quiet, step.searched, effect.id)),
+        "no objection": -float(objected),
+        "error": float(np.log(np.clip(before.searched.rms_nm / search.residual.white_nm, 1.0, 30.0))),
+        **{f"no {name}": -left[name] for name in ("structure", "terms", "held out", "work and rest")},
+    }
