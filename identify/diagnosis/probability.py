@@ -13,6 +13,7 @@ from importlib.resources import files
 
 import numpy as np
 
+from stimrig.identify.diagnosis.objections import at_bounds
 from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work, resembles_earlier
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import effect_names
@@ -69,6 +70,7 @@ def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: floa
         "no repair": -float(resembles_earlier(before.searched, effect, stage, search.seen)),
         "at rest": -float(only_at_work(search.quiet, step.searched, effect.id)),
         "no objection": -float(objected),
+        "within bounds": -float(bool(at_bounds(step.searched, effect.id))),
         "error": float(np.log(np.clip(before.searched.rms_nm / search.residual.white_nm, 1.0, 30.0))),
         **{f"no {name}": -left[name] for name in ("structure", "terms", "held out", "work and rest")},
     }

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from stimrig.identify.diagnosis import thresholds
+from stimrig.identify.diagnosis.objections import objection_to
 from stimrig.identify.diagnosis.probability import probability, scores_of_effect, scores_of_remainder
-from stimrig.identify.diagnosis.residual import HeldOutError, Remainder, held_out_error, residual_structure, vetoed
+from stimrig.identify.diagnosis.residual import HeldOutError, Remainder, held_out_error, residual_structure
 from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import likelihood_warnings
@@ -56,7 +57,7 @@ def judge(search: EffectSearch) -> Verdict:
     probabilities = dict.fromkeys(search.names("detected"), probability("seen", {}))
     rivals, objections, doubts = {}, {}, 1.0
     for before, step in [*search.found, *search.open]:
-        effect, shares_there, objection = str(step.added), _rivals(search, step), _objection(before, step)
+        effect, shares_there, objection = str(step.added), _rivals(search, step), objection_to(before, step)
         scores = scores_of_effect(search, before, step, shares_there[effect], objection is not None)
         doubts *= 1.0 - (chance := probability("missing", scores))
         if step not in search.doubted:
@@ -73,15 +74,6 @@ def judge(search: EffectSearch) -> Verdict:
     else:
         kind, certainty = "unexplained_structure", left if best >= LIKELIER_THAN_NOT else 1.0 - nothing
     return Verdict(kind, certainty, probabilities, left, rivals, objections)
-
-
-def _objection(before: Step, step: Step) -> str | None:
-    """Return what speaks against an effect, in words; None if nothing does."""
-    if objection := vetoed(before.searched, step.searched):
-        return objection
-    if find_effect(str(step.added)).band and _swings(step.searched):
-        return "Its wave dies away so soon that the pulses may set it off: a limb may swing."
-    return None
 
 
 def remainder_of(search: EffectSearch) -> Remainder:
@@ -119,11 +111,6 @@ def _no_effort(search: EffectSearch) -> bool:
     step = search.found[0][1]
     effort, holder = str(step.added), step.searched
     return only_at_work(search.quiet, holder, effort) and "resisting" in dict(holder.effects)[effort].name
-
-
-def _swings(fitted: Fitted) -> bool:
-    """Return True if the narrow band dies away sooner than a tremor does."""
-    return fitted.noise.band_s(fitted.problem.setup.grid.step_s) < thresholds.SHORTEST_WAVE_S
 
 
 def _contradicted(before: HeldOutError | None, after: HeldOutError) -> bool:
