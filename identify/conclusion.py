@@ -14,9 +14,9 @@ from stimrig.identify.yardstick import held_out_pulses
 
 WITHIN_NOISE = 2.5
 """Error on held-out pulses, divided by all noise, up to which there is no warning; slow noise alone gives 1.4."""
-OPEN = 0.5
+OPEN = 0.75
 """Probability that nothing is missing, below which the question is open."""
-VERY_PROBABLE, PROBABLE = 0.9, 0.6
+VERY_PROBABLE, PROBABLE = 0.9, 0.5
 """Probabilities above which the words are "very probably" and "probably"."""
 
 STRUCTURE_LEFT = "The error has structure that no effect of the library explains"

@@ -48,10 +48,10 @@ def search_record(
     search = search_effects(grid, raw, rows, lambda done, text: report(0.7 * done, text), structure=structure)
     search = replace(search, known=remainder_of(search))
     free = _with_terms(search, lambda done, text: report(0.7 + 0.25 * done, text))
-    return _without_doubted(search if free is search else replace(free, known=remainder_of(free)))
+    return without_doubted(search if free is search else replace(free, known=remainder_of(free)))
 
 
-def _without_doubted(search: EffectSearch) -> EffectSearch:
+def without_doubted(search: EffectSearch) -> EffectSearch:
     """The search up to the first of its models that, more probably, lacks nothing."""
     for number in range(len(search.steps) - 1):
         if judge(search.from_step(number)).kind == "nothing_missing":

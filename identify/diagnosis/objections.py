@@ -14,7 +14,9 @@ from stimrig.identify.estimation.solve import Fitted
 AT_BOUND = 1e-3
 """Part of the range of a parameter in which it counts as being at its bound."""
 IN_TIME = 0.6
-"""Share of the changes of the pulse width that come at a fixed clock: a PRBS, and ramps, which change at each pulse."""
+"""Share of the large changes of the pulse width that come at a fixed clock, as in a PRBS."""
+LARGE = 0.2
+"""A change above this share of the largest one is large; those of ramps are not."""
 CLOCK_HZ = 0.2
 """A wave so near a multiple of that clock has its frequency."""
 
@@ -52,7 +54,8 @@ def at_bounds(fitted: Fitted, effect: str) -> list[str]:
 
 def _keeps_time(wave_hz: float, grid: Grid) -> bool:
     """Return True if the pulse widths change at a fixed clock, and a wave has its frequency or a multiple of it."""
-    apart = np.diff(np.flatnonzero(np.diff(grid.pulse_width_us)))
+    steps_us = np.abs(np.diff(grid.pulse_width_us))
+    apart = np.diff(np.flatnonzero(steps_us > LARGE * np.max(steps_us, initial=0.0)))
     longest = int(np.bincount(apart).argmax()) if apart.size else 0
     clock = next((steps for steps in range(longest, 1, -1) if np.mean(apart % steps == 0) > IN_TIME), 0)
     turns = wave_hz * clock * grid.step_s

@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
 
-from stimrig.identify.diagnosis import search, verdict
-from stimrig.identify.diagnosis.residual import HeldOutError, ResidualStructure
+from stimrig.identify.diagnosis import objections, search, verdict
+from stimrig.identify.diagnosis import probability as probabilities
+from stimrig.identify.diagnosis.free import without_doubted
+from stimrig.identify.diagnosis.probability import probability, scores_of_effect, scores_of_remainder, weights
+from stimrig.identify.diagnosis.residual import HeldOutError, Remainder, ResidualStructure
 from stimrig.identify.diagnosis.search import EffectSearch, Step
-from stimrig.identify.diagnosis.verdict import Verdict, judge, shares
+from stimrig.identify.diagnosis.verdict import judge, remainder_of, shares
 from stimrig.identify.effects import find_effect
+from stimrig.identify.estimation.effect_fit import Candidate
 from stimrig.identify.noise import NoiseLevel
 from stimrig.identify.records.readings import Readings
 
@@ -22,7 +26,7 @@ FIRST, SECOND, EFFORT, TREMOR = "fatigue", "output_saturation", "voluntary_effor
 
 
 def candidate(effect: str, gain: float) -> Any:
-    return SimpleNamespace(effect=find_effect(effect), gain=gain, refusal=None)
+    return Candidate(find_effect(effect), find_effect(effect).forms[0], cast("Any", None), gain, {})
 
 
 def fitted(log_likelihood: float, *effects: str, wave_s: float = 1.0, **parameters: float) -> Any:
@@ -37,6 +41,7 @@ def fitted(log_likelihood: float, *effects: str, wave_s: float = 1.0, **paramete
     )
     return SimpleNamespace(
         log_likelihood=log_likelihood - 20.0,
+        rms_nm=2.0,
         heavy_tails=False,
         effects=forms,
         noise=NoiseLevel(0.5, 0.5, 1.0, decay=1.0 - 0.025 / wave_s),
@@ -63,7 +68,12 @@ class Made:
         monkeypatch.setattr(search, "share_at_rest", self._share_at_rest)
         for module in (search, verdict):
             monkeypatch.setattr(module, "residual_structure", self._residual)
-        monkeypatch.setattr(verdict, "vetoed", self._rise)
+        for name, value in (("objection_to", None), ("at_bounds", [])):
+            for module in (verdict, probabilities):
+                monkeypatch.setattr(module, name, lambda *_, value=value: value, raising=False)
+        monkeypatch.setattr(EffectSearch, "seen", {"mains_hum"})
+        monkeypatch.setattr(Step, "left_out", None)
+        monkeypatch.setattr(probabilities, "difference", lambda *_: SimpleNamespace(errors=3.0))
         monkeypatch.setattr(verdict, "held_out_error", self._unseen)
 
     def left(
@@ -71,7 +81,7 @@ class Made:
         ratio: float = 0.0,
         ideal: float = 80.0,
         busy_nm: float = 1.0,
-        white_nm: float = 0.0,
+        white_nm: float = 1e-3,
         scale_nm: float = 9.0,
     ) -> ResidualStructure:
         return ResidualStructure(white_nm, busy_nm, ratio, ideal, scale_nm=scale_nm)
@@ -96,8 +106,18 @@ class Made:
     def last(self) -> Any:
         return self.search.last
 
-    def judged(self) -> Verdict:
-        return judge(self.search)
+    def left_over(self) -> Remainder:
+        return remainder_of(self.search)
+
+    def ended(self, **changes: Any) -> EffectSearch:
+        """The search with what its last model leaves."""
+        self.search.known = replace(self.left_over(), **changes)
+        return self.search
+
+    def scores(self, effect: str) -> dict[str, float]:
+        search = self.ended()
+        before, step = next(pair for pair in search.found if pair[1].added == effect)
+        return scores_of_effect(search, before, step, verdict._rivals(search, step)[effect], False)
 
     def held(self, held_s: float) -> Made:
         """A recorder that holds each reading so long, at 400 samples a second."""
@@ -129,60 +149,17 @@ def made(monkeypatch: pytest.MonkeyPatch) -> Made:
     return Made(monkeypatch)
 
 
-def test_nothing_missing(made: Made):
-    found = made.judged()
-    assert (found.kind, found.probabilities, found.rivals, found.notes) == ("nothing_missing", {}, {}, [])
-    assert (found.explained, found.structure) == (0.0, 0.0)
-    assert found.held_out_error is None
-    assert found.probability == pytest.approx(1 / (1 + np.exp(1.0 - 4.5)))
-    made.search.refused = (candidate(FIRST, 4.5), candidate(SECOND, 3.5))
-    assert made.judged().probability == pytest.approx(1 / (1 + 1 + np.exp(-1.0)))
-    made.search.refused = ()
-    assert made.judged().probability == 1.0
-    made.search.refused = (candidate(FIRST, 1e6),)
-    assert made.judged().probability == pytest.approx(1 / (1 + np.exp(60.0)), rel=1e-9, abs=0)
-
-
 def test_probabilities_of_rivals():
     assert shares([]) == {"": 1.0}
     found = shares([candidate(FIRST, 20.0), candidate(SECOND, 17.4), candidate("potentiation", -1e9)])
     weights = {FIRST: 1.0, SECOND: np.exp(-1.0), "potentiation": np.exp(-60.0), "": np.exp(4.5 - 20.0)}
     total = sum(weights.values())
-    assert found == pytest.approx({name: 0.96 * weight / total for name, weight in weights.items()}, rel=1e-9, abs=0)
+    assert found == pytest.approx({name: weight / total for name, weight in weights.items()}, rel=1e-9, abs=0)
     low = shares([candidate(FIRST, -2.0), candidate(SECOND, -4.0)])
     assert low[SECOND] / low[FIRST] == pytest.approx(np.exp(-1.0)), "a negative gain does not narrow the spread"
     assert low[""] / low[FIRST] == pytest.approx(np.exp(6.5))
-    assert shares([candidate(FIRST, 1e6)])[""] == pytest.approx(0.96 * np.exp(-60.0), rel=1e-9, abs=0)
-    assert shares([candidate(FIRST, -1e6)])[FIRST] == pytest.approx(0.96 * np.exp(-60.0), rel=1e-9, abs=0)
-
-
-def test_an_effect_missing(made: Made):
-    found = made.add(FIRST, 50.0, 80.0, rival=48.0).leaves(ratio=3.0).judged()
-    assert found.kind == "effect_missing"
-    assert found.explained == pytest.approx(0.8)
-    assert found.structure == 3.0
-    assert found.rivals == {FIRST: shares([candidate(FIRST, 50.0), candidate("potentiation", 48.0)])}
-    assert found.probabilities == {FIRST: found.rivals[FIRST][FIRST]}
-    assert found.probability == found.probabilities[FIRST]
-
-
-def test_what_was_added_later_stands_on_what_was_added_before(made: Made):
-    made.add(FIRST, 50.0, 40.0, rival=50.0).add(SECOND, 90.0, 90.0)
-    first = made.search.steps[1]
-    made.search.steps[1] = replace(first, tried=(*first.tried, candidate(SECOND, 49.0)))  # no rival in this round
-    found = made.judged()
-    assert found.rivals[SECOND][SECOND] > 0.9
-    assert found.probabilities[SECOND] == found.probabilities[FIRST] == found.rivals[FIRST][FIRST] < 0.5
-    assert set(found.rivals[FIRST]) == {FIRST, "potentiation", ""}
-    assert found.probability == found.probabilities[FIRST]
-
-
-def test_effects_seen_in_the_raw_samples_are_almost_certain(made: Made):
-    made.detect("mains_hum", 30.0)
-    found = made.judged()
-    assert (found.kind, found.probabilities, found.probability) == ("effect_missing", {"mains_hum": 0.99}, 0.99)
-    made.add(FIRST, 50.0, 65.0)
-    assert made.judged().explained == pytest.approx(35.0 / 70.0), "what was given counts as known"
+    assert shares([candidate(FIRST, 1e6)])[""] == pytest.approx(np.exp(-60.0), rel=1e-9, abs=0)
+    assert shares([candidate(FIRST, -1e6)])[FIRST] == pytest.approx(np.exp(-60.0), rel=1e-9, abs=0)
 
 
 EFFORTS = {f"centre_{i}": 10.0 * i for i in range(3)} | {"width_0": 1.0, "decay_0": 1.0}
@@ -193,7 +170,7 @@ def trembling(made: Made, busy_nm: float, ratio: float, wave_s: float = 1.0) -> 
     made.left_by_first = made.left(busy_nm=0.3, white_nm=0.2)
     made.add(TREMOR, 50.0, 90.0, wave_s=wave_s).leaves(ratio=ratio, busy_nm=busy_nm, white_nm=0.2)
     made.last.noise = replace(made.last.noise, band=0.5)
-    assert made.judged().explained == pytest.approx(1 - (busy_nm**2 - 0.04) / 0.05)
+    assert made.left_over().explained == pytest.approx(1 - (busy_nm**2 - 0.04) / 0.05)
 
 
 RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any, ...]]]] = {
@@ -223,30 +200,7 @@ RULES: dict[str, tuple[Callable[..., Any], list[tuple[Any, ...]], list[tuple[Any
 )
 def test_every_rule_at_both_sides(made: Made, rule: str, values: tuple[Any, ...], strange: bool):
     RULES[rule][0](made, *values)
-    found = made.judged()
-    assert (found.kind == "unexplained_structure") is strange
-    assert not strange or found.probability == 0.9
-    assert not strange or all(probability <= 0.45 for probability in found.probabilities.values())
-
-
-def test_what_is_left_is_told(made: Made):
-    for ratio in (10.0, 10.1):
-        made.leaves(ratio=ratio)
-        assert made.judged().structure == ratio
-    assert made.judged().notes == []
-    assert made.held(0.0125).judged().notes == [
-        "The recorder holds each reading for 5 samples: the noise is that of the readings."
-    ]
-
-
-def test_an_effect_against_which_rows_not_seen_speak_is_doubted(made: Made):
-    made.add(FIRST, 50.0, 80.0).add(SECOND, 50.0, 90.0)
-    made.rises = {1}
-    found = made.judged()
-    assert found.probabilities[SECOND] == 0.45
-    assert found.probabilities[FIRST] > 0.9
-    assert len(found.notes) == 1
-    assert found.notes[0].endswith(f": {find_effect(SECOND).name}.")
+    assert made.left_over().structure is strange
 
 
 @pytest.mark.parametrize(
@@ -263,91 +217,183 @@ def test_rows_not_seen_may_contradict(
     made: Made, before: HeldOutError | None, after: HeldOutError | None, contradicted: bool
 ):
     made.unseen = [before, after]
-    found = made.judged()
-    assert found.held_out_error is after
-    assert (found.kind == "unexplained_structure") is contradicted
-    assert len(found.notes) == contradicted
-    if contradicted:
-        assert found.notes == [
-            "On held-out pulses the error of the last model is 2.5 times what noise and its uncertainty allow: "
-            "something is still missing."
-        ]
+    found = made.left_over()
+    assert found.held_out is after
+    assert found.structure is contradicted
+    told = "On held-out pulses the error of the last model is 2.5 times what noise and its uncertainty allow: "
+    assert found.notes == ((f"{told}something is still missing.",) if contradicted else ())
 
 
 def test_half_of_what_the_plain_structure_leaves_is_not_too_much(made: Made):
     first = HeldOutError(float(np.sqrt(1 + 4 * 8.0)), 1.0)
     made.unseen = [first, HeldOutError(3.0, 1.0)]  # both excesses squared: 32 and 8
-    assert made.judged().notes == []
+    assert made.left_over().notes == ()
     made.unseen = [first, HeldOutError(3.01, 1.0)]
-    assert len(made.judged().notes) == 1
+    assert len(made.left_over().notes) == 1
 
 
 @pytest.mark.parametrize(
-    ("at_rest", "name", "kind", "probability"),
-    [
-        (0.15, "bumps", "effect_missing", 0.86),
-        (0.15, "resisting bumps", "effect_missing", 0.86),
-        (0.14, "bumps", "effect_missing", 0.85),
-        (0.14, "resisting bumps", "unexplained_structure", None),
-    ],
+    ("at_rest", "name", "structure"),
+    [(0.15, "bumps", False), (0.15, "resisting bumps", False), (0.14, "bumps", False), (0.14, "resisting bumps", True)],
 )
-def test_efforts_seen_nowhere_at_rest_are_less_certain(
-    made: Made, at_rest: float, name: str, kind: str, probability: float | None
+def test_efforts_that_resist_and_do_not_appear_at_rest_are_structure(
+    made: Made, at_rest: float, name: str, structure: bool
 ):
     made.at_rest = at_rest
     made.add(EFFORT, 50.0, 90.0, **EFFORTS).last.effects[0][1].name = name
-    found = made.judged()
-    assert found.kind == kind
-    if probability == 0.85:
-        assert found.probabilities[EFFORT] == 0.85
-    elif probability:
-        assert found.probabilities[EFFORT] > 0.85
-
-
-def test_efforts_are_looked_for_in_the_model_to_which_they_were_added(made: Made):
-    made.at_rest = 0.14
-    found = made.add(EFFORT, 50.0, 80.0, **EFFORTS).add(FIRST, 50.0, 90.0).judged()
-    assert found.probabilities == {EFFORT: 0.85, FIRST: 0.85}
-
-
-@pytest.mark.parametrize(("wave_s", "doubted"), [(0.29, True), (0.31, False)])
-def test_a_tremor_that_dies_away_too_soon_is_doubted(made: Made, wave_s: float, doubted: bool):
-    trembling(made, 0.22, 3.0, wave_s)
-    found = made.judged()
-    assert ("a limb may swing" in found.objections.get(TREMOR, "")) is doubted
-    assert (found.probabilities[TREMOR] <= 0.45) is doubted
-
-
-def test_a_law_that_shows_nothing_at_rest_is_as_certain_as_ever(made: Made):
-    made.at_rest = 0.0
-    assert made.add("baseline_drift", 50.0, 90.0).judged().probabilities["baseline_drift"] > 0.9
+    assert made.left_over().structure is structure
+    assert made.scores(EFFORT)["at rest"] == -float(at_rest < 0.15)
 
 
 def test_a_structure_that_holds_effects_is_measured_from_the_plain_one(made: Made):
     made.search.steps = [Step(None, fitted(60.0, FIRST), "base")]
-    found = made.judged()
-    assert found.explained == pytest.approx(0.6)
-    assert found.kind == "nothing_missing"
+    assert made.left_over().explained == pytest.approx(0.6)
+
+
+def test_what_was_given_counts_as_known(made: Made):
+    made.detect("mains_hum", 30.0)
+    made.add(FIRST, 50.0, 65.0)
+    assert made.left_over().explained == pytest.approx(35.0 / 70.0)
 
 
 def test_little_to_explain_is_not_divided_by(made: Made):
     made.add(FIRST, 6.0, 0.5)
     made.leaves(ideal=-19.9)
-    assert made.judged().explained == pytest.approx(0.5)
+    assert made.left_over().explained == pytest.approx(0.5)
 
 
-@pytest.mark.parametrize(("names", "kind"), [((), "unexplained_structure"), ((FIRST,), "effect_missing")])
-def test_terms_beside_no_name_leave_the_cause_open(made: Made, names: tuple[str, ...], kind: str):
+# ---- probabilities --------------------------------------------------------------------------------------------------
+
+
+def test_no_score_speaks_against_what_it_should_speak_for():
+    for statement, known in weights().items():
+        assert all(weight >= 0.0 for name, weight in known.items() if name), statement
+        assert 0.0 < probability(statement, dict.fromkeys(known.keys() - {""}, 0.0)) < 1.0
+
+
+def test_each_score_has_a_weight_and_each_weight_a_score(made: Made):
+    made.add(FIRST, 50.0, 80.0, rival=48.0)
+    assert {*made.scores(FIRST), ""} == weights()["missing"].keys()
+    assert {*scores_of_remainder(made.ended()), ""} == weights()["left"].keys()
+
+
+@pytest.mark.parametrize(
+    ("change", "score"),
+    [
+        (lambda made: made.add(SECOND, 90.0, 90.0, rival=80.0), "rivals"),
+        (lambda made: made.add(SECOND, 9.0, 90.0), "gain"),
+        (lambda made: made.leaves(ratio=9.0).add(SECOND, 90.0, 90.0), "no work and rest"),
+    ],
+)
+def test_what_speaks_against_an_effect_makes_it_less_probable(made: Made, change: Callable[..., Any], score: str):
+    sure = made.add(FIRST, 90.0, 90.0).scores(FIRST)
+    made.search.steps = made.search.steps[:1]
+    change(made)
+    assert made.scores(SECOND)[score] < sure[score]
+
+
+def stated(monkeypatch: pytest.MonkeyPatch, left: float, *names: float) -> None:
+    """Let the probabilities be these: that something else is missing, and of the effects in turn."""
+    given = iter(names)
+    monkeypatch.setattr(
+        verdict, "probability", lambda statement, _: {"left": left, "seen": 0.98}.get(statement) or next(given)
+    )
+
+
+@pytest.mark.parametrize(
+    ("left", "names", "structure", "kind", "certainty"),
+    [
+        (0.1, (), False, "nothing_missing", 0.9),
+        (0.6, (), False, "unexplained_structure", 0.6),
+        (0.2, (0.95,), False, "effect_missing", 0.95),
+        (0.2, (0.7, 0.9), False, "effect_missing", 0.9),
+        (0.8, (0.95,), True, "unexplained_structure", 0.8),
+        (0.7, (0.4,), False, "unexplained_structure", 0.82),
+        (0.1, (0.3,), False, "nothing_missing", 0.63),
+    ],
+)
+def test_the_verdict_follows_from_the_probabilities(
+    made: Made,
+    monkeypatch: pytest.MonkeyPatch,
+    left: float,
+    names: tuple[float, ...],
+    structure: bool,
+    kind: str,
+    certainty: float,
+):
+    for effect in (FIRST, SECOND)[: len(names)]:
+        made.add(effect, 50.0, 90.0)
+    made.ended(structure=structure)
+    stated(monkeypatch, left, *names)
+    found = judge(made.search)
+    assert (found.kind, found.probability) == (kind, pytest.approx(certainty))
+    assert list(found.probabilities.values()) == list(names)
+
+
+def test_of_an_effect_that_is_doubted_the_model_is_not_given(made: Made, monkeypatch: pytest.MonkeyPatch):
+    made.add(FIRST, 50.0, 60.0).add(SECOND, 20.0, 90.0)
+    given = {FIRST: 0.9, SECOND: 0.3}
+    monkeypatch.setattr(verdict, "scores_of_effect", lambda _search, _before, step, *_: step.added)
+    monkeypatch.setattr(verdict, "probability", lambda statement, name: given[name] if statement == "missing" else 0.1)
+    search = without_doubted(made.ended())
+    assert search.names("library") == [FIRST] and [step.added for step in search.doubted] == [SECOND]
+    found = judge(search)
+    assert found.kind == "effect_missing" and found.probabilities == {FIRST: 0.9}
+    rest = judge(search.from_step(1))
+    assert (rest.kind, rest.probability) == ("nothing_missing", pytest.approx(0.9 * 0.7)), "its chance is not lost"
+    (refused,) = [each for each in search.refused if each.effect.id == SECOND]
+    assert "mostly where it was not there" in refused.refusal
+
+
+@pytest.mark.parametrize("names", [(), (FIRST,)])
+def test_where_terms_are_found_the_verdict_is_never_that_nothing_is_missing(
+    made: Made, monkeypatch: pytest.MonkeyPatch, names: tuple[str, ...]
+):
     for name in names:
         made.add(name, 50.0, 90.0)
     made.search.steps.append(Step("free_strength_by_drive", fitted(95.0, *names, "free_strength_by_drive"), "free"))
-    assert made.judged().kind == kind
-    assert made.judged().probabilities.keys() == {*names}
+    made.ended()
+    stated(monkeypatch, 0.2, *[0.9] * len(names))
+    assert judge(made.search).kind == ("effect_missing" if names else "unexplained_structure")
 
 
 def test_the_model_of_a_step_lacks_what_was_added_after_it(made: Made):
     made.add(FIRST, 50.0, 60.0).add(SECOND, 20.0, 90.0)
-    whole = made.judged()
-    later = judge(made.search.from_step(1))
-    assert later.probabilities == {SECOND: whole.probabilities[SECOND]}
-    assert judge(made.search.from_step(2)).kind == "nothing_missing"
+    whole = judge(made.ended())
+    assert judge(made.search.from_step(1)).probabilities == {SECOND: whole.probabilities[SECOND]}
+    assert judge(made.search.from_step(2)).left == whole.left
+
+
+# ---- what speaks against an effect ----------------------------------------------------------------------------------
+
+
+def waves(hz: float, wave_s: float = 1.0) -> tuple[Any, Any]:
+    """Steps before and with a tremor, in a PRBS of four pulses a level and a ramp."""
+    width_us = np.r_[np.repeat(np.random.default_rng(1).integers(0, 2, 100) * 300.0, 4), np.arange(80.0)]
+    grid = SimpleNamespace(step_s=0.025, pulse_width_us=width_us)
+    noise = NoiseLevel(0.5, 0.5, 1.0, turn=2 * np.pi * hz * 0.025, decay=1.0 - 0.025 / wave_s, band=0.5)
+    model = SimpleNamespace(noise=noise, problem=SimpleNamespace(setup=SimpleNamespace(grid=grid)))
+    return SimpleNamespace(searched=None), SimpleNamespace(added=TREMOR, searched=model)
+
+
+@pytest.mark.parametrize(
+    ("hz", "wave_s", "words"),
+    [(8.7, 1.0, ""), (10.05, 1.0, "10.1 Hz, is that at which"), (8.7, 0.29, "a limb may swing"), (8.7, 0.31, "")],
+)
+def test_a_wave_that_the_pulses_may_cause_is_doubted(
+    monkeypatch: pytest.MonkeyPatch, hz: float, wave_s: float, words: str
+):
+    monkeypatch.setattr(objections, "vetoed", lambda *_: None)
+    assert words in (said := objections.objection_to(*waves(hz, wave_s)) or "") and bool(said) is bool(words)
+
+
+@pytest.mark.parametrize(("ratio", "said"), [(3.0, []), (12.0, ["slow time constant divided by fast 12"])])
+def test_a_parameter_at_its_bound_is_told(ratio: float, said: list[str]):
+    effect = find_effect("mixed_fibres")
+    form = next(form for form in effect.forms if any(p.name == "ratio" for p in form.parameters))
+    values = [p.upper if p.name == "ratio" and said else 0.5 * (p.lower + p.upper) for p in form.parameters]
+    chosen = SimpleNamespace(effect=effect.id, form=form, places=range(len(values)), parameters=form.parameters)
+    model: Any = SimpleNamespace(problem=SimpleNamespace(chosen=[chosen]), physical=np.array(values))
+    assert [words.rpartition(" ")[0] for words in objections.at_bounds(model, effect.id)] == [
+        words.rpartition(" ")[0] for words in said
+    ]
