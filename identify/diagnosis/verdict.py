@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -52,20 +53,27 @@ def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[st
     return {name: weight / total for name, weight in weights.items()}
 
 
+def scores_of(search: EffectSearch) -> dict[str, Any]:
+    """Return the scores of each effect that a search found, empty for what the samples show, and those of the rest."""
+    effects = {effect: {} for effect in search.names("detected")}
+    for before, step in [*search.found, *search.open]:
+        share = _rivals(search, step)[str(step.added)]
+        objected = objection_to(before, step) is not None
+        effects[str(step.added)] = scores_of_effect(search, before, step, share, objected)
+    return {"effects": effects, "left": scores_of_remainder(search)}
+
+
 def judge(search: EffectSearch) -> Verdict:
     """The verdict on a search that has ended."""
-    probabilities = dict.fromkeys(search.names("detected"), probability("seen", {}))
-    rivals, objections, doubts = {}, {}, 1.0
-    for before, step in [*search.found, *search.open]:
-        effect, shares_there, objection = str(step.added), _rivals(search, step), objection_to(before, step)
-        scores = scores_of_effect(search, before, step, shares_there[effect], objection is not None)
-        doubts *= 1.0 - (chance := probability("missing", scores))
-        if step not in search.doubted:
-            probabilities[effect], rivals[effect] = chance, shares_there
-            objections |= {effect: objection} if objection else {}
-    free = bool(search.names("free"))
-    left = probability("left", scores_of_remainder(search))
-    nothing = (1.0 - left) * doubts * float(not search.names("detected"))
+    scores, doubted = scores_of(search), {str(step.added) for step in search.doubted}
+    chances = {
+        effect: probability("missing" if values else "seen", values) for effect, values in scores["effects"].items()
+    }
+    left, free = probability("left", scores["left"]), bool(search.names("free"))
+    nothing = (1.0 - left) * float(np.prod([1.0 - chance for chance in chances.values()]))
+    probabilities = {effect: chance for effect, chance in chances.items() if effect not in doubted}
+    rivals = {str(step.added): _rivals(search, step) for _, step in search.found}
+    objections = {str(step.added): words for before, step in search.found if (words := objection_to(before, step))}
     best, named = max(probabilities.values(), default=0.0), bool(search.found) or not free
     if best >= LIKELIER_THAN_NOT and named and not search.remainder.structure:
         kind, certainty = "effect_missing", best
