@@ -19,9 +19,9 @@ from stimrig.identify.summary import (
     Summarised,
     both_words,
     certainty,
+    change_words,
     fit_words,
     parameter_words,
-    probability,
     quantity,
     torque,
 )
@@ -107,6 +107,10 @@ class Diagnosis(Result):
     `held_out_by`, the source of the held-out values."""
     verdict: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
     probability: float  # of the verdict, 0 to 1
+    table: tuple[Row, ...]
+    """What was tried: no change, then each effect: `effect`, `name`, `parameters`, `change_percent` of the error on
+    left-out parts, its `sd_percent`, `probability`, the `seconds` that drive it, `status` ("add", "cannot decide",
+    "refused") and its `reason`."""
     missing: tuple[Row, ...]
     """Effects, most probable first: `effect`, `name`, `probability`, errors before and after, `confused_with`,
     `next_experiment` (words) and `next_experiment_plan`, `form`, `equation`, `parameters`, `rival_probabilities`,
@@ -138,6 +142,10 @@ class Diagnosis(Result):
         """The verdict and the advice in words."""
         return conclude(vars(self))
 
+    def changes(self) -> list[tuple[str, str]]:
+        """The table without the effects that are refused: an id and a line for each change."""
+        return [(str(row["effect"] or ""), change_words(row)) for row in self.table if row["status"] != "refused"]
+
     def to_dict(self) -> dict[str, Any]:
         """All fields, and `conclusion`."""
         return super().to_dict() | {"conclusion": asdict(self.conclusion)}
@@ -148,6 +156,11 @@ class Diagnosis(Result):
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')} white, {slow} slow, sd"),
             ("repetition", repetition_words(self.base)),
             ("the model", both_words(self.base)),
+            *[
+                (str(row["effect"] or "no change"), change_words(row))
+                for row in self.table
+                if row["status"] != "refused"
+            ],
             *[(str(row["effect"]), _read_row(row)) for row in self.missing],
         ]
         rows += [(str(row["effect"]), str(row["words"])) for row in self.free]
@@ -215,7 +228,7 @@ class Explanation(Result):
         return document | {"ended": why_ended(vars(self.left))}
 
     def _sheet(self) -> Sheet:
-        rows, before = [("at first", self.diagnosis.conclusion.title)], self.before.to_dict()
+        rows, before = [("at first", self.diagnosis.conclusion.title), *self.diagnosis.changes()], self.before.to_dict()
         if self.diagnosis.conclusion.kind != "nothing" or stands_out(before):
             places = healed_places(before, self.after.to_dict())
             rows += [("failed in", f"{place['text']}: {place_words(place)}") for place in places]
@@ -287,7 +300,7 @@ def _shares(rows: Sequence[Row]) -> str:
 
 def _read_row(row: Row) -> str:
     text = (
-        f"probability {probability(row['probability'])}, error from {torque(row, 'rms_before_nm')} to "
+        f"error from {torque(row, 'rms_before_nm')} to "
         f"{torque(row, 'rms_after_nm')}, held out from {torque(row, 'held_out_rms_before_nm')} to "
         f"{torque(row, 'held_out_rms_after_nm')}"
     )

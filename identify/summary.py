@@ -156,6 +156,23 @@ def probability_words(value: float) -> str:
     return "very probably" if value > VERY_PROBABLE else "probably" if value > PROBABLE else "possibly"
 
 
+def parameters_words(count: int) -> str:
+    """How many parameters a change adds."""
+    return "1 parameter" if count == 1 else f"{count} parameters"
+
+
+def change_words(row: Mapping[str, Any]) -> str:
+    """A row of a diagnosis's table in one line: change of the left-out error, parameters, probability, status."""
+    words = [] if row["effect"] else ["no change: nothing is missing"]
+    if row["change_percent"] is not None:
+        spread = "" if row["sd_percent"] is None else f" ± {row['sd_percent']:.0f}"
+        words.append(f"error {row['change_percent']:+.0f}{spread} %")
+    words += [parameters_words(row["parameters"])] * bool(row["parameters"])
+    words += [f"probability {probability(row['probability'])}"] * (row["probability"] is not None)
+    words += [f"seen most from {begin:.0f} to {end:.0f} s" for begin, end in row["seconds"]]
+    return "; ".join(words + [": ".join(filter(None, (row["status"], row["reason"])))] * bool(row["status"]))
+
+
 def torque(figures: Mapping[str, Any], key: str) -> str:
     """A torque from a dict, with its unit."""
     return quantity(figures.get(key), "N·m")

@@ -169,9 +169,7 @@ def html_report(what: Any, record: identify.Record | None, name: str) -> str:
     if record is not None and isinstance(what, identify.Explanation):
         narrative = story_of(record, what)
         structure = in_words(held_by(what.improvement.models[0], record))
-        return story_html(
-            narrative["story"], narrative["before"], narrative["after"], name, narrative["refused"], structure
-        )
+        return story_html(narrative["story"], narrative["before"], narrative["after"], name, structure)
     if record is not None and isinstance(what, identify.Model):
         comparison = rounded(identify.compare(what, record).to_dict())
         return comparison_html(what.to_dict(), json_value(curves(what, record)), name, comparison=comparison)
@@ -180,12 +178,11 @@ def html_report(what: Any, record: identify.Record | None, name: str) -> str:
 
 
 def story_of(record: Any, explained: Any) -> dict[str, Any]:
-    """Return the `story` of a record, what its figures show (`before`, `after`), and the `refused` effects."""
+    """Return the `story` of a record, and what its figures show (`before`, `after`)."""
     from stimrig.api.jobs.curves import curves, rounded
     from stimrig.api.jobs.verbs import with_experiment
     from stimrig.api.models.explanation import step_versions
     from stimrig.api.models.story import story
-    from stimrig.identify.conclusion import only_open
 
     models = explained.improvement.models
     before, after = (
@@ -197,8 +194,9 @@ def story_of(record: Any, explained: Any) -> dict[str, Any]:
         with_experiment(record, diagnosis, held_by(model, record))
         for model, diagnosis in ((models[0], explained.diagnosis), (models[-1], explained.left))
     )
-    improvement, left_open = explained.improvement.to_dict(), only_open(vars(explained.left)) or {}
-    # the last diagnosis describes what is left open
-    refused = [row for row in improvement["refused"] if row["effect"] != left_open.get("effect")]
-    text = story(step_versions(improvement), before["comparison"], after["comparison"], *diagnoses)
-    return {"story": text, "before": before, "after": after, "refused": refused}
+    rows = step_versions(explained.improvement.to_dict())
+    return {
+        "story": story(rows, before["comparison"], after["comparison"], *diagnoses),
+        "before": before,
+        "after": after,
+    }

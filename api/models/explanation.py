@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -11,7 +11,7 @@ from stimrig.api.effect_words import effect_words, effects_words, parameter_word
 from stimrig.api.structure import worded
 from stimrig.identify.conclusion import conclude, effects_to_add, in_order, is_likely
 from stimrig.identify.healing import stands_out
-from stimrig.identify.summary import probability, probability_words
+from stimrig.identify.summary import parameters_words, probability, probability_words
 
 SPLITS = {
     "segment": "By part of the test",
@@ -46,7 +46,7 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
     where = [] if noise else compared.get("where") or diagnosis.get("where") or []
     places = [place(entry, number) for number, entry in enumerate(where, start=1)]
     mostly = f" It sits mostly here: {places[0]['words']}." if places and conclusion.kind == "unexplained" else ""
-    experiment, named = diagnosis.get("experiment"), {entry["effect"] for entry in missing}
+    experiment, named = diagnosis.get("experiment"), {entry["effect"] for entry in [*missing, *free]}
     return {
         **asdict(conclusion),
         "words": conclusion.words + mostly,
@@ -60,8 +60,9 @@ def view(diagnosis: Mapping[str, Any], comparison: Mapping[str, Any] | None) -> 
         "splits": [] if noise else splits(compared),
         "tests": (compared.get("tests") or {}).get("tests", []),
         "experiment": experiment and tidy_experiment(experiment),
+        "table": [change(row, named) for row in diagnosis.get("table") or []],
         "others": [
-            {"id": row["effect"], "name": name_of(row["effect"], library), "reason": row["reason"]}
+            {"id": row["effect"], "name": name_of(row["effect"], library)}
             for row in diagnosis.get("refused") or []
             if row["effect"] not in named
         ],
@@ -90,6 +91,21 @@ def refusals(diagnosis: Mapping[str, Any], added: Sequence[str]) -> dict[str, st
 def name_of(effect: str, library: Mapping[str, Any]) -> str:
     """Return the display name of an effect."""
     return (library.get(effect) or {}).get("name") or effect_words(effect)
+
+
+def change(row: Mapping[str, Any], explained: Collection[str]) -> dict[str, Any]:
+    """Put a row of a diagnosis's table into words; `explained`: effects that are described below it."""
+    spread = "" if row["sd_percent"] is None else f" ± {row['sd_percent']:.0f}"
+    parts = [parameters_words(row["parameters"])] * bool(row["parameters"])
+    parts += [f"seen most from {begin:.0f} to {end:.0f} s" for begin, end in row["seconds"]]
+    return {
+        **row,
+        "label": row["name"] if row["effect"] else "No change: nothing is missing",
+        "change": "–" if row["change_percent"] is None else f"{row['change_percent']:+.0f}{spread} %".replace("-", "−"),
+        "chance": "–" if row["probability"] is None else probability(row["probability"]),
+        "about": " ".join([f"{'; '.join(parts)}." if parts else "", row["reason"]]).strip(),
+        "explained": row["effect"] in explained,
+    }
 
 
 def card(entry: Mapping[str, Any], library: Mapping[str, Any], base: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,6 +7,7 @@ from typing import Any
 
 from stimrig.identify.criticism import compare
 from stimrig.identify.diagnosis import search_for
+from stimrig.identify.diagnosis.changes import reason_against
 from stimrig.identify.diagnosis.result import diagnosis_of
 from stimrig.identify.diagnosis.search import EffectSearch, Progress, Step, helpful
 from stimrig.identify.diagnosis.verdict import judge
@@ -187,19 +188,12 @@ def _reason(search: EffectSearch, before: Step, step: Step, model: Model) -> str
 
 def refused(search: EffectSearch) -> list[dict[str, Any]]:
     """Effects that were tried last and not added, best first, each with the reason."""
-    margin = search.margin(max(len(search.rounds) - 1, 0))
-    rows = []
-    for candidate in search.rounds[-1] if search.rounds else ():
-        if candidate.effect.id in effect_names(search.last):
-            continue
-        reason = "Another effect explains the same error better."
-        if candidate.refusal is not None:
-            reason = candidate.refusal
-        elif candidate.gain <= 0.0:
-            reason = f"The evidence is against it: log evidence changes by {candidate.gain:+.1f}."
-        elif candidate.gain < margin:
-            reason = (
-                f"Too little evidence: log evidence rises by {candidate.gain:.1f}; at least {margin:g} is required."
-            )
-        rows.append({"effect": candidate.effect.id, "log_evidence_gain": candidate.gain, "reason": reason})
-    return rows
+    return [
+        {
+            "effect": candidate.effect.id,
+            "log_evidence_gain": candidate.gain,
+            "reason": reason_against(search, candidate),
+        }
+        for candidate in (search.rounds[-1] if search.rounds else ())
+        if candidate.effect.id not in effect_names(search.last)
+    ]

@@ -11,6 +11,7 @@ import numpy as np
 
 from stimrig.identify.conclusion import conclude, only_open
 from stimrig.identify.criticism import worst_places
+from stimrig.identify.diagnosis.changes import table_of
 from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful
 from stimrig.identify.diagnosis.thresholds import CLOSE, UNKNOWN_FORM
 from stimrig.identify.diagnosis.verdict import Verdict, judge, leaves_more
@@ -51,6 +52,7 @@ def diagnosis_of(search: EffectSearch) -> Diagnosis:
         "base": {key: base[key] for key in STATISTICS},
         "verdict": verdict.kind,
         "probability": verdict.probability,
+        "table": tuple(table_of(search, verdict)),
         "missing": tuple(missing),
         "free": tuple(free),
         "add": tuple(step.added for step in helpful(search)[0] if step.added),

@@ -34,6 +34,9 @@ class Verdict:
     rivals: dict[str, dict[str, float]] = field(default_factory=dict)
     """For each effect found: the shares of all effects tried in the same round."""
     objections: dict[str, str] = field(default_factory=dict)  # by effect: what speaks against it
+    doubted: dict[str, float] = field(
+        default_factory=dict
+    )  # probabilities of effects that were found and are not named
 
 
 def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[str, float]:
@@ -81,7 +84,8 @@ def judge(search: EffectSearch) -> Verdict:
         kind, certainty = "nothing_missing", nothing
     else:
         kind, certainty = "unexplained_structure", left if best >= LIKELIER_THAN_NOT else 1.0 - nothing
-    return Verdict(kind, certainty, probabilities, left, rivals, objections)
+    doubts = {effect: chances[effect] for effect in doubted}
+    return Verdict(kind, certainty, probabilities, left, rivals, objections, doubts)
 
 
 def remainder_of(search: EffectSearch) -> Remainder:

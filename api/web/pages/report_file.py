@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 from markupsafe import Markup
@@ -16,7 +15,7 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; form-action 'none'; bas
 """Nothing runs in a report, nothing is loaded, nothing leaves."""
 ABSENT: dict[str, Any] = {
     "model": None, "story": None, "why": None, "session": None, "problem": None, "validity": None, "recording": None,
-    "summary": None, "warnings": (), "plain": (), "refused": (), "versions": (), "digest": "",
+    "summary": None, "warnings": (), "plain": (), "versions": (), "digest": "",
     "footer": "Made by stimrig. This file needs no network.",
 }  # fmt: skip
 """What a report need not have."""
@@ -73,19 +72,17 @@ def missing_parts(view: dict[str, Any] | None, comparison: dict[str, Any] | None
 
 
 def story_html(
-    story: dict[str, Any], before: dict[str, Any], after: dict[str, Any], name: str,
-    refused: Sequence[dict[str, Any]] = (), structure: str = "",
-) -> str:  # fmt: skip
+    story: dict[str, Any], before: dict[str, Any], after: dict[str, Any], name: str, structure: str = ""
+) -> str:
     """Write the story of a model.
 
     `story`: as `stimrig.api.models.story.story` gives it; `before`, `after`: curves and comparison of the first model
-    and of the last one; `name`: of the record; `refused`: effects that were tried and not added; `structure`: of the
-    first model.
+    and of the last one; `name`: of the record; `structure`: of the first model.
     """
     begun = f" · begun with {structure}" if structure else ""
     lead = f"{name} · noise {story['noise_sd_nm'] or 0.0:.4f} N·m{begun}"
     figures = Figures(diagnosis_charts.story_figures(story, before, after))
-    return write(title=story["title"], lead=lead, story=story, figures=figures, refused=refused)
+    return write(title=story["title"], lead=lead, story=story, figures=figures)
 
 
 def write(**values: Any) -> str:
