@@ -13,7 +13,7 @@ from stimrig.identify.conclusion import conclude, only_open
 from stimrig.identify.criticism import worst_places
 from stimrig.identify.diagnosis.changes import table_of
 from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful
-from stimrig.identify.diagnosis.thresholds import CLOSE, UNKNOWN_FORM
+from stimrig.identify.diagnosis.thresholds import CLOSE, LEAST_RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict, judge, leaves_more
 from stimrig.identify.effects import Effect, find_effect
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
@@ -131,7 +131,7 @@ def _is_rival(tried: Mapping[str, Candidate], rivals: Mapping[str, float], best:
     One that resembles it and gains nearly as much is a rival, too: in another form it might be better.
     """
     similar = name in best.resembles or best.id in find_effect(name).resembles
-    return rivals[name] >= UNKNOWN_FORM or (similar and tried[name].gain > CLOSE * tried[best.id].gain)
+    return rivals[name] >= LEAST_RIVAL or (similar and tried[name].gain > CLOSE * tried[best.id].gain)
 
 
 def _plan(experiment: Experiment) -> dict[str, Any]:

@@ -32,9 +32,7 @@ NEAR = 0.1
 NAMES_SHARE = 0.5
 """Share of the log evidence gained by terms alone that names must gain where something is left beside them."""
 UNSURE = 0.85
-"""Weight of the evidence for efforts: where a law explains as much, the law is preferred, since it can be tested. It is
-also the largest probability of an effect that may only repair the inexact form of an earlier one, and of efforts that
-do not appear at rest: the stimulation itself may cause them."""
+"""Weight of the evidence for efforts: where a law explains as much, the law is preferred, since it can be tested."""
 SHARE_AT_REST = 0.15
 """An effort is seen at rest if its torque there is at least this share of its torque at work."""
 SHORTEST_WAVE_S = 0.3
@@ -47,14 +45,12 @@ LEAST_EXPLAINED = 0.75
 """Share of the explainable log-likelihood that effects must explain; otherwise another kind of structure is left."""
 LEAST_EXPLAINED_BY_BAND = 0.9
 """Share of the residual's power that a tremor must explain, if work and rest differ beside it."""
-UNKNOWN_FORM = 0.04
-"""Probability that is kept for what no form in the library describes; a rival that is less probable is not named."""
+LEAST_RIVAL = 0.04
+"""Share of probability in its round below which a rival is not named."""
 HELD_OUT_RATIO = 2.5
 """Error on held-out pulses, divided by what is allowed there, above which structure may be left."""
 HELD_OUT_SHARE = 0.5
 """The same as a share of the plain structure's error there: a law close to the true one takes most of it, not all."""
-DOUBTED = 0.45
-"""Largest probability of an effect that something speaks against."""
 QUIET = 0.025
 """Share of the largest torque below which the muscle counts as resting."""
 CLOSE = 0.8

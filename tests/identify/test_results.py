@@ -96,7 +96,7 @@ def test_nothing_missing_and_nothing_held_out_keep_to_the_schema():
 
 def test_rivals_and_the_test_between_them_keep_to_the_schema(record, monkeypatch):
     """Every effect that was tried is made a rival, so that there is a test to plan."""
-    monkeypatch.setattr(import_module("stimrig.identify.diagnosis.result"), "UNKNOWN_FORM", 0.0)
+    monkeypatch.setattr(import_module("stimrig.identify.diagnosis.result"), "LEAST_RIVAL", 0.0)
     with few_effects.only("fatigue", "potentiation", "threshold_drift"):
         found = identify.diagnose(record)
     assert found.missing[0]["next_experiment_plan"]["segments"] and errors("diagnosis", found.to_dict()) == []
