@@ -107,11 +107,11 @@ class EffectSearch:
 
     raw: Raw  # what the samples show before any fit
     rows: np.ndarray  # intervals that may be fitted, bool, shape (K,)
-    begun_with: tuple[str, ...]  # the structure from which it began: effects, "id" or "id:form"
     plain: Fitted  # the model without effects
     steps: list[Step]  # the model of the examined structure, then one effect more in each
     quiet: np.ndarray  # intervals in which the muscle rests, bool, shape (K,)
     refused: tuple[Candidate, ...] = ()  # effects of a last round in which none was chosen, best first
+    begun_with: tuple[str, ...] = ()  # the structure from which it began: effects, "id" or "id:form"
     number: int = 0  # of the step that is examined, counted from that beginning
     known: Remainder | None = None  # what the last model leaves, once the search has ended
     doubted: tuple[Step, ...] = ()  # the steps that would follow: more probably, nothing is missing
@@ -213,7 +213,7 @@ def search_effects(
         if effect not in effect_names(steps[-1].searched):
             fitted = fit_from(steps[-1].searched, effect, detected_form, values)
             steps.append(replace(steps[0], added=effect, searched=fitted, origin="detected"))
-    search = EffectSearch(raw, rows, tuple(structure), plain, steps, quiet_rows(steps[-1].searched))
+    search = EffectSearch(raw, rows, plain, steps, quiet_rows(steps[-1].searched), begun_with=tuple(structure))
     for number in range(MAX_EFFECTS):
         if not _add_best(search, progress or silent, number):
             break

@@ -320,8 +320,8 @@ def test_a_further_test_is_planned_beside_a_name_that_leaves_more_than_noise(
         problem=SimpleNamespace(setup=setup), noise=WHITE, rms_nm=noises * setup.grid.mean_noise_nm(setup.fitted)
     )
     search: Any = SimpleNamespace(record=setup.grid.record, last=last, residual=SimpleNamespace(significant=False))
-    search.names = lambda *_: ["fatigue"]
-    verdict: Any = SimpleNamespace(kind="effect_missing", held_out_error=None, objections={})
+    search.names, search.remainder = lambda *_: ["fatigue"], SimpleNamespace(held_out=None)
+    verdict: Any = SimpleNamespace(kind="effect_missing", objections={})
     assert result._undecided(search, verdict, planned) is wanted
     search.names = lambda *_: ["fatigue", "voluntary_effort"]  # efforts leave more on rows that were not fitted
     assert not result._undecided(search, verdict, planned)

@@ -62,7 +62,7 @@ class Made:
         self.raw = SimpleNamespace(readings=None)
         self.left_by_first = self.left_by_last = self.left()
         self.search = EffectSearch(
-            raw=self.raw, rows=np.ones(4000, bool), begun_with=(), plain=base, steps=[Step(None, base, "base")],
+            raw=self.raw, rows=np.ones(4000, bool), plain=base, steps=[Step(None, base, "base")],
             quiet=np.zeros(4000, bool), refused=(candidate(FIRST, 1.0),),
         )  # fmt: skip
         monkeypatch.setattr(search, "share_at_rest", self._share_at_rest)
