@@ -238,7 +238,7 @@ def diagnosis(progress: Progress, data: str, model_json: str | None = None) -> d
     found = found_missing(model_json)
     if (Path(data).parent / "nothing-missing").exists():
         found |= {"verdict": "nothing_missing", "missing": [], "where": [], "experiment": None, "signatures": {}}
-    return {**found, "improvement": improvement(model_json)}
+    return {"rows": [found], "improvement": improvement(model_json)}
 
 
 def adaptive_outlook(

@@ -283,14 +283,14 @@ def test_effects_are_shown_in_the_order_of_improve_and_only_the_likely_are_advis
     assert alone["likely"] == [] and "possibly missing" in alone["title"] and len(alone["missing"]) == 1
 
 
-def test_an_added_effect_has_the_form_that_was_found_and_its_version_is_diagnosed_anew(
+def test_an_added_effect_has_the_form_that_was_found(
     client: httpx.Client, service: Service, model: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     analyses, pool = service.context.analyses, service.context.pool
     client.get(f"/v1/models/{model}/diagnosis")
     free = {"effect": "fatigue", "form": "fitness", "name": "Fatigue", "words": "", "parameters": {}}
     two = {**MISSING, "missing": [{**FATIGUE, "effect": "tremor"}], "free": [free], "add": ["tremor", "fatigue"]}
-    analyses._store_result(model, "diagnosis", two)
+    analyses._store_result(model, "diagnosis", {**two, "improvement": {"steps": [], "models": []}})
     submit, submitted = pool.submit, []
     monkeypatch.setattr(pool, "submit", lambda *verb, **how: (submitted.append((*verb, how)), submit(*verb, **how))[1])
     body = {"effects": ["fatigue"], "force": True, "reason": "seen with the eye"}
@@ -298,7 +298,27 @@ def test_an_added_effect_has_the_form_that_was_found_and_its_version_is_diagnose
     assert child["without_evidence"] == [], "the recording asks for it"
     assert [how["effects"] for verb, how in submitted if verb == "fit"] == [["fatigue:fitness"]]
     told = client.get(f"/v1/models/{child['id']}/diagnosis").json()
-    assert told["structure"] == ["fatigue"] and submitted[-1][0] == "diagnosis", "as `stimrig diagnose --model` does"
+    assert told["structure"] == ["fatigue"] and submitted[-1][0] == "diagnosis", "its search contains no such model"
+
+
+def test_what_a_search_contains_is_neither_fitted_nor_searched_again(
+    client: httpx.Client, service: Service, model: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    analyses = service.context.analyses
+    first = client.get(f"/v1/models/{model}/diagnosis").json()
+    models = analyses.known(model, "improvement of diagnosis")["models"]
+    left = {**first, "structure": ["fatigue"], "missing": [], "verdict": "nothing_missing"}
+    improvement = {"steps": [], "models": models}
+    analyses._store_result(model, "diagnosis", {"rows": [first, left], "improvement": improvement})
+    submit, submitted = service.context.pool.submit, []
+    monkeypatch.setattr(
+        service.context.pool, "submit", lambda verb, **how: (submitted.append(verb), submit(verb, **how))[1]
+    )
+    child = client.post(f"/v1/models/{model}/effects", json={"effects": ["fatigue"]}).json()
+    assert child["id"] == models[1]["model_id"]
+    assert client.get(f"/v1/models/{child['id']}/diagnosis").json()["verdict"] == "nothing_missing"
+    assert client.get(f"/v1/models/{model}/diagnosis").json()["structure"] == []
+    assert {*submitted} <= {"effects"}
 
 
 def test_free_effects_are_added_together_and_shown_with_their_common_error(
@@ -312,7 +332,7 @@ def test_free_effects_are_added_together_and_shown_with_their_common_error(
     service.context.analyses._store_result(model, "diagnosis", found)
     shown = pages.get(f"/models/{model}").text
     assert shown.count('value="free_width_by_rise free_strength_by_torque"') == 2 and "Add this effect" not in shown
-    assert all(words in shown for words in ("+ Free level and Free strength", "≈ 0.111", "≈ 0.123"))
+    assert all(words in shown for words in ("With all that is added", "≈ 0.111", "≈ 0.123"))
 
 
 def test_places_are_shown_where_something_is_left() -> None:
@@ -348,7 +368,8 @@ def test_real_worker_finds_what_is_missing_and_the_page_shows_it(tmp_path: Path)
     hidden_records.write_csv(hidden_records.generate("asymmetric_relaxation", "middle", 8, rate_hz=100), path)
     told: list[float] = []
     with few_effects.only("asymmetric_relaxation", "fatigue", "recruitment_hysteresis", "potentiation"):
-        found = verbs.diagnosis(path, lambda share, _text="": told.append(share))
+        (found, left) = verbs.diagnosis(path, lambda share, _text="": told.append(share))["rows"]
+    assert (left["structure"], left["verdict"]) == (["asymmetric_relaxation:slow_lag"], "nothing_missing")
     assert list(jsonschema_rs.validator_for(schemas.load("diagnosis")).iter_errors(found)) == []
     assert told == sorted(told) and told[-1] <= 1 and len(told) >= 4
     assert (found["structure"], found["verdict"]) == ([], "effect_missing")
