@@ -25,7 +25,7 @@ from stimrig.identify.summary import (
     quantity,
     torque,
 )
-from stimrig.identify.yardstick import repetition_words, zero_words
+from stimrig.identify.yardstick import contradiction_words, repetition_words, zero_words
 
 Row = Mapping[str, Any]
 CORRELATED_WITH = {"residual": "itself", "u": "the pulse width", "u2": "the pulse width's square", "y": "the torque"}
@@ -57,6 +57,9 @@ class Comparison(Result):
     samples: int  # number of rows
     noise_sd_nm: float  # white measurement noise of a sample
     repetition: Row  # what repeats, and how much of it the model explains: see `identify.estimation.repetition`
+    contradiction: Row | None
+    """Whether fits to parts of the record contradict each other: see `identify.estimation.contradiction`; None for
+    another record than the model's own, or where the parts have too little."""
     fitted: Row  # the first five fields for rows that may be fitted
     held_out: Row | None  # the same for rows of `validate`; None if there are none
     by: Mapping[str, Sequence[Row]]
@@ -88,6 +91,7 @@ class Comparison(Result):
             ("repetition", repetition_words(vars(self))),
             ("residual", f"not noise: correlated with {', '.join(alarms)}" if alarms else "looks like noise"),
         ]
+        rows += [("parts", words)] if (words := contradiction_words(self.contradiction)) else []
         rows += [("note", zero_words(self.wandering_zero_nm))] * bool(self.wandering_zero_nm)
         if not looks_like_noise(vars(self)):
             rows += _listed("worst place", [row["text"] for row in self.where[:FEW]])
@@ -233,6 +237,9 @@ class Explanation(Result):
             places = healed_places(before, self.after.to_dict())
             rows += [("failed in", f"{place['text']}: {place_words(place)}") for place in places]
         rows += _listed("free effects", [str(row["words"]) for row in self.diagnosis.free])
+        for label, comparison in (("parts, at first", self.before), ("parts, at last", self.after)):
+            words = contradiction_words(comparison.contradiction)
+            rows += [(label, words)] if words else []
         improved = self.improvement._sheet()
         rows += [*improved.rows, ("ended", why_ended(vars(self.left)))]
         return Sheet(f"Explanation: {improved.title.partition(': ')[2]}", tuple(rows))

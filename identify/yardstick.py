@@ -1,4 +1,4 @@
-"""Sentences on what repeats in a record, from the values of `repetition` in a fit alone."""
+"""Sentences on what repeats and what contradicts itself in a record, from the values in a fit alone."""
 
 from __future__ import annotations
 
@@ -47,6 +47,25 @@ def zero_words(zero_nm: float) -> str:
     return (
         f"At rest the model is off by {zero_nm:.2g} N·m, root mean square of the rests: a zero that wanders, or force "
         "that lingers. It is part of the error, and no effect of the model describes it."
+    )
+
+
+def contradiction_words(contradiction: Mapping[str, Any] | None) -> str:
+    """Say which parts of the record contradict each other, and where; empty where none does significantly."""
+    if not contradiction or not contradiction["significant"]:
+        return ""
+    pair = contradiction["pairs"][0]
+    (first, second), (low, high) = pair["parts"], pair["pulse_width_us"]
+    span = f"{low:.0f}-{high:.0f}" if high - low >= 1.0 else f"{high:.0f}"
+    held = "" if pair["direction"] == "held" else f" {pair['direction']}"
+    more = "more" if pair["largest_nm"] > 0.0 else "less"
+    at = f"{span} µs{held}, {pair['start_s']:.1f}-{pair['end_s']:.1f} s"
+    size, error = f"{abs(pair['largest_nm']):.2g} N·m {more}", f"{pair['largest_error_nm']:.1g} N·m"
+    percent = f"{100.0 * contradiction['false_alarm_rate']:.0f} %"
+    return (
+        f"The parts of this record contradict each other at {at}: fitted to {first} alone the structure predicts "
+        f"{size} there than fitted to {second} alone (standard error {error}). Noise alone says so in at most "
+        f"{percent} of records, so the structure is not that of the muscle."
     )
 
 

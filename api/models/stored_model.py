@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from stimrig.api.effect_words import fact_of
 from stimrig.api.errors import ApiError
-from stimrig.identify.yardstick import repetition_sentences
+from stimrig.identify.yardstick import contradiction_words, repetition_sentences
 
 if TYPE_CHECKING:
     from stimrig.api.store.tables import Model
@@ -64,9 +64,10 @@ def is_plain(document: Mapping[str, Any]) -> bool:
 
 
 def repetition(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the repetition statistics of a MODEL.json, with `sentences`; None for unknown ones."""
+    """Return the repetition statistics of a MODEL.json, with `sentences` and `contradiction`; None for unknown ones."""
     statistics = document["fit"].get("repetition") or dict.fromkeys(("found_by", "rms_nm", "explained_percent"))
-    return {**statistics, "sentences": repetition_sentences(document["fit"])}
+    contradicts = contradiction_words(document["fit"].get("contradiction"))
+    return {**statistics, "sentences": repetition_sentences(document["fit"]), "contradiction": contradicts}
 
 
 def figures(document: Mapping[str, Any]) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from stimrig.identify.model import Model
 from stimrig.identify.problem.predict import same_data
 from stimrig.identify.records.record import Record
 from stimrig.identify.results import Comparison
-from stimrig.identify.yardstick import repetition_sentences, zero_words
+from stimrig.identify.yardstick import contradiction_words, repetition_sentences, zero_words
 
 __all__ = ["compare"]
 
@@ -83,13 +83,15 @@ def compare(model: Model, record: Record) -> Comparison:
     remarks = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
     remarks += [zero_words(zero_nm)] * bool(zero_nm)
     clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
-    fitted_repetition = model.fit.get("repetition") if same_data(model, record) else None  # by errors of left-out rows
-    repeats = fitted_repetition or repetition(clean, errors, grid.fitted)
+    known = model.fit if same_data(model, record) else {}  # by errors of left-out rows, and by refits
+    repeats = known.get("repetition") or repetition(clean, errors, grid.fitted)
+    contradicts = contradiction_words(known.get("contradiction"))
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]
     return Comparison(
         **whole,
         noise_sd_nm=noise,
         repetition=repeats,
+        contradiction=known.get("contradiction"),
         fitted=_figures(record, predicted, noise, ~record.held_out & counted),
         held_out=held_out,
         by=_error_shares(record, residual, noise, counted),
@@ -101,6 +103,7 @@ def compare(model: Model, record: Record) -> Comparison:
         plain=(
             *_plain(whole, held_out, noise, alarms, places),
             *repetition_sentences({"repetition": repeats}),
+            *([contradicts] if contradicts else []),
             *remarks,
             *outside,
         ),

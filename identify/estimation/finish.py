@@ -12,6 +12,7 @@ import numpy as np
 
 from stimrig.identify.dynamics.grid import Grid, ends_of, runs
 from stimrig.identify.dynamics.linear import Discrete, SecondOrder, run_narx
+from stimrig.identify.estimation.contradiction import contradiction
 from stimrig.identify.estimation.fit_statistics import evaluate, fit_statistics, white_sd
 from stimrig.identify.estimation.joint_sensor import sensor_of, words
 from stimrig.identify.estimation.quality import quality, valid_for
@@ -43,6 +44,8 @@ def finish(
     problem, values, setup = written.problem, written.physical, written.problem.setup
     matrix = covariance_of(written)
     statistics = statistics | {"unexplained_nm": unexplained(written, matrix)}
+    if (found := contradiction(written)) is not None:
+        statistics["contradiction"] = found
     covariance = _covariance(written, matrix, known)
     torque, rate = setup.sign * values[list(problem.initials)[:2]]
     model = Model(
