@@ -43,9 +43,10 @@ def finish(
     written = fitted.written
     problem, values, setup = written.problem, written.physical, written.problem.setup
     matrix = covariance_of(written)
-    statistics = statistics | {"unexplained_nm": unexplained(written, matrix)}
-    if (found := contradiction(written)) is not None:
-        statistics["contradiction"] = found
+    parts_differ = contradiction(written)
+    statistics = statistics | {"unexplained_nm": unexplained(written, matrix, parts_differ)}
+    if parts_differ is not None:
+        statistics["contradiction"] = parts_differ
     covariance = _covariance(written, matrix, known)
     torque, rate = setup.sign * values[list(problem.initials)[:2]]
     model = Model(

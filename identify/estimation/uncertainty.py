@@ -6,6 +6,7 @@ contains the whole true curve in 95 % of records; its width is found by drawing 
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -15,7 +16,7 @@ import numpy as np
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.fit_statistics import held_out_change
-from stimrig.identify.estimation.rests import RELAXED_S, scatter_at_rest, since_pulse
+from stimrig.identify.estimation.rests import RELAXED_S, scatter_at_rest, since_pulse, wandering_zero_nm
 from stimrig.identify.estimation.solve import Fitted
 from stimrig.identify.model import Covariance, Model
 from stimrig.identify.problem.joint_surface import POINTWISE
@@ -28,6 +29,14 @@ NEGLIGIBLE = 1e-4
 """Directions in which a change varies by less than this share of the largest are ignored."""
 EASED = 0.995
 """Share of the penalty that is removed to see how far it holds the curve back."""
+BETWEEN = 0.25
+"""Mean square by which another protocol departs from the whole fit, over that by which two parts differ: each part
+departs by about half of their difference."""
+MOST_BETWEEN = 2.0
+"""Largest part of it, over the other variance: far from linear one step may go anywhere."""
+ZERO = 1.25
+"""Mean square by which another record's zero departs from the mean of the rests, over their mean square about it. With
+1.0 bands held 86 % of the torque where the zero wanders, with 1.5 96 %, but 99 % where force lingers at rest."""
 PLACES = 481
 """Widths at which a change of the curve is looked at: several between any two knots."""
 DRAWS = 256
@@ -120,20 +129,34 @@ def _below_played(fitted: Fitted, change: np.ndarray) -> np.ndarray:
     return change if np.array_equal(limited, value) else np.linalg.lstsq(design, limited, rcond=None)[0]
 
 
-def unexplained(fitted: Fitted, matrix: np.ndarray) -> float:
-    """Error on left-out blocks beyond noise and the parameters' uncertainty, N·m, rms.
+def unexplained(fitted: Fitted, matrix: np.ndarray, contradiction: Mapping[str, Any] | None) -> float:
+    """Error of a prediction beyond noise and the parameters' uncertainty, N·m, rms, from three sources.
 
-    `matrix` is the parameters' covariance. A part that chance alone may leave is taken off, so that it is zero where
+    The error on left-out blocks, from which a part that chance alone may leave is taken off, so that it is zero where
     the structure is right. No error counts for more than the torque's own range: far from linear, one step of a refit
-    may go anywhere.
+    may go anywhere. Then what parts of the record contradict each other by beyond noise: another protocol may differ
+    from all of them as they do. At least the scatter of a zero that wanders, as another record begins at another one.
+
+    `matrix` is the parameters' covariance; `contradiction` as the function of that name gives it.
     """
     rows = fitted.problem.setup.fitted
     range_nm = float(np.ptp(fitted.problem.setup.grid.torque_nm[rows]))
     error = np.clip((fitted.residual_nm - held_out_change(fitted))[rows], -range_nm, range_nm)
     lever = (fitted.slopes / np.where(fitted.problem.log, fitted.physical, 1.0)[:, None])[:, rows]
     noise, noise_error = _noise_of_intervals(fitted)
-    more = float(np.mean(error**2)) - noise - float(np.sum(matrix * (lever @ lever.T))) / error.size
-    return float(np.sqrt(max(more - (2.0 * noise_error) ** 2 / more, 0.0))) if more > 0.0 else 0.0
+    uncertain = float(np.sum(matrix * (lever @ lever.T))) / error.size
+    more = float(np.mean(error**2)) - noise - uncertain
+    left = max(more - (2.0 * noise_error) ** 2 / more, 0.0) if more > 0.0 else 0.0
+    pairs = contradiction["pairs"] if contradiction else []
+    beyond = [
+        pair["difference_nm"] ** 2 * (1.0 - pair["limit"] / pair["statistic"])
+        for pair in pairs
+        if pair["statistic"] > pair["limit"]
+    ]
+    between = BETWEEN * sum(beyond) / max(len(pairs), 1)
+    wander_nm = wandering_zero_nm(fitted.problem.setup.grid, rows, fitted.residual_nm)
+    zero = 0.0 if fitted.noise.is_white else ZERO * wander_nm**2  # white noise moves the means of the rests, too
+    return float(np.sqrt(max(left + min(between, MOST_BETWEEN * (left + uncertain)), zero)))
 
 
 def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:

@@ -9,10 +9,20 @@ import pytest
 
 from stimrig import identify
 from stimrig.identify.dynamics.linear import SecondOrder
+from stimrig.identify.estimation.contradiction import contradiction
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
-from stimrig.identify.estimation.uncertainty import _below_played, _beyond, prediction_band, whole_factor
+from stimrig.identify.estimation.solve import Fitted
+from stimrig.identify.estimation.uncertainty import (
+    _below_played,
+    _beyond,
+    covariance_of,
+    prediction_band,
+    unexplained,
+    whole_factor,
+)
 from stimrig.identify.model import Model
+from stimrig.identify.records.record import Record
 from tests.harness.patients import Patient, make_record
 from tests.identify import hidden_muscles
 
@@ -157,10 +167,11 @@ def held_share(hidden: str) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize(
-    ("hidden", "least"), [*((name, 0.9) for name in MISSING if name != "fatigue"), ("fatigue", 0.75)]
+    ("hidden", "least"), [*((name, 0.9) for name in MISSING if name != "fatigue"), ("fatigue", 0.85)]
 )
 def test_a_prediction_is_held_though_an_effect_is_missing(hidden, least):
-    """Fatigue goes on: rows behind the fitted ones, `validate`, are further off than those left out before them."""
+    """Fatigue goes on: rows behind the fitted ones, `validate`, are further off than those left out before them.
+    That the halves contradict each other widens the band."""
     share, wide = held_share(hidden)
     assert least <= share <= 0.995
     assert wide < 4.0  # 1.96 of a band that is as wide as the error
@@ -169,6 +180,25 @@ def test_a_prediction_is_held_though_an_effect_is_missing(hidden, least):
 def test_where_the_structure_is_right_nothing_is_added():
     assert [model.fit["unexplained_nm"] for model in models_of("")] == [0.0] * len(BAND_SEEDS)
     assert all(model.fit["unexplained_nm"] > 0.05 for hidden in MISSING for model in models_of(hidden))
+
+
+def fitted_to(record: Record) -> tuple[Fitted, np.ndarray]:
+    grid, _ = prepare(record)
+    fitted = fit_plain(grid, grid.fitted)
+    return fitted, covariance_of(fitted)
+
+
+def test_parts_that_contradict_each_other_widen_the_band():
+    fitted, matrix = fitted_to(hidden_muscles.record("fatigue", seed=30))
+    with_parts, alone = (unexplained(fitted, matrix, parts) for parts in (contradiction(fitted), None))
+    assert 1.3 * alone < with_parts < 3.0 * alone
+
+
+def test_the_band_holds_another_zero_where_it_wanders():
+    record = hidden_muscles.record(seed=30)
+    wander_nm = 0.4 * np.sin(0.3 * record.time_s)
+    fitted, matrix = fitted_to(record.with_torque(record.torque_nm + wander_nm))
+    assert unexplained(fitted, matrix, None) > 1.1 * np.std(wander_nm)
 
 
 @pytest.mark.parametrize("hidden", MISSING)
