@@ -110,7 +110,7 @@ def _part_rows(grid: Grid, rows: np.ndarray) -> dict[str, np.ndarray]:
 def _refits(fitted: Fitted, part_rows: Mapping[str, np.ndarray]) -> tuple[dict[str, Part], np.ndarray, np.ndarray]:
     """Return the parts by name, the covariance of the whole fit, and the scale of the parameters that both are in."""
     problem, setup = fitted.problem, fitted.problem.setup
-    mean, precision = problem.prior
+    precision = problem.prior[1]
     white = setup.whitened(np.vstack([fitted.residual_nm, fitted.slopes]), noise_at_rest(fitted))
     at = np.concatenate([np.arange(start, stop) for start, stop in zip(*setup.stretches, strict=True)])
     residual, slopes = white[0], white[1:]
@@ -118,9 +118,6 @@ def _refits(fitted: Fitted, part_rows: Mapping[str, np.ndarray]) -> tuple[dict[s
     slopes = slopes * scale[:, None]
     prior = precision * scale[:, None] * scale + RIDGE * np.eye(scale.size)
     covariance = np.linalg.inv(slopes @ slopes.T + prior)
-    # The whole fit may have another noise, so it makes a step, too.
-    step = covariance @ (slopes @ residual - scale * (precision @ (fitted.theta - mean)))
-    residual = residual - step @ slopes
     parts = {}
     for name, rows in part_rows.items():
         of_part = slopes[:, rows[at]]

@@ -12,6 +12,7 @@ from stimrig.identify.estimation.contradiction import contradiction
 from stimrig.identify.estimation.plain import fit_plain
 from stimrig.identify.estimation.samples import prepare
 from stimrig.identify.records.record import Record
+from tests.harness.patients import Patient, make_record
 from tests.identify import hidden_muscles
 
 
@@ -36,10 +37,21 @@ def test_parts_of_an_exact_muscle_differ_by_their_standard_errors(exact):
 
 
 def test_a_zero_that_wanders_counts_as_noise():
-    """As the rests show it: the fit takes a part of it for torque."""
+    """As its levels in the rests show it; the parts' own zeros are no contradiction."""
     record = hidden_muscles.record(seed=3, rate_hz=100)
-    wander_nm = 0.2 * np.sin(0.7 * record.time_s) * np.sin(0.11 * record.time_s)
-    assert not contradiction_in(record.with_torque(record.torque_nm + wander_nm))["significant"]
+    for wander_nm in (0.02 * record.time_s, 0.4 * np.sin(0.3 * record.time_s)):
+        assert not contradiction_in(record.with_torque(record.torque_nm + wander_nm))["significant"]
+
+
+def test_parts_are_compared_at_the_widths_that_both_played():
+    rng, rest = np.random.default_rng(1), np.zeros(80)
+    levels = np.repeat(rng.uniform(60.0, 160.0, 40) * (rng.random(40) < 0.6), 10)
+    up = np.linspace(0.0, 300.0, 200)
+    pulses = np.r_[rest, levels, rest, up, up[::-1], rest]
+    names = ["rest"] * 80 + ["prbs"] * levels.size + ["rest"] * 80 + ["ramp"] * 400 + ["rest"] * 80
+    record, _ = make_record(Patient(), rng, pulses=(pulses, names), rate_hz=100, noise_nm=0.05)
+    pairs = {tuple(pair["parts"]): pair for pair in contradiction_in(record)["pairs"]}
+    assert pairs["prbs", "ramp"]["pulse_width_us"][1] < 180.0
 
 
 def test_a_wrong_structure_contradicts_itself_though_its_error_was_taken_for_slow_noise():
