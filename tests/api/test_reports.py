@@ -97,6 +97,12 @@ def test_what_repeats_stands_in_a_report_and_in_a_model() -> None:
     page = comparison_html(document, json_value(curves(model, record)), "a record")
     assert "Between 2 repeats of the same pulses the torque differs by" in page
     assert "Between 2 repeats" in str(model)
+    assert "contradict each other" not in page
+    pair = {"parts": ["prbs", "ramp"], "pulse_width_us": [80.0, 80.0], "direction": "rising", "start_s": 1.0}
+    pair |= {"end_s": 1.5, "largest_nm": -0.3, "largest_error_nm": 0.02}
+    document["fit"]["contradiction"] = {"significant": True, "false_alarm_rate": 0.05, "pairs": [pair]}
+    page = comparison_html(document, json_value(curves(model, record)), "a record")
+    assert "contradict each other at 80 µs rising, 1.0-1.5 s: fitted to prbs alone" in page
 
 
 def test_what_an_effect_says_of_itself_is_read_from_its_file_as_it_is_loaded() -> None:

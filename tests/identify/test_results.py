@@ -247,6 +247,15 @@ def test_nothing_missing_names_no_worst_place_and_says_when_the_record_is_too_po
     assert "may show what is missing" in poor
 
 
+def test_an_explanation_states_the_contradiction_of_its_first_and_of_its_last_model(results, record):
+    before, after = results["comparison"], identify.compare(results["improvement"].models[-1], record)
+    found, calm = results["diagnosis"], {"significant": False, "false_alarm_rate": 0.05, "pairs": []}
+    after = dataclasses.replace(after, contradiction=calm)
+    for first, last in ((before, after), (after, before)):
+        shown = str(identify.Explanation(found, results["improvement"], found, first, last))
+        assert ("parts, at first" in shown, "parts, at last" in shown) == (first is before, last is before)
+
+
 def test_a_name_that_is_doubted_has_not_the_probability_that_structure_is_left():
     doubted = {"verdict": "unexplained_structure", "probability": 0.9, "missing": [{"probability": 0.45}]}
     assert certainty(doubted) == ""
