@@ -20,7 +20,7 @@ from stimrig.identify.estimation.quality import range_warnings
 from stimrig.identify.estimation.repetition import repetition
 from stimrig.identify.estimation.rests import wandering_zero_nm
 from stimrig.identify.estimation.samples import block_means, inspect
-from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band
+from stimrig.identify.estimation.uncertainty import POINTWISE, prediction_band, prediction_directions
 from stimrig.identify.model import Model
 from stimrig.identify.problem.predict import same_data
 from stimrig.identify.records.record import Record
@@ -71,7 +71,8 @@ def compare(model: Model, record: Record) -> Comparison:
     raw = inspect(record)
     residual = record.torque_nm - predicted
     noise = raw.noise_sd_nm
-    tests = correlation_tests(grid, residual)
+    own_record = same_data(model, record)
+    tests = correlation_tests(grid, residual, grid.fitted & own_record, prediction_directions(model, grid))
     alarms = [test["words"] for test in tests["tests"] if not test["passed"]]
     counted = grid.counted
     places = worst_places(record, residual, noise, rows=counted)
@@ -83,7 +84,7 @@ def compare(model: Model, record: Record) -> Comparison:
     remarks = [text for text in (left_out, raw.readings.words if raw.readings else "") if text]
     remarks += [zero_words(zero_nm)] * bool(zero_nm)
     clean = replace(grid, torque_nm=block_means(grid, raw.torque_nm))
-    known = model.fit if same_data(model, record) else {}  # by errors of left-out rows, and by refits
+    known = model.fit if own_record else {}  # by errors of left-out rows, and by refits
     repeats = known.get("repetition") or repetition(clean, errors, grid.fitted)
     contradicts = contradiction_words(known.get("contradiction"))
     outside = [f"{warning[0].upper()}{warning[1:]}." for warning in range_warnings(model, record)]

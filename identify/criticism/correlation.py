@@ -1,8 +1,9 @@
 """Tests for noise in the residual: its correlation with itself, u, u² and y, with bands of a known false-alarm rate.
 
 With a band of 1.96/√N at each lag, a false alarm at any lag is far more frequent than 5 %. Here the band of a function
-is the 95 % quantile of its largest value over all lags, found by simulating noise for this record: its length, gaps and
-input.
+is a quantile of its largest value over all lags, found by simulating noise for this record: its length, gaps, input and
+what a fit takes from it. It is the quantile at which any of the four leaves its band in 5 % of records. What the
+model's uncertainty leaves in the residual is no sign of a wrong structure, and is removed first.
 """
 
 from __future__ import annotations
@@ -18,32 +19,47 @@ from stimrig.identify.noise import WHITE_AND_SLOW, profile
 LAGS = 25
 DRAWS = 1500
 LEVEL = 0.95
+LEAST_SLOW = 0.08
+"""Correlation of neighbours from which noise counts as slow."""
+NEGLIGIBLE = 0.1
+"""An uncertainty of less than so many standard deviations of the noise is ignored."""
 WORDS = {
-    "residual": "The residual is correlated with itself: the noise is slow, or the model lacks dynamics.",
-    "u": "The residual is correlated with the pulse width: delay, threshold or dynamics are wrong.",
-    "u2": "The residual is correlated with the squared pulse width: the recruitment curve or the dynamics are wrong.",
-    "y": "The residual is correlated with the torque: gain or speed change with the level, or the torque saturates.",
+    "residual": "The residual is correlated with itself: the noise may be slow, or the model may lack dynamics.",
+    "u": "The residual is correlated with the pulse width: delay, threshold or dynamics may be wrong.",
+    "u2": "The residual is correlated with the squared pulse width: recruitment curve or dynamics may be wrong.",
+    "y": "The residual is correlated with the torque: gain or speed may change with the level, or the torque saturate.",
 }
 
 
-def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
+def correlation_tests(
+    grid: Grid, residual_nm: np.ndarray, fitted: np.ndarray, directions_nm: np.ndarray
+) -> dict[str, Any]:
     """Correlation functions of a residual (at the record's samples) on the grid of pulses, with bands.
 
+    `fitted`: bool, shape (K,): intervals that the model was fitted on. `directions_nm`, shape (K, D): as
+    `prediction_directions`. The functions are those of the residual without what the model's uncertainty adds.
+
     Returns `lags_s`; `tests`: one for each of residual, u, u2, y with `values`, `band`, `passed`, `largest`, `words`;
-    `false_alarm_rate` of each function; `innovations`: whether the cross-correlations are those of the residual without
-    its slow noise.
+    `false_alarm_rate` of all tests together; `innovations`: whether the cross-correlations are those of the residual
+    without its slow noise.
     """
     known = (grid.count > 0) & ~grid.doubted
-    residual = np.where(known, block_means(grid, residual_nm), 0.0)
-    residual = residual - residual[known].mean()
-    torque = np.where(known, grid.torque_nm, 0.0)
-    white, ar1 = _innovations(residual, known, grid.step_s)
+    error = np.where(known, block_means(grid, residual_nm), 0.0)
+    # The last direction is that of the zero, which may have been set anew.
+    zero = np.full(grid.size, 1e3 * np.std(error[known]))
+    directions = np.where(known, np.c_[directions_nm, zero].T, 0.0)
+    residual, taken = _without_uncertainty(error, directions, known, fitted)
+    noise, _ = profile(residual, ends_of(runs(known)), WHITE_AND_SLOW.of_steps(grid.step_s))
+    slow, white = noise.ar1 * noise.share, residual
+    if innovations := slow >= LEAST_SLOW:  # cross-correlations of coloured noise become large by chance
+        rows = _filtered(np.vstack([error, directions]), slow, known)
+        white, _ = _without_uncertainty(rows[0], rows[1:], known, fitted)
     # At the times at which the pulses truly came: late pulses on even slots would spread a correlation over lags.
-    width = grid.pulse_width_us
-    signals = {"u": grid.interval_means(width), "u2": grid.interval_means(width**2), "y": torque - residual}
-    filtered = {name: _filtered(signal, ar1, known) for name, signal in signals.items()}
-    functions = {"residual": _auto(residual)} | {name: _cross(white, signal) for name, signal in filtered.items()}
-    bands = _bands(filtered, known)
+    width, torque = grid.pulse_width_us, np.where(known, grid.torque_nm, 0.0)
+    signals = {"u": grid.interval_means(width), "u2": grid.interval_means(width**2), "y": torque - error}
+    signals = {name: _filtered(signal, slow * innovations, known) for name, signal in signals.items()}
+    functions = {"residual": _auto(residual)} | {name: _cross(white, signal) for name, signal in signals.items()}
+    bands = _bands(signals, known, taken)
     tests = []
     for name, values in functions.items():
         largest = float(np.max(np.abs(values)))
@@ -58,28 +74,51 @@ def correlation_tests(grid: Grid, residual_nm: np.ndarray) -> dict[str, Any]:
                 "words": WORDS[name],
             }
         )
-    return {
-        "lags_s": np.arange(LAGS + 1) * grid.step_s,
-        "tests": tests,
-        "false_alarm_rate": 1.0 - LEVEL,
-        "innovations": ar1 > 0.0,
-    }
+    lags_s = np.arange(LAGS + 1) * grid.step_s
+    return {"lags_s": lags_s, "tests": tests, "false_alarm_rate": 1.0 - LEVEL, "innovations": innovations}
 
 
-def _innovations(residual: np.ndarray, known: np.ndarray, step_s: float) -> tuple[np.ndarray, float]:
-    """The residual without slow noise: cross-correlations of coloured noise become large by chance."""
-    noise, _ = profile(residual, ends_of(runs(known)), WHITE_AND_SLOW.of_steps(step_s))
-    lag_one = noise.ar1 * noise.share
-    if abs(lag_one) < 0.08:
-        return residual, 0.0
-    return _filtered(residual, lag_one, known), lag_one
+def _without_uncertainty(
+    error: np.ndarray, directions: np.ndarray, known: np.ndarray, fitted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the error without what the model's uncertainty adds, and what a fit takes from noise, shape (R, K).
+
+    Along the directions, shape (D, K), the error of a correct model is less than the noise on fitted rows, by what the
+    fit took: there it is removed. On other rows it is more, and is scaled down to the size of the noise.
+    """
+    parts = []
+    for rows, was_fitted in ((known & fitted, True), (known & ~fitted, False)):
+        sizes, axes = np.linalg.svd(directions[:, rows], full_matrices=False)[1:]
+        parts.append((rows, was_fitted, sizes, axes))
+    noise_sd = float(np.std(error[known]))
+    for _ in range(3):  # the less noise, the more directions count
+        squares, freedom = 0.0, 1e-9
+        for rows, _, sizes, axes in parts:
+            axes = axes[sizes > NEGLIGIBLE * noise_sd]
+            squares += float(np.sum((error[rows] - (axes @ error[rows]) @ axes) ** 2))
+            freedom += rows.sum() - len(axes)
+        noise_sd = np.sqrt(squares / freedom)
+    corrected, taken = error.copy(), np.zeros((0, error.size))
+    for rows, was_fitted, sizes, axes in parts:
+        counted = sizes > NEGLIGIBLE * noise_sd
+        axes, share = axes[counted], 1.0 if was_fitted else 1.0 - 1.0 / np.hypot(1.0, sizes[counted] / noise_sd)
+        corrected[rows] -= (share * (axes @ error[rows])) @ axes
+        if was_fitted:
+            taken = np.zeros((len(axes), error.size))
+            taken[:, rows] = axes
+    return corrected, taken
 
 
 def _filtered(signal: np.ndarray, ar1: float, known: np.ndarray) -> np.ndarray:
-    values = np.where(known, signal - signal[known].mean(), 0.0)
+    """Signals, shape (..., K), without slow noise of this correlation of neighbours, and without their mean."""
+    values = _centred(signal, known)
     out = values.copy()
-    out[1:] -= ar1 * values[:-1]
-    return np.where(known, out - out[known].mean(), 0.0)
+    out[..., 1:] -= ar1 * values[..., :-1]
+    return _centred(out, known)
+
+
+def _centred(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
+    return np.where(known, rows - rows[..., known].mean(axis=-1, keepdims=True), 0.0)
 
 
 def _auto(residual: np.ndarray) -> np.ndarray:
@@ -93,8 +132,11 @@ def _cross(residual: np.ndarray, signal: np.ndarray) -> np.ndarray:
     return np.array([residual[lag:] @ signal[: residual.size - lag] / size for lag in range(LAGS + 1)])
 
 
-def _bands(signals: dict[str, np.ndarray], known: np.ndarray) -> dict[str, float]:
-    """95 % quantile of the largest value over lags, for simulated white noise (the same draws every time)."""
+def _bands(signals: dict[str, np.ndarray], known: np.ndarray, taken: np.ndarray) -> dict[str, float]:
+    """Bands that any function leaves in 5 % of records, for simulated white noise (the same draws every time).
+
+    Each is the same quantile of the largest value over lags. `taken`: what a fit takes from noise, shape (R, K).
+    """
     rng = np.random.default_rng(20240229)
     size = known.size
     padded = 1 << int(np.ceil(np.log2(size + LAGS + 1)))
@@ -102,8 +144,8 @@ def _bands(signals: dict[str, np.ndarray], known: np.ndarray) -> dict[str, float
     norms = {name: np.linalg.norm(signal) for name, signal in signals.items()}
     largest: dict[str, list[np.ndarray]] = {name: [] for name in ["residual", *signals]}
     for _ in range(DRAWS // 100):
-        noise = np.where(known, rng.standard_normal((100, size)), 0.0)
-        noise -= np.where(known, noise.sum(axis=1, keepdims=True) / known.sum(), 0.0)
+        noise = _centred(rng.standard_normal((100, size)), known)
+        noise -= (noise @ taken.T) @ taken
         spectrum = np.fft.rfft(noise, padded, axis=1)
         length = np.linalg.norm(noise, axis=1, keepdims=True)
         auto = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, 1 : LAGS + 1] / length**2
@@ -111,4 +153,6 @@ def _bands(signals: dict[str, np.ndarray], known: np.ndarray) -> dict[str, float
         for name, other in spectra.items():
             cross = np.fft.irfft(spectrum * other, padded, axis=1)[:, : LAGS + 1] / (length * max(norms[name], 1e-30))
             largest[name].append(np.max(np.abs(cross), axis=1))
-    return {name: float(np.quantile(np.concatenate(values), LEVEL)) for name, values in largest.items()}
+    draws = np.array([np.concatenate(values) for values in largest.values()])
+    rank = np.argsort(np.argsort(draws, axis=1), axis=1).max(axis=0) / (DRAWS - 1)
+    return dict(zip(largest, np.quantile(draws, np.quantile(rank, LEVEL), axis=1).tolist(), strict=True))

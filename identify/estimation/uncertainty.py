@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.dynamics.grid import make_grid
+from stimrig.identify.dynamics.grid import Grid, make_grid
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.estimation.fit_statistics import held_out_change
 from stimrig.identify.estimation.rests import RELAXED_S, scatter_at_rest, since_pulse, wandering_zero_nm
@@ -22,6 +22,8 @@ from stimrig.identify.model import Covariance, Model
 from stimrig.identify.problem.joint_surface import POINTWISE
 from stimrig.identify.problem.predict import same_data, slopes, unpredictable_torque
 from stimrig.identify.records.record import Record
+from stimrig.identify.recruitment import Curve
+from stimrig.identify.recruitment.bases import SplineBasis
 
 BLOCK_S = 3.0
 """Longer than a contraction's rise: within a block, what is wrong stays wrong."""
@@ -39,6 +41,9 @@ ZERO = 1.25
 1.0 bands held 86 % of the torque where the zero wanders, with 1.5 96 %, but 99 % where force lingers at rest."""
 PLACES = 481
 """Widths at which a change of the curve is looked at: several between any two knots."""
+BETWEEN_KNOTS = 1.25
+"""Error of the curve between knots, as a share of its second difference over half of their distance: so large that the
+tests of `compare` alarm on 5 % of exact muscles."""
 DRAWS = 256
 POINTS = 41
 DYNAMICS = ("time_constant_s", "damping", "delay_s")
@@ -209,6 +214,27 @@ def step_slopes(linear: SecondOrder, covariance: Covariance, time_s: np.ndarray)
             up, down = (replace(linear, **{name: near}).step_response(time_s) for near in (value + step, value - step))
             slopes[:, covariance.names.index(name)] = (up - down) / (2 * step)
     return slopes
+
+
+def prediction_directions(model: Model, grid: Grid) -> np.ndarray:
+    """Errors of a prediction of interval means that the model's uncertainty makes usual, N·m, shape (K, D).
+
+    Each is one standard deviation, independent of the others. Beside those of the covariance there is what no spline
+    on the fitted knots can follow: a steep curve bends between two knots, too. Without a covariance there are none.
+    """
+    covariance, curve = model.covariance, model.recruitment
+    if covariance is None or not (isinstance(model.linear, SecondOrder) and isinstance(curve.basis, SplineBasis)):
+        return np.zeros((grid.size, 0))
+    estimated = slopes(model, grid, covariance.names) @ square_root(covariance.matrix)
+    knots_us = curve.basis.knots_us
+    finer = SplineBasis(np.sort(np.r_[knots_us, 0.5 * (knots_us[1:] + knots_us[:-1])]))
+    at_us = np.interp(np.linspace(0.0, 1.0, 4 * finer.size), np.linspace(0.0, 1.0, knots_us.size), knots_us)
+    values_nm = np.linalg.lstsq(finer.design(at_us), curve(at_us), rcond=None)[0]
+    bend_nm = np.abs(np.diff(np.r_[0.0, values_nm, values_nm[-1]], 2))
+    near_nm = np.max([bend_nm, np.r_[bend_nm[1:], 0.0], np.r_[0.0, bend_nm[:-1]]], axis=0)
+    names = [f"recruitment_{place}_nm" for place in range(finer.size)]
+    between = slopes(model.with_(recruitment=Curve(finer, values_nm)), grid, names) * (BETWEEN_KNOTS * near_nm)
+    return np.c_[estimated, between]
 
 
 def prediction_band(model: Model, record: Record) -> tuple[np.ndarray, np.ndarray]:

@@ -368,6 +368,8 @@ def test_correlations_are_taken_with_what_was_felt():
     record = Record.from_arrays(np.arange(1200) / 40, widths, np.zeros(1200), late_s=late_s)
     grid = make_grid(record)
     error_nm = grid.interval_means(widths)[grid.interval]
-    found = {test["with"]: test for test in correlation_tests(grid, error_nm)["tests"]}
+    found = {
+        test["with"]: test for test in correlation_tests(grid, error_nm, grid.fitted, np.zeros((grid.size, 0)))["tests"]
+    }
     assert found["u"]["values"][0] == pytest.approx(1.0)
     assert not found["u"]["passed"]
