@@ -95,16 +95,17 @@ def fit_statistics(
     sd_nm: float,
     held_out_change: np.ndarray | None = None,
     predictable_nm: np.ndarray | None = None,
+    unforeseen_nm: np.ndarray | float = 0.0,
 ) -> dict[str, Any]:
     """The key `fit` of MODEL.json, computed at the record's samples.
 
     Percentages are NaN if the torque is constant. Doubted samples are not counted.
 
     `rows`: fitted intervals. `sd_nm`: white noise of a sample. `held_out_change`: of fitted intervals where they are
-    left out of the fit, N·m: see the function of that name. `predictable_nm`: torque without the
-    effects that cannot be predicted. The held-out figures are computed with it. The torque that it lacks there
-    (`unforeseen_nm`) counts as noise in the ceiling, since it is known and does not come from the muscle; it is at most
-    the error beyond noise there, so that a misplaced effect does not lower the ceiling.
+    left out of the fit, N·m: see the function of that name. `predictable_nm`: torque without the effects that cannot be
+    predicted; the held-out figures are computed with it. `unforeseen_nm`: size of the torque that it lacks. In the
+    ceiling this counts as noise, since it is known and does not come from the muscle; it is at most the error beyond
+    noise there, so that a misplaced effect does not lower the ceiling.
     """
     record = grid.record
     measured = record.torque_nm
@@ -126,7 +127,8 @@ def fit_statistics(
         judged, by = (judged, by) if judged.any() else (used, "cross-validation")
     if judged.any():
         beside_noise = rms((measured - left_out)[judged]) ** 2 - sd_nm**2
-        unpredictable_nm = min(rms((predicted_nm - judged_nm)[judged]), float(np.sqrt(max(beside_noise, 0.0))))
+        lacking_nm = rms(np.broadcast_to(unforeseen_nm, measured.shape)[judged])
+        unpredictable_nm = min(lacking_nm, float(np.sqrt(max(beside_noise, 0.0))))
         result |= figures(measured[judged], left_out[judged], float(np.hypot(sd_nm, unpredictable_nm)), "held_out_")
         result |= {"held_out_by": by, "held_out_samples": int(judged.sum())}
         result |= {"unforeseen_nm": unpredictable_nm} if unpredictable_nm > 0.0 else {}
@@ -163,9 +165,9 @@ def evaluate(fitted: Fitted) -> dict[str, Any]:
     grid = setup.grid
     one_fold = setup.fitted.sum() < fold_rows(grid)  # without it nothing is left to fit
     change = None if one_fold else held_out_change(fitted)
-    predicted, predictable = predict_fitted(fitted)
+    predicted, *foreseen = predict_fitted(fitted)
     noise = white_sd(grid, predicted, fitted.noise.sd_nm, fitted.freedom, fitted.noise.is_white)
-    statistics = fit_statistics(grid, setup.fitted, predicted, noise, change, predictable)
+    statistics = fit_statistics(grid, setup.fitted, predicted, noise, change, *foreseen)
     return statistics | {"log_evidence": fitted.log_evidence, "log_likelihood": fitted.log_likelihood}
 
 

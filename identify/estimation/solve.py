@@ -11,6 +11,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 from numba import njit
 
+from stimrig.identify.dynamics.grid import ends_of
 from stimrig.identify.dynamics.linear import SecondOrder
 from stimrig.identify.effects import depend_on_joint, find_effect, registry
 from stimrig.identify.effects.base import Form
@@ -421,13 +422,36 @@ def band_as_effect(fitted: Fitted) -> Fitted:
     )
 
 
-def predict_fitted(fitted: Fitted) -> tuple[np.ndarray, np.ndarray]:
+def predict_fitted(fitted: Fitted) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Free-run torque of a candidate at its own record's samples, N·m, shape (N,): as fitted, and as it could have been
-    foreseen."""
-    fitted = fitted.written
-    whole, unpredictable = fitted.problem.at_samples(fitted.theta), fitted.unpredictable_torque
+    foreseen; and the size of what could not.
+
+    In held-out rows hum and a drift go on. Efforts and tremor are not what the fitted rows on either side lead to: an
+    effort has its usual size there, and tremor the one that the residual shows in its band.
+    """
+    written = fitted.written
+    problem, unpredictable = written.problem, written.unpredictable_torque
+    whole = problem.at_samples(written.theta)
     if not unpredictable:
-        return whole, whole
-    return whole, fitted.problem.at_samples(fitted.theta, frozenset(unpredictable)) + sum(
-        mean for mean, _ in unpredictable.values()
-    )
+        return whole, whole, np.zeros(whole.size)
+    predictable = problem.at_samples(written.theta, frozenset(unpredictable))
+    predictable = predictable + sum(mean for mean, _ in unpredictable.values())
+    sporadic = frozenset(name for name in unpredictable if find_effect(name).sporadic)
+    lasting = problem.at_samples(written.theta, sporadic) - predictable
+    usual_nm = [_tremor_held_out(fitted) if find_effect(name).band else unpredictable[name][1] for name in sporadic]
+    there = np.hypot(lasting, np.linalg.norm(usual_nm))
+    return whole, predictable, np.where(problem.setup.grid.record.held_out, there, whole - predictable)
+
+
+def _tremor_held_out(fitted: Fitted) -> float:
+    """Root mean square of the narrow band in the residual of held-out rows, N·m."""
+    grid = fitted.problem.setup.grid
+    rows = grid.comparable & grid.held_out
+    if not rows.any():
+        return 0.0
+    # Estimated anew beside slow noise, in which an error of the structure is.
+    residual, stretches = np.nan_to_num(fitted.residual_nm), ends_of(grid.stretches(rows))
+    noise = profile(residual, stretches, fitted.noise)[0]
+    wave = band_part(residual, stretches, noise)[rows]
+    # The mean over an interval is smaller than the wave itself.
+    return float(np.sqrt(np.mean(wave**2)) / np.sinc(noise.turn / (2 * np.pi)))

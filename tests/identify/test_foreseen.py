@@ -105,3 +105,20 @@ def test_rows_left_out_in_turn_are_judged_without_it_too():
     assert fitted["held_out_by"] == "cross-validation"
     assert fitted["unforeseen_nm"] == pytest.approx(HUM_NM / np.sqrt(2), rel=0.05)
     assert fitted["held_out_rms_nm"] > 4 * fitted["rms_nm"]
+
+
+@pytest.mark.parametrize("held_out_gain", [1.0, 0.8])
+def test_tremor_counts_on_held_out_rows_as_it_is_there_and_an_error_of_the_structure_does_not(held_out_gain: float):
+    record = hidden_muscles.record(seed=6, rate_hz=100)
+    phase = 2 * np.pi * 5.0 * record.time_s + np.cumsum(np.random.default_rng(6).normal(0.0, 0.08, record.time_s.size))
+    gain, wave_nm = np.where(record.held_out, held_out_gain, 1.0), 0.4 * np.sin(phase)
+    model = identify.fit(record.with_torque(gain * record.torque_nm + wave_nm), effects=["tremor"])
+    assert model.fit["unforeseen_nm"] == pytest.approx(0.4 / np.sqrt(2), rel=0.07)
+    assert (model.quality["verdict"] == "not usable") == (held_out_gain < 1.0)
+
+
+def test_an_effort_on_held_out_rows_is_taken_to_be_of_its_usual_size():
+    _, _, model = of_one_record("voluntary_effort")
+    beside_noise_nm = np.sqrt(model.fit["held_out_rms_nm"] ** 2 - model.fit["noise_sd_nm"] ** 2)
+    usual_nm = unpredictable_torque(model)["voluntary_effort"][1]
+    assert model.fit["unforeseen_nm"] == pytest.approx(min(usual_nm, beside_noise_nm))
