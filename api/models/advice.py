@@ -76,7 +76,7 @@ GATES: dict[str, Gate] = {
         "The fit is less than the noise would allow.",
         "The model does not follow the torque: the controller's pulses would be too wide at one time and too narrow at "
         "another.",
-        test="electrodes checked and the limb relaxed: the torque hardly follows",
+        test="electrodes checked and the limb relaxed",
     ),
     "held_out": Gate(
         "The error on held-out pulses is clearly larger than on the others.",

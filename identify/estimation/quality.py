@@ -11,6 +11,7 @@ from stimrig.identify.dynamics.grid import Grid
 from stimrig.identify.dynamics.linear import Discrete
 from stimrig.identify.effects import depend_on_joint
 from stimrig.identify.errors import RunsAway
+from stimrig.identify.estimation.fit_statistics import best_fit_percent
 from stimrig.identify.model import Model
 from stimrig.identify.problem.joint_surface import JointEffect, Surfaces
 from stimrig.identify.problem.predict import refuse_rate
@@ -22,6 +23,8 @@ from stimrig.identify.yardstick import held_out_pulses
 UNDER_CEILING_POINTS = 1.0
 LARGEST_DIP = 0.05
 LEAST_FIT_PERCENT = 30.0
+FILTER_S, FOLLOWS_PERCENT = 1.0, 50.0
+"""The torque follows the pulses if a linear filter of this memory, s, reaches such a fit."""
 GOOD_GAP, LARGEST_GAP = 2.0, 8.0
 """Percentage points of fit below the ceiling on held-out pulses: above the first something is missing, above the second
 too much."""
@@ -119,7 +122,7 @@ def quality(model: Model, grid: Grid, rows: np.ndarray, converged: bool = True) 
         "joint": _joint_at_rest(model, grid, rows, moving),
         "monotone": _monotone(model),
         "range": _range(grid, rows),
-        "ceiling": _ceiling(model),
+        "ceiling": _ceiling(model, grid, rows),
         "held_out": _held_out(model),
         "gap": _gap(model),
         "residual": _residual(model, float(np.ptp(grid.torque_nm[rows]))),
@@ -172,8 +175,30 @@ def _torque(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     finite = bool(np.all(np.isfinite(table))) and spread < 50 * max(measured_nm, 1e-12)
     if not finite:
         return _gate(False, "refuse", "the recruitment curve is far outside the measured torque")
+    if spread > 4 * model.noise.block_sd_nm:
+        return _gate(True, "refuse", "")
     message = "stimulation hardly changes the torque: check electrodes, current and load cell"
-    return _gate(spread > 4 * model.noise.block_sd_nm, "refuse", message)
+    return _gate(False, "refuse", _blame(model, grid, rows) or message)
+
+
+def _blame(model: Model, grid: Grid, rows: np.ndarray) -> str:
+    """Say what fails if not the record: a linear filter of width and squared width over the last second follows it.
+
+    Empty if that does not follow the torque either.
+    """
+    width = grid.interval_means(grid.pulse_width_us)
+    powers = np.stack([width, width**2]) / np.max(width) ** np.array([[1], [2]])
+    lags = range(0, min(round(FILTER_S / grid.step_s), grid.size), 2)[: int(rows.sum()) // 20]
+    design = np.vstack([np.ones(grid.size), *(np.pad(powers, ((0, 0), (lag, 0)))[:, : grid.size] for lag in lags)])
+    design, torque_nm = design[:, rows].T, grid.torque_nm[rows]
+    filter_nm = np.linalg.lstsq(design, torque_nm, rcond=1e-9)[0]
+    follows = best_fit_percent(torque_nm, design @ filter_nm)
+    if not follows > FOLLOWS_PERCENT:
+        return ""
+    cure = "an effect is missing; see the diagnosis"
+    if model.method != "maximum-likelihood":
+        cure = f"the method {model.method} fails on this record; fit with maximum-likelihood"
+    return f"the torque follows the pulses (a linear filter fits {follows:.0f} %), and this model does not: {cure}"
 
 
 def _monotone(model: Model) -> dict[str, Any]:
@@ -192,12 +217,13 @@ def _range(grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     return _gate(count >= 8, "care", message)
 
 
-def _ceiling(model: Model) -> dict[str, Any]:
+def _ceiling(model: Model, grid: Grid, rows: np.ndarray) -> dict[str, Any]:
     fit, ceiling = _statistic(model, "fit_percent"), _statistic(model, "ceiling_percent")
     if not np.isfinite(fit) or not np.isfinite(ceiling):
         return _gate(False, "care", "the fit cannot be compared with what the noise allows")
     if fit < LEAST_FIT_PERCENT or (fit < 50.0 and ceiling > 60.0):
-        return _gate(False, "refuse", f"the fit of {fit:.1f} % is too poor: the torque hardly follows the pulses")
+        cause = _blame(model, grid, rows) or "the torque hardly follows the pulses"
+        return _gate(False, "refuse", f"the fit of {fit:.1f} % is too poor: {cause}")
     return _gate(
         fit >= ceiling - UNDER_CEILING_POINTS,
         "care",

@@ -178,3 +178,14 @@ def test_a_residual_that_is_not_noise_asks_for_care_alone(record: identify.Recor
     assert (
         found["words"] == "Check this before use: the residual is not pure noise (whiteness test): see the diagnosis."
     )
+
+
+@pytest.mark.parametrize("follows", [True, False])
+def test_a_method_that_fails_is_blamed_where_the_torque_follows_the_pulses(record: identify.Record, follows: bool):
+    noise_nm = np.random.default_rng(3).normal(0.0, 1.0, record.time_s.size)
+    asked = record if follows else record.with_torque(noise_nm)
+    found = identify.fit(asked, method="ramp-deconvolution", natural_frequency_rad_s=0.3).quality
+    assert found["verdict"] == "not usable"
+    blamed = "the torque follows the pulses" in found["words"] and "ramp-deconvolution fails" in found["words"]
+    assert blamed == follows
+    assert any("hardly" in reason for reason in found["reasons"]) != follows
