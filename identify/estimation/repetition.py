@@ -21,6 +21,8 @@ from stimrig.identify.yardstick import floor_nm
 EXACT, ESTIMATE = "exact repeats", "estimate"
 LEAST_S = 1.0
 """Shortest time with repeated input, or at rest, that is evaluated."""
+DECAYS_S = (0.2, 0.5, 1.2)
+"""Time constants of decays whose sum follows what a slow muscle still relaxes in a rest."""
 LEAST_SHARE = 0.75
 """If less than this share of the variance repeats, what differs may hide any error: no share is reported."""
 UNKNOWN: dict[str, Any] = dict.fromkeys(
@@ -37,8 +39,8 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
     plain repetition predicts an interval of `validate` as the mean of the others of its group: from n - 1 of them it
     errs by √(1 + 1/(n-1)) s, if all vary alike. `explained_percent` is 100 (1 - (e² - s²) / v), between 0 and 100: e is
     the model's error, v the variance that repeats: that of the groups' means, less s²/n for their own error. Of
-    `validate` alone if enough of it repeats. In an estimate s² is the torque's variance about straight lines in the
-    rests, and v is the variance of the torque less s².
+    `validate` alone if enough of it repeats. In an estimate s² is the torque's variance about straight lines and decays
+    in the rests, and v is the variance of the torque less s².
 
     `error_nm`, shape (K,): measured minus predicted; of fitted intervals as predicted when they were left out of the
     fit, if known. `rows`, bool, shape (K,): intervals that were fitted.
@@ -64,7 +66,7 @@ def repetition(grid: Grid, error_nm: np.ndarray, rows: np.ndarray) -> dict[str, 
         lowest_us = float(grid.pulse_width_us.min())  # taken as rest where the width never becomes 0
         rests = usable & ~grid.held_out & relaxed(grid, FORGOTTEN_S, lowest_us)
         at = _unseen(grid, np.flatnonzero(usable & ~rests), min_rows)
-        variance, free = scatter_at_rest(grid, rests, grid.torque_nm)
+        variance, free = scatter_at_rest(grid, rests, grid.torque_nm, DECAYS_S)
         if free < min_rows or not at.size:
             return dict(UNKNOWN)
         result = UNKNOWN | {"found_by": ESTIMATE}

@@ -65,12 +65,22 @@ def since_pulse(grid: Grid, strongest_us: float = 0.0) -> np.ndarray:
     return at - np.maximum.accumulate(last)
 
 
-def scatter_at_rest(grid: Grid, rests: np.ndarray, values_nm: np.ndarray) -> tuple[float, int]:
-    """Variance of some values about a straight line in each rest, (N·m)², and from how many free rows; 0 from none."""
-    long_rests = [rest for rest in grid.stretches(rests) if rest.stop - rest.start > SHORT]
-    squares = [np.polyfit(grid.time_s[rest], values_nm[rest], 1, full=True)[1].sum() for rest in long_rests]
-    free = sum(rest.stop - rest.start - 2 for rest in long_rests)
-    return (float(sum(squares)) / free if free else 0.0), free
+def scatter_at_rest(
+    grid: Grid, rests: np.ndarray, values_nm: np.ndarray, decays_s: tuple[float, ...] = ()
+) -> tuple[float, int]:
+    """Variance of some values in the rests, (N·m)², and from how many free rows; 0 from none.
+
+    It is that about a straight line in each rest, and about decays of some time constants.
+    """
+    squares, free = 0.0, 0
+    for rest in grid.stretches(rests):
+        if rest.stop - rest.start > SHORT:
+            time_s, values = grid.time_s[rest] - grid.time_s[rest.start], values_nm[rest]
+            shapes = [np.ones(time_s.size), time_s, *(np.exp(-time_s / decay_s) for decay_s in decays_s)]
+            axes = np.linalg.qr(np.stack(shapes, axis=1))[0]
+            squares += float(np.sum((values - axes @ (axes.T @ values)) ** 2))
+            free += time_s.size - len(shapes)
+    return (squares / free if free else 0.0), free
 
 
 def wandering_zero_nm(grid: Grid, rows: np.ndarray, residual_nm: np.ndarray) -> float:

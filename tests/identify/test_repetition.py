@@ -137,6 +137,16 @@ def test_what_a_model_foresees_is_not_called_unforeseeable():
     assert "more than 99.9 %" in nearly and "100" not in nearly
 
 
+@pytest.mark.parametrize("time_constant_s", [0.3, 0.6])
+def test_what_a_slow_muscle_still_relaxes_at_rest_is_no_scatter(time_constant_s: float):
+    rng = np.random.default_rng(13)
+    widths = np.concatenate([width for _, width in parts_of(rng, 1)])
+    torque = Patient(time_constant_s=time_constant_s).torque(widths, 400.0)
+    found = of(as_record(torque + WHITE_NM * rng.standard_normal(torque.size), widths, 400.0), 1.0)
+    assert found["found_by"] == "estimate"
+    assert found["rms_nm"] == pytest.approx(WHITE_NM / 10**0.5, rel=0.1)
+
+
 def test_what_never_repeats_claims_nothing_exact():
     rng = np.random.default_rng(12)
     record, _ = make_record(QUICK, rng, noise_nm=WHITE_NM)
