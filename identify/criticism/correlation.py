@@ -58,22 +58,13 @@ def correlation_tests(
     width, torque = grid.pulse_width_us, np.where(known, grid.torque_nm, 0.0)
     signals = {"u": grid.interval_means(width), "u2": grid.interval_means(width**2), "y": torque - error}
     signals = {name: _filtered(signal, slow * innovations, known) for name, signal in signals.items()}
-    functions = {"residual": _auto(residual)} | {name: _cross(white, signal) for name, signal in signals.items()}
-    bands = _bands(signals, known, taken)
-    tests = []
-    for name, values in functions.items():
-        largest = float(np.max(np.abs(values)))
-        tests.append(
-            {
-                "with": name,
-                "values": values,
-                "band": bands[name],
-                "largest": largest,
-                "at_lag_s": float(np.argmax(np.abs(values)) + (name == "residual")) * grid.step_s,
-                "passed": largest <= bands[name],
-                "words": WORDS[name],
-            }
-        )
+    functions = _functions(white, signals) | _functions(residual, {})
+    tests, bands = [], _bands(signals, known, taken)
+    for name, words in WORDS.items():
+        values, place = functions[name], int(np.argmax(np.abs(functions[name])))
+        largest, at_lag_s = float(np.abs(values[place])), float(place + (name == "residual")) * grid.step_s
+        test = {"with": name, "values": values, "band": bands[name], "largest": largest, "at_lag_s": at_lag_s}
+        tests.append(test | {"passed": largest <= bands[name], "words": words})
     lags_s = np.arange(LAGS + 1) * grid.step_s
     return {"lags_s": lags_s, "tests": tests, "false_alarm_rate": 1.0 - LEVEL, "innovations": innovations}
 
@@ -121,15 +112,16 @@ def _centred(rows: np.ndarray, known: np.ndarray) -> np.ndarray:
     return np.where(known, rows - rows[..., known].mean(axis=-1, keepdims=True), 0.0)
 
 
-def _auto(residual: np.ndarray) -> np.ndarray:
-    power = max(float(residual @ residual), 1e-30)
-    return np.array([residual[lag:] @ residual[:-lag] / power for lag in range(1, LAGS + 1)])
-
-
-def _cross(residual: np.ndarray, signal: np.ndarray) -> np.ndarray:
-    """Correlation of the residual with the signal `lag` steps earlier, lags 0 to LAGS."""
-    size = max(float(np.linalg.norm(residual) * np.linalg.norm(signal)), 1e-30)
-    return np.array([residual[lag:] @ signal[: residual.size - lag] / size for lag in range(LAGS + 1)])
+def _functions(rows: np.ndarray, signals: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Correlations of rows, shape (..., K), with themselves 1 to LAGS steps earlier, and with signals 0 to LAGS."""
+    padded = 1 << int(np.ceil(np.log2(rows.shape[-1] + LAGS + 1)))
+    spectrum = np.fft.rfft(rows, padded)
+    length = np.maximum(np.linalg.norm(rows, axis=-1, keepdims=True), 1e-30)
+    functions = {"residual": np.fft.irfft(np.abs(spectrum) ** 2, padded)[..., 1 : LAGS + 1] / length**2}
+    for name, signal in signals.items():
+        products = np.fft.irfft(spectrum * np.conj(np.fft.rfft(signal, padded)), padded)[..., : LAGS + 1]
+        functions[name] = products / (length * max(float(np.linalg.norm(signal)), 1e-30))
+    return functions
 
 
 def _bands(signals: dict[str, np.ndarray], known: np.ndarray, taken: np.ndarray) -> dict[str, float]:
@@ -137,22 +129,11 @@ def _bands(signals: dict[str, np.ndarray], known: np.ndarray, taken: np.ndarray)
 
     Each is the same quantile of the largest value over lags. `taken`: what a fit takes from noise, shape (R, K).
     """
-    rng = np.random.default_rng(20240229)
-    size = known.size
-    padded = 1 << int(np.ceil(np.log2(size + LAGS + 1)))
-    spectra = {name: np.conj(np.fft.rfft(signal, padded)) for name, signal in signals.items()}
-    norms = {name: np.linalg.norm(signal) for name, signal in signals.items()}
-    largest: dict[str, list[np.ndarray]] = {name: [] for name in ["residual", *signals]}
+    rng, draws = np.random.default_rng(20240229), []
     for _ in range(DRAWS // 100):
-        noise = _centred(rng.standard_normal((100, size)), known)
-        noise -= (noise @ taken.T) @ taken
-        spectrum = np.fft.rfft(noise, padded, axis=1)
-        length = np.linalg.norm(noise, axis=1, keepdims=True)
-        auto = np.fft.irfft(np.abs(spectrum) ** 2, padded, axis=1)[:, 1 : LAGS + 1] / length**2
-        largest["residual"].append(np.max(np.abs(auto), axis=1))
-        for name, other in spectra.items():
-            cross = np.fft.irfft(spectrum * other, padded, axis=1)[:, : LAGS + 1] / (length * max(norms[name], 1e-30))
-            largest[name].append(np.max(np.abs(cross), axis=1))
-    draws = np.array([np.concatenate(values) for values in largest.values()])
-    rank = np.argsort(np.argsort(draws, axis=1), axis=1).max(axis=0) / (DRAWS - 1)
-    return dict(zip(largest, np.quantile(draws, np.quantile(rank, LEVEL), axis=1).tolist(), strict=True))
+        noise = _centred(rng.standard_normal((100, known.size)), known)
+        functions = _functions(noise - (noise @ taken.T) @ taken, signals)
+        draws.append([np.max(np.abs(values), axis=1) for values in functions.values()])
+    largest = np.concatenate(draws, axis=1)
+    rank = np.argsort(np.argsort(largest, axis=1), axis=1).max(axis=0) / (DRAWS - 1)
+    return dict(zip(functions, np.quantile(largest, np.quantile(rank, LEVEL), axis=1).tolist(), strict=True))

@@ -12,7 +12,7 @@ import pytest
 from bench.muscles.physics_records import NOISE_SD_NM, record_of_physics
 from stimrig import identify
 from stimrig.identify.criticism import compare
-from stimrig.identify.criticism.correlation import _auto, _bands, _cross, _filtered, _without_uncertainty
+from stimrig.identify.criticism.correlation import _bands, _filtered, _functions, _without_uncertainty
 from stimrig.identify.dynamics.grid import make_grid
 from stimrig.identify.estimation.fit_statistics import UNDEFINED, best_fit_percent, ceiling_percent
 from stimrig.identify.estimation.quality import quality
@@ -88,8 +88,7 @@ def test_all_tests_together_alarm_on_five_percent_of_correct_models(share_fitted
         estimate = directions[:, fitted] @ noise[fitted] if fitted.any() else rng.standard_normal(len(directions))
         residual, taken = _without_uncertainty(noise - estimate @ directions, directions, known, fitted)
         bands = bands or _bands(signals, known, taken)
-        values = {"residual": _auto(residual)} | {name: _cross(residual, signal) for name, signal in signals.items()}
-        alarms += any(np.max(np.abs(values[name])) > bands[name] for name in bands)
+        alarms += any(np.max(np.abs(values)) > bands[name] for name, values in _functions(residual, signals).items())
     assert 0.023 < alarms / draws < 0.077
 
 
