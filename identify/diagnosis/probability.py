@@ -27,6 +27,8 @@ LARGEST_ODDS = 5.0
 """Largest logarithm of the odds against rivals that counts."""
 FALLS = (-2.0, 8.0)
 """Standard errors of the left-out error between which its fall counts."""
+USUAL_CONTRADICTION = 0.15
+"""Of models that lack nothing: the median over records; it stands where there are too few parts to compare."""
 
 
 @cache
@@ -51,6 +53,7 @@ def scores_of_remainder(search: EffectSearch) -> Scores:
         "terms": float(bool(search.names("free"))),
         "held out": float(np.log(np.clip(held_out, 0.5, 6.0))),
         "work and rest": float(np.log1p(max(remainder.ratio, 0.0))),
+        "parts": float(np.log(np.clip(remainder.contradiction or USUAL_CONTRADICTION, 0.02, 50.0))),
         "open": float(np.log1p(np.clip(remainder.open_gain, 0.0, 300.0))),
     }
 
@@ -72,5 +75,5 @@ def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: floa
         "no objection": -float(objected),
         "within bounds": -float(bool(at_bounds(step.searched, effect.id))),
         "error": float(np.log(np.clip(before.searched.rms_nm / search.residual.white_nm, 1.0, 30.0))),
-        **{f"no {name}": -left[name] for name in ("structure", "terms", "held out", "work and rest")},
+        **{f"no {name}": -left[name] for name in ("structure", "terms", "held out", "work and rest", "parts")},
     }

@@ -151,5 +151,8 @@ class Remainder:
     explained: float  # share of the explainable log-likelihood that the effects explain
     ratio: float  # log-likelihood by which the residuals at work and at rest still differ
     held_out: HeldOutError | None  # None if held-out pulses cannot be judged
+    contradiction: float | None
+    """Mean square difference between its fits to parts of the record over the limit of a contradiction; None: too few
+    parts."""
     open_gain: float  # log evidence of the best effect that was tried last and is not in the model
     notes: tuple[str, ...] = ()  # reasons, for people

@@ -15,6 +15,7 @@ from stimrig.identify.diagnosis.residual import HeldOutError, Remainder, held_ou
 from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.candidates import likelihood_warnings
+from stimrig.identify.estimation.contradiction import contradiction
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.solve import Fitted
 
@@ -106,13 +107,14 @@ def remainder_of(search: EffectSearch) -> Remainder:
             f"On held-out pulses the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
             "allow: something is still missing."
         )
-    held = effect_names(last)
+    held, pairs = effect_names(last), (contradiction(last) or {"pairs": None})["pairs"]
     tried = next(reversed(search.rounds), ())
     return Remainder(
         structure=contradicted or _strange(search, effects, explained),
         explained=float(explained),
         ratio=float(residual.ratio),
         held_out=after,
+        contradiction=pairs and pairs[0]["statistic"] / pairs[0]["limit"],
         open_gain=max((candidate.gain for candidate in tried if candidate.effect.id not in held), default=0.0),
         notes=tuple(notes),
     )

@@ -71,6 +71,7 @@ class Made:
         for name, value in (("objection_to", None), ("at_bounds", [])):
             for module in (verdict, probabilities):
                 monkeypatch.setattr(module, name, lambda *_, value=value: value, raising=False)
+        monkeypatch.setattr(verdict, "contradiction", lambda _fitted: None)
         monkeypatch.setattr(EffectSearch, "seen", {"mains_hum"})
         monkeypatch.setattr(Step, "left_out", None)
         monkeypatch.setattr(probabilities, "difference", lambda *_: SimpleNamespace(errors=3.0))
