@@ -159,21 +159,22 @@ def caution(diagnosis: Mapping[str, Any]) -> str:
     return ""
 
 
-def _times_noise(diagnosis: Mapping[str, Any], noise_nm: float) -> float | None:
+def _times_noise(diagnosis: Mapping[str, Any]) -> float | None:
+    """The error on held-out pulses over all noise, white and slow."""
+    noise_nm = math.hypot(diagnosis.get("noise_sd_nm") or 0.0, (diagnosis.get("slow_noise") or {}).get("sd_nm") or 0.0)
     error_nm = (diagnosis.get("base") or {}).get("held_out_rms_nm")
     return error_nm / noise_nm if error_nm is not None and noise_nm > 0.0 else None
 
 
 def _with_error(words: str, diagnosis: Mapping[str, Any]) -> str:
     """The words, and the error on held-out pulses in parts of the noise."""
-    times = _times_noise(diagnosis, diagnosis.get("noise_sd_nm") or 0.0)
+    times = _times_noise(diagnosis)
     where = held_out_pulses(diagnosis.get("base") or {})
     return words if times is None else f"{words} On {where} the model's error is {times:.1f} times the noise."
 
 
 def _beyond_noise(diagnosis: Mapping[str, Any]) -> str:
-    noise_nm = math.hypot(diagnosis["noise_sd_nm"], (diagnosis.get("slow_noise") or {}).get("sd_nm") or 0.0)
-    times = _times_noise(diagnosis, noise_nm)
+    times = _times_noise(diagnosis)
     if times is None or not times > WITHIN_NOISE:
         return ""
     where = held_out_pulses(diagnosis.get("base") or {})

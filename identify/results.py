@@ -160,11 +160,7 @@ class Diagnosis(Result):
             ("noise", f"{quantity(self.noise_sd_nm, 'N·m')} white, {slow} slow, sd"),
             ("repetition", repetition_words(self.base)),
             ("the model", both_words(self.base)),
-            *[
-                (str(row["effect"] or "no change"), change_words(row))
-                for row in self.table
-                if row["status"] != "refused"
-            ],
+            *self.changes(),
             *[(str(row["effect"]), _read_row(row)) for row in self.missing],
         ]
         rows += [(str(row["effect"]), str(row["words"])) for row in self.free]

@@ -168,7 +168,7 @@ def change_words(row: Mapping[str, Any]) -> str:
         spread = "" if row["sd_percent"] is None else f" ± {row['sd_percent']:.0f}"
         words.append(f"error {row['change_percent']:+.0f}{spread} %")
     words += [parameters_words(row["parameters"])] * bool(row["parameters"])
-    words += [f"probability {probability(row['probability'])}"] * (row["probability"] is not None)
+    words += [] if row["probability"] is None else [f"probability {probability(row['probability'])}"]
     words += [f"seen most from {begin:.0f} to {end:.0f} s" for begin, end in row["seconds"]]
     return "; ".join(words + [": ".join(filter(None, (row["status"], row["reason"])))] * bool(row["status"]))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -26,12 +27,13 @@ MOST_OF_IT = 0.5
 """Share of an effect's improvement that falls in the seconds which drive it."""
 
 
-def table_of(search: EffectSearch, verdict: Verdict) -> list[dict[str, Any]]:
+def table_of(search: EffectSearch, verdict: Verdict, like: Mapping[str, Sequence[str]]) -> list[dict[str, Any]]:
     """Return the changes: none, each effect that was found, then each that was refused, best first.
 
     Each has `effect` (None: no change), `name`, `parameters` (how many it adds), `change_percent` of the error on
     left-out blocks and its `sd_percent`, `probability`, the `seconds` of the record that drive it, `status` and the
-    `reason` of the status. Values that were not asked for are None.
+    `reason` of the status. Values that were not asked for are None. `like`: for each free effect, the effects of the
+    library that act as it does.
     """
     nothing = (1.0 - verdict.left) * float(np.prod([1.0 - chance for chance in verdict.probabilities.values()]))
     rows = [_row(None, NO_CHANGE, None, 0) | {"probability": None if search.names("free") else nothing}]
@@ -43,6 +45,7 @@ def table_of(search: EffectSearch, verdict: Verdict) -> list[dict[str, Any]]:
         status = ADD if step in supported else OPEN
         if chance is not None and (chance < PROBABLE or (why and status == ADD)):
             status, why = OPEN, why or "Other effects, or a cause outside the library, explain the record as well."
+        why = why or " ".join(_instead(search, name) for name in like.get(effect, ()))
         found = _of_step(before, step) | {"probability": chance}
         rows.append(found | {"status": status, "reason": why})
     for before, step in search.open:
@@ -58,6 +61,17 @@ def table_of(search: EffectSearch, verdict: Verdict) -> list[dict[str, Any]]:
         row = _row(candidate.effect.id, candidate.effect.name, change, len(candidate.form.parameters))
         rows.append(row | {"status": REFUSED, "reason": reason_against(search, candidate)})
     return rows
+
+
+def _instead(search: EffectSearch, effect: str) -> str:
+    """Return why an effect of the library is not named where a free effect acts as it does, in words."""
+    name = find_effect(effect).name
+    tried = next((each for each in (search.rounds or [()])[0] if each.effect.id == effect), None)
+    if tried is None:
+        return f"{name} was not tried on this record."
+    if tried.refusal is None and tried.gain >= search.margin(0):
+        return f"{name} in the library's forms predicts left-out parts less well."
+    return f"{name} in the library's forms is refused: {reason_against(search, tried)}"
 
 
 def reason_against(search: EffectSearch, candidate: Candidate) -> str:

@@ -52,7 +52,7 @@ def diagnosis_of(search: EffectSearch) -> Diagnosis:
         "base": {key: base[key] for key in STATISTICS},
         "verdict": verdict.kind,
         "probability": verdict.probability,
-        "table": tuple(table_of(search, verdict)),
+        "table": tuple(table_of(search, verdict, {row["effect"]: row["behaves_as"] for row in free})),
         "missing": tuple(missing),
         "free": tuple(free),
         "add": tuple(step.added for step in helpful(search)[0] if step.added),
