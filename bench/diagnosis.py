@@ -105,7 +105,7 @@ def diagnose_record(job: tuple[str, str, int, dict[str, Any]]) -> dict[str, Any]
 
 def _reports_structure(result: dict[str, Any]) -> bool:
     """Return true where verdict, figure or words report structure that is left."""
-    words = " ".join([*result["plain"], *result["notes"]]).lower()
+    words = " ".join([*result["conclusion"].values(), *result["notes"]]).lower()
     unexplained = result["verdict"] == "unexplained_structure" or result["structure_left"] > NEXT_MARGIN
     return bool(unexplained or "structure left" in words)
 
@@ -169,7 +169,6 @@ def figures(kind: str, rows: list[dict[str, Any]]) -> dict[str, str]:
                     [not {*r["truth"]}.isdisjoint(r["group"]) for r in some]
                 )
                 by_label[f"verdict 'effect missing', {which}"] = share([r["verdict"] == "effect_missing" for r in some])
-        by_label |= _calibration(rows)
         gone = [_removed(r) for r in rows if _first(r) and r["before"] > 1.2 * r["noise"] and _foreseeable(r)]
         if gone:
             by_label["held-out error above noise removed, efforts and tremor aside"] = (
@@ -218,18 +217,6 @@ def _foreseeable(row: dict[str, Any]) -> bool:
 def _removed(row: dict[str, Any]) -> float:
     excess = [np.sqrt(max(row[key] ** 2 - row["noise"] ** 2, 0.0)) for key in ("before", "after")]
     return 1.0 - excess[1] / max(excess[0], 1e-9)
-
-
-def _calibration(rows: list[dict[str, Any]]) -> dict[str, str]:
-    by_label = {}
-    named = [r for r in rows if r["named"] and r["verdict"] == "effect_missing"]
-    for low, high in ((0.0, 0.6), (0.6, 0.85), (0.85, 0.97), (0.97, 1.01)):
-        some = [r for r in named if low <= r["probabilities"][0] < high]
-        if some:
-            stated = np.mean([r["probabilities"][0] for r in some])
-            right = share([_first(r) for r in some])
-            by_label[f"right where {low:g} to {min(high, 1):g} is stated"] = f"{right}, mean stated {stated:.2f}"
-    return by_label
 
 
 def _confusions(rows: list[dict[str, Any]]) -> dict[str, str]:

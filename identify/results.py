@@ -139,7 +139,6 @@ class Diagnosis(Result):
     candidates: tuple[Sequence[Row], ...]
     """Effects tried in each round, best first: `effect`, `form`, `log_evidence_gain`, `rms_nm`, `forms`."""
     notes: tuple[str, ...]  # further reasons for the verdict
-    plain: tuple[str, ...]  # sentences for people
 
     @property
     def conclusion(self) -> Conclusion:

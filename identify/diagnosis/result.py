@@ -9,23 +9,22 @@ from typing import Any
 
 import numpy as np
 
-from stimrig.identify.conclusion import conclude, only_open
+from stimrig.identify.conclusion import only_open
 from stimrig.identify.criticism import worst_places
 from stimrig.identify.diagnosis.changes import table_of
 from stimrig.identify.diagnosis.search import EffectSearch, Step, helpful
 from stimrig.identify.diagnosis.thresholds import CLOSE, LEAST_RIVAL
 from stimrig.identify.diagnosis.verdict import Verdict, judge, leaves_more
 from stimrig.identify.effects import Effect, find_effect
-from stimrig.identify.estimation.effect_fit import Candidate, effect_names
+from stimrig.identify.estimation.effect_fit import Candidate
 from stimrig.identify.estimation.finish import describe_parameters, finish
-from stimrig.identify.estimation.left_out import difference, from_to
+from stimrig.identify.estimation.left_out import difference
 from stimrig.identify.estimation.shapes import shape_of
 from stimrig.identify.estimation.solve import predict_fitted
 from stimrig.identify.estimation.still import moves
 from stimrig.identify.estimation.uncertainty import covariance_of
 from stimrig.identify.experiments import NOTHING, Experiment, plan, plan_further
 from stimrig.identify.results import Diagnosis
-from stimrig.identify.summary import probability, probability_words
 
 MAX_PARAMETERS = 24
 """The wave of a tremor has hundreds."""
@@ -66,7 +65,7 @@ def diagnosis_of(search: EffectSearch) -> Diagnosis:
         "notes": remainder.notes,
     }
     fields["deciding_experiment"] = _deciding(search, verdict, fields)
-    return Diagnosis(**fields, plain=tuple(_plain(search, fields)))
+    return Diagnosis(**fields)
 
 
 def _effects(search: EffectSearch, verdict: Verdict) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -171,14 +170,6 @@ def _is_noise(search: EffectSearch) -> bool:
     return bool(model.quality["gates"]["residual"]["passed"])
 
 
-PARTS = {
-    "f": "f(u), the recruitment curve",
-    "G": "G, the linear dynamics",
-    "g": "g(x, ẋ), the active torque over angle and velocity",
-    "h": "h(x, ẋ), the passive torque over angle and velocity",
-}
-
-
 def _candidate(candidate: Candidate) -> dict[str, Any]:
     return {
         "effect": candidate.effect.id,
@@ -189,36 +180,3 @@ def _candidate(candidate: Candidate) -> dict[str, Any]:
         "forms": candidate.forms,
         "refusal": candidate.refusal,
     }
-
-
-def _plain(search: EffectSearch, diagnosis: dict[str, Any]) -> list[str]:
-    base, missing = diagnosis["base"], diagnosis["missing"]
-    named = [step for step in search.steps if step.origin != "free"][-1].statistics
-    base_names = " and ".join(find_effect(name).name.lower() for name in effect_names(search.base))
-    conclusion = conclude(diagnosis)
-    lines = [
-        f"The model {f'with {base_names}' if base_names else 'without effects'} fits {base['fit_percent']:.1f} %; the "
-        f"noise of {diagnosis['noise_sd_nm']:.3g} N·m allows {base['ceiling_percent']:.1f} % at most.",
-        f"{conclusion.title}. {conclusion.words}",
-        *[
-            f"Most of it is here: {place['text']}."
-            for place in diagnosis["where"][:1]
-            if conclusion.kind == "unexplained"
-        ],
-        *[f"{row['words']} {row['equation']}. {row['left_out']}" for row in diagnosis["free"]],
-    ]
-    for entry in missing:
-        chance = entry["probability"]
-        text = f"{entry['name']} is {probability_words(chance)} missing ({probability(chance)}). {entry['plain']}"
-        if entry["part"]:
-            text += f" In the paper's Fig. 2 it stands in {PARTS[entry['part']]}."
-        if entry["confused_with"]:
-            others = ", ".join(find_effect(name).name.lower() for name in entry["confused_with"])
-            text += f" This record cannot clearly separate it from: {others}. To decide: {entry['next_experiment']}"
-        lines.append(text)
-    if missing and diagnosis["verdict"] == "effect_missing":
-        lines.append(
-            f"With {'it' if len(missing) == 1 else 'them'} the error on held-out pulses "
-            f"{from_to(base['held_out_rms_nm'], named['held_out_rms_nm'])}."
-        )
-    return [*lines, *diagnosis["notes"], conclusion.advice]
