@@ -57,7 +57,16 @@ def search_for(record: Record, model: Model | None = None, progress: Progress | 
     """Search for what a model lacks on a record.
 
     The model of a step of an earlier search of the same record is not searched again as such: that search is run, and
-    what the model lacks are the later steps. Parameters and errors are those of `diagnose`.
+    what the model lacks are the later steps. Errors are those of `diagnose`.
+
+    Parameters
+    ----------
+    record : Record
+        The measurement.
+    model : Model, optional
+        Its structure is examined; default: the plain one.
+    progress : callable, optional
+        Called with a share of 0 to 1 and a line of text; what it raises ends the work.
     """
     structure = structure_of(model)
     if model is not None and "begun_with" in model.extra and same_data(model, record):

@@ -17,7 +17,7 @@ from stimrig.identify.diagnosis.objections import at_bounds
 from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work, resembles_earlier
 from stimrig.identify.effects import find_effect
 from stimrig.identify.estimation.effect_fit import effect_names
-from stimrig.identify.estimation.left_out import difference
+from stimrig.identify.estimation.left_out import difference, hold_out
 
 Scores = dict[str, float]
 """What speaks for a statement, by name; larger values make it more probable."""
@@ -65,7 +65,9 @@ def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: floa
     stage = dict(step.searched.effects).get(effect.id, effect.forms[0]).stage
     left = scores_of_remainder(search)
     fall = difference(before.left_out, step.left_out).errors if effect.predictable else FALLS[0]
+    unseen = difference(hold_out(before.searched), hold_out(step.searched))
     return {
+        "unseen": float(np.clip(unseen.gain, -0.5, 2.0)),
         "gain": float(np.log(np.clip(gain, *GAINS))),
         "rivals": float(np.clip(np.log(share / max(1.0 - share, 1e-9)), -LARGEST_ODDS, LARGEST_ODDS)),
         "fall": float(np.clip(fall, *FALLS)),

@@ -74,7 +74,8 @@ class Made:
         monkeypatch.setattr(verdict, "contradiction", lambda _fitted: None)
         monkeypatch.setattr(EffectSearch, "seen", {"mains_hum"})
         monkeypatch.setattr(Step, "left_out", None)
-        monkeypatch.setattr(probabilities, "difference", lambda *_: SimpleNamespace(errors=3.0))
+        monkeypatch.setattr(probabilities, "hold_out", lambda _fitted: None)
+        monkeypatch.setattr(probabilities, "difference", lambda *_: SimpleNamespace(errors=3.0, gain=0.5))
         monkeypatch.setattr(verdict, "held_out_error", self._unseen)
 
     def left(
