@@ -73,20 +73,20 @@ def main() -> None:
             models = {"fit": identify.fit(record)}
             if options.improve:
                 models["improve"] = identify.improve(record).models[-1]
-            for made, model in models.items():
-                found = model.fit.get("contradiction")
-                about = {"set": kinds, "seed": seed, "kind": kind, "model": made}
-                rows.append(about | held_by(model, unseen) | {"contradicts": bool(found and found["significant"])})
+            for verb, model in models.items():
+                parts = model.fit.get("contradiction")
+                about = {"set": kinds, "seed": seed, "kind": kind, "model": verb}
+                rows.append(about | held_by(model, unseen) | {"contradicts": bool(parts and parts["significant"])})
     write_json(options.json, rows)
     lines = []
-    for made in ("fit", "improve") if options.improve else ("fit",):
+    for verb in ("fit", "improve") if options.improve else ("fit",):
         for kinds in [*options.sets.split(","), "all"]:
-            of_set = [row for row in rows if row["model"] == made and kinds in (row["set"], "all")]
+            of_set = [row for row in rows if row["model"] == verb and kinds in (row["set"], "all")]
             shares = np.array([row["share"] for row in of_set])
             ratio = np.median([row["sd_nm"] / row["error_nm"] for row in of_set])
-            says = f"{sum(row['contradicts'] for row in of_set)} of {len(of_set)}"
-            figures = (f"{100 * np.mean(shares):.1f}", f"{100 * shares.min():.0f}", f"{ratio:.2f}", says)
-            lines.append([made, kinds, *figures])
+            alarms = f"{sum(row['contradicts'] for row in of_set)} of {len(of_set)}"
+            figures = (f"{100 * np.mean(shares):.1f}", f"{100 * shares.min():.0f}", f"{ratio:.2f}", alarms)
+            lines.append([verb, kinds, *figures])
     print(*table(["model", "set", "held, %", "lowest", "sd over error", "contradicts itself"], lines), sep="\n")
 
 

@@ -45,7 +45,7 @@ RECORDINGS: tuple[dict[str, Any], ...] = (
 STRENGTHS = ("weak", "middle", "strong")
 RIDGE = 0.5
 """Weight of the squares of the map's weights: a prior that is as wide as the scores are sure."""
-SURE = 0.9
+SURE_PROBABILITY = 0.9
 Job = tuple[str, str, str, int, dict[str, Any]]
 """Set, what is in the muscle, strength or protocol, seed, settings."""
 Row = dict[str, Any]
@@ -153,8 +153,8 @@ def statements(rows: Iterable[Row]) -> dict[str, list[tuple[Mapping[str, float],
             statement = "missing" if scores else "seen"
             by[statement].append((scores, effect in row["true"], row["kind"], library))
         if row["more"] is not None:
-            left = row["more"] or not {*row["true"]} <= row["scores"]["effects"].keys()
-            by["left"].append((row["scores"]["left"], left, row["kind"], library))
+            remaining = row["more"] or not {*row["true"]} <= row["scores"]["effects"].keys()
+            by["left"].append((row["scores"]["left"], remaining, row["kind"], library))
     return by
 
 
@@ -197,21 +197,22 @@ def report(title: str, stated: list[Any], probabilities: np.ndarray) -> list[str
     rows = [
         (
             f"{tenth / 10:.1f} to {(tenth + 1) / 10:.1f}",
-            own.sum(),
-            f"{probabilities[own].mean():.2f}",
-            f"{true[own].mean():.2f}",
+            of_tenth.sum(),
+            f"{probabilities[of_tenth].mean():.2f}",
+            f"{true[of_tenth].mean():.2f}",
         )
         for tenth in range(10)
-        if (own := tenths == tenth).any()
+        if (of_tenth := tenths == tenth).any()
     ]
-    sure = [
-        f"{name} {int(true[own].sum())} of {own.sum()}"
+    confident = [
+        f"{name} {int(true[of_tenth].sum())} of {of_tenth.sum()}"
         for name, kind in (("library's kinds", True), ("other physics", False))
-        for own in [(probabilities >= SURE) & (np.array([each[3] for each in stated]) == kind)]
+        for of_tenth in [(probabilities >= SURE_PROBABILITY) & (np.array([each[3] for each in stated]) == kind)]
     ]
     brier = f"Brier score {np.mean((probabilities - true) ** 2):.3f}; of the base rate alone {np.var(true):.3f}."
+    by_sure = f"True with {SURE_PROBABILITY} and more: {', '.join(confident)}."
     heads = ("stated", "statements", "mean stated", "true")
-    return [f"### {title}", "", f"{brier} True with {SURE} and more: {', '.join(sure)}.", "", *table(heads, rows), ""]
+    return [f"### {title}", "", f"{brier} {by_sure}", "", *table(heads, rows), ""]
 
 
 def main() -> None:

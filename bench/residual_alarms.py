@@ -34,8 +34,8 @@ def alarms_of(job: tuple[int, tuple[str, ...]]) -> list[dict[str, Any]]:
     seed, effects = job
     record = as_record(generate(None, seed=seed))
     rows = [_row(EXACT[0], seed, identify.fit(record), record)]
-    made = record_of_physics("plain", seed, disturbed=())
-    record, unseen = as_record(made), as_record(made["unseen"])
+    generated = record_of_physics("plain", seed, disturbed=())
+    record, unseen = as_record(generated), as_record(generated["unseen"])
     noise_nm = np.random.default_rng([seed, 7]).normal(0.0, NOISE_SD_NM, unseen.time_s.size)
     model = identify.fit(record)
     rows.append(_row(EXACT[1], seed, model, record))
@@ -75,7 +75,7 @@ def main() -> int:
     options = parser.parse_args()
     effects = tuple(filter(None, options.effects.split(",")))
     jobs = [(seed, effects) for seed in options.seeds]
-    rows = [row for found in in_processes(alarms_of, jobs, options.workers) for row in found]
+    rows = [row for alarms in in_processes(alarms_of, jobs, options.workers) for row in alarms]
     write_json(options.json, rows)
     print("\n".join(summary(rows)))
     return 0

@@ -77,8 +77,8 @@ def diagnosis(data: str, progress: Progress, model_json: str | None = None) -> d
     structures = [held_by(model, record), *(held_by(later, record) for later in improvement.models[1:])]
     more = {"signatures": signatures(record, improvement), "refused": list(improvement.refused)}
     rows = [
-        {**with_experiment(record, found, structure), **more}
-        for found, structure in zip(diagnoses, structures, strict=True)
+        {**with_experiment(record, each, structure), **more}
+        for each, structure in zip(diagnoses, structures, strict=True)
     ]
     return json_value({"rows": rows, "improvement": improvement.to_dict()})
 

@@ -33,7 +33,7 @@ def is_plain(model: Model) -> bool:
     return not model.effects and stored_model.is_plain(stored_model.read(model))
 
 
-class Found(NamedTuple):
+class SearchRow(NamedTuple):
     """The search that tells what a version lacks: where it is stored, and which of its models has that structure."""
 
     place: Model
@@ -71,31 +71,31 @@ class Analyses:
         """Diagnose what the structure of a model lacks; versions whose structures one search contains share it."""
         return (await self._diagnose(model, on_call))[1]
 
-    async def _diagnose(self, model: Model, on_call: OnCall | None) -> tuple[Found, dict[str, Any]]:
-        found = await asyncio.to_thread(self._search_of, model)
-        structure = {"model_json": stored_model.text(model)} if found.kind == OWN_DIAGNOSIS else {}
-        search = await self._find(found.place, found.kind, "diagnosis", on_call=on_call, **structure)
-        return found, _rows(search)[found.number]
+    async def _diagnose(self, model: Model, on_call: OnCall | None) -> tuple[SearchRow, dict[str, Any]]:
+        row = await asyncio.to_thread(self._search_of, model)
+        structure = {"model_json": stored_model.text(model)} if row.kind == OWN_DIAGNOSIS else {}
+        search = await self._find(row.place, row.kind, "diagnosis", on_call=on_call, **structure)
+        return row, _rows(search)[row.number]
 
-    def _search_of(self, model: Model) -> Found:
+    def _search_of(self, model: Model) -> SearchRow:
         """Return the search from the plain structure, stored with the recording's first version, or the version's own.
 
         A version is not searched again if a model of the plain one's search has its structure.
         """
         first = self.store.first(Model, Model.recording_id == model.recording_id, order=Model.created_utc)
         if is_plain(model):
-            return Found(first, DIAGNOSIS, 0)
+            return SearchRow(first, DIAGNOSIS, 0)
         structure = {*stored_model.structure(stored_model.read(model)).values()}
         for number, row in enumerate(_rows(self.known(first.id, DIAGNOSIS))):
             if structure and {*row.get("structure", ())} == structure:
-                return Found(first, DIAGNOSIS, number)
-        return Found(model, OWN_DIAGNOSIS, 0)
+                return SearchRow(first, DIAGNOSIS, number)
+        return SearchRow(model, OWN_DIAGNOSIS, 0)
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """Return the diagnosis, or None while there is none."""
-        found = self._search_of(model)
-        rows = _rows(self.known(found.place.id, found.kind))
-        return rows[found.number] if rows else None
+        row = self._search_of(model)
+        rows = _rows(self.known(row.place.id, row.kind))
+        return rows[row.number] if rows else None
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
         """Return a stored analysis, or None."""
@@ -195,8 +195,8 @@ class Analyses:
 
     def _searched(self, model: Model, effects: list[str]) -> dict[str, Any] | None:
         """Return the model with these effects, if the search for what a version lacks contains it."""
-        found = self._search_of(model)
-        improvement = self.known(found.place.id, f"{IMPROVEMENT} of {found.kind}") or {"models": []}
+        row = self._search_of(model)
+        improvement = self.known(row.place.id, f"{IMPROVEMENT} of {row.kind}") or {"models": []}
         for document in improvement["models"]:
             if document["method"] == model.method and {each["id"] for each in document["effects"]} == {*effects}:
                 return document
@@ -215,16 +215,16 @@ class Analyses:
 
         They descend from the version whose structure was diagnosed; of the plain one there may be several.
         """
-        found, diagnosis = await self._diagnose(model, on_call)
+        row, diagnosis = await self._diagnose(model, on_call)
 
         def store() -> tuple[dict[str, Any], list[Model]]:
-            improvement = self.known(found.place.id, f"{IMPROVEMENT} of {found.kind}")
+            improvement = self.known(row.place.id, f"{IMPROVEMENT} of {row.kind}")
             assert improvement is not None, "kept with the diagnosis"
             rows = [model]
-            if (found.kind, found.number) == (DIAGNOSIS, 0):
-                rows = [next((row for row in [found.place, *self.versions.ancestry(model)] if is_plain(row)), model)]
-            first, *steps = improvement["steps"][found.number :]
-            for step, document in zip(steps, improvement.pop("models")[found.number + 1 :], strict=True):
+            if (row.kind, row.number) == (DIAGNOSIS, 0):
+                rows = [next((each for each in [row.place, *self.versions.ancestry(model)] if is_plain(each)), model)]
+            first, *steps = improvement["steps"][row.number :]
+            for step, document in zip(steps, improvement.pop("models")[row.number + 1 :], strict=True):
                 rows.append(self._child(rows[-1], [step["added"]], document, by))
                 step["model_id"] = rows[-1].id
             steps = [{**first, "added": None, "model_id": rows[0].id}, *steps]

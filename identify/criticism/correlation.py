@@ -48,7 +48,7 @@ def correlation_tests(
     # The last direction is that of the zero, which may have been set anew.
     zero = np.full(grid.size, 1e3 * np.std(error[known]))
     directions = np.where(known, np.c_[directions_nm, zero].T, 0.0)
-    residual, taken = _without_uncertainty(error, directions, known, fitted)
+    residual, absorbed = _without_uncertainty(error, directions, known, fitted)
     noise, _ = profile(residual, ends_of(runs(known)), WHITE_AND_SLOW.of_steps(grid.step_s))
     slow, white = noise.ar1 * noise.share, residual
     if innovations := slow >= LEAST_SLOW:  # cross-correlations of coloured noise become large by chance
@@ -59,7 +59,7 @@ def correlation_tests(
     signals = {"u": grid.interval_means(width), "u2": grid.interval_means(width**2), "y": torque - error}
     signals = {name: _filtered(signal, slow * innovations, known) for name, signal in signals.items()}
     functions = _functions(white, signals) | _functions(residual, {})
-    tests, bands = [], _bands(signals, known, taken)
+    tests, bands = [], _bands(signals, known, absorbed)
     for name, words in WORDS.items():
         values, place = functions[name], int(np.argmax(np.abs(functions[name])))
         largest, at_lag_s = float(np.abs(values[place])), float(place + (name == "residual")) * grid.step_s
@@ -89,15 +89,15 @@ def _without_uncertainty(
             squares += float(np.sum((error[rows] - (axes @ error[rows]) @ axes) ** 2))
             freedom += rows.sum() - len(axes)
         noise_sd = np.sqrt(squares / freedom)
-    corrected, taken = error.copy(), np.zeros((0, error.size))
+    corrected, absorbed = error.copy(), np.zeros((0, error.size))
     for rows, was_fitted, sizes, axes in parts:
         counted = sizes > NEGLIGIBLE * noise_sd
         axes, share = axes[counted], 1.0 if was_fitted else 1.0 - 1.0 / np.hypot(1.0, sizes[counted] / noise_sd)
         corrected[rows] -= (share * (axes @ error[rows])) @ axes
         if was_fitted:
-            taken = np.zeros((len(axes), error.size))
-            taken[:, rows] = axes
-    return corrected, taken
+            absorbed = np.zeros((len(axes), error.size))
+            absorbed[:, rows] = axes
+    return corrected, absorbed
 
 
 def _filtered(signal: np.ndarray, ar1: float, known: np.ndarray) -> np.ndarray:
@@ -124,15 +124,15 @@ def _functions(rows: np.ndarray, signals: dict[str, np.ndarray]) -> dict[str, np
     return functions
 
 
-def _bands(signals: dict[str, np.ndarray], known: np.ndarray, taken: np.ndarray) -> dict[str, float]:
+def _bands(signals: dict[str, np.ndarray], known: np.ndarray, absorbed: np.ndarray) -> dict[str, float]:
     """Bands that any function leaves in 5 % of records, for simulated white noise (the same draws every time).
 
-    Each is the same quantile of the largest value over lags. `taken`: what a fit takes from noise, shape (R, K).
+    Each is the same quantile of the largest value over lags. `absorbed`: what a fit takes from noise, shape (R, K).
     """
     rng, draws = np.random.default_rng(20240229), []
     for _ in range(DRAWS // 100):
         noise = _centred(rng.standard_normal((100, known.size)), known)
-        functions = _functions(noise - (noise @ taken.T) @ taken, signals)
+        functions = _functions(noise - (noise @ absorbed.T) @ absorbed, signals)
         draws.append([np.max(np.abs(values), axis=1) for values in functions.values()])
     largest = np.concatenate(draws, axis=1)
     rank = np.argsort(np.argsort(largest, axis=1), axis=1).max(axis=0) / (DRAWS - 1)

@@ -35,7 +35,7 @@ def table_of(search: EffectSearch, verdict: Verdict, like: Mapping[str, Sequence
     `reason` of the status. Values that were not asked for are None. `like`: for each free effect, the effects of the
     library that act as it does.
     """
-    nothing = (1.0 - verdict.left) * float(np.prod([1.0 - chance for chance in verdict.probabilities.values()]))
+    nothing = (1.0 - verdict.remaining) * float(np.prod([1.0 - chance for chance in verdict.probabilities.values()]))
     rows = [_row(None, NO_CHANGE, None, 0) | {"probability": None if search.names("free") else nothing}]
     supported, against = helpful(search)
     vetoed = {row["effect"]: row["reason"] for row in against}
@@ -46,14 +46,14 @@ def table_of(search: EffectSearch, verdict: Verdict, like: Mapping[str, Sequence
         if chance is not None and (chance < PROBABLE or (why and status == ADD)):
             status, why = OPEN, why or "Other effects, or a cause outside the library, explain the record as well."
         why = why or " ".join(_instead(search, name) for name in like.get(effect, ()))
-        found = _of_step(before, step) | {"probability": chance}
-        rows.append(found | {"status": status, "reason": why})
+        row = _of_step(before, step) | {"probability": chance}
+        rows.append(row | {"status": status, "reason": why})
     for before, step in search.open:
         chance, why = verdict.doubted[str(step.added)], "More probably it is not there."
         rows.append(_of_step(before, step) | {"probability": chance, "status": OPEN, "reason": why})
-    shown, compared = {row["effect"] for row in rows}, 0
+    listed, compared = {row["effect"] for row in rows}, 0
     for candidate in search.rounds[-1] if search.rounds else ():
-        if candidate.effect.id in shown or candidate.effect.id in effect_names(search.last):
+        if candidate.effect.id in listed or candidate.effect.id in effect_names(search.last):
             continue
         change = None
         if candidate.gain > 0.0 and compared < MOST_COMPARED and not search.names("free"):
@@ -92,10 +92,10 @@ def _row(effect: str | None, name: str, change: Difference | None, parameters: i
         "probability": None, "seconds": [], "status": "", "reason": "",
     }  # fmt: skip
     if change is not None and np.isfinite(change.gain):
-        left = float(np.exp(-change.gain))
+        ratio = float(np.exp(-change.gain))
         row |= {
-            "change_percent": 100.0 * (left - 1.0),
-            "sd_percent": 100.0 * left * change.sd if change.errors else None,
+            "change_percent": 100.0 * (ratio - 1.0),
+            "sd_percent": 100.0 * ratio * change.sd if change.errors else None,
         }
     return row
 

@@ -122,8 +122,8 @@ def _improvement_of(search: EffectSearch, max_effects: int | None = None, force:
         reasons = likelihood_warnings(step.fitted)
         model = finish("maximum-likelihood", step.fitted, reasons, statistics=step.statistics)
         parent = models[-1].model_id if models else None
-        found = {"parent": parent, "added": step.added, "step": search.number + number}
-        models.append(model.with_(extra=model.extra | found | {"begun_with": list(search.begun_with)}))
+        lineage = {"parent": parent, "added": step.added, "step": search.number + number}
+        models.append(model.with_(extra=model.extra | lineage | {"begun_with": list(search.begun_with)}))
         reason = _reason(search, steps[number - 1], step, models[-1]) if number < len(steps) else FORCED
         rows.append(
             {"added": step.added}

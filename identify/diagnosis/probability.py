@@ -63,7 +63,7 @@ def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: floa
     effect = find_effect(str(step.added))
     gain = next(candidate.gain for candidate in step.tried if candidate.effect.id == effect.id)
     stage = dict(step.searched.effects).get(effect.id, effect.forms[0]).stage
-    left = scores_of_remainder(search)
+    remaining = scores_of_remainder(search)
     fall = difference(before.left_out, step.left_out).errors if effect.predictable else FALLS[0]
     unseen = difference(hold_out(before.searched), hold_out(step.searched))
     return {
@@ -71,11 +71,11 @@ def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: floa
         "gain": float(np.log(np.clip(gain, *GAINS))),
         "rivals": float(np.clip(np.log(share / max(1.0 - share, 1e-9)), -LARGEST_ODDS, LARGEST_ODDS)),
         "fall": float(np.clip(fall, *FALLS)),
-        "first": -float(any(name not in search.seen for name in effect_names(before.searched))),
-        "no repair": -float(resembles_earlier(before.searched, effect, stage, search.seen)),
+        "first": -float(any(name not in search.in_samples for name in effect_names(before.searched))),
+        "no repair": -float(resembles_earlier(before.searched, effect, stage, search.in_samples)),
         "at rest": -float(only_at_work(search.quiet, step.searched, effect.id)),
         "no objection": -float(objected),
         "within bounds": -float(bool(at_bounds(step.searched, effect.id))),
         "error": float(np.log(np.clip(before.searched.rms_nm / search.residual.white_nm, 1.0, 30.0))),
-        **{f"no {name}": -left[name] for name in ("structure", "terms", "held out", "work and rest", "parts")},
+        **{f"no {name}": -remaining[name] for name in ("structure", "terms", "held out", "work and rest", "parts")},
     }

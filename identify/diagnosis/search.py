@@ -162,10 +162,10 @@ class EffectSearch:
 
     def margin(self, number: int) -> float:
         """Log evidence that an effect must gain in a round."""
-        return thresholds.NEXT_MARGIN if number or {*self.base_effects} - self.seen else thresholds.FIRST_MARGIN
+        return thresholds.NEXT_MARGIN if number or {*self.base_effects} - self.in_samples else thresholds.FIRST_MARGIN
 
     @property
-    def seen(self) -> set[str]:
+    def in_samples(self) -> set[str]:
         """Effects that the samples show."""
         return {effect for effect, _, _ in detected_effects(self.raw)}
 

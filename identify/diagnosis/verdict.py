@@ -31,7 +31,7 @@ class Verdict:
     kind: str  # "effect_missing", "nothing_missing" or "unexplained_structure"
     probability: float  # of the verdict as a whole
     probabilities: dict[str, float]  # by effect, of those added
-    left: float  # probability that something else is missing
+    remaining: float  # probability that something else is missing
     rivals: dict[str, dict[str, float]] = field(default_factory=dict)
     """For each effect found: the shares of all effects tried in the same round."""
     objections: dict[str, str] = field(default_factory=dict)  # by effect: what speaks against it
@@ -69,13 +69,13 @@ def scores_of(search: EffectSearch) -> dict[str, Any]:
 
 def judge(search: EffectSearch) -> Verdict:
     """The verdict on a search that has ended."""
-    scores, doubted = scores_of(search), {str(step.added) for step in search.doubted}
+    scores, improbable = scores_of(search), {str(step.added) for step in search.doubted}
     chances = {
         effect: probability("missing" if values else "seen", values) for effect, values in scores["effects"].items()
     }
-    left, free = probability("left", scores["left"]), bool(search.names("free"))
-    nothing = (1.0 - left) * float(np.prod([1.0 - chance for chance in chances.values()]))
-    probabilities = {effect: chance for effect, chance in chances.items() if effect not in doubted}
+    remaining, free = probability("left", scores["left"]), bool(search.names("free"))
+    nothing = (1.0 - remaining) * float(np.prod([1.0 - chance for chance in chances.values()]))
+    probabilities = {effect: chance for effect, chance in chances.items() if effect not in improbable}
     rivals = {str(step.added): _rivals(search, step) for _, step in search.found}
     objections = {str(step.added): words for before, step in search.found if (words := objection_to(before, step))}
     best, named = max(probabilities.values(), default=0.0), bool(search.found) or not free
@@ -84,9 +84,9 @@ def judge(search: EffectSearch) -> Verdict:
     elif nothing >= LIKELIER_THAN_NOT and not free:
         kind, certainty = "nothing_missing", nothing
     else:
-        kind, certainty = "unexplained_structure", left if best >= LIKELIER_THAN_NOT else 1.0 - nothing
-    doubts = {effect: chances[effect] for effect in doubted}
-    return Verdict(kind, certainty, probabilities, left, rivals, objections, doubts)
+        kind, certainty = "unexplained_structure", remaining if best >= LIKELIER_THAN_NOT else 1.0 - nothing
+    doubted = {effect: chances[effect] for effect in improbable}
+    return Verdict(kind, certainty, probabilities, remaining, rivals, objections, doubted)
 
 
 def remainder_of(search: EffectSearch) -> Remainder:
@@ -107,7 +107,7 @@ def remainder_of(search: EffectSearch) -> Remainder:
             f"On held-out pulses the error of the last model is {after.ratio:.1f} times what noise and its uncertainty "
             "allow: something is still missing."
         )
-    held, pairs = effect_names(last), (contradiction(last) or {"pairs": None})["pairs"]
+    present, pairs = effect_names(last), (contradiction(last) or {"pairs": None})["pairs"]
     tried = next(reversed(search.rounds), ())
     return Remainder(
         structure=contradicted or _strange(search, effects, explained),
@@ -115,7 +115,7 @@ def remainder_of(search: EffectSearch) -> Remainder:
         ratio=float(residual.ratio),
         held_out=after,
         contradiction=pairs and pairs[0]["statistic"] / pairs[0]["limit"],
-        open_gain=max((candidate.gain for candidate in tried if candidate.effect.id not in held), default=0.0),
+        open_gain=max((candidate.gain for candidate in tried if candidate.effect.id not in present), default=0.0),
         notes=tuple(notes),
     )
 

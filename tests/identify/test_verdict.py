@@ -72,7 +72,7 @@ class Made:
             for module in (verdict, probabilities):
                 monkeypatch.setattr(module, name, lambda *_, value=value: value, raising=False)
         monkeypatch.setattr(verdict, "contradiction", lambda _fitted: None)
-        monkeypatch.setattr(EffectSearch, "seen", {"mains_hum"})
+        monkeypatch.setattr(EffectSearch, "in_samples", {"mains_hum"})
         monkeypatch.setattr(Step, "left_out", None)
         monkeypatch.setattr(probabilities, "hold_out", lambda _fitted: None)
         monkeypatch.setattr(probabilities, "difference", lambda *_: SimpleNamespace(errors=3.0, gain=0.5))
@@ -363,7 +363,7 @@ def test_the_model_of_a_step_lacks_what_was_added_after_it(made: Made):
     made.add(FIRST, 50.0, 60.0).add(SECOND, 20.0, 90.0)
     whole = judge(made.ended())
     assert judge(made.search.from_step(1)).probabilities == {SECOND: whole.probabilities[SECOND]}
-    assert judge(made.search.from_step(2)).left == whole.left
+    assert judge(made.search.from_step(2)).remaining == whole.remaining
 
 
 # ---- what speaks against an effect ----------------------------------------------------------------------------------
