@@ -89,10 +89,10 @@ def make(job: Job) -> tuple[Record, Row]:
     """Return the record of a job and its truth: `kind`, `true` (names that are no mistake), `more` (always missing)."""
     kind, what, strength, seed, options = job
     if kind == "physics":
-        made = record_of_physics(what, seed, protocol=strength)
-        truth = made["truth"]
+        generated = record_of_physics(what, seed, protocol=strength)
+        truth = generated["truth"]
         more = bool(SETS[what]) or "breath" in truth["disturbed"]
-        return as_record(made), {"kind": truth["kind"], "true": truth["true"], "more": more}
+        return as_record(generated), {"kind": truth["kind"], "true": truth["true"], "more": more}
     if kind == "fault":
         more = None if what != "gap" else False  # what a fault adds is in the record, though the muscle lacks nothing
         return faulty(what, seed), {"kind": what, "true": [], "more": more}
@@ -116,12 +116,12 @@ def faulty(fault: str, seed: int) -> Record:
     elif fault == "late":
         felt_us[at_fault] = felt_us[at_fault - 1]
     noise_nm = lambda count: rng.normal(0.0, NOISE_SD_NM, count)  # noqa: E731
-    made = sampled(muscle, Design(felt_us, design.segment), RATE_HZ, noise_nm)
-    pulse = np.minimum(np.floor(made["time_s"] * 40 + 1e-9).astype(int), felt_us.size - 1)
-    made["pulse_width_us"] = design.width_us[pulse]
+    generated = sampled(muscle, Design(felt_us, design.segment), RATE_HZ, noise_nm)
+    pulse = np.minimum(np.floor(generated["time_s"] * 40 + 1e-9).astype(int), felt_us.size - 1)
+    generated["pulse_width_us"] = design.width_us[pulse]
     if fault == "gap":
-        made = recorded(made | {"truth": {"effects": [], "strength": "middle"}}, "gap", seed)
-    return as_record(made)
+        generated = recorded(generated | {"truth": {"effects": [], "strength": "middle"}}, "gap", seed)
+    return as_record(generated)
 
 
 def look_at(job: Job) -> Row | None:
@@ -171,8 +171,8 @@ def fit_weights(stated: list[Any]) -> dict[str, float]:
         return float(value), np.r_[np.sum(off), scores.T @ off + RIDGE * weights[1:]]
 
     bounds = [(None, None), *[(0.0, None)] * len(names)]
-    found = minimize(cost, np.zeros(len(names) + 1), jac=True, method="L-BFGS-B", bounds=bounds)
-    return {name: round(float(weight), 3) for name, weight in zip(["", *names], found.x, strict=True)}
+    solution = minimize(cost, np.zeros(len(names) + 1), jac=True, method="L-BFGS-B", bounds=bounds)
+    return {name: round(float(weight), 3) for name, weight in zip(["", *names], solution.x, strict=True)}
 
 
 def chances(stated: list[Any], weights: Mapping[str, float]) -> np.ndarray:
@@ -183,11 +183,11 @@ def chances(stated: list[Any], weights: Mapping[str, float]) -> np.ndarray:
 
 def chances_without_own_kind(stated: list[Any]) -> np.ndarray:
     """Probabilities of statements, each by a map that was made without its kind."""
-    kinds, found = np.array([each[2] for each in stated]), np.zeros(len(stated))
+    kinds, probabilities = np.array([each[2] for each in stated]), np.zeros(len(stated))
     for kind in {*kinds}:
         others = [each for each in stated if each[2] != kind]
-        found[kinds == kind] = chances([each for each in stated if each[2] == kind], fit_weights(others))
-    return found
+        probabilities[kinds == kind] = chances([each for each in stated if each[2] == kind], fit_weights(others))
+    return probabilities
 
 
 def report(title: str, stated: list[Any], probabilities: np.ndarray) -> list[str]:
@@ -237,8 +237,8 @@ def main() -> None:
     by = statements(rows)
     if options.write:
         weights = {statement: fit_weights(stated) for statement, stated in by.items()}
-        made = written_by("python -m bench.calibration --scores … --write")
-        write_json(MAP, {"made": f"{made} From {len(rows)} records.", "weights": weights})
+        generated = written_by("python -m bench.calibration --scores … --write")
+        write_json(MAP, {"made": f"{generated} From {len(rows)} records.", "weights": weights})
     known = json.loads(MAP.read_text())["weights"]
     for statement, stated in by.items():
         print(*report(f"{statement}, by the map", stated, chances(stated, known[statement])), sep="\n")

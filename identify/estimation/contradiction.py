@@ -75,12 +75,12 @@ def contradiction(fitted: Fitted) -> dict[str, Any] | None:
     slopes = fitted.slopes * (scale * counted)[:, None]
     pairs = []
     for first, second in combinations(parts, 2):
-        one, other = parts[first], parts[second]
+        part, other = parts[first], parts[second]
         if (first in HALVES) != (second in HALVES):
             continue
-        rows = setup.fitted & near_widths(setup.grid, one.rows) & near_widths(setup.grid, other.rows)
+        rows = setup.fitted & near_widths(setup.grid, part.rows) & near_widths(setup.grid, other.rows)
         if np.sum(rows & (setup.grid.pulse_width_us > 0.0)) >= LEAST_ROWS:
-            pairs.append(_pair((first, second), one, other, whole, slopes[:, rows], setup.grid, np.flatnonzero(rows)))
+            pairs.append(_pair((first, second), part, other, whole, slopes[:, rows], setup.grid, np.flatnonzero(rows)))
     if not pairs:
         return None
     for pair in pairs:
@@ -103,8 +103,8 @@ def _part_rows(grid: Grid, rows: np.ndarray) -> dict[str, np.ndarray]:
     part_rows = {label: rows & (kind == key) for key, label in (("prbs", "prbs"), ("ramp", "ramp"), ("", other))}
     count = np.cumsum(rows & stimulated)
     part_rows |= dict(zip(HALVES, (rows & (2 * count <= count[-1]), rows & (2 * count > count[-1])), strict=True))
-    least = LEAST_S / grid.step_s
-    return {label: part for label, part in part_rows.items() if np.sum(part & stimulated) >= least}
+    min_rows = LEAST_S / grid.step_s
+    return {label: part for label, part in part_rows.items() if np.sum(part & stimulated) >= min_rows}
 
 
 def _refits(fitted: Fitted, part_rows: Mapping[str, np.ndarray]) -> tuple[dict[str, Part], np.ndarray, np.ndarray]:
@@ -146,19 +146,19 @@ def noise_at_rest(fitted: Fitted) -> NoiseLevel:
 
 def _pair(
     names: tuple[str, str],
-    one: Part,
-    other: Part,
+    first: Part,
+    second: Part,
     whole: np.ndarray,
     slopes: np.ndarray,
     grid: Grid,
     at: np.ndarray,
 ) -> dict[str, Any]:
     """Compare two parts at intervals `at`, where `slopes` are the derivatives of the torque, N·m."""
-    difference = (one.change - other.change) @ slopes
+    difference = (first.change - second.change) @ slopes
     # The residual of a fit has lost what the fit took: its covariance is I - X' whole X where the model is right.
-    gained = [part.gain @ part.information for part in (one, other)]
+    gained = [part.gain @ part.information for part in (first, second)]
     lost = gained[0] - gained[1]
-    covariance = gained[0] @ one.gain + gained[1] @ other.gain - lost @ whole @ lost.T
+    covariance = gained[0] @ first.gain + gained[1] @ second.gain - lost @ whole @ lost.T
     sd = np.sqrt(np.maximum(np.sum((covariance @ slopes) * slopes, axis=0), 0.0))
     sd = np.maximum(sd, 1e-3 * max(float(sd.max()), 1e-300))
     weighted = slopes / sd

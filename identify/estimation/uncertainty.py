@@ -151,7 +151,7 @@ def unexplained(fitted: Fitted, matrix: np.ndarray, contradiction: Mapping[str, 
     noise, noise_error = _noise_of_intervals(fitted)
     uncertain = float(np.sum(matrix * (lever @ lever.T))) / error.size
     more = float(np.mean(error**2)) - noise - uncertain
-    left = max(more - (2.0 * noise_error) ** 2 / more, 0.0) if more > 0.0 else 0.0
+    remaining = max(more - (2.0 * noise_error) ** 2 / more, 0.0) if more > 0.0 else 0.0
     pairs = contradiction["pairs"] if contradiction else []
     beyond = [
         pair["difference_nm"] ** 2 * (1.0 - pair["limit"] / pair["statistic"])
@@ -161,7 +161,7 @@ def unexplained(fitted: Fitted, matrix: np.ndarray, contradiction: Mapping[str, 
     between = BETWEEN * sum(beyond) / max(len(pairs), 1)
     wander_nm = wandering_zero_nm(fitted.problem.setup.grid, rows, fitted.residual_nm)
     zero = 0.0 if fitted.noise.is_white else ZERO * wander_nm**2  # white noise moves the means of the rests, too
-    return float(np.sqrt(max(left + min(between, MOST_BETWEEN * (left + uncertain)), zero)))
+    return float(np.sqrt(max(remaining + min(between, MOST_BETWEEN * (remaining + uncertain)), zero)))
 
 
 def _noise_of_intervals(fitted: Fitted) -> tuple[float, float]:
