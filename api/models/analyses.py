@@ -8,6 +8,7 @@ import json
 import logging
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
+from uuid import uuid4
 
 from stimrig.api.clock import Clock
 from stimrig.api.errors import ApiError, require_found
@@ -39,6 +40,8 @@ class SearchRow(NamedTuple):
     place: Model
     kind: str
     number: int
+    diagnosis: dict[str, Any] | None
+    """Of that model; None while there is none."""
 
 
 class Analyses:
@@ -83,19 +86,19 @@ class Analyses:
         A version is not searched again if a model of the plain one's search has its structure.
         """
         first = self.store.first(Model, Model.recording_id == model.recording_id, order=Model.created_utc)
+        rows = _rows(self.known(first.id, DIAGNOSIS))
         if is_plain(model):
-            return SearchRow(first, DIAGNOSIS, 0)
+            return SearchRow(first, DIAGNOSIS, 0, rows[0] if rows else None)
         structure = {*stored_model.structure(stored_model.read(model)).values()}
-        for number, row in enumerate(_rows(self.known(first.id, DIAGNOSIS))):
+        for number, row in enumerate(rows):
             if structure and {*row.get("structure", ())} == structure:
-                return SearchRow(first, DIAGNOSIS, number)
-        return SearchRow(model, OWN_DIAGNOSIS, 0)
+                return SearchRow(first, DIAGNOSIS, number, row)
+        rows = _rows(self.known(model.id, OWN_DIAGNOSIS))
+        return SearchRow(model, OWN_DIAGNOSIS, 0, rows[0] if rows else None)
 
     def known_diagnosis(self, model: Model) -> dict[str, Any] | None:
         """Return the diagnosis, or None while there is none."""
-        row = self._search_of(model)
-        rows = _rows(self.known(row.place.id, row.kind))
-        return rows[row.number] if rows else None
+        return self._search_of(model).diagnosis
 
     def known(self, model_id: str, kind: str) -> dict[str, Any] | None:
         """Return a stored analysis, or None."""
@@ -240,6 +243,9 @@ class Analyses:
         same = self.versions.child_with(parent, [*parent.effects, *added], set(added) - set(forced))
         if same is not None:
             return same
+        stored = self.store.get(Model, document["model_id"])
+        if stored is not None and stored.parent_id != parent.id:  # one search serves versions of several descents
+            document["model_id"] = str(uuid4())
         stored_model.mark_without_evidence(document, [*parent.fit["without_evidence"], *forced])
         document["extra"] = {**(document.get("extra") or {}), "parent": parent.id}
         of = (parent.participant, parent.recording_id)

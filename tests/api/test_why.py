@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import re
 from pathlib import Path
 from types import SimpleNamespace
@@ -319,6 +320,21 @@ def test_what_a_search_contains_is_neither_fitted_nor_searched_again(
     assert client.get(f"/v1/models/{child['id']}/diagnosis").json()["verdict"] == "nothing_missing"
     assert client.get(f"/v1/models/{model}/diagnosis").json()["structure"] == []
     assert {*submitted} <= {"effects"}
+
+
+def test_one_search_serves_two_versions_of_the_same_structure(
+    client: httpx.Client, service: Service, model: str
+) -> None:
+    """Its models are stored once for each line of descent, and none is taken for another."""
+    client.get(f"/v1/models/{model}/diagnosis")
+    versions = service.context.versions
+    first = versions.get(model)
+    twin = versions.add(
+        json.dumps({**json.loads(first.document), "model_id": "twin"}), first.participant, first.recording_id, "Ada"
+    )
+    body = {"effects": ["fatigue"]}
+    one, other = (client.post(f"/v1/models/{name}/effects", json=body).json() for name in (model, twin.id))
+    assert (one["parent_id"], other["parent_id"]) == (model, "twin") and one["id"] != other["id"]
 
 
 def test_free_effects_are_added_together_and_shown_with_their_common_error(
