@@ -161,15 +161,26 @@ def parameters_words(count: int) -> str:
     return "1 parameter" if count == 1 else f"{count} parameters"
 
 
+def error_change(row: Mapping[str, Any]) -> str:
+    """Change of the left-out error in a row of a diagnosis's table, with its standard error; empty if not computed."""
+    if row["change_percent"] is None:
+        return ""
+    spread = "" if row["sd_percent"] is None else f" ± {row['sd_percent']:.0f}"
+    return f"{row['change_percent']:+.0f}{spread} %"
+
+
+def stretch_words(row: Mapping[str, Any]) -> list[str]:
+    """Where in the record a row of the table improves the model most."""
+    return [f"seen most from {begin:.0f} to {end:.0f} s" for begin, end in row["seconds"]]
+
+
 def change_words(row: Mapping[str, Any]) -> str:
     """A row of a diagnosis's table in one line: change of the left-out error, parameters, probability, status."""
     words = [] if row["effect"] else ["no change: nothing is missing"]
-    if row["change_percent"] is not None:
-        spread = "" if row["sd_percent"] is None else f" ± {row['sd_percent']:.0f}"
-        words.append(f"error {row['change_percent']:+.0f}{spread} %")
+    words += [f"error {change}"] if (change := error_change(row)) else []
     words += [parameters_words(row["parameters"])] * bool(row["parameters"])
     words += [] if row["probability"] is None else [f"probability {probability(row['probability'])}"]
-    words += [f"seen most from {begin:.0f} to {end:.0f} s" for begin, end in row["seconds"]]
+    words += stretch_words(row)
     return "; ".join(words + [": ".join(filter(None, (row["status"], row["reason"])))] * bool(row["status"]))
 
 

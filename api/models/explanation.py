@@ -11,7 +11,7 @@ from stimrig.api.effect_words import effect_words, effects_words, parameter_word
 from stimrig.api.structure import worded
 from stimrig.identify.conclusion import conclude, effects_to_add, in_order, is_likely
 from stimrig.identify.healing import stands_out
-from stimrig.identify.summary import parameters_words, probability, probability_words
+from stimrig.identify.summary import error_change, parameters_words, probability, probability_words, stretch_words
 
 SPLITS = {
     "segment": "By part of the test",
@@ -95,13 +95,11 @@ def name_of(effect: str, library: Mapping[str, Any]) -> str:
 
 def change(row: Mapping[str, Any], explained: Collection[str]) -> dict[str, Any]:
     """Put a row of a diagnosis's table into words; `explained`: effects that are described below it."""
-    spread = "" if row["sd_percent"] is None else f" ± {row['sd_percent']:.0f}"
-    parts = [parameters_words(row["parameters"])] * bool(row["parameters"])
-    parts += [f"seen most from {begin:.0f} to {end:.0f} s" for begin, end in row["seconds"]]
+    parts = [parameters_words(row["parameters"])] * bool(row["parameters"]) + stretch_words(row)
     return {
         **row,
         "label": row["name"] if row["effect"] else "No change: nothing is missing",
-        "change": "–" if row["change_percent"] is None else f"{row['change_percent']:+.0f}{spread} %".replace("-", "−"),
+        "change": error_change(row).replace("-", "−") or "–",
         "chance": "–" if row["probability"] is None else probability(row["probability"]),
         "about": " ".join([f"{'; '.join(parts)}." if parts else "", row["reason"]]).strip(),
         "explained": row["effect"] in explained,
