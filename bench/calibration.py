@@ -31,7 +31,8 @@ from stimrig.hardware_sim.hidden.library import EFFECTS, OUTSIDERS
 from stimrig.hardware_sim.hidden.scenario import draw_pair, rng_of
 from stimrig.identify.diagnosis import side_by_side as workers
 from stimrig.identify.diagnosis.free import search_record
-from stimrig.identify.diagnosis.verdict import judge, scores_of
+from stimrig.identify.diagnosis.probability import logistic, scores_of_remainder
+from stimrig.identify.diagnosis.verdict import examine, judge
 from stimrig.identify.records.record import Record
 from tests.harness.carried_sessions import as_record
 
@@ -134,10 +135,12 @@ def look_at(job: Job) -> Row | None:
     cpu_s = time.process_time()
     search = search_record(record)
     verdict = judge(search)
+    effects = {effect: {} for effect in search.names("detected")}
+    effects |= {effect: each.scores for effect, each in examine(search).items()}
     return {
         "job": job, **truth,
         "verdict": verdict.kind, "probability": verdict.probability, "probabilities": verdict.probabilities,
-        "scores": scores_of(search), "cpu_s": time.process_time() - cpu_s,
+        "scores": {"effects": effects, "left": scores_of_remainder(search)}, "cpu_s": time.process_time() - cpu_s,
     }  # fmt: skip
 
 
@@ -177,8 +180,7 @@ def fit_weights(stated: list[Any]) -> dict[str, float]:
 
 def chances(stated: list[Any], weights: Mapping[str, float]) -> np.ndarray:
     """Probabilities of statements by a map."""
-    odds = [weights[""] + sum(weights[name] * value for name, value in scores.items()) for scores, *_ in stated]
-    return 1.0 / (1.0 + np.exp(-np.array(odds)))
+    return np.array([logistic(weights, scores) for scores, *_ in stated])
 
 
 def chances_without_own_kind(stated: list[Any]) -> np.ndarray:

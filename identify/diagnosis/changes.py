@@ -35,8 +35,7 @@ def table_of(search: EffectSearch, verdict: Verdict, like: Mapping[str, Sequence
     `reason` of the status. Values that were not asked for are None. `like`: for each free effect, the effects of the
     library that act as it does.
     """
-    nothing = (1.0 - verdict.remaining) * float(np.prod([1.0 - chance for chance in verdict.probabilities.values()]))
-    rows = [_row(None, NO_CHANGE, None, 0) | {"probability": None if search.names("free") else nothing}]
+    rows = [_row(None, NO_CHANGE, None, 0) | {"probability": None if search.names("free") else verdict.nothing}]
     supported, against = helpful(search)
     vetoed = {row["effect"]: row["reason"] for row in against}
     for before, step in pairwise(search.steps):

@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.candidate_terms import MAX_TERMS, fit_terms, fix_noise
 from stimrig.identify.diagnosis.residual import vetoed
@@ -35,16 +33,14 @@ Chain = tuple[Step, ...]
 """Steps of a search from its base on, the last ones with terms."""
 
 
-def search_record(
-    record: Record, progress: Progress | None = None, structure: Sequence[str] = (), rows: np.ndarray | None = None
-) -> EffectSearch:
+def search_record(record: Record, progress: Progress | None = None, structure: Sequence[str] = ()) -> EffectSearch:
     """Search a record for effects of the library, and then, where structure is left, for terms.
 
-    As `search_effects`; by default on all rows that may be fitted.
+    As `search_effects`, on all rows that may be fitted.
     """
     report = progress or silent
     grid, raw = prepare(record)
-    rows = fitted_rows(grid, None) if rows is None else rows
+    rows = fitted_rows(grid, None)
     search = search_effects(grid, raw, rows, lambda done, text: report(0.7 * done, text), structure=structure)
     search = replace(search, known=remainder_of(search))
     free = _with_terms(search, lambda done, text: report(0.7 + 0.25 * done, text))

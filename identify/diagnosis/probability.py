@@ -40,7 +40,11 @@ def weights() -> Mapping[str, Scores]:
 
 def probability(statement: str, scores: Scores) -> float:
     """Probability, 0 to 1, of a statement, one of `weights`, from its scores."""
-    known = weights()[statement]
+    return logistic(weights()[statement], scores)
+
+
+def logistic(known: Scores, scores: Scores) -> float:
+    """Probability, 0 to 1, by these weights."""
     return float(1.0 / (1.0 + np.exp(-known[""] - sum(known[name] * value for name, value in scores.items()))))
 
 
@@ -76,6 +80,6 @@ def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: floa
         "at rest": -float(only_at_work(search.quiet, step.searched, effect.id)),
         "no objection": -float(objected),
         "within bounds": -float(bool(at_bounds(step.searched, effect.id))),
-        "error": float(np.log(np.clip(before.searched.rms_nm / search.residual.white_nm, 1.0, 30.0))),
+        "error": float(np.log(np.clip(before.searched.rms_nm / search.remainder.white_nm, 1.0, 30.0))),
         **{f"no {name}": -remaining[name] for name in ("structure", "terms", "held out", "work and rest", "parts")},
     }

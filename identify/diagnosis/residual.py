@@ -150,6 +150,7 @@ class Remainder:
     structure: bool  # whether the fitted or the held-out rows show that structure is left
     explained: float  # share of the explainable log-likelihood that the effects explain
     ratio: float  # log-likelihood by which the residuals at work and at rest still differ
+    white_nm: float  # standard deviation that white noise of the samples alone gives an interval's mean
     held_out: HeldOutError | None  # None if held-out pulses cannot be judged
     contradiction: float | None
     """Mean square difference between its fits to parts of the record over the limit of a contradiction; None: too few

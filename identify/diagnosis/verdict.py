@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
+from stimrig.identify.conclusion import PROBABLE
 from stimrig.identify.diagnosis import thresholds
 from stimrig.identify.diagnosis.objections import objection_to
-from stimrig.identify.diagnosis.probability import probability, scores_of_effect, scores_of_remainder
+from stimrig.identify.diagnosis.probability import Scores, probability, scores_of_effect, scores_of_remainder
 from stimrig.identify.diagnosis.residual import HeldOutError, Remainder, held_out_error, residual_structure
 from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work
 from stimrig.identify.effects import find_effect
@@ -19,7 +19,6 @@ from stimrig.identify.estimation.contradiction import contradiction
 from stimrig.identify.estimation.effect_fit import Candidate, effect_names
 from stimrig.identify.estimation.solve import Fitted
 
-LIKELIER_THAN_NOT = 0.5
 LONGEST_HELD_S = 0.05
 """A reading that is held for longer than two pulses hides how the torque rises and falls."""
 
@@ -32,12 +31,12 @@ class Verdict:
     probability: float  # of the verdict as a whole
     probabilities: dict[str, float]  # by effect, of those added
     remaining: float  # probability that something else is missing
+    nothing: float  # probability that nothing is missing
     rivals: dict[str, dict[str, float]] = field(default_factory=dict)
     """For each effect found: the shares of all effects tried in the same round."""
     objections: dict[str, str] = field(default_factory=dict)  # by effect: what speaks against it
-    doubted: dict[str, float] = field(
-        default_factory=dict
-    )  # probabilities of effects that were found and are not named
+    doubted: dict[str, float] = field(default_factory=dict)
+    """Probabilities of the effects that were found and are not named."""
 
 
 def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[str, float]:
@@ -57,36 +56,51 @@ def shares(candidates: Sequence[Candidate], max_gain: float = np.inf) -> dict[st
     return {name: weight / total for name, weight in weights.items()}
 
 
-def scores_of(search: EffectSearch) -> dict[str, Any]:
-    """Return the scores of each effect that a search found, empty for what the samples show, and those of the rest."""
-    effects = {effect: {} for effect in search.names("detected")}
+@dataclass(frozen=True)
+class Examined:
+    """What is known of an effect that a search found."""
+
+    shares: dict[str, float]  # of all effects tried in the same round
+    objection: str | None  # what speaks against it
+    scores: Scores
+
+
+def examine(search: EffectSearch) -> dict[str, Examined]:
+    """Return what is known of each effect that a search found, the doubted ones last."""
+    examined = {}
     for before, step in [*search.found, *search.open]:
-        share = _rivals(search, step)[str(step.added)]
-        objected = objection_to(before, step) is not None
-        effects[str(step.added)] = scores_of_effect(search, before, step, share, objected)
-    return {"effects": effects, "left": scores_of_remainder(search)}
+        shares_there, objection = _rivals(search, step), objection_to(before, step)
+        scores = scores_of_effect(search, before, step, shares_there[str(step.added)], objection is not None)
+        examined[str(step.added)] = Examined(shares_there, objection, scores)
+    return examined
 
 
 def judge(search: EffectSearch) -> Verdict:
     """The verdict on a search that has ended."""
-    scores, improbable = scores_of(search), {str(step.added) for step in search.doubted}
-    chances = {
-        effect: probability("missing" if values else "seen", values) for effect, values in scores["effects"].items()
-    }
-    remaining, free = probability("left", scores["left"]), bool(search.names("free"))
+    examined, doubted = examine(search), {str(step.added) for step in search.doubted}
+    chances = dict.fromkeys(search.names("detected"), probability("seen", {}))
+    chances |= {effect: probability("missing", each.scores) for effect, each in examined.items()}
+    remaining, free = probability("left", scores_of_remainder(search)), bool(search.names("free"))
     nothing = (1.0 - remaining) * float(np.prod([1.0 - chance for chance in chances.values()]))
-    probabilities = {effect: chance for effect, chance in chances.items() if effect not in improbable}
-    rivals = {str(step.added): _rivals(search, step) for _, step in search.found}
-    objections = {str(step.added): words for before, step in search.found if (words := objection_to(before, step))}
-    best, named = max(probabilities.values(), default=0.0), bool(search.found) or not free
-    if best >= LIKELIER_THAN_NOT and named and not search.remainder.structure:
+    named = {effect: each for effect, each in examined.items() if effect not in doubted}
+    probabilities = {effect: chance for effect, chance in chances.items() if effect not in doubted}
+    best = max(probabilities.values(), default=0.0)
+    if best >= PROBABLE and (named or not free) and not search.remainder.structure:
         kind, certainty = "effect_missing", best
-    elif nothing >= LIKELIER_THAN_NOT and not free:
+    elif nothing >= PROBABLE and not free:
         kind, certainty = "nothing_missing", nothing
     else:
-        kind, certainty = "unexplained_structure", remaining if best >= LIKELIER_THAN_NOT else 1.0 - nothing
-    doubted = {effect: chances[effect] for effect in improbable}
-    return Verdict(kind, certainty, probabilities, remaining, rivals, objections, doubted)
+        kind, certainty = "unexplained_structure", remaining if best >= PROBABLE else 1.0 - nothing
+    return Verdict(
+        kind,
+        certainty,
+        probabilities,
+        remaining,
+        nothing,
+        rivals={effect: each.shares for effect, each in named.items()},
+        objections={effect: each.objection for effect, each in named.items() if each.objection},
+        doubted={effect: chances[effect] for effect in doubted},
+    )
 
 
 def remainder_of(search: EffectSearch) -> Remainder:
@@ -113,6 +127,7 @@ def remainder_of(search: EffectSearch) -> Remainder:
         structure=contradicted or _strange(search, effects, explained),
         explained=float(explained),
         ratio=float(residual.ratio),
+        white_nm=residual.white_nm,
         held_out=after,
         contradiction=pairs and pairs[0]["statistic"] / pairs[0]["limit"],
         open_gain=max((candidate.gain for candidate in tried if candidate.effect.id not in present), default=0.0),

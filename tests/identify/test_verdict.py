@@ -343,6 +343,7 @@ def test_of_an_effect_that_is_doubted_the_model_is_not_given(made: Made, monkeyp
     assert found.kind == "effect_missing" and found.probabilities == {FIRST: 0.9}
     rest = judge(search.from_step(1))
     assert (rest.kind, rest.probability) == ("nothing_missing", pytest.approx(0.9 * 0.7)), "its chance is not lost"
+    assert rest.nothing == rest.probability
     (refused,) = [each for each in search.refused if each.effect.id == SECOND]
     assert "mostly where it was not there" in refused.refusal
 
