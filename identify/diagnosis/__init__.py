@@ -69,9 +69,11 @@ def search_for(record: Record, model: Model | None = None, progress: Progress | 
         Called with a share of 0 to 1 and a line of text; what it raises ends the work.
     """
     structure = structure_of(model)
-    if model is not None and "begun_with" in model.extra and same_data(model, record):
-        search = search_record(record, progress, model.extra["begun_with"])
-        number = model.extra.get("step", 0)
+    begun_with = None if model is None else model.extra.get("begun_with")
+    if model is not None and begun_with is not None and {*begun_with} <= {*structure} and same_data(model, record):
+        begun_with = list(dict.fromkeys(begun_with))
+        search = search_record(record, progress, begun_with)
+        number = len(structure) - len(begun_with)  # each step adds one effect
         if number < len(search.steps) and search.steps[number].structure == structure:
             return search.from_step(number)
     return search_record(record, progress, structure)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import cache
+from importlib import import_module
 from types import SimpleNamespace
 from typing import Any
 
@@ -366,3 +367,30 @@ def test_a_model_whose_free_effect_cannot_be_run_is_refused(wrong, says: str):
     document["effects"] = wrong(document["effects"][0])
     with pytest.raises((BadModel, BadRequest), match=says):
         Model.from_json(json.dumps(document)).predict(hidden_muscles.record(seed=3, rate_hz=100))
+
+
+@pytest.mark.parametrize(
+    ("extra", "begins"),
+    [
+        ({"begun_with": []}, []),
+        ({"begun_with": ["fatigue:fitness"], "step": 0.5}, ["fatigue:fitness"]),
+        ({"begun_with": ["fatigue:fitness"] * 1000}, ["fatigue:fitness"]),
+        ({"begun_with": ["output_saturation:knee"]}, ["fatigue:fitness"]),
+        ({"begun_with": ["no_such_effect"]}, ["fatigue:fitness"]),
+        ({}, ["fatigue:fitness"]),
+    ],
+)
+def test_a_model_names_only_a_search_that_may_contain_it(
+    extra: dict[str, Any], begins: list[str], monkeypatch: pytest.MonkeyPatch
+):
+    diagnosis = import_module("stimrig.identify.diagnosis")
+    step, asked = SimpleNamespace(structure=["fatigue:fitness"]), []
+    whole: Any = SimpleNamespace(steps=[SimpleNamespace(structure=[]), step], from_step=lambda number: number)
+    monkeypatch.setattr(diagnosis, "structure_of", lambda _model: ["fatigue:fitness"])
+    monkeypatch.setattr(diagnosis, "same_data", lambda *_: True)
+    monkeypatch.setattr(diagnosis, "search_record", lambda _r, _p, structure: asked.append([*structure]) or whole)
+    model: Any = SimpleNamespace(extra=extra)
+    record: Any = None
+    found = diagnosis.search_for(record, model)
+    assert asked[0] == begins
+    assert (found == 1) is (begins == [])
