@@ -14,19 +14,14 @@ from importlib.resources import files
 import numpy as np
 
 from stimrig.identify.diagnosis.objections import at_bounds
-from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work, resembles_earlier
-from stimrig.identify.effects import find_effect
+from stimrig.identify.diagnosis.search import EffectSearch, Step, only_at_work
 from stimrig.identify.estimation.effect_fit import effect_names
 from stimrig.identify.estimation.left_out import difference, hold_out
 
 Scores = dict[str, float]
 """What speaks for a statement, by name; larger values make it more probable."""
-GAINS = (3.0, 3000.0)
-"""Log evidence between which more of it makes an effect more probable."""
 LARGEST_ODDS = 5.0
 """Largest logarithm of the odds against rivals that counts."""
-FALLS = (-2.0, 8.0)
-"""Standard errors of the left-out error between which its fall counts."""
 USUAL_CONTRADICTION = 0.15
 """Of models that lack nothing: the median over records; it stands where there are too few parts to compare."""
 
@@ -63,23 +58,21 @@ def scores_of_remainder(search: EffectSearch) -> Scores:
 
 
 def scores_of_effect(search: EffectSearch, before: Step, step: Step, share: float, objected: bool) -> Scores:
-    """Return what speaks for an effect that a search added; `share`: its share of probability among its rivals."""
-    effect = find_effect(str(step.added))
-    gain = next(candidate.gain for candidate in step.tried if candidate.effect.id == effect.id)
-    stage = dict(step.searched.effects).get(effect.id, effect.forms[0]).stage
+    """Return what speaks for an effect that a search added; `share`: its share of probability among its rivals.
+
+    The log evidence, the fall of the left-out error, a resemblance to an earlier effect and the rules for structure had
+    no weight beside these: the search has asked for them already.
+    """
+    effect = str(step.added)
     remaining = scores_of_remainder(search)
-    fall = difference(before.left_out, step.left_out).errors if effect.predictable else FALLS[0]
     unseen = difference(hold_out(before.searched), hold_out(step.searched))
     return {
         "unseen": float(np.clip(unseen.gain, -0.5, 2.0)),
-        "gain": float(np.log(np.clip(gain, *GAINS))),
         "rivals": float(np.clip(np.log(share / max(1.0 - share, 1e-9)), -LARGEST_ODDS, LARGEST_ODDS)),
-        "fall": float(np.clip(fall, *FALLS)),
         "first": -float(any(name not in search.in_samples for name in effect_names(before.searched))),
-        "no repair": -float(resembles_earlier(before.searched, effect, stage, search.in_samples)),
-        "at rest": -float(only_at_work(search.quiet, step.searched, effect.id)),
+        "at rest": -float(only_at_work(search.quiet, step.searched, effect)),
         "no objection": -float(objected),
-        "within bounds": -float(bool(at_bounds(step.searched, effect.id))),
+        "within bounds": -float(bool(at_bounds(step.searched, effect))),
         "error": float(np.log(np.clip(before.searched.rms_nm / search.remainder.white_nm, 1.0, 30.0))),
-        **{f"no {name}": -remaining[name] for name in ("structure", "terms", "held out", "work and rest", "parts")},
+        **{f"no {name}": -remaining[name] for name in ("terms", "held out", "work and rest", "parts")},
     }
